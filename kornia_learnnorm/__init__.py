@@ -1,0 +1,45 @@
+r"""Learned normalisation for the normalised eight-point algorithm, composed with Kornia.
+
+Example:
+    >>> import torch, kornia_learnnorm as kln
+    >>> points1, points2 = torch.rand(4, 8, 2) * 600, torch.rand(4, 8, 2) * 600
+    >>> F_mat = kln.find_fundamental(points1, points2, normalizer=kln.LearnedNormalizer.from_pretrained())
+    >>> F_mat.shape
+    torch.Size([4, 3, 3])
+
+"""
+
+from kornia_learnnorm.estimators import EightPoint
+from kornia_learnnorm.learned import LearnedNormalizer
+from kornia_learnnorm.losses import EpipolarLoss
+from kornia_learnnorm.metrics import BetterRate, better_rate
+from kornia_learnnorm.networks import CrossViewNetwork
+from kornia_learnnorm.normalizers import Hartley, Identity, PerView, Whitening, paper_transform, spd_transform
+from kornia_learnnorm.residuals import algebraic_distance, sampson_distance, symmetric_epipolar_distance
+from kornia_learnnorm.reweighting import ReweightedWhitening
+from kornia_learnnorm.solver import design_matrix, find_fundamental, null_vector, rank2_projection
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "BetterRate",
+    "CrossViewNetwork",
+    "EightPoint",
+    "EpipolarLoss",
+    "Hartley",
+    "Identity",
+    "LearnedNormalizer",
+    "PerView",
+    "ReweightedWhitening",
+    "Whitening",
+    "algebraic_distance",
+    "better_rate",
+    "design_matrix",
+    "find_fundamental",
+    "null_vector",
+    "paper_transform",
+    "rank2_projection",
+    "sampson_distance",
+    "spd_transform",
+    "symmetric_epipolar_distance",
+]

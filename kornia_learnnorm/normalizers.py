@@ -1,8 +1,8 @@
 r"""Normalisers: modules that choose the coordinates in which the fundamental matrix is solved and projected.
 
 The one contract of this package is ``(points1, points2, weights=None) -> (T1, T2)``: pixels :math:`(B, N, 2)` of both
-views and optional weights :math:`(B, N)` go in, two affine transforms :math:`(B, 3, 3)` come out. Anything that keeps it
-can be given to :func:`kornia_learnnorm.find_fundamental`.
+views and optional weights :math:`(B, N)` go in, two affine transforms :math:`(B, 3, 3)` come out. Anything that keeps
+it can be given to :func:`kornia_learnnorm.find_fundamental`.
 """
 
 from __future__ import annotations
@@ -288,7 +288,7 @@ class Whitening(nn.Module):
         x, w = points.to(dtype), None if weights is None else weights.to(dtype)
         origin = _mean(x, w)
         centred = x - origin[:, None]
-        covariance = _mean((centred[..., :, None] * centred[..., None, :]).flatten(-2), w).unflatten(-1, (2, 2))
+        covariance = torch.unflatten(_mean((centred[..., :, None] * centred[..., None, :]).flatten(-2), w), -1, (2, 2))
         return affine_transform(inverse_sqrt(covariance, self.floor), origin).to(points.dtype)
 
 

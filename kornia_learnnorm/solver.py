@@ -12,6 +12,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from kornia_learnnorm.normalizers import Hartley, check_correspondences, solve_dtype, transform_fundamental
 
@@ -27,8 +28,8 @@ def find_fundamental(
     r"""Compute the fundamental matrix from eight or more correspondences by the normalised eight-point algorithm.
 
     The points are mapped to normalised coordinates :math:`\hat x_i = T_i x_i`, the direct linear transformation (DLT)
-    finds :math:`\hat F` with :math:`\hat x_2^\top \hat F \hat x_1 = 0`, the rank-2 constraint is enforced **there**, and
-    :math:`F = T_2^\top \hat F T_1`. With eight points the DLT is exact, and the normalisation acts only through the
+    finds :math:`\hat F` with :math:`\hat x_2^\top \hat F \hat x_1 = 0`, the rank-2 constraint is enforced **there**,
+    and :math:`F = T_2^\top \hat F T_1`. With eight points the DLT is exact, and the normalisation acts only through the
     metric in which :math:`F` is projected.
 
     Args:
@@ -64,13 +65,14 @@ def find_fundamental(
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     w = None if weights is None else weights.to(dtype)
-    T1, T2 = (T.to(dtype) for T in (normalizer or Hartley())(x1, x2, w))
+    T1, T2 = (normalizer or Hartley())(x1, x2, w)
+    T1, T2 = T1.to(dtype), T2.to(dtype)
     x1 = convert_points_to_homogeneous(x1) @ T1.mT
     x2 = convert_points_to_homogeneous(x2) @ T2.mT
     f = null_vector(design_matrix(x1, x2), w)
-    F = rank2_projection(f.unflatten(-1, (3, 3)))
-    F = transform_fundamental(F, T1, T2)
-    return (F / F.norm(dim=(-2, -1), keepdim=True)).to(points1.dtype)
+    F = transform_fundamental(rank2_projection(torch.unflatten(f, -1, (3, 3))), T1, T2)
+    F_mat: Tensor = F / torch.linalg.matrix_norm(F, keepdim=True)
+    return F_mat.to(points1.dtype)
 
 
 def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
@@ -129,7 +131,7 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
     bordered = torch.where(determined[..., None, None], bordered, eye)
     h = torch.linalg.solve_ex(bordered, eye[:, 8].expand(*A.shape[:-2], 9).unsqueeze(-1))[0].squeeze(-1)
     h = torch.where(determined[..., None], h, h0)
-    return h / h.norm(dim=-1, keepdim=True)
+    return normalize(h, dim=-1)
 
 
 def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -166,7 +168,7 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
     eigenvalue = G[..., -1:, -1] + (g * x).sum(-1, keepdim=True)
     x = x - inverse_gap * ((G11 @ x[..., None]).squeeze(-1) - eigenvalue * x + g)
     v = (Vh.mT @ torch.cat([x, torch.ones_like(x[..., :1])], -1)[..., None]).squeeze(-1)
-    return v / v.norm(dim=-1, keepdim=True)
+    return normalize(v, dim=-1)
 
 
 def rank2_projection(F_mat: Tensor) -> Tensor:

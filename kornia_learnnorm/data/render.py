@@ -1,0 +1,288 @@
+r"""A small renderer: two views of a furnished room made of textured planes, with the exact fundamental matrix.
+
+For a first run without any data set. A back wall, a floor and slanted boards are each warped into each view by the
+homography of their plane and painted from back to front. The scene is far from planar, so :math:`F` is well determined.
+Images need OpenCV (the extra ``kornia-learnnorm[images]``), which is imported on use.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_learnnorm.files import replacing
+
+__all__ = ["RenderedPair", "render_pair", "write_pair"]
+
+Array = NDArray[np.float64]
+Texture = NDArray[np.float32]
+
+Painter = Callable[[np.random.Generator, Any, Texture], None]
+
+SUPERSAMPLING = 3  # pixels are averages of 3 x 3 samples
+
+
+class RenderedPair(NamedTuple):
+    r"""Two rendered images and their geometry; :math:`X_2 = R X_1 + t` for points in space.
+
+    Args:
+        image1: first image, grey, uint8 with shape :math:`(H, W)`.
+        image2: second image, grey, uint8 with shape :math:`(H, W)`.
+        K: intrinsics of both cameras with shape :math:`(3, 3)`; pixel centres are at whole numbers.
+        R: rotation with shape :math:`(3, 3)`.
+        t: translation in metres with shape :math:`(3,)`.
+        F_mat: fundamental matrix with shape :math:`(3, 3)`, unit Frobenius norm, :math:`x_2^\top F x_1 = 0`.
+
+    """
+
+    image1: NDArray[np.uint8]
+    image2: NDArray[np.uint8]
+    K: Array
+    R: Array
+    t: Array
+    F_mat: Array
+
+
+class _Plane(NamedTuple):
+    """A textured rectangle in space: its top left corner and its two sides, in metres of the first camera's frame."""
+
+    corner: Array
+    right: Array
+    down: Array
+    texture: Texture
+
+
+def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedPair:
+    r"""Render two views of a room with pictures on stands: the same seed gives the same images.
+
+    The second camera is about half a metre to the side of and ahead of the first one and turned a little. The ground
+    truth is :math:`F = K^{-\top} [t]_\times R K^{-1}`.
+
+    Args:
+        seed: seed of the textures, of the boards' places and of the motion; not negative.
+        width: width of the images in pixels.
+        height: height of the images in pixels.
+
+    Returns:
+        the images and their geometry.
+
+    Raises:
+        ImportError: if OpenCV is not installed.
+        ValueError: if the seed is negative, the height under 64 pixels or above the width.
+
+    Example:
+        >>> pair = render_pair(seed=0, width=320, height=240)
+        >>> pair.image1.shape, pair.image1.dtype
+        ((240, 320), dtype('uint8'))
+
+    """
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}")
+    if not 64 <= height <= width:
+        raise ValueError(f"images must be at least 64 pixels high and no higher than wide, got {width} x {height}")
+    cv2 = _import_cv2()
+    rng = np.random.default_rng(seed)
+    K = np.array([[0.9 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]])
+    yaw, pitch, roll = np.deg2rad([rng.uniform(-5, -3), rng.uniform(-1, 1), rng.uniform(-1.5, 1.5)])
+    R = _rotation(yaw, pitch, roll)
+    t = -R @ np.array([rng.uniform(0.5, 0.65), rng.uniform(-0.1, 0.05), rng.uniform(0.2, 0.4)])
+    planes = _room(rng, cv2, texels=SUPERSAMPLING * width / 640)
+    image1 = _expose(_render(cv2, planes, K, np.eye(3), np.zeros(3), (width, height)), rng)
+    image2 = _expose(_render(cv2, planes, K, R, t, (width, height)), rng)
+    return RenderedPair(image1, image2, K, R, t, _fundamental(K, R, t))
+
+
+def write_pair(folder: str | Path, pair: RenderedPair) -> None:
+    """Write ``image1.png``, ``image2.png`` and ``ground_truth.json``, each complete or not at all.
+
+    Args:
+        folder: where to write; made if absent. Files of these names in it are replaced.
+        pair: what to write. The ground truth holds ``K``, ``R``, ``t``, ``F_mat``, ``width`` and ``height``.
+
+    Raises:
+        ImportError: if OpenCV is not installed.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_pair(folder, render_pair(width=160, height=120))
+        ...     sorted(path.name for path in Path(folder).iterdir())
+        ['ground_truth.json', 'image1.png', 'image2.png']
+
+    """
+    cv2, folder = _import_cv2(), Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    height, width = pair.image1.shape
+    truth = {name: getattr(pair, name).tolist() for name in ("K", "R", "t", "F_mat")}
+    for name in ("image1", "image2"):
+        with replacing(folder / f"{name}.png") as temporary:
+            temporary.write_bytes(cv2.imencode(".png", getattr(pair, name))[1].tobytes())
+    with replacing(folder / "ground_truth.json") as temporary:
+        temporary.write_text(json.dumps({"width": width, "height": height, **truth}, indent=2) + "\n")
+
+
+def _import_cv2() -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError("rendering needs OpenCV: pip install 'kornia-learnnorm[images]'") from error
+    return cv2
+
+
+def _rotation(yaw: float, pitch: float, roll: float) -> Array:
+    """Return the rotation about the axes y, then x, then z, in radians."""
+    (cy, sy), (cx, sx), (cz, sz) = ((np.cos(angle), np.sin(angle)) for angle in (yaw, pitch, roll))
+    Ry = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+    Rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return np.asarray(Rz @ Rx @ Ry)
+
+
+def _fundamental(K: Array, R: Array, t: Array) -> Array:
+    x, y, z = t
+    F_mat = np.linalg.inv(K).T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R @ np.linalg.inv(K)
+    return np.asarray(F_mat / np.linalg.norm(F_mat))
+
+
+def _room(rng: np.random.Generator, cv2: Any, texels: float) -> list[_Plane]:
+    """Furnish the room, from back to front; ``texels`` is the number of texels per pixel of a 640 pixel wide image."""
+    wall_z, floor_y = 7.0, 1.35
+    wall = _masonry(rng, cv2, (15.0, 6.0), 85 * texels, brick=(0.62, 0.27), shift=0.5)
+    floor = _masonry(rng, cv2, (15.0, 5.8), 110 * texels, brick=(0.45, 0.45), shift=0.0)
+    planes = [
+        _Plane(np.array([-7.5, floor_y - 6.0, wall_z]), np.array([15.0, 0, 0]), np.array([0, 6.0, 0]), wall),
+        _Plane(np.array([-7.5, floor_y, wall_z]), np.array([15.0, 0, 0]), np.array([0, 0, -5.8]), floor),
+    ]
+    # Boards, leaning back a little: x and z of the foot on the floor, width, height, angle in degrees, painter.
+    boards = [
+        (0.4, 5.9, 2.1, 2.3, 8, _circles),
+        (-1.4, 4.7, 1.6, 1.7, -32, _polygons),
+        (1.5, 4.3, 1.3, 1.6, 30, _letters),
+        (0.2, 3.6, 0.85, 0.75, -14, _circles),
+    ]
+    for x, z, wide, high, degrees, paint in boards:
+        foot = np.array([x + rng.uniform(-0.1, 0.1), floor_y, z + rng.uniform(-0.1, 0.1)])
+        angle = np.deg2rad(degrees + rng.uniform(-4, 4))
+        right = wide * np.array([np.cos(angle), 0, -np.sin(angle)])
+        down = high * np.array([-0.12 * np.sin(angle), 1, -0.12 * np.cos(angle)])
+        _darken_floor(cv2, planes[1], foot, right)
+        picture = _framed(rng, cv2, paint, (wide, high), 160 * texels)
+        planes.append(_Plane(foot - right / 2 - down, right, down, picture))
+    return planes
+
+
+def _darken_floor(cv2: Any, floor: _Plane, foot: Array, right: Array) -> None:
+    """Paint the soft shadow of a board on the floor's texture."""
+    density = floor.texture.shape[1] / np.linalg.norm(floor.right)
+    behind = np.array([right[2], 0, -right[0]]) * -0.2
+    outline = np.array([foot - right / 2, foot + right / 2, foot + right / 2 + behind, foot - right / 2 + behind])
+    pixels = np.stack([outline[:, 0] - floor.corner[0], floor.corner[2] - outline[:, 2]], -1) * density
+    shadow = np.zeros(floor.texture.shape, np.float32)
+    cv2.fillConvexPoly(shadow, pixels.round().astype(np.int32), 0.6)
+    floor.texture[...] *= 1 - cv2.blur(shadow, (int(0.3 * density), int(0.3 * density)))
+
+
+def _noise(rng: np.random.Generator, cv2: Any, shape: tuple[int, int], finest: int) -> Texture:
+    """Return noise of all scales from the whole texture to ``finest`` texels, with standard deviation one."""
+    total = np.zeros(shape, np.float32)
+    cell = max(shape) // 2
+    while cell >= finest:
+        grid = rng.standard_normal((shape[0] // cell + 2, shape[1] // cell + 2)).astype(np.float32)
+        total += cv2.resize(grid, shape[::-1], interpolation=cv2.INTER_CUBIC) * np.float32(cell**0.3)
+        cell //= 2
+    return np.asarray(total / total.std(), np.float32)
+
+
+def _masonry(
+    rng: np.random.Generator,
+    cv2: Any,
+    size: tuple[float, float],
+    density: float,
+    brick: tuple[float, float],
+    shift: float,
+) -> Texture:
+    """Lay bricks or tiles, each of its own tone; every other row is shifted by a share of a brick."""
+    rows, columns = (np.arange(int(metres * density)) / density for metres in size[::-1])
+    row = rows / brick[1]
+    column = columns / brick[0] + shift * (row.astype(int)[:, None] % 2)
+    tones = rng.uniform(0.3, 0.75, (int(row[-1]) + 1, int(column.max()) + 1))
+    tone = tones[row.astype(int)[:, None], column.astype(int)]
+    joint = (row % 1 < 0.02 / brick[1])[:, None] | (column % 1 < 0.02 / brick[0])
+    texture = np.where(joint, 0.85, tone).astype(np.float32)
+    texture += 0.09 * _noise(rng, cv2, texture.shape, finest=4)
+    return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)
+
+
+def _framed(rng: np.random.Generator, cv2: Any, paint: Painter, size: tuple[float, float], density: float) -> Texture:
+    """Hang a painting in a dark frame with a pale mount."""
+    width, height = (int(metres * density) for metres in size)
+    texture = 0.55 + 0.12 * _noise(rng, cv2, (height, width), finest=4)
+    paint(rng, cv2, texture)
+    edge = int(0.05 * density)
+    for inset, tone in ((2 * edge, 0.92), (edge, 0.12)):
+        border = np.ones(texture.shape, bool)
+        border[inset:-inset, inset:-inset] = False
+        texture[border] = tone
+    texture += 0.03 * _noise(rng, cv2, texture.shape, finest=4)
+    return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)
+
+
+def _circles(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
+    """Paint rings and discs, large ones first."""
+    height, width = texture.shape
+    for radius in np.sort(rng.uniform(0.015, 0.16, 70))[::-1] * min(height, width):
+        centre = (int(rng.integers(width)), int(rng.integers(height)))
+        for share in (1.0, rng.uniform(0.5, 0.85), rng.uniform(0.15, 0.4)):
+            cv2.circle(texture, centre, max(1, int(share * radius)), rng.uniform(0.05, 1.0), -1, cv2.LINE_AA)
+
+
+def _polygons(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
+    """Paint triangles and quadrilaterals, large ones first."""
+    height, width = texture.shape
+    for radius in np.sort(rng.uniform(0.02, 0.25, 110))[::-1] * min(height, width):
+        angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 5)))
+        corners = rng.uniform((0, 0), (width, height)) + radius * np.stack([np.cos(angles), np.sin(angles)], -1)
+        cv2.fillPoly(texture, [corners.round().astype(np.int32)], rng.uniform(0.05, 1.0), cv2.LINE_AA)
+
+
+def _letters(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
+    """Set lines of random letters in several sizes on pale paper."""
+    height, width = texture.shape
+    ink = np.zeros(texture.shape, np.uint8)  # OpenCV writes on eight bits only
+    left, baseline = int(0.1 * width), int(0.06 * height)
+    while baseline < height:
+        scale = rng.uniform(0.0018, 0.005) * width
+        baseline += int(32 * scale)
+        text = "".join(rng.choice(list("ABCDEFGHJKLMNPRSTUVWXYZ23456789&"), 24))
+        thickness = max(1, int(2.5 * scale))
+        cv2.putText(ink, text, (left, baseline), cv2.FONT_HERSHEY_DUPLEX, scale, 255, thickness, cv2.LINE_AA)
+    texture[...] = (0.3 * texture + 0.6) * (1 - ink.astype(np.float32) / 280)
+
+
+def _render(cv2: Any, planes: list[_Plane], K: Array, R: Array, t: Array, size: tuple[int, int]) -> Texture:
+    """Paint the planes from back to front on a finer grid and average it down."""
+    fine = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
+    centre = (SUPERSAMPLING - 1) / 2
+    K_fine = np.array([[SUPERSAMPLING, 0, centre], [0, SUPERSAMPLING, centre], [0, 0, 1]]) @ K
+    image = np.zeros(fine[::-1], np.float32)
+    for plane in planes:
+        height, width = plane.texture.shape
+        # Texel centres are at whole numbers: texel u lies (u + 1/2) / width along the side.
+        to_space = np.stack([plane.right / width, plane.down / height, plane.corner], -1)
+        to_space[:, 2] += (to_space[:, 0] + to_space[:, 1]) / 2
+        H = K_fine @ (R @ to_space + np.outer(t, [0, 0, 1]))
+        painted = cv2.warpPerspective(plane.texture, H, fine, flags=cv2.INTER_LINEAR)
+        cover = cv2.warpPerspective(np.ones_like(plane.texture), H, fine, flags=cv2.INTER_LINEAR)
+        image = painted + (1 - cover) * image
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _expose(image: Texture, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Turn brightness into grey levels, with a sensor's noise of one level."""
+    levels = 235 * image + 8 + rng.standard_normal(image.shape)
+    return levels.round().clip(0, 255).astype(np.uint8)

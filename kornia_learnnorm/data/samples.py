@@ -1,0 +1,228 @@
+r"""Samples: the correspondences of image pairs, shuffled and cut into sets of eight, and sources that draw them."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.data.synthetic import random_scenes
+from kornia_learnnorm.normalizers import Identity
+from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.solver import find_fundamental
+
+__all__ = ["Samples", "StoreSamples", "SyntheticSamples", "draw_samples", "plain_residual"]
+
+RATIO = 0.8
+
+
+class Samples(NamedTuple):
+    """Samples of correspondences and further correspondences of the same image pairs.
+
+    Attributes:
+        points1: pixels in the first view, (S, N, 2).
+        points2: pixels in the second view, (S, N, 2).
+        heldout1: pixels in the first view of correspondences held out of the sample, (S, M, 2); M may be 0.
+        heldout2: pixels in the second view of correspondences held out of the sample, (S, M, 2).
+        pair: index of the image pair in its store, (S,) int64.
+    """
+
+    points1: Tensor
+    points2: Tensor
+    heldout1: Tensor
+    heldout2: Tensor
+    pair: Tensor
+
+    def select(self, rows: Tensor) -> Samples:
+        """Return the samples of the given rows (indices or mask)."""
+        return Samples(*(field[rows] for field in self))
+
+
+def draw_samples(
+    store: CorrespondenceStore,
+    generator: torch.Generator,
+    size: int = 8,
+    max_ratio: float | None = RATIO,
+    num_heldout: int = 0,
+    max_residual: float | None = None,
+) -> Samples:
+    """Shuffle each pair's correspondences and cut them into samples; what does not fill a sample is left out.
+
+    Held-out correspondences are the pair's others that pass the ratio test, so they measure the same motion whether or
+    not the samples are filtered.
+
+    Args:
+        store: correspondences of image pairs.
+        generator: source of the shuffle; equal states give equal samples.
+        size: correspondences in a sample, at least 8.
+        max_ratio: keep correspondences with Lowe's ratio below this; None keeps all.
+        num_heldout: held-out correspondences per sample, drawn with replacement.
+        max_residual: drop samples whose :func:`plain_residual` is at least this many pixels; None keeps all.
+
+    Returns:
+        samples in the order of the pairs, float32.
+
+    Raises:
+        ValueError: if ``size`` is below 8 or no pair fills a sample.
+
+    """
+    if size < 8:
+        raise ValueError(f"a sample needs at least 8 correspondences, got size={size}")
+    points = torch.cat([torch.from_numpy(store.points1), torch.from_numpy(store.points2)], -1)
+    pair = torch.repeat_interleave(torch.arange(len(store)), torch.from_numpy(store.offsets).diff())
+    ratio = torch.from_numpy(store.ratio)
+    rows = torch.arange(len(points)) if max_ratio is None else torch.nonzero(ratio < max_ratio)[:, 0]
+    rows = rows[torch.randperm(len(rows), generator=generator)]
+    rows = rows[torch.argsort(pair[rows], stable=True)]
+    count = torch.bincount(pair[rows], minlength=len(store))
+    place = torch.arange(len(rows)) - (count.cumsum(0) - count)[pair[rows]]
+    rows = rows[place < (count // size * size)[pair[rows]]].reshape(-1, size)
+    if len(rows) == 0:
+        raise ValueError(f"no pair of the store has {size} correspondences with ratio below {max_ratio}")
+    heldout = _draw_heldout(rows, pair[rows[:, 0]], pair, ratio < RATIO, num_heldout, generator)
+    cut, rest = points[rows], points[heldout]
+    samples = Samples(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], pair[rows[:, 0]])
+    if max_residual is None:
+        return samples
+    return samples.select(plain_residual(samples.points1, samples.points2) < max_residual)
+
+
+def _draw_heldout(
+    rows: Tensor, sample_pair: Tensor, pair: Tensor, passes: Tensor, number: int, generator: torch.Generator
+) -> Tensor:
+    """Draw ``number`` rows for each sample from its pair, none of them its own."""
+    pool = torch.nonzero(passes)[:, 0]
+    count = torch.bincount(pair[pool], minlength=int(pair.max()) + 1)
+    start = count.cumsum(0) - count
+    if number and int(count[sample_pair].min()) <= rows.shape[1]:
+        few = int(count[sample_pair].min())
+        raise ValueError(f"held-out correspondences: a pair has only {few} that pass the ratio test {RATIO}")
+
+    def draw() -> Tensor:
+        u = torch.rand(len(rows), number, generator=generator, dtype=torch.float64)
+        return pool[(u * count[sample_pair, None]).long() + start[sample_pair, None]]
+
+    drawn = draw()
+    while bool((own := (drawn[..., None] == rows[:, None, :]).any(-1)).any()):
+        drawn = torch.where(own, draw(), drawn)
+    return drawn
+
+
+def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = 8192) -> Tensor:
+    """Return each sample's mean symmetric epipolar distance under the un-normalised eight-point algorithm.
+
+    The paper drops samples of 60 px and more (Fan et al., section 4, training procedure).
+
+    Args:
+        points1: pixels in the first view with shape (S, N, 2).
+        points2: pixels in the second view with shape (S, N, 2).
+        batch_size: samples solved at once, which bounds the memory.
+
+    Returns:
+        pixels with shape (S,), float64.
+
+    """
+    residuals = [
+        symmetric_epipolar_distance(x1, x2, find_fundamental(x1, x2, normalizer=Identity())).mean(-1)
+        for x1, x2 in zip(
+            torch.split(points1.double(), batch_size), torch.split(points2.double(), batch_size), strict=True
+        )
+    ]
+    return torch.cat(residuals) if residuals else points1.new_zeros(0, dtype=torch.float64)
+
+
+class StoreSamples:
+    """Draw samples from stores of correspondences, each store once per ratio.
+
+    Args:
+        paths: store files; environment variables such as ``$LEARNNORM_DATA`` are filled in.
+        max_ratios: ratio tests; 0.8 gives the filtered samples, None the unfiltered ones, both a mix.
+        size: correspondences in a sample.
+        num_heldout: held-out correspondences per sample.
+        max_residual: drop samples whose :func:`plain_residual` is at least this many pixels; None keeps all.
+
+    Raises:
+        ValueError: if no path is given or an environment variable is not set.
+        FileNotFoundError: if there is no such store.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[str],
+        max_ratios: Sequence[float | None] = (RATIO,),
+        size: int = 8,
+        num_heldout: int = 0,
+        max_residual: float | None = 60.0,
+    ) -> None:
+        if not paths or not max_ratios:
+            raise ValueError(f"at least one store and one ratio are needed, got {paths!r} and {max_ratios!r}")
+        self.stores = [read_store(_expand(path)) for path in paths]
+        self.max_ratios = max_ratios
+        self.size = size
+        self.num_heldout = num_heldout
+        self.max_residual = max_residual
+
+    def draw(self, seed: int) -> Samples:
+        """Return one shuffle of all stores; the pairs of later stores count on from those of earlier ones."""
+        generator = torch.Generator().manual_seed(seed)
+        parts, first = [], 0
+        for store in self.stores:
+            for ratio in self.max_ratios:
+                part = draw_samples(store, generator, self.size, ratio, self.num_heldout, self.max_residual)
+                parts.append(part._replace(pair=part.pair + first))
+            first += len(store)
+        return Samples(*map(torch.cat, zip(*parts, strict=True)))
+
+
+class SyntheticSamples:
+    """Draw samples from :func:`~kornia_learnnorm.data.synthetic.random_scenes`, a scene for each.
+
+    Args:
+        number: scenes per draw; the residual filter drops some of them.
+        size: correspondences in a sample.
+        num_heldout: held-out correspondences per sample, inliers and outliers alike.
+        max_residual: drop samples whose :func:`plain_residual` is at least this many pixels; None keeps all.
+
+    Raises:
+        ValueError: if ``number`` is not positive or ``size`` is below 8.
+    """
+
+    def __init__(
+        self, number: int = 262_144, size: int = 8, num_heldout: int = 0, max_residual: float | None = 60.0
+    ) -> None:
+        if number < 1 or size < 8:
+            raise ValueError(f"number must be positive and size at least 8, got {number} and {size}")
+        self.number = number
+        self.size = size
+        self.num_heldout = num_heldout
+        self.max_residual = max_residual
+
+    def draw(self, seed: int) -> Samples:
+        """Return fresh samples."""
+        generator = torch.Generator().manual_seed(seed)
+        parts = [self._chunk(min(8192, self.number - done), generator) for done in range(0, self.number, 8192)]
+        samples = Samples(*map(torch.cat, zip(*parts, strict=True)))
+        return samples._replace(pair=torch.arange(len(samples.pair)))
+
+    def _chunk(self, number: int, generator: torch.Generator) -> Samples:
+        scenes = random_scenes(number, self.size + self.num_heldout, generator)
+        sizes = [self.size, self.num_heldout]
+        points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
+        points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
+        samples = Samples(points1, points2, heldout1, heldout2, torch.arange(number))
+        if self.max_residual is None:
+            return samples
+        return samples.select(plain_residual(points1, points2) < self.max_residual)
+
+
+def _expand(path: str) -> str:
+    expanded = os.path.expandvars(path)
+    unset = re.search(r"\$\{?(\w+)", expanded)
+    if unset:
+        raise ValueError(f"the environment variable {unset[1]}, named in {path!r}, is not set")
+    return expanded

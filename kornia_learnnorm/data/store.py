@@ -1,0 +1,149 @@
+r"""The file of correspondences: one HDF5 file, ragged arrays, one run of rows per image pair.
+
+Pair ``i`` owns the rows ``offsets[i]:offsets[i + 1]`` of ``points1``, ``points2`` and ``ratio``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_learnnorm.files import replacing
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["CorrespondenceStore", "read_store", "write_store"]
+
+FORMAT, VERSION = "correspondences", 1
+# name: shape behind the first axis, dtype, "M" correspondences or "P" pairs
+_LAYOUT: dict[str, tuple[tuple[int, ...], str, str]] = {
+    "points1": ((2,), "float32", "M"),
+    "points2": ((2,), "float32", "M"),
+    "ratio": ((), "float32", "M"),
+    "image_size": ((2, 2), "int32", "P"),
+    "F": ((3, 3), "float64", "P"),
+    "K": ((2, 3, 3), "float64", "P"),
+    "R": ((3, 3), "float64", "P"),
+    "t": ((3,), "float64", "P"),
+}
+
+
+@dataclass(frozen=True)
+class CorrespondenceStore:
+    """Correspondences of many image pairs, in memory.
+
+    Attributes:
+        points1: pixels (x, y) in the first images, (M, 2) float32.
+        points2: pixels (x, y) in the second images, (M, 2) float32.
+        ratio: nearest over second-nearest descriptor distance (Lowe's ratio), (M,) float32.
+        offsets: pair ``i`` owns rows ``offsets[i]:offsets[i + 1]``, (P + 1,) int64.
+        image_size: (width, height) of both images, (P, 2, 2) int32.
+        names: file names of both images, P pairs.
+        F: ground truth, x2^T F x1 = 0, unit Frobenius norm, NaN where unknown, (P, 3, 3) float64.
+        K: cameras, (P, 2, 3, 3) float64.
+        R: rotations of x2 = R x1 + t, (P, 3, 3) float64.
+        t: translations of x2 = R x1 + t in metres, (P, 3) float64.
+        dataset: what the images are.
+        pairs: how the pairs were chosen.
+        detector: how the correspondences were found.
+    """
+
+    points1: NDArray[np.float32]
+    points2: NDArray[np.float32]
+    ratio: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    image_size: NDArray[np.int32]
+    names: list[tuple[str, str]]
+    F: NDArray[np.float64]
+    K: NDArray[np.float64]
+    R: NDArray[np.float64]
+    t: NDArray[np.float64]
+    dataset: str
+    pairs: str
+    detector: str
+
+    def __len__(self) -> int:
+        """Return the number of image pairs."""
+        return len(self.offsets) - 1
+
+
+def _h5py() -> Any:
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError("reading stores needs h5py: pip install 'kornia-learnnorm[images]'") from error
+    return h5py
+
+
+def read_store(path: str | Path) -> CorrespondenceStore:
+    """Read a store of correspondences and check it.
+
+    Args:
+        path: an HDF5 file in the format that this module describes.
+
+    Returns:
+        the store, in memory.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is not a store of this version, is truncated, or its arrays do not fit together.
+
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no store at {path}")
+    h5py = _h5py()
+    try:
+        with h5py.File(path, "r") as file:
+            return _read(path, file)
+    except (OSError, RuntimeError) as error:
+        raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
+
+
+def _read(path: Path, file: h5py.File) -> CorrespondenceStore:
+    if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
+        got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')!r}"
+        raise ValueError(f"{path} is not a store: expected format={FORMAT!r}, version={VERSION}, got {got}")
+    missing = [name for name in (*_LAYOUT, "offsets", "names") if name not in file]
+    if missing:
+        raise ValueError(f"{path} lacks the datasets {', '.join(missing)}")
+    offsets = np.asarray(file["offsets"][:], np.int64)
+    if offsets.ndim != 1 or len(offsets) < 2 or offsets[0] != 0 or (np.diff(offsets) < 0).any():
+        raise ValueError(f"{path}: offsets must rise from 0 over at least one pair, got {offsets[:4]}...")
+    rows = {"M": int(offsets[-1]), "P": len(offsets) - 1}
+    for name, (tail, _, axis) in _LAYOUT.items():
+        if file[name].shape != (rows[axis], *tail):
+            raise ValueError(f"{path}: {name} must have shape {(rows[axis], *tail)}, got {file[name].shape}")
+    arrays: dict[str, Any] = {name: np.asarray(file[name][:], dtype) for name, (_, dtype, _) in _LAYOUT.items()}
+    for name in ("points1", "points2"):
+        if not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{path}: {name} holds NaN or infinite pixels")
+    names = [(str(first), str(second)) for first, second in file["names"].asstr()[:]]
+    about: dict[str, Any] = {key: str(file.attrs.get(key, "")) for key in ("dataset", "pairs", "detector")}
+    return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about)
+
+
+def write_store(path: str | Path, store: CorrespondenceStore) -> None:
+    """Write a store to a file beside the target, then rename it: the target is whole or untouched.
+
+    Args:
+        path: the HDF5 file to write; an existing one is replaced.
+        store: the correspondences.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+
+    """
+    h5py = _h5py()
+    with replacing(path) as beside, h5py.File(beside, "w") as file:
+        file.attrs.update({"format": FORMAT, "version": VERSION})
+        file.attrs.update({key: getattr(store, key) for key in ("dataset", "pairs", "detector")})
+        file["offsets"] = store.offsets.astype(np.int64)
+        file["names"] = np.array(store.names, dtype=h5py.string_dtype())
+        for name, (_, dtype, _) in _LAYOUT.items():
+            file[name] = getattr(store, name).astype(dtype)

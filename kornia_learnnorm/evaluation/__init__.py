@@ -1,0 +1,1 @@
+"""Using and measuring estimates: image pairs, predictions, tables and figures."""

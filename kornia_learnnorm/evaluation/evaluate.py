@@ -1,0 +1,84 @@
+"""Better rates and errors of the normalisers on stores of correspondences: ``learnnorm evaluate``."""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+
+from kornia_learnnorm.data.samples import RATIO, draw_samples, plain_residual
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.predict import Normalizer, evaluate_normalizers
+from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows
+from kornia_learnnorm.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers import Hartley, Identity, Whitening
+from kornia_learnnorm.reweighting import ReweightedWhitening
+
+__all__ = ["add_arguments", "evaluate_store", "run"]
+
+MAX_RESIDUAL = 60.0
+
+
+def evaluate_store(
+    store: CorrespondenceStore, weights: list[str], max_ratio: float | None, seed: int = 0
+) -> tuple[str, list[list[str]]]:
+    """Evaluate none, Hartley, whitening, reweighted whitening and trained weights on all samples of a seeded shuffle.
+
+    Args:
+        store: correspondences of image pairs.
+        weights: names or paths for :meth:`~kornia_learnnorm.LearnedNormalizer.from_pretrained`.
+        max_ratio: 0.8 for the filtered samples, None for the unfiltered ones.
+        seed: seed of the shuffle.
+
+    Returns:
+        a line that says what was evaluated, and the rows of the table.
+
+    Raises:
+        ValueError: if no pair fills a sample or no sample passes the filter.
+
+    """
+    samples = draw_samples(store, torch.Generator().manual_seed(seed), max_ratio=max_ratio)
+    kept = plain_residual(samples.points1, samples.points2) < MAX_RESIDUAL
+    if not bool(kept.any()):
+        raise ValueError(f"none of {len(kept)} samples has an un-normalised residual below {MAX_RESIDUAL:g} px")
+    normalizers: dict[str, Normalizer] = {
+        "none": Identity(),
+        "Hartley": Hartley(),
+        "whitening": Whitening(),
+        "reweighted whitening": ReweightedWhitening(),
+        **{f"learned: {name}": LearnedNormalizer.from_pretrained(name) for name in weights},
+    }
+    rows = method_rows(evaluate_normalizers(samples.select(kept), store, normalizers))
+    kind = "unfiltered matches" if max_ratio is None else f"matches with ratio below {max_ratio:g}"
+    about = f"{kind}: {int(kept.sum())} of {len(kept)} samples, un-normalised residual below {MAX_RESIDUAL:g} px"
+    return about, rows
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``learnnorm evaluate`` to a parser."""
+    parser.add_argument("stores", metavar="STORE", nargs="+", help="stores of correspondences (.h5)")
+    parser.add_argument(
+        "--weights",
+        metavar="NAME_OR_PATH",
+        nargs="+",
+        default=["crossview", "crossview-synthetic"],
+        help="weights to evaluate (default: those that ship: %(default)s)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run ``learnnorm evaluate``: print two tables per store, for filtered and unfiltered matches.
+
+    Raises:
+        FileNotFoundError: if a store or weights are missing.
+        ValueError: if a store or weights cannot be read.
+
+    """
+    for path in args.stores:
+        store = read_store(path)
+        print(f"\n{path}: {store.dataset or 'no description'}, {len(store)} pairs")
+        for max_ratio in (RATIO, None):
+            about, rows = evaluate_store(store, args.weights, max_ratio, args.seed)
+            print(f"\n{about}\n\n{format_table(HEADER, rows)}", flush=True)
+    return 0

@@ -1,0 +1,178 @@
+r"""The learned normaliser: a base normaliser, a network, and a builder that turns its output into transforms."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from kornia_learnnorm import networks, normalizers, reweighting
+from kornia_learnnorm.files import replacing
+from kornia_learnnorm.networks import CrossViewNetwork
+from kornia_learnnorm.normalizers import Whitening, check_correspondences, solve_dtype, spd_transform
+
+__all__ = ["LearnedNormalizer"]
+
+WEIGHTS = Path(__file__).parent / "weights"
+FORMAT = "kornia_learnnorm.normalizer.v1"
+
+
+class LearnedNormalizer(nn.Module):
+    r"""Predict the transforms of the normalised eight-point algorithm from the correspondences.
+
+    :math:`T_i = B(p_i)\, T_i^{base}`: the base normaliser gives coordinates, the network reads the correspondences
+    there and predicts parameters :math:`p_i`, the builder :math:`B` makes a transform of them. With zero parameters
+    the transforms are exactly the base's.
+
+    Args:
+        base: normaliser ``(points1, points2, weights) -> (T1, T2)``; whitening when not given.
+        network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates; a fresh
+            :class:`~kornia_learnnorm.networks.CrossViewNetwork` when not given.
+        transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
+
+    Reference:
+        Fan et al., section 4: normalisation matrices predicted from the correspondences by a network that is
+        invariant to their order.
+
+    Example:
+        >>> normalizer = LearnedNormalizer.from_pretrained()
+        >>> T1, T2 = normalizer(torch.rand(2, 8, 2) * 600, torch.rand(2, 8, 2) * 600)
+        >>> T1.shape
+        torch.Size([2, 3, 3])
+
+    """
+
+    def __init__(
+        self,
+        base: nn.Module | None = None,
+        network: nn.Module | None = None,
+        transform: Callable[[Tensor], Tensor] = spd_transform,
+    ) -> None:
+        super().__init__()
+        self.base = Whitening() if base is None else base
+        self.network = CrossViewNetwork() if network is None else network
+        self.transform = transform
+
+    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        r"""Return the transforms :math:`(B, 3, 3)` of both views, in the dtype of the points.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+
+        Raises:
+            TypeError: if the points are not floating-point tensors of one dtype.
+            ShapeError: if a shape is wrong.
+            ValueError: if there are fewer than eight correspondences or a value is not finite.
+
+        """
+        check_correspondences(points1, points2, weights)
+        dtype = solve_dtype(points1.device)
+        x1, x2 = points1.to(dtype), points2.to(dtype)
+        w = None if weights is None else weights.to(dtype)
+        T1, T2 = self.base(x1, x2, w)
+        params1, params2 = self.network(_apply(T1, x1), _apply(T2, x2), w)
+        T1, T2 = self.transform(params1) @ T1, self.transform(params2) @ T2
+        return T1.to(points1.dtype), T2.to(points2.dtype)
+
+    def save_pretrained(self, path: str | Path) -> None:
+        """Write weights and architecture to one safetensors file, beside the target and then renamed.
+
+        Args:
+            path: the file to write.
+
+        Raises:
+            TypeError: if the base, the network or the builder is not one of this package, so that the file could not
+                say how to build it; use ``state_dict`` for those.
+
+        """
+        architecture = {
+            "base": _describe(self.base, normalizers, reweighting),
+            "network": _describe(self.network, networks),
+            "transform": _name(self.transform, normalizers),
+        }
+        state = {key: value.detach().cpu().contiguous() for key, value in self.state_dict().items()}
+        with replacing(path) as beside:
+            save_file(state, beside, metadata={"format": FORMAT, "architecture": json.dumps(architecture)})
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path = "crossview") -> LearnedNormalizer:
+        """Load a trained normaliser: one that ships with the package, by name, or a safetensors file.
+
+        Args:
+            name: ``"crossview"``, ``"crossview-synthetic"``, or the path of a ``.safetensors`` file.
+
+        Returns:
+            the normaliser, in evaluation mode.
+
+        Raises:
+            FileNotFoundError: if there are no such weights; the message lists those that ship.
+            ValueError: if the file is not a normaliser of this package or its tensors do not fit.
+
+        Example:
+            >>> normalizer = LearnedNormalizer.from_pretrained("crossview-synthetic")
+
+        """
+        path = Path(name) if Path(name).suffix == ".safetensors" else WEIGHTS / f"{name}.safetensors"
+        if not path.is_file():
+            shipped = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
+            raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {shipped}")
+        try:
+            with safe_open(path, "pt") as file:
+                metadata = file.metadata() or {}
+                state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+        except SafetensorError as error:
+            raise ValueError(f"{path} is not a safetensors file: {error}") from error
+        if metadata.get("format") != FORMAT:
+            raise ValueError(f"{path} is not a normaliser: expected format {FORMAT!r}, got {metadata.get('format')!r}")
+        normalizer = cls(**_build(path, metadata.get("architecture", "")))
+        try:
+            normalizer.load_state_dict(state, strict=True)
+        except RuntimeError as error:
+            raise ValueError(f"{path}: the tensors do not fit the architecture: {error}") from error
+        return normalizer.eval()
+
+
+def _apply(T: Tensor, points: Tensor) -> Tensor:
+    return points @ T[..., :2, :2].mT + T[..., None, :2, 2]
+
+
+def _name(part: Any, *modules: Any) -> str:
+    name = getattr(part, "__name__", "")
+    if not any(getattr(module, name, None) is part for module in modules):
+        raise TypeError(f"only this package's parts can be saved with their architecture, got {part!r}")
+    return str(name)
+
+
+def _describe(part: nn.Module, *modules: Any) -> dict[str, Any]:
+    """Name a part of this package and its constructor's arguments, which it keeps as attributes of the same names."""
+    arguments = list(inspect.signature(type(part)).parameters)
+    return {"name": _name(type(part), *modules), **{key: getattr(part, key) for key in arguments}}
+
+
+def _build(path: Path, architecture: str) -> dict[str, Any]:
+    """Build the parts that a file names; only public classes and builders of this package can be named."""
+
+    def find(name: str, *modules: Any) -> Any:
+        for module in modules:
+            if name in module.__all__:
+                return getattr(module, name)
+        raise ValueError(f"unknown part {name!r}")
+
+    try:
+        parts = json.loads(architecture)
+        base, network = dict(parts["base"]), dict(parts["network"])
+        return {
+            "base": find(base.pop("name"), normalizers, reweighting)(**base),
+            "network": find(network.pop("name"), networks)(**network),
+            "transform": find(parts["transform"], normalizers),
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} describes no normaliser of this version: {error}") from error

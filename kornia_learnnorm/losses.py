@@ -1,0 +1,99 @@
+r"""Losses of a fundamental matrix: residuals of correspondences, reduced to one number.
+
+No loss needs a label. Measured on a sample's own points it is the paper's self-supervision; measured on held-out
+correspondences of the same image pair, it asks for the motion instead of the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor, nn
+
+from kornia_learnnorm.residuals import symmetric_epipolar_distance
+
+__all__ = ["EpipolarLoss"]
+
+
+class EpipolarLoss(nn.Module):
+    r"""Residuals on the sample's own points and on held-out ones, mixed and reduced.
+
+    With ``log=False``, the mean residual of a sample is averaged over the batch (Fan et al., Eq. 7). With ``log=True``,
+    its logarithm is, so that a few bad samples do not outweigh the rest. Held-out correspondences hold outliers: they
+    enter one by one, each through its own logarithm or mean.
+
+    Args:
+        residual: maps ``(points1, points2, F_mat)`` to residuals :math:`(B, N)`;
+            :func:`~kornia_learnnorm.symmetric_epipolar_distance`, :func:`~kornia_learnnorm.sampson_distance` or
+            :func:`~kornia_learnnorm.algebraic_distance`.
+        log: average the logarithm instead of the residual.
+        heldout_weight: share of the held-out part, 0 to 1.
+        floor: added to the residuals under the logarithm, in their unit; own points fit far below a pixel, held-out
+            ones do not.
+        heldout_floor: the same for held-out residuals.
+        ceiling: residuals above this count as this much and send no gradient; it keeps infinite ones (points on an
+            epipole) out of the mean.
+
+    Raises:
+        ValueError: if ``heldout_weight`` is outside 0 to 1, or a floor or the ceiling is not positive.
+
+    Example:
+        >>> import torch
+        >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
+        >>> points1, points2 = torch.zeros(1, 8, 2), torch.ones(1, 8, 2)
+        >>> EpipolarLoss(log=False)(points1, points2, F_mat)
+        tensor(2.)
+
+    """
+
+    def __init__(
+        self,
+        residual: Callable[[Tensor, Tensor, Tensor], Tensor] = symmetric_epipolar_distance,
+        log: bool = True,
+        heldout_weight: float = 0.0,
+        floor: float = 1e-3,
+        heldout_floor: float = 0.1,
+        ceiling: float = 1e4,
+    ) -> None:
+        super().__init__()
+        if not 0 <= heldout_weight <= 1:
+            raise ValueError(f"heldout_weight must be in [0, 1], got {heldout_weight}")
+        if min(floor, heldout_floor, ceiling) <= 0:
+            raise ValueError(f"floors and ceiling must be positive, got {floor}, {heldout_floor} and {ceiling}")
+        self.residual = residual
+        self.log = log
+        self.heldout_weight = heldout_weight
+        self.floor = floor
+        self.heldout_floor = heldout_floor
+        self.ceiling = ceiling
+
+    def forward(
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        F_mat: Tensor,
+        heldout1: Tensor | None = None,
+        heldout2: Tensor | None = None,
+    ) -> Tensor:
+        """Return the loss, a scalar.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            F_mat: fundamental matrices with shape :math:`(B, 3, 3)`.
+            heldout1: held-out pixels in the first view with shape :math:`(B, M, 2)`.
+            heldout2: held-out pixels in the second view with shape :math:`(B, M, 2)`.
+
+        Raises:
+            ValueError: if ``heldout_weight`` is positive and there are no held-out correspondences.
+
+        """
+        own = self.residual(points1, points2, F_mat).clamp(max=self.ceiling).mean(-1)
+        loss = (own + self.floor).log().mean() if self.log else own.mean()
+        if self.heldout_weight == 0:
+            return loss
+        if heldout1 is None or heldout2 is None or heldout1.shape[-2] == 0:
+            raise ValueError(f"heldout_weight={self.heldout_weight} needs held-out correspondences, got none")
+        rest = self.residual(heldout1, heldout2, F_mat).clamp(max=self.ceiling)
+        heldout = (rest + self.heldout_floor).log().mean() if self.log else rest.mean()
+        return (1 - self.heldout_weight) * loss + self.heldout_weight * heldout

@@ -1,0 +1,176 @@
+r"""Set networks that predict the parameters of both views' transforms from correspondences.
+
+The contract is ``(points1, points2, weights) -> (params1, params2)``: points :math:`(B, N, 2)` in the coordinates of
+the base normaliser, parameters :math:`(B, P)` for a transform builder. Zero parameters mean the base itself.
+"""
+
+from __future__ import annotations
+
+import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from kornia_learnnorm.solver import design_matrix, null_vector, smallest_right_singular_vector
+
+__all__ = ["CrossViewNetwork", "SetNetwork"]
+
+_POINT_FEATURES, _SET_FEATURES = 13, 10
+
+
+class CrossViewNetwork(nn.Module):
+    r"""Predict each view's parameters from the correspondences of both and from the null vector of the DLT.
+
+    One :class:`SetNetwork` serves both views. View 1 sees the problem as it is, view 2 its mirror image (views swapped,
+    :math:`F` transposed), so that swapping the views swaps the outputs exactly. A correspondence enters as its two
+    points, the directions and norms of its two epipolar lines, its distances from the lines of the rank-2 correction
+    and the epipolar distance that this correction leaves it; the set enters with the nine numbers of :math:`F` and the
+    size of the correction. The last layer starts at zero: an untrained network is the base.
+
+    Args:
+        width: channels.
+        depth: residual layers.
+        num_parameters: parameters per view, as the transform builder wants them.
+        bound: the parameters stay within plus and minus this.
+
+    Example:
+        >>> network = CrossViewNetwork(width=16, depth=2)
+        >>> network(torch.rand(2, 8, 2), torch.rand(2, 8, 2))[0]
+        tensor([[0., 0., 0., 0., 0.],
+                [0., 0., 0., 0., 0.]], grad_fn=...)
+
+    """
+
+    def __init__(self, width: int = 64, depth: int = 4, num_parameters: int = 5, bound: float = 3.0) -> None:
+        super().__init__()
+        self.width, self.depth, self.num_parameters, self.bound = width, depth, num_parameters, bound
+        self.set_network = SetNetwork(_POINT_FEATURES, _SET_FEATURES, width, depth, num_parameters)
+
+    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the parameters of both views.
+
+        Args:
+            points1: points of the first view in base coordinates with shape :math:`(B, N, 2)`, :math:`N >= 8`.
+            points2: points of the second view in base coordinates with shape :math:`(B, N, 2)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+
+        Returns:
+            parameters with shape :math:`(B, P)` of view 1 and view 2, in the dtype of the points.
+
+        """
+        x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
+        F = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
+        F = F * _sign(F)
+        v, u = smallest_right_singular_vector(F), smallest_right_singular_vector(F.mT)
+        views = _view_features(x1, x2, F, v, u), _view_features(x2, x1, F.mT, u, v)
+        point, whole = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
+        doubled = None if weights is None else torch.cat([weights, weights]).to(self.dtype)
+        params = self.set_network(point, whole, doubled).to(points1.dtype)
+        params1, params2 = (self.bound * torch.tanh(params / self.bound)).chunk(2)
+        return params1, params2
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The dtype of the network's own weights."""
+        return next(self.parameters()).dtype
+
+
+def _sign(F: Tensor) -> Tensor:
+    """Sign that makes the largest entry of ``F`` positive: one and the same for ``F`` and its transpose."""
+    entries = F.detach().flatten(-2)
+    return entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
+
+
+def _view_features(own: Tensor, other: Tensor, F: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Describe the problem as one view sees it, where ``other^T F own = 0``.
+
+    ``v`` and ``u`` are the right and left singular vectors of the smallest singular value of ``F``: projected to rank
+    2, ``F`` loses ``(u^T F v) u v^T``. Returns features of the points ``(B, N, 13)`` and of the set ``(B, 10)``.
+    """
+    line, other_line = (other @ F)[..., :2], (own @ F.mT)[..., :2]
+    norm, other_norm = line.norm(dim=-1, keepdim=True), other_line.norm(dim=-1, keepdim=True)
+    distance, other_distance = own @ v[..., None], other @ u[..., None]
+    correction = (u[..., None, :] @ F @ v[..., None]).squeeze(-1)
+    residual = correction[..., None] * distance * other_distance * (1 / (norm + 1e-4) + 1 / (other_norm + 1e-4))
+    scale = residual.abs().mean(-2, keepdim=True)
+    points = [own[..., :2], other[..., :2], normalize(line, dim=-1), normalize(other_line, dim=-1)]
+    points += [(norm + 1e-4).log(), (other_norm + 1e-4).log(), residual / (scale + 1e-12)]
+    points += [(distance.abs() + 1e-3).log(), (other_distance.abs() + 1e-3).log()]
+    return torch.cat(points, -1), torch.cat([3 * F.flatten(-2), (correction.abs() + 1e-6).log()], -1)
+
+
+class SetNetwork(nn.Module):
+    """Residual layers over the points of a set, with the set's maximum as context; blind to their order.
+
+    Args:
+        point_features: features of a point.
+        set_features: features of the set.
+        width: channels.
+        depth: residual layers.
+        outputs: numbers predicted per set.
+
+    Example:
+        >>> SetNetwork(4, 9, width=16, depth=2, outputs=5)(torch.rand(3, 8, 4), torch.rand(3, 9)).shape
+        torch.Size([3, 5])
+
+    """
+
+    def __init__(self, point_features: int, set_features: int, width: int, depth: int, outputs: int) -> None:
+        super().__init__()
+        self.point_stem = nn.Linear(point_features, width)
+        self.set_stem = nn.Linear(set_features, width)
+        self.layers = nn.ModuleList(ContextLayer(width) for _ in range(depth))
+        last = nn.Linear(width, outputs)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.head = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), last)
+
+    def forward(self, points: Tensor, whole: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return the outputs with shape :math:`(B, P)`.
+
+        Args:
+            points: features of the points with shape :math:`(B, N, C)`.
+            whole: features of the sets with shape :math:`(B, D)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+
+        """
+        h = self.point_stem(points) + self.set_stem(whole)[:, None]
+        absent = None if weights is None else (weights <= 0)[..., None]
+        for layer in self.layers:
+            h = layer(h, absent)
+        outputs: Tensor = self.head(torch.cat([_maximum(h, absent), _average(h, weights)], -1))
+        return outputs
+
+
+class ContextLayer(nn.Module):
+    """A residual two-layer perceptron over each point, whose hidden layer also sees the maximum over the set."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.point = nn.Linear(width, width)
+        self.context = nn.Linear(width, width, bias=False)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, h: Tensor, absent: Tensor | None) -> Tensor:
+        """Return the features after the layer, ``(B, N, C)``."""
+        z = self.norm(h)
+        hidden = self.point(z) + self.context(_maximum(z, absent))[:, None]
+        update: Tensor = self.out(torch.relu(hidden))
+        return h + update
+
+
+def _maximum(h: Tensor, absent: Tensor | None) -> Tensor:
+    """Maximum over the present points, ``(B, C)``; zero where all are absent."""
+    if absent is None:
+        return h.amax(1)
+    empty = absent.all(1)
+    return torch.where(empty, 0.0, torch.where(absent, -torch.inf, h).amax(1))
+
+
+def _average(h: Tensor, weights: Tensor | None) -> Tensor:
+    """Average over the points, ``(B, C)``."""
+    if weights is None:
+        return h.mean(1)
+    total = weights.sum(1, keepdim=True)
+    return (weights[..., None] * h).sum(1) / torch.where(total > 0, total, 1.0)

@@ -1,0 +1,145 @@
+"""The training task: correspondences in, loss of the fundamental matrix out, no labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
+
+from kornia_learnnorm.data.samples import Samples
+from kornia_learnnorm.learned import LearnedNormalizer
+from kornia_learnnorm.losses import EpipolarLoss
+from kornia_learnnorm.metrics import better_rate
+from kornia_learnnorm.normalizers import Hartley, Whitening
+from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.solver import find_fundamental
+
+__all__ = ["NormalizerTask"]
+
+
+def _adamw(params: Iterable[nn.Parameter]) -> Optimizer:
+    return torch.optim.AdamW(params, lr=3e-3)
+
+
+class NormalizerTask(pl.LightningModule):
+    """Train a learned normaliser by back-propagating a residual through the whole eight-point algorithm.
+
+    Validation and test log the mean log residual and the better rates against Hartley and whitening on the samples'
+    own points; prediction returns the transforms, the fundamental matrix and the residual of each sample.
+
+    Args:
+        normalizer: the normaliser to train.
+        loss: residual and reduction.
+        optimizer: builds the optimiser from the parameters; AdamW with a learning rate of 3e-3 when not given.
+        lr_scheduler: builds a schedule that steps once an epoch; when not given, one cycle over all steps of the run
+            up to the optimiser's learning rate.
+        sample_gradient: largest norm of one sample's gradient with respect to its predicted parameters, before the
+            batch's average. Near-degenerate samples have gradients a thousand times the typical one, and a clip of the
+            whole batch would leave only their direction. None leaves all as they are.
+    """
+
+    def __init__(
+        self,
+        normalizer: LearnedNormalizer,
+        loss: EpipolarLoss | None = None,
+        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = _adamw,
+        lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        sample_gradient: float | None = 1.0,
+    ) -> None:
+        super().__init__()
+        self.normalizer = normalizer
+        self.loss = loss or EpipolarLoss()
+        self.optimizer = optimizer
+        self.lr_scheduler = lr_scheduler
+        self.sample_gradient = sample_gradient
+        self.hartley, self.whitening = Hartley(), Whitening()
+        self._residuals: dict[str, list[Tensor]] = {}
+
+    def configure_optimizers(self) -> Any:
+        """Build the optimiser and its schedule."""
+        optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
+        if self.lr_scheduler is not None:
+            return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self.lr_scheduler(optimizer)}}
+        steps = int(self.trainer.estimated_stepping_batches)
+        schedule = OneCycleLR(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=max(2, steps))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return the fundamental matrices of correspondences; see :func:`kornia_learnnorm.find_fundamental`."""
+        return find_fundamental(points1, points2, weights, self.normalizer)
+
+    def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
+        """Return the loss of a batch of samples."""
+        x1, x2 = batch.points1.double(), batch.points2.double()
+        with self._limited_gradients():
+            F_mat = self(x1, x2)
+        loss: Tensor = self.loss(x1, x2, F_mat, batch.heldout1.double(), batch.heldout2.double())
+        self.log("train/loss", loss, prog_bar=True)
+        return loss
+
+    @contextmanager
+    def _limited_gradients(self) -> Iterator[None]:
+        """Limit each sample's gradient where it enters the network."""
+
+        def limit(gradient: Tensor) -> Tensor:
+            most = self.sample_gradient / len(gradient)  # type: ignore[operator]
+            norm: Tensor = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+            return gradient * (most / norm.clamp(min=most))
+
+        def attach(module: nn.Module, args: Any, params: tuple[Tensor, Tensor]) -> None:
+            for p in params:
+                if p.requires_grad and self.sample_gradient is not None:
+                    p.register_hook(limit)  # type: ignore[no-untyped-call]
+
+        handle = self.normalizer.network.register_forward_hook(attach)
+        try:
+            yield
+        finally:
+            handle.remove()
+
+    def validation_step(self, batch: Samples, batch_idx: int) -> None:
+        """Collect the residuals of a batch."""
+        self._collect(batch)
+
+    def test_step(self, batch: Samples, batch_idx: int) -> None:
+        """Collect the residuals of a batch."""
+        self._collect(batch)
+
+    def predict_step(self, batch: Samples, batch_idx: int) -> dict[str, Tensor]:
+        """Return transforms, fundamental matrices and mean residuals of a batch."""
+        T1, T2 = self.normalizer(batch.points1, batch.points2)
+        F_mat = self(batch.points1, batch.points2)
+        residual = symmetric_epipolar_distance(batch.points1, batch.points2, F_mat).mean(-1)
+        return {"T1": T1, "T2": T2, "F_mat": F_mat, "residual": residual, "pair": batch.pair}
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics of the collected residuals."""
+        self._log_residuals("val")
+
+    def on_test_epoch_end(self) -> None:
+        """Log the metrics of the collected residuals."""
+        self._log_residuals("test")
+
+    def _collect(self, batch: Samples) -> None:
+        x1, x2 = batch.points1.double(), batch.points2.double()
+        methods = {"learned": self.normalizer, "hartley": self.hartley, "whitening": self.whitening}
+        for name, normalizer in methods.items():
+            F_mat = find_fundamental(x1, x2, normalizer=normalizer)
+            residual = symmetric_epipolar_distance(x1, x2, F_mat).mean(-1)
+            self._residuals.setdefault(name, []).append(residual)
+
+    def _log_residuals(self, stage: str) -> None:
+        if not self._residuals:
+            return
+        residuals = {name: torch.cat(parts) for name, parts in self._residuals.items()}
+        self._residuals.clear()
+        learned = residuals.pop("learned")
+        self.log(f"{stage}/log_sed", (learned + self.loss.floor).log().mean(), prog_bar=True)
+        for name, baseline in residuals.items():
+            self.log(f"{stage}/better_than_{name}", better_rate(learned, baseline).rate, prog_bar=True)

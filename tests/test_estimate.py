@@ -1,0 +1,394 @@
+"""The fundamental matrix of two image files and the command around it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.evaluation import estimate as module
+from kornia_learnnorm.evaluation.estimate import PairEstimate, add_arguments, estimate_pair, run, write_json
+from kornia_learnnorm.files import replacing
+from kornia_learnnorm.normalizers import Hartley, Whitening
+from kornia_learnnorm.residuals import symmetric_epipolar_distance
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+
+WIDTH, HEIGHT = 320, 240
+K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+
+
+def cross(t: np.ndarray) -> np.ndarray:
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
+def texture(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    image = sum(cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
+    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def warp(image: np.ndarray, R: np.ndarray, t: np.ndarray, depth: float) -> np.ndarray:
+    """Image 2 of the plane Z = depth: X2 = R X1 + t gives the homography K (R + t n^T / depth) K^-1."""
+    H = K @ (R + np.outer(t, [0, 0, 1]) / depth) @ np.linalg.inv(K)
+    return cv2.warpPerspective(image, H, (WIDTH, HEIGHT))
+
+
+class Scene:
+    """Two images of two planes, the left half nearer than the right one, and the true F."""
+
+    def __init__(self, folder: Path) -> None:
+        R, t = cv2.Rodrigues(np.array([0.01, -0.03, 0.02]))[0], np.array([0.3, 0.05, 0.1])
+        self.R, self.t = R, t
+        self.F = np.linalg.inv(K).T @ cross(t) @ R @ np.linalg.inv(K)
+        image, near = texture(0), np.zeros((HEIGHT, WIDTH), np.uint8)
+        near[:, : WIDTH // 2] = 255
+        moved = np.where(warp(near, R, t, 4.0) > 127, warp(image, R, t, 4.0), warp(image, R, t, 9.0))
+        self.folder, self.left, self.right = folder, folder / "left.png", folder / "right.png"
+        self.blank, self.plane, self.noisy = folder / "blank.png", folder / "plane.png", folder / "noisy.png"
+        noisy = np.clip(image + np.random.default_rng(1).normal(0, 1, image.shape), 0, 255).astype(np.uint8)
+        plane, blank = warp(image, R, t, 4.0), np.zeros_like(image)
+        for name in ("left", "right", "blank", "plane", "noisy"):
+            pixels = {"left": image, "right": moved, "blank": blank, "plane": plane, "noisy": noisy}[name]
+            cv2.imwrite(str(getattr(self, name)), pixels)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="module")
+def result(scene) -> PairEstimate:
+    return estimate_pair(scene.left, scene.right, Hartley())
+
+
+def distances(F: np.ndarray, points1: np.ndarray, points2: np.ndarray) -> np.ndarray:
+    """Symmetric epipolar distances by NumPy: both points to their lines."""
+    x1, x2 = (np.c_[points, np.ones(len(points))] for points in (points1, points2))
+    lines2, lines1 = x1 @ F.T, x2 @ F
+    residual = np.abs((x2 * lines2).sum(1))
+    return residual / np.hypot(*lines2[:, :2].T) + residual / np.hypot(*lines1[:, :2].T)
+
+
+class TestEstimatePair:
+    def test_finds_the_true_geometry(self, scene, result):
+        points1, points2 = result.points1[result.inliers].numpy(), result.points2[result.inliers].numpy()
+        assert result.num_inliers > 150
+        assert result.num_inliers > 0.8 * result.num_matches
+        assert np.median(distances(scene.F, points1, points2)) < 0.3
+        # Exact projections of points between and behind the planes, which the estimate has not seen.
+        X = np.random.default_rng(2).uniform([-1.5, -1.0, 4.0], [1.5, 1.0, 12.0], (200, 3))
+        x1, x2 = X @ K.T, (X @ scene.R.T + scene.t) @ K.T
+        unseen = distances(result.F_mat.numpy(), x1[:, :2] / x1[:, 2:], x2[:, :2] / x2[:, 2:])
+        assert np.median(unseen) < 0.5
+
+    def test_fields(self, scene, result):
+        assert result.F_mat.dtype == result.points1.dtype == torch.float64
+        assert result.F_mat.shape == (3, 3)
+        assert abs(result.F_mat.norm().item() - 1) < 1e-12
+        assert np.linalg.svd(result.F_mat.numpy())[1][2] < 1e-12
+        assert result.points1.shape == result.points2.shape == (result.num_matches, 2)
+        assert (result.size1, result.size2) == ((WIDTH, HEIGHT), (WIDTH, HEIGHT))
+        assert (result.path1, result.path2) == (scene.left, scene.right)
+
+    def test_inliers_and_errors_belong_to_the_returned_f(self, result):
+        d = distances(result.F_mat.numpy(), result.points1.numpy(), result.points2.numpy())
+        assert np.array_equal(d < 1.0, result.inliers.numpy())
+        assert result.mean_distance == pytest.approx(d[d < 1].mean(), rel=1e-6)
+        assert result.median_distance == pytest.approx(np.median(d[d < 1]), rel=1e-6)
+
+    def test_matches_are_distinct(self, result):
+        pairs = torch.cat([result.points1, result.points2], 1)
+        assert len(np.unique(pairs.numpy(), axis=0)) == len(pairs)
+
+    def test_same_files_and_seed_give_the_same_estimate(self, scene, result):
+        again = estimate_pair(str(scene.left), str(scene.right), Hartley())
+        assert torch.equal(again.F_mat, result.F_mat)
+        assert torch.equal(again.inliers, result.inliers)
+
+    def test_other_seeds_give_a_similar_estimate(self, scene, result):
+        other = estimate_pair(scene.left, scene.right, Hartley(), seed=7)
+        assert abs(other.num_inliers - result.num_inliers) < 0.05 * result.num_inliers
+
+    def test_normalizer_is_used(self, scene, result):
+        calls = []
+
+        def normalizer(points1, points2, weights=None):
+            calls.append((points1, weights))
+            return Whitening()(points1, points2, weights)
+
+        other = estimate_pair(scene.left, scene.right, normalizer)
+        points, weights = calls[0]
+        assert 1 <= len(calls) <= 3
+        assert points.dtype == torch.float64
+        assert points.shape[0] == 1
+        assert weights is None
+        assert not torch.equal(other.F_mat, result.F_mat)
+
+    def test_no_gradient_leaves_a_learned_normalizer(self, scene):
+        class Scaled(Hartley):
+            def __init__(self):
+                super().__init__()
+                self.scale = torch.nn.Parameter(torch.ones((), dtype=torch.float64))
+
+            def forward(self, points1, points2, weights=None):
+                T1, T2 = super().forward(points1, points2, weights)
+                return self.scale * T1, self.scale * T2
+
+        assert not estimate_pair(scene.left, scene.right, Scaled()).F_mat.requires_grad
+
+    def test_refit_keeps_the_larger_set(self, scene, result):
+        """Starting from few inliers, the fit may only grow them."""
+        start = torch.zeros_like(result.inliers)
+        start[torch.nonzero(result.inliers).flatten()[::8]] = True
+        F_mat, inliers = module._fit(result.points1, result.points2, start, Hartley(), 1.0)
+        x1, x2 = result.points1[start][None], result.points2[start][None]
+        first = module.find_fundamental(x1, x2, normalizer=Hartley())[0]
+        once = symmetric_epipolar_distance(result.points1, result.points2, first) < 1.0
+        assert inliers.sum() >= once.sum()
+        assert torch.equal(symmetric_epipolar_distance(result.points1, result.points2, F_mat) < 1.0, inliers)
+
+
+class TestErrors:
+    def fails(self, first, second, message, error=ValueError, **options):
+        with pytest.raises(error, match=message) as caught:
+            estimate_pair(first, second, Hartley(), **options)
+        assert "\n" not in str(caught.value)
+
+    def test_missing_file(self, scene):
+        self.fails(scene.left, scene.folder / "no.png", r"no\.png does not exist", FileNotFoundError)
+
+    def test_corrupt_file(self, scene, tmp_path):
+        (tmp_path / "half.png").write_bytes(scene.left.read_bytes()[:5000])
+        self.fails(tmp_path / "half.png", scene.right, "truncated or corrupt")
+
+    def test_blank(self, scene):
+        self.fails(scene.blank, scene.right, r"blank\.png and .*right\.png: image 1 is blank")
+        self.fails(scene.left, scene.blank, "image 2 is blank")
+
+    def test_few_matches(self, scene):
+        self.fails(scene.left, scene.right, r"\d distinct matches of \d+ pass the ratio test 0\.001", ratio=0.001)
+
+    def test_same_image(self, scene):
+        self.fails(scene.left, scene.left, "no motion")
+
+    def test_same_view_with_noise(self, scene):
+        self.fails(scene.left, scene.noisy, "no motion")
+
+    def test_few_inliers(self, scene):
+        self.fails(scene.left, scene.right, r"of \d+ matches agree .* within 1e-09 px", threshold=1e-9)
+
+    def test_plane(self, scene):
+        self.fails(scene.left, scene.plane, "degenerate: one homography explains")
+
+    @pytest.mark.parametrize("ratio", [0.0, -1.0, 1.5, float("nan")])
+    def test_ratio(self, scene, ratio):
+        self.fails(scene.left, scene.right, "ratio must be above 0", ratio=ratio)
+
+    @pytest.mark.parametrize("threshold", [0.0, -1.0, float("inf"), float("nan")])
+    def test_threshold(self, scene, threshold):
+        self.fails(scene.left, scene.right, "threshold must be positive", threshold=threshold)
+
+
+class TestWriting:
+    def test_json(self, result, tmp_path):
+        write_json(tmp_path / "F.json", result)
+        content = json.loads((tmp_path / "F.json").read_text())
+        assert content["F"] == result.F_mat.tolist()
+        assert content["matches"] == result.num_matches
+        assert content["inliers"] == result.num_inliers
+        assert content["image1"] == {"file": str(result.path1), "width": WIDTH, "height": HEIGHT}
+        assert content["inlier_symmetric_epipolar_distance_px"]["median"] == result.median_distance
+        assert (content["ratio"], content["threshold_px"]) == (0.8, 1.0)
+        assert [path.name for path in tmp_path.iterdir()] == ["F.json"]
+
+    def test_missing_folder(self, result, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"the folder .*none does not exist"):
+            write_json(tmp_path / "none" / "F.json", result)
+
+    def test_unwritable_folder(self, result, tmp_path, monkeypatch):
+        monkeypatch.setattr(os, "access", lambda path, mode: False)
+        with pytest.raises(PermissionError, match="is not writable"):
+            write_json(tmp_path / "F.json", result)
+
+    @pytest.mark.parametrize("path", [".", "/dev/null"])
+    def test_not_a_file(self, result, path):
+        with pytest.raises(ValueError, match="not a regular file"):
+            write_json(path, result)
+
+    @staticmethod
+    def stop_halfway(path):
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("stop")
+
+    def test_failure_keeps_the_old_file(self, tmp_path):
+        path = tmp_path / "F.json"
+        path.write_text("old")
+        with pytest.raises(RuntimeError, match="stop"):
+            self.stop_halfway(path)
+        assert path.read_text() == "old"
+        assert [path.name for path in tmp_path.iterdir()] == ["F.json"]
+
+
+@pytest.fixture
+def command(scene, tmp_path, monkeypatch):
+    """Run the command with Hartley's normalisation in the place of the learned one; record the weights asked for."""
+    asked = []
+
+    class LearnedNormalizer:
+        @staticmethod
+        def from_pretrained(*names):
+            asked.append(names)
+            return Hartley()
+
+    learned = types.ModuleType("kornia_learnnorm.learned")
+    learned.LearnedNormalizer = LearnedNormalizer
+    monkeypatch.setitem(sys.modules, "kornia_learnnorm.learned", learned)
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments, images=(scene.left, scene.right)):
+        parser = argparse.ArgumentParser()
+        add_arguments(parser)
+        return run(parser.parse_args([*map(str, images), *arguments]))
+
+    call.asked = asked
+    return call
+
+
+class TestCommand:
+    def test_prints_the_estimate(self, command, result, capsys):
+        assert command() == 0
+        lines = capsys.readouterr().out.splitlines()
+        printed = [[float(value) for value in line.split()] for line in lines[1:4]]
+        assert np.allclose(printed, result.F_mat.numpy(), rtol=1e-8)
+        assert re.match(rf"matches +{result.num_matches} ", lines[4])
+        assert re.match(rf"inliers +{result.num_inliers} ", lines[5])
+        assert f"mean {result.mean_distance:.3f} px, median {result.median_distance:.3f} px" in lines[6]
+        assert len(lines) == 7
+        assert not list(Path().iterdir())
+        assert command.asked == [()]
+
+    def test_writes_picture_and_json(self, command, capsys):
+        pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
+        assert command("--out", "pair.png", "--json", "F.json", "--weights", "mine.safetensors") == 0
+        assert sorted(path.name for path in Path().iterdir()) == ["F.json", "pair.png"]
+        assert cv2.imread("pair.png").shape[1] == 1200
+        assert capsys.readouterr().out.splitlines()[-2:] == ["wrote    pair.png", "wrote    F.json"]
+        assert command.asked == [("mine.safetensors",)]
+
+    def test_options_reach_the_estimate(self, command, capsys):
+        command("--ratio", "0.7", "--threshold", "2")
+        printed = capsys.readouterr().out
+        assert "(ratio test 0.7)" in printed
+        assert "< 2 px" in printed
+
+    @pytest.mark.parametrize(
+        ("arguments", "error", "message"),
+        [
+            (["--out", "pair.txt"], ValueError, r"--out pair\.txt: expected a name that ends in one of \.png"),
+            (["--out", "pair"], ValueError, "--out pair: expected"),
+            (["--out", "none/pair.png"], FileNotFoundError, "folder none does not exist"),
+            (["--json", "none/F.json"], FileNotFoundError, "folder none does not exist"),
+            (["--json", "."], ValueError, "not a regular file"),
+            (["--out", "a.png", "--json", "a.png"], ValueError, "would overwrite another file"),
+        ],
+    )
+    def test_bad_outputs_are_refused_before_the_work(self, command, arguments, error, message, monkeypatch, capsys):
+        monkeypatch.setattr(module, "estimate_pair", lambda *_: pytest.fail("the work was begun"))
+        with pytest.raises(error, match=message):
+            command(*arguments)
+        assert not list(Path().iterdir())
+        assert capsys.readouterr().out == ""
+
+    def test_images_are_not_overwritten(self, command, scene):
+        with pytest.raises(ValueError, match=r"--out .*left\.png: would overwrite"):
+            command("--out", str(scene.left))
+
+    def test_failure_writes_nothing(self, command, scene, capsys):
+        with pytest.raises(ValueError, match="image 2 is blank"):
+            command("--out", "pair.png", "--json", "F.json", images=(scene.left, scene.blank))
+        assert not list(Path().iterdir())
+        assert capsys.readouterr().out == ""
+
+    def test_failure_of_the_last_step_writes_nothing(self, command, monkeypatch, capsys):
+        pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
+
+        def full(path, estimate):
+            Path(path).write_text("half")
+            raise OSError("no space left")
+
+        monkeypatch.setattr(module, "write_json", full)
+        with pytest.raises(OSError, match="no space left"):
+            command("--out", "pair.png", "--json", "F.json")
+        assert not list(Path().iterdir())
+        assert capsys.readouterr().out == ""
+
+    def test_picture_without_matplotlib(self, command, monkeypatch):
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        monkeypatch.setattr(module, "estimate_pair", lambda *_: pytest.fail("the work was begun"))
+        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[report\]'"):
+            command("--out", "pair.png")
+
+
+def real_data() -> Path:
+    folder = os.environ.get("LEARNNORM_DATA")
+    if not folder:
+        pytest.skip("LEARNNORM_DATA does not name a folder of real images")
+    return Path(folder)
+
+
+def relative_pose(world1: np.ndarray, world2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R and t of x2 = R x1 + t from two camera-to-world poses (3, 4)."""
+    R = world2[:, :3].T @ world1[:, :3]
+    return R, world2[:, :3].T @ (world1[:, 3] - world2[:, 3])
+
+
+def true_fundamental(camera: np.ndarray, world1: np.ndarray, world2: np.ndarray) -> np.ndarray:
+    R, t = relative_pose(world1, world2)
+    return np.linalg.inv(camera).T @ cross(t) @ R @ np.linalg.inv(camera)
+
+
+class TestRealImages:
+    @pytest.mark.parametrize(("first", "second"), [(10, 11), (20, 21), (40, 41)])
+    def test_kitti(self, first, second):
+        sequence = real_data() / "kitti" / "sequences" / "06"
+        calibration = (sequence / "calib.txt").read_text().splitlines()
+        P0 = next(line for line in calibration if line.startswith("P0"))
+        camera = np.array(P0.split()[1:], float).reshape(3, 4)[:, :3]
+        poses = np.loadtxt(sequence.parents[1] / "poses" / "06.txt").reshape(-1, 3, 4)
+        paths = [sequence / "image_0" / f"{frame:06d}.png" for frame in (first, second)]
+        result = estimate_pair(*paths, Hartley())
+        F = true_fundamental(camera, poses[first], poses[second])
+        inliers = result.inliers.numpy()
+        assert result.num_inliers > 500
+        assert result.median_distance < 0.3
+        assert np.median(distances(F, result.points1.numpy()[inliers], result.points2.numpy()[inliers])) < 1.0
+
+    @pytest.mark.parametrize("first", [0, 12])
+    def test_tum(self, first):
+        folder = real_data() / "tum" / "rgbd_dataset_freiburg3_long_office_household"
+        paths = sorted((folder / "rgb").glob("*.png"))[first : first + 2]
+        result = estimate_pair(*paths, Hartley())
+        track = np.loadtxt(folder / "groundtruth.txt")
+        poses = []
+        for path in paths:
+            x, y, z, i, j, k, w = track[np.abs(track[:, 0] - float(path.stem)).argmin(), 1:]
+            angle = 2 * np.arctan2(np.linalg.norm([i, j, k]), w)
+            axis = np.array([i, j, k]) / np.linalg.norm([i, j, k])
+            poses.append(np.c_[cv2.Rodrigues(axis * angle)[0], [x, y, z]])
+        F = true_fundamental(np.array([[535.4, 0, 320.1], [0, 539.2, 247.6], [0, 0, 1]]), *poses)
+        inliers = result.inliers.numpy()
+        assert result.num_inliers > 300
+        assert result.median_distance < 0.5
+        # Images are not undistorted and poses the nearest in time: the ground truth is good to about 3 px.
+        assert np.median(distances(F, result.points1.numpy()[inliers], result.points2.numpy()[inliers])) < 4.0

@@ -1,0 +1,129 @@
+"""Pictures of an estimate."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.evaluation.estimate import PairEstimate
+from kornia_learnnorm.evaluation.figures import clip_lines, draw_pair
+
+pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
+image_module = pytest.importorskip("matplotlib.image")
+
+
+def make_pair(width: int = 160, height: int = 120, points: int = 30) -> tuple[np.ndarray, np.ndarray, PairEstimate]:
+    """Two grey images and an estimate whose epipolar lines are the rows; the last five matches are outliers."""
+    rng = np.random.default_rng(0)
+    image1, image2 = (rng.integers(0, 256, (height, width), dtype=np.uint8) for _ in range(2))
+    points1 = torch.from_numpy(rng.uniform(10, [width - 10, height - 10], (points, 2)))
+    points2 = points1 + torch.tensor([6.0, 0.0])
+    points2[-5:, 1] += 9
+    inliers = torch.arange(points) < points - 5
+    F_mat = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / 2**0.5
+    size = (width, height)
+    estimate = PairEstimate(
+        F_mat, points1, points2, inliers, 0.2, 0.1, Path("1.png"), Path("2.png"), size, size, 0.8, 1.0
+    )
+    return image1, image2, estimate
+
+
+class TestClipLines:
+    def test_axis_parallel_and_diagonal(self):
+        lines = np.array([[0, 1, -5], [1, 0, -3], [1, -1, 0]], float)  # y = 5, x = 3, y = x
+        segments, meets = clip_lines(lines, 20, 10)
+        assert meets.all()
+        ends = [sorted(map(tuple, segment.tolist())) for segment in segments]
+        expected = [[(-0.5, 5), (19.5, 5)], [(3, -0.5), (3, 9.5)], [(-0.5, -0.5), (9.5, 9.5)]]
+        assert np.allclose(ends, expected)
+
+    def test_lines_that_miss(self):
+        lines = np.array([[0, 1, 5], [1, 0, -30], [1, 1, 5], [0, 0, 1]], float)  # the last one is at infinity
+        segments, meets = clip_lines(lines, 20, 10)
+        assert not meets.any()
+        assert np.isnan(segments).all()
+
+    def test_ends_lie_on_the_line_and_on_the_border(self):
+        lines = np.random.default_rng(0).normal(size=(500, 3)) * [1, 1, 30]
+        segments, meets = clip_lines(lines, 64, 48)
+        assert 50 < meets.sum() < 500
+        x, y = segments[meets].reshape(-1, 2).T
+        a, b, c = np.repeat(lines[meets], 2, axis=0).T
+        assert np.allclose(a * x + b * y + c, 0, atol=1e-9)
+        border = np.stack([x + 0.5, x - 63.5, y + 0.5, y - 47.5])
+        assert np.allclose(np.abs(border).min(0), 0, atol=1e-9)
+        assert (np.minimum(x, y) >= -0.5 - 1e-9).all()
+        assert (x <= 63.5 + 1e-9).all()
+        assert (y <= 47.5 + 1e-9).all()
+
+    def test_scale_does_not_matter(self):
+        lines = np.random.default_rng(1).normal(size=(20, 3)) * [1, 1, 30]
+        assert np.allclose(clip_lines(lines, 64, 48)[0], clip_lines(lines * 1e-9, 64, 48)[0], equal_nan=True)
+
+
+class TestDrawPair:
+    @pytest.mark.parametrize(("width", "height", "ratio"), [(160, 120, 0.42), (300, 100, 0.75), (90, 120, 0.72)])
+    def test_layout_follows_the_shape(self, tmp_path, width, height, ratio):
+        draw_pair(*make_pair(width, height), tmp_path / "pair.png")
+        picture = image_module.imread(tmp_path / "pair.png")
+        assert picture.shape[1] == 1200
+        assert picture.shape[0] / picture.shape[1] == pytest.approx(ratio, abs=0.05)
+        assert [path.name for path in tmp_path.iterdir()] == ["pair.png"]
+
+    def test_colours_of_inliers_and_outliers(self, tmp_path):
+        image1, image2, estimate = make_pair()
+        draw_pair(image1, image2, estimate, tmp_path / "pair.png", num_lines=0)
+        picture = (image_module.imread(tmp_path / "pair.png")[50:, :590, :3] * 255).round()
+        blue = (np.abs(picture - [0x45, 0xA1, 0xFF]).max(2) < 8).sum()
+        red = (np.abs(picture - [0xFF, 0x5C, 0x5C]).max(2) < 40).sum()
+        assert blue > 200
+        assert red > 20
+
+    def test_deterministic_and_seeded(self, tmp_path):
+        pair = make_pair()
+        for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+            draw_pair(*pair, tmp_path / f"{name}.png", num_lines=5, seed=seed)
+        a, b, c = (image_module.imread(tmp_path / f"{name}.png") for name in "abc")
+        assert np.array_equal(a, b)
+        assert not np.array_equal(a, c)
+
+    def test_images_of_different_shapes(self, tmp_path):
+        image1, image2, estimate = make_pair(300, 100)
+        estimate = dataclasses.replace(estimate, size2=(70, 100))
+        draw_pair(image1, image2[:, :70], estimate, tmp_path / "pair.png")
+
+    def test_no_outliers(self, tmp_path):
+        image1, image2, estimate = make_pair()
+        draw_pair(image1, image2, dataclasses.replace(estimate, inliers=torch.ones(30, dtype=torch.bool)),
+                  tmp_path / "pair.png", num_lines=1000)  # fmt: skip
+
+    @pytest.mark.parametrize("suffix", ["jpg", "webp", "tiff", "pdf", "svg"])
+    def test_formats(self, tmp_path, suffix):
+        draw_pair(*make_pair(), tmp_path / f"pair.{suffix}")
+        assert (tmp_path / f"pair.{suffix}").stat().st_size > 1000
+
+    def test_unknown_format_leaves_nothing(self, tmp_path):
+        with pytest.raises(ValueError, match="not supported"):
+            draw_pair(*make_pair(), tmp_path / "pair.xyz")
+        assert not list(tmp_path.iterdir())
+
+    def test_missing_folder(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match="does not exist"):
+            draw_pair(*make_pair(), tmp_path / "none" / "pair.png")
+
+    def test_wrong_arguments(self, tmp_path):
+        image1, image2, estimate = make_pair()
+        with pytest.raises(ValueError, match=r"shape \(120, 160\), got \(120, 80\)"):
+            draw_pair(image1, image2[:, :80], estimate, tmp_path / "pair.png")
+        with pytest.raises(ValueError, match="num_lines must not be negative, got -1"):
+            draw_pair(image1, image2, estimate, tmp_path / "pair.png", num_lines=-1)
+
+    def test_without_matplotlib(self, tmp_path, monkeypatch):
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[report\]'"):
+            draw_pair(*make_pair(), tmp_path / "pair.png")

@@ -1,0 +1,133 @@
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from kornia_learnnorm.data.render import RenderedPair, render_pair, write_pair
+
+cv2 = pytest.importorskip("cv2")
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return render_pair()
+
+
+@pytest.fixture(scope="module")
+def matches(pair):
+    """SIFT with the ratio test, in plain OpenCV and numpy."""
+    sift = cv2.SIFT_create()
+    (keys1, desc1), (keys2, desc2) = (sift.detectAndCompute(image, None) for image in (pair.image1, pair.image2))
+    good = [a for a, b in cv2.BFMatcher().knnMatch(desc1, desc2, k=2) if a.distance < 0.8 * b.distance]
+    points1 = np.array([keys1[match.queryIdx].pt for match in good], np.float64)
+    return points1, np.array([keys2[match.trainIdx].pt for match in good], np.float64)
+
+
+def symmetric_distance(points1, points2, F_mat):
+    x1, x2 = (np.column_stack([points, np.ones(len(points))]) for points in (points1, points2))
+    lines2, lines1 = x1 @ F_mat.T, x2 @ F_mat
+    residual = np.abs((x2 * lines2).sum(1))
+    return residual / np.linalg.norm(lines2[:, :2], axis=1) + residual / np.linalg.norm(lines1[:, :2], axis=1)
+
+
+def test_images(pair):
+    assert isinstance(pair, RenderedPair)
+    for image in (pair.image1, pair.image2):
+        assert image.shape == (480, 640)
+        assert image.dtype == np.uint8
+        assert image.std() > 40
+        assert np.mean((image == 0) | (image == 255)) < 0.02  # no holes, hardly anything over- or underexposed
+    assert np.mean(pair.image1 != pair.image2) > 0.5
+
+
+def test_ground_truth_is_that_of_the_cameras(pair):
+    assert pair.K.tolist() == [[576.0, 0.0, 319.5], [0.0, 576.0, 239.5], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(pair.R @ pair.R.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(pair.R) == pytest.approx(1)
+    assert 0.4 < np.linalg.norm(pair.t) < 0.9
+    # Points in space, projected by hand.
+    X1 = np.random.default_rng(0).uniform((-2, -1, 3), (2, 1, 7), (20, 3))
+    x1, x2 = X1 @ pair.K.T, (X1 @ pair.R.T + pair.t) @ pair.K.T
+    x1, x2 = x1 / x1[:, 2:], x2 / x2[:, 2:]
+    assert symmetric_distance(x1[:, :2], x2[:, :2], pair.F_mat).max() < 1e-9
+    assert np.linalg.norm(pair.F_mat) == pytest.approx(1)
+
+
+def test_matches_agree_with_the_ground_truth(pair, matches):
+    assert len(matches[0]) >= 300
+    distance = symmetric_distance(*matches, pair.F_mat)
+    assert np.mean(distance < 1) >= 0.8
+    assert np.median(distance) < 0.3  # images and F agree to a fraction of a pixel
+
+
+def test_matches_determine_the_fundamental_matrix(pair, matches):
+    _, on_plane = cv2.findHomography(*matches, cv2.RANSAC, 2.0)
+    assert on_plane.mean() < 0.6
+    F_mat, _ = cv2.findFundamentalMat(*matches, cv2.FM_RANSAC, 0.5, 0.999, 2000)
+    F_mat /= np.linalg.norm(F_mat)
+    good = symmetric_distance(*matches, pair.F_mat) < 1
+    assert np.median(symmetric_distance(matches[0][good], matches[1][good], F_mat)) < 0.5
+    # The epipoles, computed from the estimate and from the truth, lie in the same direction.
+    true, found = (np.linalg.svd(matrix)[2][-1] for matrix in (pair.F_mat, F_mat))
+    true, found = (np.linalg.inv(pair.K) @ epipole for epipole in (true, found))
+    cosine = abs(true @ found) / np.linalg.norm(true) / np.linalg.norm(found)
+    assert np.degrees(np.arccos(min(cosine, 1))) < 5
+
+
+def test_the_seed_determines_the_pair():
+    first, again, other = (render_pair(seed, width=96, height=72) for seed in (1, 1, 2))
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first.image1, other.image1)
+    assert not np.array_equal(first.F_mat, other.F_mat)
+
+
+def test_write_pair(tmp_path):
+    folder, pair = tmp_path / "new" / "pair", render_pair(width=96, height=72)
+    write_pair(str(folder), pair)
+    write_pair(folder, pair)
+    assert sorted(path.name for path in folder.iterdir()) == ["ground_truth.json", "image1.png", "image2.png"]
+    for name in ("image1", "image2"):
+        image = cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(image, getattr(pair, name))
+    truth = json.loads((folder / "ground_truth.json").read_text())
+    assert (truth["width"], truth["height"]) == (96, 72)
+    for name in ("K", "R", "t", "F_mat"):
+        assert np.array_equal(truth[name], getattr(pair, name))  # to the last bit
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
+    pair = render_pair(width=96, height=72)
+    write_pair(tmp_path, pair)
+    before = (tmp_path / "image1.png").read_bytes()
+
+    def interrupted(self, target):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", interrupted)
+    with pytest.raises(OSError, match="no space"):
+        write_pair(tmp_path, render_pair(seed=1, width=96, height=72))
+    assert (tmp_path / "image1.png").read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"seed": -1}, "seed .* -1"),
+        ({"width": 640, "height": 10}, "640 x 10"),
+        ({"width": 100, "height": 200}, "100 x 200"),
+    ],
+)
+def test_bad_values(values, message):
+    with pytest.raises(ValueError, match=message):
+        render_pair(**values)
+
+
+def test_opencv_is_asked_for_by_name(monkeypatch, tmp_path):
+    pair = render_pair(width=96, height=72)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    for use in (render_pair, lambda: write_pair(tmp_path / "pair", pair)):
+        with pytest.raises(ImportError, match=r"kornia-learnnorm\[images\]"):
+            use()
+    assert not (tmp_path / "pair").exists()

@@ -1,0 +1,282 @@
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.data import synthetic
+from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
+
+NAMED = [forward_driving, handheld, orbit]
+ALL = [random_scenes, *NAMED]
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def clean(make, monkeypatch, batch_size=64, num_points=24, seed=0):
+    """Scenes without noise or gross outliers."""
+    if make is not random_scenes:
+        return make(batch_size, num_points, generator(seed), noise=0.0)
+    monkeypatch.setattr(synthetic, "_student_t", lambda shape, generator: torch.zeros(shape, dtype=torch.float64))
+    return make(batch_size, num_points, generator(seed))
+
+
+def homogeneous(points):
+    return np.concatenate([points, np.ones_like(points[..., :1])], -1)
+
+
+def triangulated_depths(scene):
+    """Depths in both views by cross products, in numpy: z2 x2 = z1 R x1 + t."""
+    x1 = homogeneous(scene.points1.numpy()) @ np.linalg.inv(scene.K1.numpy()).transpose(0, 2, 1)
+    x2 = homogeneous(scene.points2.numpy()) @ np.linalg.inv(scene.K2.numpy()).transpose(0, 2, 1)
+    Rx1, t = x1 @ scene.R.numpy().transpose(0, 2, 1), scene.t.numpy()[:, None]
+    a, b = np.cross(x2, Rx1), np.cross(x2, np.broadcast_to(t, x2.shape))
+    z1 = -(a * b).sum(-1) / (a * a).sum(-1)
+    return z1, (z1[..., None] * Rx1 + t)[..., 2]
+
+
+@pytest.mark.parametrize("make", ALL)
+@pytest.mark.parametrize(("batch_size", "num_points"), [(1, 1), (3, 8), (2, 50)])
+def test_shapes_and_dtypes(make, batch_size, num_points):
+    scene = make(batch_size, num_points, generator())
+    assert isinstance(scene, TwoViewScene)
+    for name, shape in {
+        "points1": (num_points, 2),
+        "points2": (num_points, 2),
+        "F_mat": (3, 3),
+        "inliers": (num_points,),
+        "K1": (3, 3),
+        "K2": (3, 3),
+        "R": (3, 3),
+        "t": (3,),
+        "image_size": (2,),
+    }.items():
+        value = getattr(scene, name)
+        assert value.shape == (batch_size, *shape)
+        assert value.dtype == (torch.bool if name == "inliers" else torch.float64)
+        assert torch.isfinite(value).all()
+
+
+@pytest.mark.parametrize("make", ALL)
+def test_fundamental_matrix_is_that_of_the_cameras(make):
+    scene = make(5, 8, generator(1))
+    for K1, K2, R, t, F_mat in zip(scene.K1, scene.K2, scene.R, scene.t, scene.F_mat, strict=True):
+        K1, K2, R, (x, y, z) = K1.numpy(), K2.numpy(), R.numpy(), t.tolist()
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1)
+        E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
+        expected = np.linalg.inv(K2).T @ E @ np.linalg.inv(K1)
+        np.testing.assert_allclose(F_mat.numpy(), expected / np.linalg.norm(expected), atol=1e-14)
+
+
+@pytest.mark.parametrize("make", ALL)
+def test_inliers_meet_the_epipolar_constraint(make, monkeypatch):
+    scene = clean(make, monkeypatch)
+    # In coordinates divided by the image's width, with F of unit norm there.
+    width = scene.image_size[:, :1].numpy()
+    S = np.zeros((len(width), 3, 3))
+    S[:, 0, 0] = S[:, 1, 1] = width[:, 0]
+    S[:, 2, 2] = 1
+    F_mat = S @ scene.F_mat.numpy() @ S
+    F_mat /= np.linalg.norm(F_mat, axis=(1, 2), keepdims=True)
+    x1, x2 = (homogeneous(points.numpy() / width[:, None]) for points in (scene.points1, scene.points2))
+    residual = np.einsum("bni,bij,bnj->bn", x2, F_mat, x1)
+    assert np.abs(residual[scene.inliers.numpy()]).max() < 1e-9
+
+
+@pytest.mark.parametrize("make", ALL)
+@pytest.mark.parametrize("seed", range(8))
+def test_inliers_lie_before_both_cameras_and_in_both_images(make, seed, monkeypatch):
+    scene = clean(make, monkeypatch, num_points=16, seed=seed)
+    inliers = scene.inliers.numpy()
+    z1, z2 = triangulated_depths(scene)
+    assert z1[inliers].min() > 0.5
+    assert (z2 > z1 / 4.001)[inliers].all()
+    for points in (scene.points1, scene.points2):
+        assert (points[scene.inliers] >= 0).all()
+        assert (points <= scene.image_size[:, None] - 1)[scene.inliers].all()
+    if make is not random_scenes:
+        assert inliers.all()
+
+
+@pytest.mark.parametrize("make", ALL)
+def test_the_generator_determines_everything(make):
+    torch.manual_seed(0)
+    first, again, other = (make(3, 12, generator(seed)) for seed in (5, 5, 6))
+    torch.manual_seed(1)
+    untouched = torch.rand(1)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not torch.equal(first.points1, other.points1)
+    torch.manual_seed(1)
+    make(3, 12, generator())
+    assert torch.equal(torch.rand(1), untouched)
+
+
+@pytest.mark.parametrize("make", ALL)
+def test_successive_calls_differ(make):
+    source = generator()
+    assert not torch.equal(make(2, 8, source).points1, make(2, 8, source).points1)
+
+
+@pytest.mark.parametrize("make", NAMED)
+def test_noise_has_the_standard_deviation_asked_for(make):
+    exact = make(100, 200, generator(2), noise=0.0)
+    noisy = make(100, 200, generator(2), noise=0.7)
+    for view in ("points1", "points2"):
+        noise = (getattr(noisy, view) - getattr(exact, view)).numpy().ravel()
+        assert noise.std() == pytest.approx(0.7, rel=0.02)  # 40,000 numbers: standard error 0.4 %
+        assert abs(noise.mean()) < 0.02
+        assert np.mean(np.abs(noise) < 0.7) == pytest.approx(0.6827, abs=0.015)  # Gaussian
+
+
+@pytest.mark.parametrize("make", NAMED)
+@pytest.mark.parametrize(("outliers", "expected"), [(0.0, 0), (0.25, 10), (1.0, 40)])
+def test_share_of_gross_outliers(make, outliers, expected):
+    scene = make(20, 40, generator(3), noise=0.0, outliers=outliers)
+    assert ((~scene.inliers).sum(-1) == expected).all()
+    exact = make(20, 40, generator(3), noise=0.0)
+    moved = (scene.points2 != exact.points2).any(-1)
+    assert torch.equal(moved, ~scene.inliers)
+    assert torch.equal(scene.points1, exact.points1)
+
+
+def test_student_t_noise():
+    noise = synthetic._student_t((200_000, 2), generator(4)).numpy()
+    # Quantiles of Student's t with three degrees of freedom, from its closed-form distribution function:
+    # F(x) = 1/2 + (x / (sqrt(3) (1 + x^2/3)) + atan(x / sqrt(3))) / pi.
+    for x in (-3.0, -1.0, 0.0, 0.5, 2.0, 6.0):
+        u = x / np.sqrt(3)
+        expected = 0.5 + (u / (1 + u * u) + np.arctan(u)) / np.pi
+        np.testing.assert_allclose((noise < x).mean(0), expected, atol=0.005)
+
+
+def test_random_scenes_have_the_breadth_promised():
+    scene = random_scenes(4000, 20, generator(7))
+    width, height = scene.image_size.unbind(-1)
+    assert 400 <= width.min() < 420
+    assert 1380 < width.max() <= 1400
+    ratio, focal = height / width, scene.K1[:, 0, 0] / width
+    assert ratio.min() == pytest.approx(0.3, abs=0.01)
+    assert ratio.max() == pytest.approx(0.8, abs=0.01)
+    assert focal.min() == pytest.approx(0.5, abs=0.01)
+    assert focal.max() == pytest.approx(1.3, abs=0.01)
+    angle = torch.linalg.matrix_norm(scene.R - torch.eye(3).double()).div(8**0.5).asin() * 2
+    assert 0.002 <= angle.min() < 0.0025
+    assert 0.3 < angle.max() <= 0.48
+    # The scenes that drive: one in three, and of the others those that happen to go ahead (a cap of 8 % at 0.84).
+    centre = -(scene.R.mT @ scene.t[..., None]).squeeze(-1)
+    ahead = (centre[:, 2] / centre.norm(dim=-1) > 0.84).double().mean()
+    assert ahead == pytest.approx(1 / 3 + 2 / 3 * 0.08, abs=0.04)
+    outliers = (~scene.inliers).double().mean(-1)
+    assert (outliers == 0).double().mean() == pytest.approx(
+        0.5 + 0.5 / 12, abs=0.04
+    )  # below half a point in 20: 1 in 12
+    assert outliers.mean() == pytest.approx(0.075, abs=0.005)
+    assert outliers.max() <= 0.5
+
+
+def test_half_of_the_random_scenes_are_clustered():
+    size = torch.tensor([[1000.0, 500.0]]).double().expand(2000, 2)
+    spread = [
+        synthetic._spread_points(size, 30, generator(8), clustered=share).std(1).prod(-1) for share in (0.0, 0.5, 1.0)
+    ]
+    below = [(values < 20_000).double().mean().item() for values in spread]  # uniform: 289 x 144 = 41,600
+    assert below[0] < 0.01
+    assert below[2] > 0.3
+    assert below[1] == pytest.approx(below[2] / 2, abs=0.05)
+
+
+def test_ground_plane():
+    size, K = synthetic._random_cameras(2000, generator(9))
+    points = synthetic._spread_points(size, 20, generator(10))
+    height = torch.full((2000, 1), 2.0).double()
+    depths = synthetic._draw_depths(points, K, 3.0, 75.0, height, generator(11))
+    assert depths.min() >= 3
+    assert depths.max() <= 75
+    level = (points[..., 1] - K[:, 1, 2, None]) / K[:, 1, 1, None] * depths  # how far below the camera
+    assert ((level - 2).abs() < 1e-9).double().mean() == pytest.approx(0.4, abs=0.05)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_scenes_are_finite_for_many_seeds(seed):
+    scene = random_scenes(256, 12, generator(seed))
+    assert all(torch.isfinite(value).all() for value in scene)
+    assert scene.inliers.double().mean() > 0.9
+    outside = (scene.points2 < 0) | (scene.points2 > scene.image_size[:, None] - 1)
+    assert not outside.any(-1)[~scene.inliers].any()
+
+
+def test_points_that_no_motion_shows_become_outliers():
+    size, K = synthetic._fixed_camera(2, (640.0, 480.0), 500.0, (319.5, 239.5), generator())
+    points = synthetic._spread_points(size, 32, generator())
+    depths = torch.full((2, 32), 5.0).double()
+    R = torch.diag(torch.tensor([-1.0, 1.0, -1.0])).double().expand(2, 1, 3, 3)  # the camera looks back
+    scene = synthetic._two_views(points, depths, K, R, torch.ones(2, 1, 3).double(), size, 8)
+    assert not scene.inliers.any()
+    zero = torch.zeros(2, 8, 2).double()
+    scene = synthetic._corrupt(scene, zero, zero, torch.zeros(2, 1).double(), generator())
+    assert not scene.inliers.any()
+    assert (scene.points2 >= 0).all()
+    assert (scene.points2 <= size[:, None] - 1).all()
+
+
+def test_the_first_motion_that_shows_enough_is_chosen():
+    size, K = synthetic._fixed_camera(1, (640.0, 480.0), 500.0, (319.5, 239.5), generator())
+    points = synthetic._spread_points(size, 64, generator())
+    depths = torch.full((1, 64), 5.0).double()
+    back, ahead = torch.diag(torch.tensor([-1.0, 1.0, -1.0])).double(), torch.eye(3).double()
+    R = torch.stack([back, ahead, ahead])[None]
+    t = torch.tensor([[[0.0, 0, 0], [0.125, 0, 0], [0.01, 0, 0]]]).double()
+    scene = synthetic._two_views(points, depths, K, R, t, size, 24)
+    assert scene.inliers.all()
+    assert scene.t.tolist() == [[0.125, 0.0, 0.0]]
+
+
+def test_cameras_of_the_named_scenes():
+    driving = forward_driving(1, 1, generator())
+    assert driving.image_size.tolist() == [[1241.0, 376.0]]
+    assert driving.K1[0].tolist() == [[718.856, 0.0, 607.1928], [0.0, 718.856, 185.2157], [0.0, 0.0, 1.0]]
+    for make in (handheld, orbit):
+        scene = make(1, 1, generator())
+        assert scene.image_size.tolist() == [[640.0, 480.0]]
+        assert scene.K2[0, 0, 0] == scene.K2[0, 1, 1] == 535.0
+
+
+def test_motions_of_the_named_scenes():
+    driving, orbiting = forward_driving(50, 8, generator()), orbit(50, 8, generator())
+    centre = -(driving.R.mT @ driving.t[..., None]).squeeze(-1)
+    assert (centre[:, 2] > 0.9 * centre.norm(dim=-1)).all()
+    pivot = torch.tensor([0.0, 0.0, 4.0]).double()  # stays where it is
+    assert torch.allclose(orbiting.R @ pivot + orbiting.t, pivot.expand(50, 3))
+
+
+@pytest.mark.parametrize("make", ALL)
+@pytest.mark.parametrize(
+    ("batch_size", "num_points", "message"), [(0, 8, "batch_size .* 0"), (2, -1, "num_points .* -1")]
+)
+def test_sizes_must_be_positive(make, batch_size, num_points, message):
+    with pytest.raises(ValueError, match=message):
+        make(batch_size, num_points, generator())
+
+
+@pytest.mark.parametrize("make", NAMED)
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"noise": -0.5}, "noise .* -0.5"),
+        ({"noise": float("nan")}, "noise .* nan"),
+        ({"noise": float("inf")}, "noise .* inf"),
+        ({"outliers": -0.1}, "outliers .* -0.1"),
+        ({"outliers": 1.5}, "outliers .* 1.5"),
+        ({"outliers": float("nan")}, "outliers .* nan"),
+    ],
+)
+def test_noise_and_outliers_must_make_sense(make, values, message):
+    with pytest.raises(ValueError, match=message):
+        make(2, 8, generator(), **values)
+
+
+@pytest.mark.parametrize("make", ALL)
+def test_generator_is_needed(make):
+    with pytest.raises(TypeError, match=r"generator .* 'int'"):
+        make(2, 8, 0)
