@@ -41,6 +41,7 @@ class LearnedNormalizer(nn.Module):
         invariant to their order.
 
     Example:
+        >>> import torch
         >>> normalizer = LearnedNormalizer.from_pretrained()
         >>> T1, T2 = normalizer(torch.rand(2, 8, 2) * 600, torch.rand(2, 8, 2) * 600)
         >>> T1.shape

@@ -39,6 +39,7 @@ def better_rate(residual: Tensor, baseline: Tensor) -> BetterRate:
         ValueError: if the shapes differ or nothing can be compared.
 
     Example:
+        >>> import torch
         >>> better_rate(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.0, 1.0]))
         BetterRate(rate=0.333..., ties=1, degenerate=0, compared=3)
 

@@ -11,6 +11,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from kornia_learnnorm.normalizers import weighted_mean
 from kornia_learnnorm.solver import design_matrix, null_vector, smallest_right_singular_vector
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
@@ -62,7 +63,7 @@ class CrossViewNetwork(nn.Module):
         F = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
         F = F * _sign(F)
         v, u = smallest_right_singular_vector(F), smallest_right_singular_vector(F.mT)
-        views = _view_features(x1, x2, F, v, u), _view_features(x2, x1, F.mT, u, v)
+        views = _view_features(x1, x2, F, v, u, weights), _view_features(x2, x1, F.mT, u, v, weights)
         point, whole = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
         doubled = None if weights is None else torch.cat([weights, weights]).to(self.dtype)
         params = self.set_network(point, whole, doubled).to(points1.dtype)
@@ -81,7 +82,9 @@ def _sign(F: Tensor) -> Tensor:
     return entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
 
 
-def _view_features(own: Tensor, other: Tensor, F: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+def _view_features(
+    own: Tensor, other: Tensor, F: Tensor, v: Tensor, u: Tensor, weights: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Describe the problem as one view sees it, where ``other^T F own = 0``.
 
     ``v`` and ``u`` are the right and left singular vectors of the smallest singular value of ``F``: projected to rank
@@ -92,7 +95,7 @@ def _view_features(own: Tensor, other: Tensor, F: Tensor, v: Tensor, u: Tensor) 
     distance, other_distance = own @ v[..., None], other @ u[..., None]
     correction = (u[..., None, :] @ F @ v[..., None]).squeeze(-1)
     residual = correction[..., None] * distance * other_distance * (1 / (norm + 1e-4) + 1 / (other_norm + 1e-4))
-    scale = residual.abs().mean(-2, keepdim=True)
+    scale = weighted_mean(residual.abs(), weights)[..., None, :]
     points = [own[..., :2], other[..., :2], normalize(line, dim=-1), normalize(other_line, dim=-1)]
     points += [(norm + 1e-4).log(), (other_norm + 1e-4).log(), residual / (scale + 1e-12)]
     points += [(distance.abs() + 1e-3).log(), (other_distance.abs() + 1e-3).log()]

@@ -25,6 +25,7 @@ __all__ = [
     "solve_dtype",
     "spd_transform",
     "transform_fundamental",
+    "weighted_mean",
 ]
 
 
@@ -178,7 +179,7 @@ def spd_transform(params: Tensor) -> Tensor:
     return affine_transform(torch.stack([row1, row2], -2), origin)
 
 
-def _mean(values: Tensor, weights: Tensor | None) -> Tensor:
+def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:
     """Average over the points ``(B, N, C) -> (B, C)``; weights that sum to zero count as equal."""
     if weights is None:
         return values.mean(-2)
@@ -237,11 +238,11 @@ class Hartley(nn.Module):
     Coincident points keep their scale.
 
     Example:
-        >>> points = torch.tensor([[[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, 2.0]]])
+        >>> points = torch.tensor([[[0.0, 0.0], [4.0, 0.0], [0.0, 4.0], [4.0, 4.0]]])
         >>> Hartley()(points, points)[0]
-        tensor([[[ 1.,  0., -1.],
-                 [ 0.,  1., -1.],
-                 [ 0.,  0.,  1.]]])
+        tensor([[[ 0.5000,  0.0000, -1.0000],
+                 [ 0.0000,  0.5000, -1.0000],
+                 [ 0.0000,  0.0000,  1.0000]]])
 
     """
 
@@ -251,8 +252,8 @@ class Hartley(nn.Module):
 
     @staticmethod
     def _transform(points: Tensor, weights: Tensor | None) -> Tensor:
-        origin = _mean(points, weights)
-        radius = _mean((points - origin[:, None]).norm(dim=-1, keepdim=True), weights)[..., 0]
+        origin = weighted_mean(points, weights)
+        radius = weighted_mean((points - origin[:, None]).norm(dim=-1, keepdim=True), weights)[..., 0]
         scale = math.sqrt(2) / torch.where(radius > 0, radius, math.sqrt(2))
         return affine_transform(scale[:, None, None] * torch.eye(2).to(points), origin)
 
@@ -268,10 +269,8 @@ class Whitening(nn.Module):
 
     Example:
         >>> points = torch.tensor([[[0.0, 0.0], [4.0, 0.0], [0.0, 2.0], [4.0, 2.0]]])
-        >>> Whitening()(points, points)[0]
-        tensor([[[ 0.5000,  0.0000, -1.0000],
-                 [ 0.0000,  1.0000, -1.0000],
-                 [ 0.0000,  0.0000,  1.0000]]])
+        >>> Whitening()(points, points)[0][0].diagonal()
+        tensor([0.5000, 1.0000, 1.0000])
 
     """
 
@@ -286,9 +285,11 @@ class Whitening(nn.Module):
     def _transform(self, points: Tensor, weights: Tensor | None) -> Tensor:
         dtype = solve_dtype(points.device)
         x, w = points.to(dtype), None if weights is None else weights.to(dtype)
-        origin = _mean(x, w)
+        origin = weighted_mean(x, w)
         centred = x - origin[:, None]
-        covariance = torch.unflatten(_mean((centred[..., :, None] * centred[..., None, :]).flatten(-2), w), -1, (2, 2))
+        covariance = torch.unflatten(
+            weighted_mean((centred[..., :, None] * centred[..., None, :]).flatten(-2), w), -1, (2, 2)
+        )
         return affine_transform(inverse_sqrt(covariance, self.floor), origin).to(points.dtype)
 
 

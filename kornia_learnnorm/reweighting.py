@@ -15,7 +15,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.normalizers import Hartley, Whitening, solve_dtype, transform_fundamental
+from kornia_learnnorm.normalizers import Hartley, Whitening, solve_dtype, transform_fundamental, weighted_mean
 from kornia_learnnorm.solver import design_matrix, null_vector, smallest_right_singular_vector
 
 __all__ = ["ReweightedWhitening", "line_norms"]
@@ -62,37 +62,48 @@ class ReweightedWhitening(nn.Module):
         # Hartley's coordinates keep the shape of the pixels, which the distances to lines need.
         x1 = convert_points_to_homogeneous(points1.to(dtype)) @ H1.mT
         x2 = convert_points_to_homogeneous(points2.to(dtype)) @ H2.mT
-        F0 = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
-        w = _distance_factor(x1, x2, F0)
-        T1, T2 = self._whiten(x1, x2, w, w, weights)
-        for _ in range(self.iterations):
-            T1, T2 = self._whiten(x1, x2, *self._reweight(x1, x2, F0, T1, T2), weights)
+        w1, w2 = self._weigh(*_hold_undetermined(x1, x2, weights))
+        T1, T2 = self._whiten(x1, x2, w1, w2, weights)
         return (T1 @ H1).to(points1.dtype), (T2 @ H2).to(points2.dtype)
+
+    def _weigh(self, x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the weights of the last whitening, of both views."""
+        F0 = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
+        w1 = w2 = _distance_factor(x1, x2, F0, weights)
+        for _ in range(self.iterations):
+            T1, T2 = self._whiten(x1, x2, w1, w2, weights)
+            w1, w2 = self._reweight(x1, x2, F0, T1, T2, weights)
+        return w1, w2
 
     def _whiten(self, x1: Tensor, x2: Tensor, w1: Tensor, w2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         w1, w2 = (w1, w2) if weights is None else (w1 * weights, w2 * weights)
         return self.whitening(x1[..., :2], x2[..., :2], w1)[0], self.whitening(x1[..., :2], x2[..., :2], w2)[1]
 
-    def _reweight(self, x1: Tensor, x2: Tensor, F0: Tensor, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
+    def _reweight(
+        self, x1: Tensor, x2: Tensor, F0: Tensor, T1: Tensor, T2: Tensor, weights: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         F_hat = transform_fundamental(F0, torch.linalg.inv_ex(T1)[0], torch.linalg.inv_ex(T2)[0])
         b = smallest_right_singular_vector(F_hat)[..., None]
         a = smallest_right_singular_vector(F_hat.mT)[..., None]
-        w = _distance_factor(x1, x2, transform_fundamental(F_hat - (F_hat @ b) @ b.mT, T1, T2))
+        w = _distance_factor(x1, x2, transform_fundamental(F_hat - (F_hat @ b) @ b.mT, T1, T2), weights)
         r1, r2 = (x1 @ (T1.mT @ b)).squeeze(-1).abs(), (x2 @ (T2.mT @ a)).squeeze(-1).abs()
         residual = w * r1 * r2
-        scale = residual.mean(-1, keepdim=True)
+        scale = weighted_mean(residual[..., None], weights)
         scale = torch.where(scale > 0, scale, 1.0)
         factor = w.square() / (residual + self.damping * scale)
         return _unit_mean(factor * r2.square()), _unit_mean(factor * r1.square())
 
 
-def line_norms(x1: Tensor, x2: Tensor, F_mat: Tensor, floor: float = 1e-3) -> tuple[Tensor, Tensor]:
+def line_norms(
+    x1: Tensor, x2: Tensor, F_mat: Tensor, weights: Tensor | None = None, floor: float = 1e-3
+) -> tuple[Tensor, Tensor]:
     r"""Return the norms of both epipolar lines' normals, :math:`\|(F^\top x_2)_{1:2}\|` and :math:`\|(F x_1)_{1:2}\|`.
 
     Args:
         x1: homogeneous points of the first view with shape :math:`(*, N, 3)`.
         x2: homogeneous points of the second view with shape :math:`(*, N, 3)`.
         F_mat: fundamental matrices with shape :math:`(*, 3, 3)`.
+        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
         floor: share of the set's mean norm added to each, against points on an epipole.
 
     Returns:
@@ -100,15 +111,31 @@ def line_norms(x1: Tensor, x2: Tensor, F_mat: Tensor, floor: float = 1e-3) -> tu
 
     """
     norms = (x2 @ F_mat)[..., :2].norm(dim=-1), (x1 @ F_mat.mT)[..., :2].norm(dim=-1)
-    means = (n.mean(-1, keepdim=True) for n in norms)
+    means = (weighted_mean(n[..., None], weights) for n in norms)
     first, second = (n + floor * torch.where(mean > 0, mean, 1.0) for n, mean in zip(norms, means, strict=True))
     return first, second
 
 
-def _distance_factor(x1: Tensor, x2: Tensor, F_mat: Tensor) -> Tensor:
+def _distance_factor(x1: Tensor, x2: Tensor, F_mat: Tensor, weights: Tensor | None) -> Tensor:
     """Factor from the algebraic residual to the symmetric epipolar distance, ``(*, N)``, with unit mean."""
-    first, second = line_norms(x1, x2, F_mat)
+    first, second = line_norms(x1, x2, F_mat, weights)
     return _unit_mean(1 / first + 1 / second)
+
+
+def _hold_undetermined(x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Cut the derivatives of the samples that do not determine the fundamental matrix; the values stay.
+
+    Where rounding decides on the null vector (at 1e-6, that of float32 pixels), so it does on the weights, and every
+    iteration multiplies their derivatives by another inverse of a vanishing number.
+    """
+    if not (torch.is_grad_enabled() and (x1.requires_grad or x2.requires_grad)):
+        return x1, x2, weights
+    with torch.no_grad():
+        A = design_matrix(x1, x2)
+        s = torch.linalg.svdvals(A if weights is None else A * weights.sqrt()[..., None])
+        held = s[:, 7:8] <= 1e-6 * s[:, :1]
+    x1, x2 = (torch.where(held[..., None], x.detach(), x) for x in (x1, x2))
+    return x1, x2, None if weights is None else torch.where(held, weights.detach(), weights)
 
 
 def _unit_mean(weights: Tensor) -> Tensor:

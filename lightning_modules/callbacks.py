@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from pytorch_lightning.callbacks import BasePredictionWriter, Callback, ModelCheckpoint
+from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 from safetensors.torch import save_file
+from torch import Tensor
 
 from kornia_learnnorm.files import replacing
 from lightning_modules.task import NormalizerTask
@@ -54,7 +54,7 @@ class ExportWeights(Callback):
             print(f"wrote {path}")
 
 
-class WritePredictions(BasePredictionWriter):
+class WritePredictions(Callback):
     """Write the tensors that ``predict`` returns to one safetensors file.
 
     Args:
@@ -62,20 +62,21 @@ class WritePredictions(BasePredictionWriter):
     """
 
     def __init__(self, filename: str = "predictions.safetensors") -> None:
-        super().__init__(write_interval="epoch")
         self.filename = filename
+        self._batches: list[dict[str, Tensor]] = []
 
-    def write_on_epoch_end(
-        self,
-        trainer: pl.Trainer,
-        pl_module: pl.LightningModule,
-        predictions: Sequence[Any],
-        batch_indices: Sequence[Any],
+    def on_predict_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, *args: Any, **kwargs: Any
     ) -> None:
+        """Keep the predictions of a batch."""
+        self._batches.append({key: value.cpu() for key, value in outputs.items()})
+
+    def on_predict_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Concatenate the batches and write them beside the target, then rename."""
         path = Path(trainer.default_root_dir) / self.filename
         path.parent.mkdir(parents=True, exist_ok=True)
-        fields = {key: torch.cat([batch[key] for batch in predictions]).contiguous() for key in predictions[0]}
+        fields = {key: torch.cat([batch[key] for batch in self._batches]) for key in self._batches[0]}
+        self._batches.clear()
         with replacing(path) as beside:
             save_file(fields, beside)
         print(f"wrote {path}")

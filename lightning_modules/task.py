@@ -75,17 +75,22 @@ class NormalizerTask(pl.LightningModule):
         return find_fundamental(points1, points2, weights, self.normalizer)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
-        """Return the loss of a batch of samples."""
+        """Log and return the loss of a batch of samples."""
+        loss = self.compute_loss(batch)
+        self.log("train/loss", loss, prog_bar=True)
+        return loss
+
+    def compute_loss(self, batch: Samples) -> Tensor:
+        """Return the loss of a batch of samples, each sample's gradient limited where it enters the network."""
         x1, x2 = batch.points1.double(), batch.points2.double()
         with self._limited_gradients():
             F_mat = self(x1, x2)
         loss: Tensor = self.loss(x1, x2, F_mat, batch.heldout1.double(), batch.heldout2.double())
-        self.log("train/loss", loss, prog_bar=True)
         return loss
 
     @contextmanager
     def _limited_gradients(self) -> Iterator[None]:
-        """Limit each sample's gradient where it enters the network."""
+        """Attach the limit to the network's outputs while the block runs."""
 
         def limit(gradient: Tensor) -> Tensor:
             most = self.sample_gradient / len(gradient)  # type: ignore[operator]

@@ -1,0 +1,104 @@
+"""What the tests of the core share: scenes, references in NumPy, and comparisons that know about sign and scale."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
+from kornia_learnnorm.learned import LearnedNormalizer
+from kornia_learnnorm.networks import CrossViewNetwork
+
+SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
+
+
+def scenes(name: str, batch_size: int = 20, num_points: int = 8, seed: int = 0, **options: float) -> TwoViewScene:
+    """Scenes of one kind, in float64 on the CPU."""
+    return SCENES[name](batch_size, num_points, torch.Generator().manual_seed(seed), **options)
+
+
+def correspondences(name: str = "handheld", *args, **options) -> tuple[Tensor, Tensor]:
+    scene = scenes(name, *args, **options)
+    return scene.points1, scene.points2
+
+
+def uniform(*shape: int, low: float = 0.0, high: float = 1.0, seed: int = 0, dtype=torch.float64) -> Tensor:
+    return torch.empty(shape, dtype=dtype).uniform_(low, high, generator=torch.Generator().manual_seed(seed))
+
+
+def shaken(normalizer: LearnedNormalizer | None = None, scale: float = 0.3, seed: int = 0) -> LearnedNormalizer:
+    """A learned normaliser whose last layer holds random numbers, so that it differs from its base."""
+    torch.manual_seed(seed)
+    normalizer = LearnedNormalizer(network=CrossViewNetwork(width=16, depth=2)) if normalizer is None else normalizer
+    with torch.no_grad():
+        for value in normalizer.network.set_network.head[-1].parameters():
+            value.normal_(0, scale)
+    return normalizer.eval()
+
+
+def homogeneous(points: np.ndarray) -> np.ndarray:
+    return np.concatenate([points, np.ones_like(points[..., :1])], -1)
+
+
+def unit(F: np.ndarray) -> np.ndarray:
+    return F / np.linalg.norm(F, axis=(-2, -1), keepdims=True)
+
+
+def eight_point(points1, points2, T1, T2, weights=None) -> np.ndarray:
+    """The normalised eight-point algorithm by two singular value decompositions; the weights are of squares."""
+    points1, points2, T1, T2 = (np.asarray(value, dtype=np.float64) for value in (points1, points2, T1, T2))
+    F = []
+    for k, (p1, p2, t1, t2) in enumerate(zip(points1, points2, T1, T2, strict=True)):
+        x1, x2 = homogeneous(p1) @ t1.T, homogeneous(p2) @ t2.T
+        A = np.stack([np.kron(b, a) for a, b in zip(x1, x2, strict=True)])
+        if weights is not None:
+            A = A * np.sqrt(np.asarray(weights[k]))[:, None]
+        U, s, Vh = np.linalg.svd(np.linalg.svd(A, full_matrices=True)[2][-1].reshape(3, 3))
+        F.append(t2.T @ U @ np.diag([s[0], s[1], 0]) @ Vh @ t1)
+    return unit(np.stack(F))
+
+
+def numpy_hartley(points, weights=None) -> np.ndarray:
+    T = []
+    for k, p in enumerate(np.asarray(points, dtype=np.float64)):
+        w = None if weights is None else np.asarray(weights[k])
+        o = np.average(p, axis=0, weights=w)
+        s = np.sqrt(2) / np.average(np.hypot(*(p - o).T), weights=w)
+        T.append([[s, 0, -s * o[0]], [0, s, -s * o[1]], [0, 0, 1]])
+    return np.array(T)
+
+
+def numpy_whitening(points, weights=None) -> np.ndarray:
+    T = []
+    for k, p in enumerate(np.asarray(points, dtype=np.float64)):
+        w = np.full(len(p), 1.0) if weights is None else np.asarray(weights[k])
+        values, vectors = np.linalg.eigh(np.cov(p.T, aweights=w, ddof=0))
+        M = vectors @ np.diag(values**-0.5) @ vectors.T
+        T.append(np.block([[M, -M @ np.average(p, axis=0, weights=w)[:, None]], [np.zeros((1, 2)), np.ones((1, 1))]]))
+    return np.array(T)
+
+
+def epipolar_distances(points1, points2, F) -> np.ndarray:
+    """The sum of both points' distances to their epipolar lines, line by line."""
+    x1, x2 = homogeneous(np.asarray(points1)), homogeneous(np.asarray(points2))
+    lines2, lines1 = x1 @ np.asarray(F).swapaxes(-1, -2), x2 @ np.asarray(F)
+    residual = np.abs((x2 * lines2).sum(-1))
+    return residual / np.hypot(*lines2[..., :2].T).T + residual / np.hypot(*lines1[..., :2].T).T
+
+
+def up_to_sign(F, G) -> float:
+    """Largest difference of two batches of matrices, each scaled to unit norm, whatever their signs."""
+    F, G = unit(np.asarray(F, dtype=np.float64)), unit(np.asarray(G, dtype=np.float64))
+    return float(np.minimum(np.abs(F - G).max((-2, -1)), np.abs(F + G).max((-2, -1))).max(initial=0))
+
+
+def in_hartley(F, points1, points2) -> np.ndarray:
+    """F of pixels in Hartley's coordinates, where all nine entries count."""
+    inverse1, inverse2 = np.linalg.inv(numpy_hartley(points1)), np.linalg.inv(numpy_hartley(points2))
+    return unit(inverse2.swapaxes(-1, -2) @ np.asarray(F, dtype=np.float64) @ inverse1)
+
+
+def signless(F: Tensor) -> Tensor:
+    """Smooth numbers of unit matrices that do not see the sign; a gradient check must not trip on it."""
+    return (F.flatten(-2) @ uniform(9, 4, low=-1, seed=9).to(F)).square()
