@@ -35,7 +35,7 @@ endif
 	$(BIN)/learnnorm estimate $(RUN)/image1.png $(RUN)/image2.png --out $(RUN)/pair.png --json $(RUN)/pair.json
 
 test: $(VENV)/.ready
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

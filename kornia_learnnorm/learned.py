@@ -154,8 +154,10 @@ def _name(part: Any, *modules: Any) -> str:
 
 def _describe(part: nn.Module, *modules: Any) -> dict[str, Any]:
     """Name a part of this package and its constructor's arguments, which it keeps as attributes of the same names."""
-    arguments = list(inspect.signature(type(part)).parameters)
-    return {"name": _name(type(part), *modules), **{key: getattr(part, key) for key in arguments}}
+    name, arguments = _name(type(part), *modules), inspect.signature(type(part)).parameters.values()
+    # A part without a constructor of its own shows the `*args, **kwargs` of `nn.Module`.
+    keys = [argument.name for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD]
+    return {"name": name, **{key: getattr(part, key) for key in keys}}
 
 
 def _build(path: Path, architecture: str) -> dict[str, Any]:

@@ -189,6 +189,11 @@ def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:
     return (weights[..., None] * values).sum(-2) / torch.where(empty, weights.shape[-1], total)
 
 
+def _rounding(origin: Tensor) -> Tensor:
+    """Spread ``(B,)`` about ``origin`` up to which points coincide: a mean is not exact."""
+    return 16 * torch.finfo(origin.dtype).eps * origin.detach().norm(dim=-1)
+
+
 class Identity(nn.Module):
     """No normalisation: both transforms are the identity (the original eight-point algorithm, in pixels).
 
@@ -254,7 +259,7 @@ class Hartley(nn.Module):
     def _transform(points: Tensor, weights: Tensor | None) -> Tensor:
         origin = weighted_mean(points, weights)
         radius = weighted_mean((points - origin[:, None]).norm(dim=-1, keepdim=True), weights)[..., 0]
-        scale = math.sqrt(2) / torch.where(radius > 0, radius, math.sqrt(2))
+        scale = math.sqrt(2) / torch.where(radius > _rounding(origin), radius, math.sqrt(2))
         return affine_transform(scale[:, None, None] * torch.eye(2).to(points), origin)
 
 
@@ -290,6 +295,8 @@ class Whitening(nn.Module):
         covariance = torch.unflatten(
             weighted_mean((centred[..., :, None] * centred[..., None, :]).flatten(-2), w), -1, (2, 2)
         )
+        spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+        covariance = torch.where((spread > _rounding(origin))[:, None, None], covariance, 0.0)
         return affine_transform(inverse_sqrt(covariance, self.floor), origin).to(points.dtype)
 
 

@@ -14,11 +14,12 @@ from __future__ import annotations
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from kornia_learnnorm.normalizers import Hartley, Whitening, solve_dtype, transform_fundamental, weighted_mean
 from kornia_learnnorm.solver import design_matrix, null_vector, smallest_right_singular_vector
 
-__all__ = ["ReweightedWhitening", "line_norms"]
+__all__ = ["ReweightedWhitening", "adjugate", "line_norms"]
 
 
 class ReweightedWhitening(nn.Module):
@@ -26,13 +27,14 @@ class ReweightedWhitening(nn.Module):
 
     Starts from the DLT's null vector :math:`F_0` and the weights
     :math:`w_i = 1 / \|(F_0^\top x_{2,i})_{1:2}\| + 1 / \|(F_0 x_{1,i})_{1:2}\|`, the factor from an algebraic residual
-    to the symmetric epipolar distance (Fan et al., Eq. 7). Each iteration whitens both views, takes the lines
-    :math:`a, b` of the rank-2 correction, and sets the weights of view 1 to
-    :math:`w_i |a^\top x_{2,i}| / |b^\top x_{1,i}|` and of view 2 to its mirror image: iteratively reweighted least
-    squares for the sum of absolute residuals.
+    to the symmetric epipolar distance (Fan et al., Eq. 7). Each iteration finds the lines :math:`a, b` of the rank-2
+    correction, :math:`b \propto S_1^{-1} F_0^{-1} a` and :math:`a \propto S_2^{-1} F_0^{-\top} b`, and sets the weights
+    of view 1 to :math:`w_i |a^\top x_{2,i}| / |b^\top x_{1,i}|`, of view 2 to its mirror image: iteratively reweighted
+    least squares for the sum of absolute residuals. The views take turns together, not one after the other, so that
+    swapping them swaps the transforms.
 
     Args:
-        iterations: number of reweightings; 0 whitens once with :math:`w`.
+        iterations: number of reweightings; 0 whitens with :math:`w`.
         damping: share of the mean residual added to each residual before it divides.
 
     Raises:
@@ -46,7 +48,7 @@ class ReweightedWhitening(nn.Module):
 
     """
 
-    def __init__(self, iterations: int = 5, damping: float = 0.1) -> None:
+    def __init__(self, iterations: int = 10, damping: float = 0.1) -> None:
         super().__init__()
         if iterations < 0 or damping <= 0:
             raise ValueError(f"iterations must be >= 0 and damping > 0, got {iterations} and {damping}")
@@ -63,35 +65,70 @@ class ReweightedWhitening(nn.Module):
         x1 = convert_points_to_homogeneous(points1.to(dtype)) @ H1.mT
         x2 = convert_points_to_homogeneous(points2.to(dtype)) @ H2.mT
         w1, w2 = self._weigh(*_hold_undetermined(x1, x2, weights))
-        T1, T2 = self._whiten(x1, x2, w1, w2, weights)
+        T1, T2 = self._whiten(x1, x2, w1, w2)
         return (T1 @ H1).to(points1.dtype), (T2 @ H2).to(points2.dtype)
 
-    def _weigh(self, x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the weights of the last whitening, of both views."""
-        F0 = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
-        w1 = w2 = _distance_factor(x1, x2, F0, weights)
-        for _ in range(self.iterations):
-            T1, T2 = self._whiten(x1, x2, w1, w2, weights)
-            w1, w2 = self._reweight(x1, x2, F0, T1, T2, weights)
-        return w1, w2
-
-    def _whiten(self, x1: Tensor, x2: Tensor, w1: Tensor, w2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        w1, w2 = (w1, w2) if weights is None else (w1 * weights, w2 * weights)
+    def _whiten(self, x1: Tensor, x2: Tensor, w1: Tensor, w2: Tensor) -> tuple[Tensor, Tensor]:
         return self.whitening(x1[..., :2], x2[..., :2], w1)[0], self.whitening(x1[..., :2], x2[..., :2], w2)[1]
 
-    def _reweight(
-        self, x1: Tensor, x2: Tensor, F0: Tensor, T1: Tensor, T2: Tensor, weights: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _weigh(self, x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the weights of the last whitening, of both views, ``(B, N)``."""
+        F0 = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
+        given: Tensor | float = 1.0 if weights is None else weights
+        w1 = w2 = given * _distance_factor(x1, x2, F0, weights)
+        if self.iterations == 0:
+            return w1, w2
+        # Adjugates stand for inverses: a line has no scale, and they exist where inverses do not.
+        inverse = adjugate(F0)
+        b = self._first_line(x1, x2, F0, w1, w2)
+        a = _solve(x2, w2, inverse.mT, b)
+        for iteration in range(self.iterations):
+            if iteration:
+                b, a = _solve(x1, w1, inverse, a), _solve(x2, w2, inverse.mT, b)
+            r1, r2 = (x1 @ b[..., None]).squeeze(-1).abs(), (x2 @ a[..., None]).squeeze(-1).abs()
+            w = _distance_factor(x1, x2, _corrected(F0, inverse, a, b), weights)
+            residual = w * r1 * r2
+            floor = self.damping * _positive(weighted_mean(residual[..., None], weights))
+            factor = given * w.square() / (residual + floor)
+            w1, w2 = _unit_mean(factor * r2.square()), _unit_mean(factor * r1.square())
+        return w1, w2
+
+    def _first_line(self, x1: Tensor, x2: Tensor, F0: Tensor, w1: Tensor, w2: Tensor) -> Tensor:
+        """Return view 1's line of the rank-2 correction in the whitened coordinates, ``(B, 3)``, unit norm."""
+        T1, T2 = self._whiten(x1, x2, w1, w2)
         F_hat = transform_fundamental(F0, torch.linalg.inv_ex(T1)[0], torch.linalg.inv_ex(T2)[0])
-        b = smallest_right_singular_vector(F_hat)[..., None]
-        a = smallest_right_singular_vector(F_hat.mT)[..., None]
-        w = _distance_factor(x1, x2, transform_fundamental(F_hat - (F_hat @ b) @ b.mT, T1, T2), weights)
-        r1, r2 = (x1 @ (T1.mT @ b)).squeeze(-1).abs(), (x2 @ (T2.mT @ a)).squeeze(-1).abs()
-        residual = w * r1 * r2
-        scale = weighted_mean(residual[..., None], weights)
-        scale = torch.where(scale > 0, scale, 1.0)
-        factor = w.square() / (residual + self.damping * scale)
-        return _unit_mean(factor * r2.square()), _unit_mean(factor * r1.square())
+        return normalize((T1.mT @ smallest_right_singular_vector(F_hat)[..., None]).squeeze(-1), dim=-1)
+
+
+def adjugate(A: Tensor) -> Tensor:
+    r"""Return the adjugate of matrices :math:`(*, 3, 3)`: :math:`\mathrm{adj}(A)\, A = \det(A)\, I`.
+
+    Example:
+        >>> adjugate(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
+        tensor([[6., 0., 0.],
+                [0., 3., 0.],
+                [0., 0., 2.]])
+
+    """
+    first, second, third = A.unbind(-1)
+    cross = torch.linalg.cross
+    return torch.stack([cross(second, third), cross(third, first), cross(first, second)], -2)
+
+
+def _solve(x: Tensor, w: Tensor, inverse: Tensor, line: Tensor) -> Tensor:
+    """The best line of one view for the other view's ``line``: weighted least squares, ``(B, 3)``, unit norm."""
+    moments = x.mT @ (w[..., None] * x)
+    solution = (adjugate(moments) @ (inverse @ line[..., None])).squeeze(-1)
+    # Not `normalize`, whose floor leaves short lines short: from singular moments, shorter with every iteration.
+    return solution / _positive(solution.norm(dim=-1, keepdim=True))
+
+
+def _corrected(F0: Tensor, inverse: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """``F0`` less the multiple of ``a b^T`` that leaves it singular; ``inverse`` is the adjugate of ``F0``."""
+    determinant = (inverse[..., 0, :] * F0[..., :, 0]).sum(-1)
+    divisor = (b * (inverse @ a[..., None]).squeeze(-1)).sum(-1)
+    scale = determinant / torch.where(divisor == 0, 1.0, divisor)
+    return F0 - scale[..., None, None] * a[..., :, None] * b[..., None, :]
 
 
 def line_norms(
@@ -111,8 +148,7 @@ def line_norms(
 
     """
     norms = (x2 @ F_mat)[..., :2].norm(dim=-1), (x1 @ F_mat.mT)[..., :2].norm(dim=-1)
-    means = (weighted_mean(n[..., None], weights) for n in norms)
-    first, second = (n + floor * torch.where(mean > 0, mean, 1.0) for n, mean in zip(norms, means, strict=True))
+    first, second = (n + floor * _positive(weighted_mean(n[..., None], weights)) for n in norms)
     return first, second
 
 
@@ -139,5 +175,8 @@ def _hold_undetermined(x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[
 
 
 def _unit_mean(weights: Tensor) -> Tensor:
-    mean = weights.mean(-1, keepdim=True)
-    return weights / torch.where(mean > 0, mean, 1.0)
+    return weights / _positive(weights.mean(-1, keepdim=True))
+
+
+def _positive(values: Tensor) -> Tensor:
+    return torch.where(values > 0, values, 1.0)

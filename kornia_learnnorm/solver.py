@@ -43,7 +43,7 @@ def find_fundamental(
         fundamental matrices with shape :math:`(B, 3, 3)` in the dtype of the points, of rank 2 and unit Frobenius norm,
         :math:`x_2^\top F x_1 = 0`. The sign is arbitrary. Where the correspondences do not determine
         :math:`F` (coincident, collinear or coplanar points) it is one of the solutions and its null vector carries no
-        gradient.
+        gradient towards the others.
 
     Raises:
         TypeError: if the points are not floating-point tensors of one dtype.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+import warnings
 from collections.abc import Sequence
 
 __all__ = ["main"]
@@ -29,7 +30,7 @@ def main(args: Sequence[str] | None = None) -> int:
         args: command line without the program's name; ``sys.argv`` when not given.
 
     Returns:
-        the exit code: 0, or 2 after an error, of which one line is printed.
+        the exit code, 0, or 2 after an error, of which one line is printed.
 
     """
     given, args = args, list(sys.argv[1:] if args is None else args)
@@ -58,6 +59,7 @@ def _train(command: str, args: list[str] | None) -> int:
         from lightning_modules.task import NormalizerTask
     except ImportError as error:
         return _fail(command, ImportError(f"{error}: pip install 'kornia-learnnorm[train]'"))
+    warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")  # Lightning's own call of torch
     try:
         LightningCLI(
             NormalizerTask,

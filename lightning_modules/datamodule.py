@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.utilities import rank_zero_info
 
 from kornia_learnnorm.data.samples import Samples
 
@@ -127,4 +128,6 @@ class CorrespondenceDataModule(pl.LightningDataModule):
     def _loader(self, stage: str, source: SampleSource | None, seed: int, shuffle: bool) -> SampleLoader:
         if source is None:
             raise ValueError(f"data.{stage} is not set: give it a source of samples")
-        return SampleLoader(source, self.batch_size, seed, shuffle)
+        loader = SampleLoader(source, self.batch_size, seed, shuffle)
+        rank_zero_info(f"{stage}: {len(loader)} batches of up to {self.batch_size} samples")
+        return loader

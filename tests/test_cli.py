@@ -15,6 +15,12 @@ CONFIGS = sorted((Path(__file__).parent.parent / "configs").glob("*.yaml"))
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 
 
+@pytest.fixture(autouse=True)
+def program(monkeypatch):
+    """LightningCLI warns about arguments from Python while pytest's own are on the command line."""
+    monkeypatch.setattr("sys.argv", ["learnnorm"])
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     """A folder like LEARNNORM_DATA's, with small synthetic stores under the names that the configs use."""

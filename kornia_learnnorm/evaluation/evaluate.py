@@ -16,11 +16,9 @@ from kornia_learnnorm.reweighting import ReweightedWhitening
 
 __all__ = ["add_arguments", "evaluate_store", "run"]
 
-MAX_RESIDUAL = 60.0
-
 
 def evaluate_store(
-    store: CorrespondenceStore, weights: list[str], max_ratio: float | None, seed: int = 0
+    store: CorrespondenceStore, weights: list[str], max_ratio: float | None, max_residual: float = 60.0, seed: int = 0
 ) -> tuple[str, list[list[str]]]:
     """Evaluate none, Hartley, whitening, reweighted whitening and trained weights on all samples of a seeded shuffle.
 
@@ -28,6 +26,7 @@ def evaluate_store(
         store: correspondences of image pairs.
         weights: names or paths for :meth:`~kornia_learnnorm.LearnedNormalizer.from_pretrained`.
         max_ratio: 0.8 for the filtered samples, None for the unfiltered ones.
+        max_residual: samples whose un-normalised residual is not below this are left out, pixels; infinite keeps all.
         seed: seed of the shuffle.
 
     Returns:
@@ -38,9 +37,9 @@ def evaluate_store(
 
     """
     samples = draw_samples(store, torch.Generator().manual_seed(seed), max_ratio=max_ratio)
-    kept = plain_residual(samples.points1, samples.points2) < MAX_RESIDUAL
+    kept = plain_residual(samples.points1, samples.points2) < max_residual
     if not bool(kept.any()):
-        raise ValueError(f"none of {len(kept)} samples has an un-normalised residual below {MAX_RESIDUAL:g} px")
+        raise ValueError(f"none of {len(kept)} samples has an un-normalised residual below {max_residual:g} px")
     normalizers: dict[str, Normalizer] = {
         "none": Identity(),
         "Hartley": Hartley(),
@@ -48,10 +47,13 @@ def evaluate_store(
         "reweighted whitening": ReweightedWhitening(),
         **{f"learned: {name}": LearnedNormalizer.from_pretrained(name) for name in weights},
     }
-    rows = method_rows(evaluate_normalizers(samples.select(kept), store, normalizers))
+    residuals = evaluate_normalizers(samples.select(kept), store, normalizers)
+    infinite = int(torch.stack([r.own for r in residuals.values()]).isinf().any(0).sum())
     kind = "unfiltered matches" if max_ratio is None else f"matches with ratio below {max_ratio:g}"
-    about = f"{kind}: {int(kept.sum())} of {len(kept)} samples, un-normalised residual below {MAX_RESIDUAL:g} px"
-    return about, rows
+    about = f"{kind}: {int(kept.sum())} of {len(kept)} samples, un-normalised residual below {max_residual:g} px"
+    if infinite:
+        about += f"; {infinite} with a point on an epipole, not in the means"
+    return about, method_rows(residuals)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +65,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=["crossview", "crossview-synthetic"],
         help="weights to evaluate (default: those that ship: %(default)s)",
+    )
+    parser.add_argument(
+        "--max-residual",
+        type=float,
+        default=60.0,
+        help="leave out samples with an un-normalised residual from this many px on (default: %(default)s; inf: none)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
 
@@ -79,6 +87,6 @@ def run(args: argparse.Namespace) -> int:
         store = read_store(path)
         print(f"\n{path}: {store.dataset or 'no description'}, {len(store)} pairs")
         for max_ratio in (RATIO, None):
-            about, rows = evaluate_store(store, args.weights, max_ratio, args.seed)
+            about, rows = evaluate_store(store, args.weights, max_ratio, args.max_residual, args.seed)
             print(f"\n{about}\n\n{format_table(HEADER, rows)}", flush=True)
     return 0

@@ -18,8 +18,8 @@ HEADER = (
     "than whitening %",
     "mean px",
     "median px",
-    "ground truth: median px",
-    "better than Hartley %",
+    "truth: median px",
+    "truth: better than Hartley %",
 )
 
 
