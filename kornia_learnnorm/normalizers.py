@@ -191,7 +191,8 @@ def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:
 
 def _rounding(origin: Tensor) -> Tensor:
     """Spread ``(B,)`` about ``origin`` up to which points coincide: a mean is not exact."""
-    return 16 * torch.finfo(origin.dtype).eps * origin.detach().norm(dim=-1)
+    size: Tensor = torch.linalg.vector_norm(origin.detach(), dim=-1)
+    return 16 * torch.finfo(origin.dtype).eps * size
 
 
 class Identity(nn.Module):

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation import estimate as module
-from kornia_learnnorm.evaluation.estimate import PairEstimate, add_arguments, estimate_pair, run, write_json
+from kornia_learnnorm.evaluation import estimate as command_module
+from kornia_learnnorm.evaluation import pair as module
+from kornia_learnnorm.evaluation.estimate import add_arguments, run
+from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
 from kornia_learnnorm.files import replacing
 from kornia_learnnorm.normalizers import Hartley, Whitening
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
@@ -304,7 +306,7 @@ class TestCommand:
         ],
     )
     def test_bad_outputs_are_refused_before_the_work(self, command, arguments, error, message, monkeypatch, capsys):
-        monkeypatch.setattr(module, "estimate_pair", lambda *_: pytest.fail("the work was begun"))
+        monkeypatch.setattr(command_module, "estimate_pair", lambda *_: pytest.fail("the work was begun"))
         with pytest.raises(error, match=message):
             command(*arguments)
         assert not list(Path().iterdir())
@@ -327,7 +329,7 @@ class TestCommand:
             Path(path).write_text("half")
             raise OSError("no space left")
 
-        monkeypatch.setattr(module, "write_json", full)
+        monkeypatch.setattr(command_module, "write_json", full)
         with pytest.raises(OSError, match="no space left"):
             command("--out", "pair.png", "--json", "F.json")
         assert not list(Path().iterdir())
@@ -335,7 +337,7 @@ class TestCommand:
 
     def test_picture_without_matplotlib(self, command, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
-        monkeypatch.setattr(module, "estimate_pair", lambda *_: pytest.fail("the work was begun"))
+        monkeypatch.setattr(command_module, "estimate_pair", lambda *_: pytest.fail("the work was begun"))
         with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[report\]'"):
             command("--out", "pair.png")
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation.estimate import PairEstimate
 from kornia_learnnorm.evaluation.figures import clip_lines, draw_pair
+from kornia_learnnorm.evaluation.pair import PairEstimate
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 image_module = pytest.importorskip("matplotlib.image")

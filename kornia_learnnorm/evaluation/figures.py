@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from kornia_learnnorm.evaluation.estimate import PairEstimate
+from kornia_learnnorm.evaluation.pair import PairEstimate
 from kornia_learnnorm.files import replacing
 
 if TYPE_CHECKING:

@@ -1,0 +1,234 @@
+"""The fundamental matrix of two image files: matches, robust inliers, the eight-point algorithm on them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.data.matching import import_cv2, match_images, read_image
+from kornia_learnnorm.files import replacing
+from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.solver import find_fundamental
+
+__all__ = ["PairEstimate", "estimate_pair", "write_json"]
+
+MIN_DISPLACEMENT = 0.1  # pixels, median over the matches: below it the camera has not moved
+MIN_PARALLAX = 0.05  # share of the inliers that no single homography may explain
+
+
+@dataclass(frozen=True, eq=False)
+class PairEstimate:
+    r"""The fundamental matrix of two images and the correspondences behind it.
+
+    Attributes:
+        F_mat: :math:`(3, 3)`, float64, unit Frobenius norm, :math:`x_2^\top F x_1 = 0` in pixels.
+        points1: pixels of the matches in image 1 with shape :math:`(N, 2)`, float64.
+        points2: pixels of the matches in image 2 with shape :math:`(N, 2)`, float64.
+        inliers: which matches lie within ``threshold`` of ``F_mat``, with shape :math:`(N,)`, bool.
+        mean_distance: mean symmetric epipolar distance of the inliers, pixels.
+        median_distance: median symmetric epipolar distance of the inliers, pixels.
+        path1: the file of image 1.
+        path2: the file of image 2.
+        size1: width and height of image 1.
+        size2: width and height of image 2.
+        ratio: the ratio test that the matches have passed.
+        threshold: largest symmetric epipolar distance of an inlier, pixels.
+
+    """
+
+    F_mat: Tensor
+    points1: Tensor
+    points2: Tensor
+    inliers: Tensor
+    mean_distance: float
+    median_distance: float
+    path1: Path
+    path2: Path
+    size1: tuple[int, int]
+    size2: tuple[int, int]
+    ratio: float
+    threshold: float
+
+    @property
+    def num_matches(self) -> int:
+        """Number of distinct matches that passed the ratio test."""
+        return len(self.points1)
+
+    @property
+    def num_inliers(self) -> int:
+        """Number of matches within the threshold."""
+        return int(self.inliers.sum())
+
+
+def estimate_pair(
+    path1: str | Path,
+    path2: str | Path,
+    normalizer: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]],
+    ratio: float = 0.8,
+    threshold: float = 1.0,
+    seed: int = 0,
+) -> PairEstimate:
+    """Estimate the fundamental matrix of two image files.
+
+    SIFT matches, the ratio test, a first set of inliers by OpenCV's MAGSAC, then the normalised eight-point algorithm
+    with ``normalizer`` on all inliers. The inliers of that fit are fitted again, at most twice, while they grow in
+    number.
+
+    Args:
+        path1: file of image 1.
+        path2: file of image 2.
+        normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views.
+        ratio: largest ratio of the nearest to the second-nearest descriptor distance.
+        threshold: largest symmetric epipolar distance of an inlier, pixels.
+        seed: seed of MAGSAC; the same files and seed give the same estimate.
+
+    Returns:
+        the estimate, of which all numbers are finite.
+
+    Raises:
+        FileNotFoundError: if a file does not exist.
+        ValueError: if a file is not an image, ``ratio`` or ``threshold`` is out of range, or the images do not
+            determine a fundamental matrix: blank, fewer than eight matches or inliers, no motion, or all inliers on
+            one homography.
+        ImportError: if OpenCV is not installed.
+
+    """
+    if not 0 < ratio <= 1:
+        raise ValueError(f"ratio must be above 0 and at most 1, got {ratio:g}")
+    if not 0 < threshold < float("inf"):
+        raise ValueError(f"threshold must be positive and finite, got {threshold:g} px")
+    image1, image2 = read_image(path1), read_image(path2)
+    try:
+        points1, points2 = _distinct_matches(*match_images(image1, image2), ratio)
+        inliers = _robust_inliers(points1, points2, threshold, seed)
+        F_mat, inliers = _fit(points1, points2, inliers, normalizer, threshold)
+        _check_parallax(points1[inliers], points2[inliers], threshold)
+    except ValueError as error:
+        raise ValueError(f"{path1} and {path2}: {error}") from error
+    distances = symmetric_epipolar_distance(points1[inliers], points2[inliers], F_mat)
+    return PairEstimate(
+        F_mat=F_mat,
+        points1=points1,
+        points2=points2,
+        inliers=inliers,
+        mean_distance=distances.mean().item(),
+        median_distance=distances.quantile(0.5).item(),
+        path1=Path(path1),
+        path2=Path(path2),
+        size1=(image1.shape[1], image1.shape[0]),
+        size2=(image2.shape[1], image2.shape[0]),
+        ratio=ratio,
+        threshold=threshold,
+    )
+
+
+def _distinct_matches(points1: Tensor, points2: Tensor, ratios: Tensor, ratio: float) -> tuple[Tensor, Tensor]:
+    """Return the matches below the ratio once each, float64; complain about too few of them or no motion."""
+    kept = torch.from_numpy(np.unique(torch.cat([points1, points2], -1)[ratios < ratio].double().numpy(), axis=0))
+    if len(kept) < 8:
+        raise ValueError(
+            f"{len(kept)} distinct matches of {len(ratios)} pass the ratio test {ratio:g}, at least 8 are needed"
+        )
+    displacement = (kept[:, 2:] - kept[:, :2]).norm(dim=-1).median().item()
+    if displacement < MIN_DISPLACEMENT:
+        raise ValueError(
+            f"no motion between the images (median displacement {displacement:.2g} px of {len(kept)} matches): the "
+            "fundamental matrix is not determined"
+        )
+    return kept[:, :2], kept[:, 2:]
+
+
+def _robust_inliers(points1: Tensor, points2: Tensor, threshold: float, seed: int) -> Tensor:
+    """Return MAGSAC's inliers, a mask (N,)."""
+    cv2 = import_cv2()
+    # MAGSAC draws its samples from a generator of its own: the order of the matches is what a seed can change.
+    order = torch.randperm(len(points1), generator=torch.Generator().manual_seed(seed))
+    cv2.setRNGSeed(seed)
+    inliers = torch.zeros(len(points1), dtype=torch.bool)
+    inliers[order] = _magsac(cv2.findFundamentalMat, points1[order], points2[order], threshold, 0.9999, 10000)
+    _check_inliers(inliers, threshold)
+    return inliers
+
+
+def _magsac(find: Callable[..., Any], points1: Tensor, points2: Tensor, threshold: float, *options: float) -> Tensor:
+    """Return the inliers (N,) of an OpenCV function that takes MAGSAC as its method; none where it finds no model."""
+    cv2 = import_cv2()
+    try:
+        _, mask = find(points1.numpy(), points2.numpy(), cv2.USAC_MAGSAC, threshold, *options)
+    except cv2.error:  # OpenCV 4, where too few points are left to sample from
+        mask = None
+    return torch.zeros(len(points1), dtype=torch.bool) if mask is None else torch.from_numpy(mask.ravel()).bool()
+
+
+def _check_inliers(inliers: Tensor, threshold: float) -> None:
+    if inliers.sum() < 8:
+        raise ValueError(
+            f"{int(inliers.sum())} of {len(inliers)} matches agree on a fundamental matrix within {threshold:g} px, at "
+            "least 8 are needed"
+        )
+
+
+def _fit(
+    points1: Tensor,
+    points2: Tensor,
+    inliers: Tensor,
+    normalizer: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]],
+    threshold: float,
+) -> tuple[Tensor, Tensor]:
+    """Fit all inliers, and the inliers of that fit again, at most twice, while their number grows."""
+    F_mat, best = torch.zeros(3, 3, dtype=torch.float64), torch.zeros_like(inliers)
+    for _ in range(3):
+        with torch.no_grad():
+            F_fit = find_fundamental(points1[inliers][None], points2[inliers][None], normalizer=normalizer)[0]
+        inliers = symmetric_epipolar_distance(points1, points2, F_fit) < threshold
+        if inliers.sum() <= best.sum():
+            break
+        F_mat, best = F_fit, inliers
+        if inliers.sum() < 8:
+            break
+    _check_inliers(best, threshold)
+    return F_mat, best
+
+
+def _check_parallax(points1: Tensor, points2: Tensor, threshold: float) -> None:
+    """Complain if one homography explains the inliers, as on a plane or when the camera only turns."""
+    explained = int(_magsac(import_cv2().findHomography, points1, points2, threshold).sum())
+    if len(points1) - explained < max(2, MIN_PARALLAX * len(points1)):
+        raise ValueError(
+            f"degenerate: one homography explains {explained} of {len(points1)} inliers within {threshold:g} px (a "
+            "plane, or a camera that only turns): the fundamental matrix is not determined"
+        )
+
+
+def write_json(path: str | Path, estimate: PairEstimate) -> None:
+    """Write an estimate as JSON, whole or not at all.
+
+    Args:
+        path: the file to write.
+        estimate: the estimate of :func:`estimate_pair`.
+
+    Raises:
+        OSError: if the folder does not exist or is not writable.
+        ValueError: if ``path`` is a folder or a device.
+
+    """
+    content = {
+        "F": estimate.F_mat.tolist(),
+        "convention": "x2^T F x1 = 0, x = (column, row, 1) in pixels, unit Frobenius norm",
+        "image1": {"file": str(estimate.path1), "width": estimate.size1[0], "height": estimate.size1[1]},
+        "image2": {"file": str(estimate.path2), "width": estimate.size2[0], "height": estimate.size2[1]},
+        "matches": estimate.num_matches,
+        "inliers": estimate.num_inliers,
+        "inlier_symmetric_epipolar_distance_px": {"mean": estimate.mean_distance, "median": estimate.median_distance},
+        "ratio": estimate.ratio,
+        "threshold_px": estimate.threshold,
+    }
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
