@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
+from kornia_learnnorm.normalizers import solve_dtype
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
 
 __all__ = ["EpipolarLoss"]
@@ -88,12 +89,21 @@ class EpipolarLoss(nn.Module):
             ValueError: if ``heldout_weight`` is positive and there are no held-out correspondences.
 
         """
-        own = self.residual(points1, points2, F_mat).clamp(max=self.ceiling).mean(-1)
+        own = self._residuals(points1, points2, F_mat).mean(-1)
         loss = (own + self.floor).log().mean() if self.log else own.mean()
         if self.heldout_weight == 0:
-            return loss
+            return loss.to(F_mat.dtype)
         if heldout1 is None or heldout2 is None or heldout1.shape[-2] == 0:
             raise ValueError(f"heldout_weight={self.heldout_weight} needs held-out correspondences, got none")
-        rest = self.residual(heldout1, heldout2, F_mat).clamp(max=self.ceiling)
+        rest = self._residuals(heldout1, heldout2, F_mat)
         heldout = (rest + self.heldout_floor).log().mean() if self.log else rest.mean()
-        return (1 - self.heldout_weight) * loss + self.heldout_weight * heldout
+        return ((1 - self.heldout_weight) * loss + self.heldout_weight * heldout).to(F_mat.dtype)
+
+    def _residuals(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+        """Return residuals up to the ceiling.
+
+        In float64: next to an epipole, the square of a line's normal leaves the range of float32, and what is zero
+        above the ceiling would be zero times infinity below.
+        """
+        dtype = solve_dtype(F_mat.device)
+        return self.residual(points1.to(dtype), points2.to(dtype), F_mat.to(dtype)).clamp(max=self.ceiling)

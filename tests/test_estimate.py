@@ -7,7 +7,6 @@ import json
 import os
 import re
 import sys
-import types
 from pathlib import Path
 
 import numpy as np
@@ -253,9 +252,7 @@ def command(scene, tmp_path, monkeypatch):
             asked.append(names)
             return Hartley()
 
-    learned = types.ModuleType("kornia_learnnorm.learned")
-    learned.LearnedNormalizer = LearnedNormalizer
-    monkeypatch.setitem(sys.modules, "kornia_learnnorm.learned", learned)
+    monkeypatch.setattr(command_module, "LearnedNormalizer", LearnedNormalizer)
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments, images=(scene.left, scene.right)):

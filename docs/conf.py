@@ -1,0 +1,67 @@
+"""Configuration of Sphinx. `make docs` builds the pages and runs their code, without data and network.
+
+Formulas are set by MathJax, which the reader's browser fetches.
+"""
+
+import kornia_learnnorm
+
+project = "kornia_learnnorm"
+author = "the authors of kornia_learnnorm"
+copyright = author
+release = version = kornia_learnnorm.__version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"kornia-learnnorm {release}"
+
+# Names of this project must resolve; those of others have no pages here.
+nitpicky = True
+nitpick_ignore_regex = [(r"py:.*", r"(?!kornia_learnnorm|lightning_modules).*")]
+
+add_module_names = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_preserve_defaults = True
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 88
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_custom_sections = [("Attributes", "params_style")]
+
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 3
+
+# A cache would keep outputs of code that has changed since: every build runs every page.
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120
+nb_merge_streams = True
+nb_render_markdown_format = "myst"
+
+
+def _skip_tuple_fields(app, what, name, obj, skip, options):
+    """Leave out the fields of named tuples: their classes describe them."""
+    return True if type(obj).__name__ == "_tuplegetter" else None
+
+
+def _no_arguments(app, what, name, obj, options, signature, returns):
+    """Show modules without a constructor of their own as taking no arguments."""
+    return ("()", returns) if signature == "(*args, **kwargs)" else None
+
+
+def _resolve_exported(app, env, node, contnode):
+    """Find names of the package itself where they are described, in the modules that define them."""
+    name, _, method = node.get("reftarget", "").removeprefix("kornia_learnnorm.").partition(".")
+    if name not in kornia_learnnorm.__all__:
+        return None
+    target = ".".join([getattr(kornia_learnnorm, name).__module__, name, *filter(None, [method])])
+    return env.get_domain("py").resolve_xref(env, node["refdoc"], app.builder, node["reftype"], target, node, contnode)
+
+
+def setup(app):
+    """Connect what the settings above cannot say."""
+    app.connect("autodoc-skip-member", _skip_tuple_fields)
+    app.connect("autodoc-process-signature", _no_arguments)
+    app.connect("missing-reference", _resolve_exported)

@@ -1,0 +1,128 @@
+"""Finite values and gradients on degenerate and extreme samples."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from two_view import shaken, uniform
+
+from kornia_learnnorm import (
+    CrossViewNetwork,
+    EpipolarLoss,
+    Hartley,
+    LearnedNormalizer,
+    ReweightedWhitening,
+    Whitening,
+    find_fundamental,
+)
+
+
+@cache
+def normalizers():
+    """Made once, and not at import: the networks draw random numbers."""
+    small = CrossViewNetwork(width=16, depth=2)
+    return {
+        "hartley": Hartley(),
+        "whitening": Whitening(),
+        "reweighted": ReweightedWhitening(),
+        "learned": shaken(),
+        "learned, reweighted": shaken(LearnedNormalizer(ReweightedWhitening(), small)),
+    }
+
+
+NAMES = ["hartley", "whitening", "reweighted", "learned", "learned, reweighted"]
+HOMOGRAPHY = torch.tensor([[1.0, 0.1, 1e-4], [0.0, 1.1, 2e-4], [5.0, 3.0, 1.0]], dtype=torch.float64)
+
+
+def base(num_points: int = 8, seed: int = 0, batch_size: int = 16) -> torch.Tensor:
+    return uniform(batch_size, num_points, 2, high=600, seed=seed)
+
+
+def direction(x: float, y: float) -> torch.Tensor:
+    return torch.tensor([x, y], dtype=torch.float64)
+
+
+def plane(points: torch.Tensor) -> torch.Tensor:
+    x = torch.cat([points, torch.ones_like(points[..., :1])], -1) @ HOMOGRAPHY
+    return x[..., :2] / x[..., 2:]
+
+
+# Each makes both views of a batch of samples with N points.
+SAMPLES = {
+    "plain": lambda n: (base(n), base(n) + base(n, 1) / 30),
+    "unrelated": lambda n: (base(n), base(n, 1)),
+    "identical views": lambda n: (base(n), base(n)),
+    "pure translation": lambda n: (base(n), base(n) + direction(3, 4)),
+    "all zero": lambda n: (0 * base(n), 0 * base(n)),
+    "all points equal": lambda n: (base(n)[:, :1].expand(-1, n, -1), base(n)[:, 1:2].expand(-1, n, -1)),
+    "one view all equal": lambda n: (base(n)[:, :1].expand(-1, n, -1), base(n, 1)),
+    "four places": lambda n: (base(n)[:, torch.arange(n) % 4], base(n, 1)[:, torch.arange(n) % 4]),
+    "seven places": lambda n: (base(n)[:, torch.arange(n) % 7], base(n, 1)[:, torch.arange(n) % 7]),
+    "collinear": lambda n: (base(n)[..., :1] * direction(1, 0.5), base(n)[..., :1] * direction(1, -0.3) + 7),
+    "horizontal": lambda n: (base(n) * direction(1, 0), base(n, 1) * direction(1, 0)),
+    "one view collinear": lambda n: (base(n)[..., :1] * direction(1, 0.5), base(n) + base(n, 1) / 200),
+    "plane": lambda n: (base(n), plane(base(n))),
+    "grid": lambda n: ((base(n) / 200).round() * 200, (base(n) / 200).round() * 200 + (base(n, 1) / 200).round()),
+    **{f"scale {s:g}": lambda n, s=s: (s * base(n), s * (base(n) + base(n, 1) / 60)) for s in (1e-6, 1e-3, 1e3, 1e6)},
+    "scales 1e-6 and 1e6": lambda n: (1e-6 * base(n), 1e6 * (base(n) + base(n, 1) / 60)),
+    "offset 1e6": lambda n: (base(n) + 1e6, base(n) + 1e6 + base(n, 1) / 600),
+    "one far point": lambda n: (base(n), torch.cat([base(n, 1)[:, 1:], 1e8 + base(n)[:, :1]], 1)),
+}
+WEIGHTS = {
+    "random": lambda n: uniform(16, n, seed=5),
+    "zeros": lambda n: uniform(16, n, seed=5) * (torch.arange(n) % 3 > 0),
+    "all zero": lambda n: torch.zeros(16, n),
+    "extreme": lambda n: 10 ** uniform(16, n, low=-6, high=6, seed=5),
+}
+
+
+def check(points1, points2, weights, normalizer):
+    """Everything is finite: F, the loss, and the gradients of both in the points, weights and parameters."""
+    values = [v.detach().clone().requires_grad_() for v in (points1, points2, weights) if v is not None]
+    F_mat = find_fundamental(*values, normalizer=normalizer)
+    assert torch.isfinite(F_mat).all()
+    norms = np.linalg.norm(F_mat.detach().double().numpy(), axis=(1, 2))
+    np.testing.assert_allclose(norms, 1, rtol=1e-6)
+    assert (np.linalg.svd(F_mat.detach().double().numpy())[1][:, 2] < 1e-6).all()
+    direction = torch.randn(F_mat.shape, generator=torch.Generator().manual_seed(1)).to(F_mat)
+    loss = EpipolarLoss()(values[0], values[1], F_mat)
+    assert torch.isfinite(loss)
+    parameters = list(normalizer.parameters())
+    total = (F_mat * direction).sum() + loss
+    for gradient in torch.autograd.grad(total, [*values, *parameters], allow_unused=True):
+        assert gradient is None or torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("num_points", [8, 12])
+@pytest.mark.parametrize("sample", SAMPLES)
+@pytest.mark.parametrize("name", NAMES)
+def test_degenerate_and_extreme_samples(name, sample, num_points, dtype):
+    points1, points2 = (points.to(dtype) for points in SAMPLES[sample](num_points))
+    check(points1, points2, None, normalizers()[name])
+
+
+@pytest.mark.parametrize("weights", ["random", "zeros", "all zero", "extreme"])
+@pytest.mark.parametrize("sample", ["plain", "all points equal", "collinear", "one view collinear", "four places"])
+@pytest.mark.parametrize("name", ["hartley", "reweighted", "learned"])
+def test_with_weights(name, sample, weights, dtype):
+    for num_points in (8, 12):
+        points1, points2 = (points.to(dtype) for points in SAMPLES[sample](num_points))
+        check(points1, points2, WEIGHTS[weights](num_points).to(dtype), normalizers()[name])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_many_correspondences(name, dtype):
+    check(base(5000, 0, 2).to(dtype), base(5000, 1, 2).to(dtype), None, normalizers()[name])
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(st.sampled_from([8, 9]), st.lists(st.integers(-2, 2), min_size=36, max_size=36))
+def test_small_whole_coordinates(name, num_points, coordinates):
+    """Coordinates of which many coincide, so that every kind of degeneracy turns up."""
+    points = torch.tensor(coordinates, dtype=torch.float64).view(2, 1, 9, 2)[:, :, :num_points]
+    check(points[0], points[1], None, normalizers()[name])

@@ -1,0 +1,526 @@
+"""The learned normaliser: its base, its invariances, its files."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+import re
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from kornia.geometry.epipolar import normalize_points
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import nn
+from torch.autograd import gradcheck
+from two_view import correspondences, eight_point, epipolar_distances, in_hartley, shaken, signless, uniform, up_to_sign
+
+from kornia_learnnorm import (
+    CrossViewNetwork,
+    Hartley,
+    Identity,
+    LearnedNormalizer,
+    PerView,
+    ReweightedWhitening,
+    Whitening,
+    find_fundamental,
+    learned,
+    spd_transform,
+)
+from kornia_learnnorm.normalizers import affine_transform
+
+SHIPPED = ["crossview", "crossview-synthetic"]
+
+
+def small(base=None) -> LearnedNormalizer:
+    return LearnedNormalizer(base, CrossViewNetwork(width=16, depth=2))
+
+
+@pytest.fixture
+def normalizer():
+    return shaken(small())
+
+
+@pytest.fixture
+def file(normalizer, tmp_path):
+    path = tmp_path / "weights.safetensors"
+    normalizer.save_pretrained(path)
+    return path
+
+
+class TestForward:
+    @pytest.mark.parametrize("batch_size", [0, 1, 4])
+    @pytest.mark.parametrize("num_points", [8, 30])
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_smoke(self, normalizer, batch_size, num_points, weighted, device, dtype):
+        points = [uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
+        weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
+        for T in normalizer.to(device)(*points, weights):
+            assert T.shape == (batch_size, 3, 3)
+            assert T.dtype == dtype
+            assert T.device.type == device.type
+            assert torch.isfinite(T).all()
+            assert torch.equal(T[:, 2].cpu(), torch.tensor([[0, 0, 1]], dtype=dtype).expand(batch_size, 3))
+
+    @pytest.mark.parametrize("base", [Identity(), Hartley(), Whitening(), ReweightedWhitening()])
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_untrained_is_exactly_the_base(self, base, num_points, dtype):
+        points = [p.to(dtype) for p in correspondences("handheld", 5, num_points)]
+        weights = uniform(5, num_points, low=0.1)
+        for w in (None, weights):
+            expected = base(*(p.double() for p in points), w)
+            for T, want in zip(small(base)(*points, w), expected, strict=True):
+                assert torch.equal(T, want.to(dtype))
+
+    def test_defaults(self):
+        normalizer = LearnedNormalizer()
+        assert isinstance(normalizer.base, Whitening)
+        assert isinstance(normalizer.network, CrossViewNetwork)
+        assert normalizer.transform is spd_transform
+
+    def test_composes_builder_and_base(self):
+        """With known parameters: T = B(p) T_base."""
+
+        class Known(nn.Module):
+            def forward(self, points1, points2, weights=None):
+                self.seen = points1, points2, weights
+                return torch.full((2, 3), 0.1, dtype=torch.float64), torch.full((2, 3), -0.2, dtype=torch.float64)
+
+        def build(params):
+            return affine_transform(params[:, 0, None, None] * torch.eye(2), params[:, 1:])
+
+        network, points, weights = Known(), correspondences("driving", 2, 9), uniform(2, 9)
+        found = LearnedNormalizer(Hartley(), network, build)(*points, weights)
+        base = Hartley()(*points, weights)
+        for T, H, p, x, seen in zip(found, base, (0.1, -0.2), points, network.seen[:2], strict=True):
+            B = np.array([[p, 0, -p * p], [0, p, -p * p], [0, 0, 1]])
+            np.testing.assert_allclose(T.numpy(), B @ H.numpy(), rtol=1e-12)
+            np.testing.assert_allclose(
+                seen.numpy(), normalize_points(x, weights=weights)[0].numpy(), rtol=1e-6, atol=1e-9
+            )
+        assert torch.equal(network.seen[2], weights)
+
+    def test_any_base_of_the_contract(self):
+        points = correspondences("driving", 3, 9)
+        for T, H in zip(small(PerView(normalize_points))(*points), Hartley()(*points), strict=True):
+            assert torch.allclose(T, H, rtol=1e-7)
+
+    def test_differs_from_the_base_once_trained(self, normalizer):
+        points = correspondences("driving", 10)
+        difference = in_hartley(find_fundamental(*points, normalizer=normalizer).detach(), *points) - in_hartley(
+            find_fundamental(*points, normalizer=Whitening()), *points
+        )
+        assert np.abs(difference).max(axis=(1, 2)).min() > 1e-6
+
+    def test_fundamental_matrix_is_that_of_its_transforms(self, normalizer):
+        points = correspondences("handheld", 10, 12)
+        with torch.no_grad():
+            F_mat, (T1, T2) = find_fundamental(*points, normalizer=normalizer), normalizer(*points)
+        assert up_to_sign(F_mat, eight_point(*points, T1, T2)) < 1e-9
+
+    def test_float32_points_get_float64_arithmetic(self, normalizer):
+        points = [p.float() for p in correspondences("handheld", 10)]
+        single, double = normalizer(*points), normalizer(*(p.double() for p in points))
+        for T, expected in zip(single, double, strict=True):
+            assert torch.equal(T, expected.float())
+
+    def test_double_network(self, normalizer):
+        points = correspondences("handheld", 10)
+        single, double = normalizer(*points), copy.deepcopy(normalizer).double()(*points)
+        for T, expected in zip(single, double, strict=True):
+            assert T.dtype == torch.float64
+            assert torch.allclose(T, expected, rtol=1e-3, atol=1e-3)
+
+    @pytest.mark.parametrize(
+        ("points1", "points2", "weights", "error", "message"),
+        [
+            (
+                torch.rand(2, 7, 2),
+                torch.rand(2, 7, 2),
+                None,
+                ValueError,
+                "at least 8 correspondences are needed, got 7",
+            ),
+            (
+                torch.rand(2, 8, 2),
+                torch.rand(2, 9, 2),
+                None,
+                ValueError,
+                r"pair up, got shapes \[2, 8, 2\] and \[2, 9, 2\]",
+            ),
+            (torch.rand(2, 8, 3), torch.rand(2, 8, 3), None, ShapeError, "2, 8, 3"),
+            (torch.rand(2, 8, 2), torch.rand(2, 8, 2).double(), None, TypeError, "one dtype"),
+            (torch.ones(2, 8, 2).int(), torch.rand(2, 8, 2), None, TypeError, "points1 must be .* got torch.int32"),
+            (torch.full((2, 8, 2), torch.nan), torch.rand(2, 8, 2), None, ValueError, "points1 must be finite, got 32"),
+            (torch.rand(2, 8, 2), torch.rand(2, 8, 2), -torch.ones(2, 8), ValueError, "must not be negative"),
+        ],
+    )
+    def test_exceptions(self, normalizer, points1, points2, weights, error, message):
+        with pytest.raises(error, match=message):
+            normalizer(points1, points2, weights)
+
+
+class TestInvariances:
+    """Of the fundamental matrix, compared where all of its entries count."""
+
+    def same(self, found, expected, points, tolerance=1e-4):
+        found, expected = (in_hartley(F.detach(), *points) for F in (found, expected))
+        assert up_to_sign(found, expected) < tolerance
+
+    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.randoms())
+    def test_order(self, seed, num_points, random):
+        normalizer, (points1, points2) = shaken(small()), correspondences("handheld", 3, num_points, seed)
+        order = random.sample(range(num_points), num_points)
+        shuffled = find_fundamental(points1[:, order], points2[:, order], normalizer=normalizer)
+        self.same(shuffled, find_fundamental(points1, points2, normalizer=normalizer), (points1, points2))
+
+    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.booleans())
+    def test_swap(self, seed, num_points, weighted):
+        normalizer, (points1, points2) = shaken(small()), correspondences("driving", 3, num_points, seed)
+        weights = uniform(3, num_points, low=0.1, seed=seed) if weighted else None
+        mirrored = find_fundamental(points2, points1, weights, normalizer).mT
+        self.same(mirrored, find_fundamental(points1, points2, weights, normalizer), (points1, points2))
+
+    @given(
+        st.integers(0, 2**31),
+        st.sampled_from([8, 9, 20]),
+        st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
+        st.tuples(*[st.floats(-2e3, 2e3)] * 4),
+    )
+    def test_scale_and_shift_of_either_view(self, seed, num_points, log_scales, shifts):
+        normalizer, points = shaken(small()), correspondences("driving", 3, num_points, seed)
+        S = torch.eye(3).double().repeat(2, 1, 1)
+        S[:, 0, 0] = S[:, 1, 1] = 10 ** torch.tensor(log_scales).double()
+        S[:, :2, 2] = S[:, :1, 0] * torch.tensor(shifts).double().view(2, 2)
+        moved = [p @ s[:2, :2] + s[:2, 2] for p, s in zip(points, S, strict=True)]
+        pulled_back = S[1].mT @ find_fundamental(*moved, normalizer=normalizer) @ S[0]
+        self.same(pulled_back, find_fundamental(*points, normalizer=normalizer), points)
+
+    @pytest.mark.parametrize("base", [Whitening(), ReweightedWhitening()])
+    @given(seed=st.integers(0, 2**31), num_points=st.sampled_from([8, 9, 20]), num_junk=st.integers(1, 9))
+    def test_zero_weights(self, base, seed, num_points, num_junk):
+        normalizer, points = shaken(small(base)), correspondences("handheld", 3, num_points, seed)
+        weights = uniform(3, num_points, low=0.5, seed=seed) if num_points > 8 else torch.ones(3, 8).double()
+        junk = [uniform(3, num_junk, 2, low=-2e3, high=2e3, seed=seed + k) for k in (1, 2)]
+        zeros = torch.zeros(3, num_junk).double()
+        extended = [torch.cat(p, 1) for p in zip((*points, weights), (*junk, zeros), strict=True)]
+        expected = find_fundamental(*points, weights, normalizer)
+        self.same(find_fundamental(*extended, normalizer), expected, points)
+
+    def test_common_factor_of_the_weights(self, normalizer):
+        points, weights = correspondences("handheld", 10, 12), uniform(10, 12, low=0.1)
+        expected = find_fundamental(*points, weights, normalizer)
+        self.same(find_fundamental(*points, 1e3 * weights, normalizer), expected, points)
+        self.same(
+            find_fundamental(*points, torch.full_like(weights, 1e-3), normalizer),
+            find_fundamental(*points, normalizer=normalizer),
+            points,
+        )
+
+
+class TestGradients:
+    @pytest.mark.parametrize("num_points", [8, 10])
+    def test_gradcheck(self, num_points):
+        normalizer = shaken(small()).double()
+        points = [uniform(1, num_points, 2, low=-1, seed=seed).requires_grad_() for seed in (1, 2)]
+        assert gradcheck(lambda *p: signless(find_fundamental(*p, normalizer=normalizer)), points, rtol=1e-2, atol=1e-4)
+
+    @pytest.mark.parametrize("num_points", [8, 10])
+    @pytest.mark.parametrize("base", [Whitening(), ReweightedWhitening()])
+    def test_reach_points_weights_and_parameters(self, base, num_points, dtype):
+        normalizer = shaken(small(base))
+        values = [
+            p.to(dtype).requires_grad_() for p in (*correspondences("handheld", 4, num_points), uniform(4, num_points))
+        ]
+        signless(find_fundamental(*values, normalizer)).sum().backward()
+        for value in (*values, *normalizer.parameters()):
+            assert torch.isfinite(value.grad).all()
+            assert value.grad.count_nonzero() > 0
+
+    def test_a_step_lowers_the_distance(self):
+        """Some steps of training on one batch, from the base on, measured in NumPy."""
+        normalizer, points = small(), correspondences("handheld", 64)
+        optimizer = torch.optim.Adam(normalizer.parameters(), 3e-3)
+
+        def mean():
+            with torch.no_grad():
+                return np.log(
+                    epipolar_distances(*points, find_fundamental(*points, normalizer=normalizer)).mean(1)
+                ).mean()
+
+        before = mean()
+        for _ in range(15):
+            F_mat = find_fundamental(*points, normalizer=normalizer)
+            x1, x2 = (torch.cat([p, torch.ones_like(p[..., :1])], -1) for p in points)
+            lines1, lines2 = x2 @ F_mat, x1 @ F_mat.mT
+            distance = (x2 * lines2).sum(-1).abs() * (
+                1 / lines1[..., :2].norm(dim=-1) + 1 / lines2[..., :2].norm(dim=-1)
+            )
+            optimizer.zero_grad()
+            distance.mean(-1).log().mean().backward()
+            optimizer.step()
+        assert mean() < before - 0.05
+
+
+class TestFiles:
+    @pytest.mark.parametrize("base", [Identity(), Hartley(), Whitening(), Whitening(1e-4), ReweightedWhitening(3, 0.2)])
+    def test_round_trip(self, base, tmp_path):
+        normalizer = shaken(LearnedNormalizer(base, CrossViewNetwork(8, 1, bound=2.0)))
+        normalizer.save_pretrained(tmp_path / "weights.safetensors")
+        loaded = LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
+        assert not loaded.training
+        assert type(loaded.base) is type(base)
+        assert {k: v for k, v in vars(loaded.base).items() if k[0] != "_"} == {
+            k: v for k, v in vars(base).items() if k[0] != "_"
+        }
+        assert (loaded.network.width, loaded.network.depth, loaded.network.bound) == (8, 1, 2.0)
+        points = correspondences("driving", 5, 9)
+        for T, expected in zip(loaded(*points), normalizer(*points), strict=True):
+            assert torch.equal(T, expected)
+
+    def test_path_may_be_a_string_and_is_overwritten(self, normalizer, file):
+        changed = shaken(small(), seed=1)
+        changed.save_pretrained(str(file))
+        points = correspondences("driving", 5)
+        for T, expected in zip(LearnedNormalizer.from_pretrained(str(file))(*points), changed(*points), strict=True):
+            assert torch.equal(T, expected)
+        assert [entry.name for entry in file.parent.iterdir()] == [file.name]
+
+    def test_saving_changes_nothing(self, file):
+        normalizer = shaken(small()).train()
+        before = copy.deepcopy(normalizer.state_dict())
+        normalizer.save_pretrained(file)
+        assert normalizer.training
+        assert all(torch.equal(value, before[key]) for key, value in normalizer.state_dict().items())
+
+    def test_what_the_file_holds(self, normalizer, file):
+        with safe_open(file, "pt") as opened:
+            metadata = opened.metadata()
+        assert json.loads(metadata["architecture"]) == {
+            "base": {"name": "Whitening", "floor": 1e-6},
+            "network": {"name": "CrossViewNetwork", "width": 16, "depth": 2, "num_parameters": 5, "bound": 3.0},
+            "transform": "spd_transform",
+        }
+        state = load_file(file)
+        assert state.keys() == normalizer.state_dict().keys()
+
+    @pytest.mark.parametrize("name", SHIPPED)
+    def test_shipped_weights(self, name, dtype):
+        normalizer = LearnedNormalizer.from_pretrained(name)
+        assert not normalizer.training
+        for scene in ("driving", "handheld"):
+            points = [p.to(dtype) for p in correspondences(scene, 300, noise=0.5)]
+            with torch.no_grad():
+                found, hartley = (find_fundamental(*points, normalizer=n).double() for n in (normalizer, Hartley()))
+            better = epipolar_distances(*points, found).mean(1) < epipolar_distances(*points, hartley).mean(1)
+            assert better.mean() > 0.9
+
+    @pytest.mark.parametrize("name", SHIPPED)
+    def test_shipped_weights_have_the_invariances(self, name):
+        normalizer, (points1, points2) = LearnedNormalizer.from_pretrained(name), correspondences("driving", 50)
+        with torch.no_grad():
+            F_mat = find_fundamental(points1, points2, normalizer=normalizer)
+            mirrored = find_fundamental(points2, points1, normalizer=normalizer).mT
+            reversed_ = find_fundamental(points1.flip(1), points2.flip(1), normalizer=normalizer)
+        for other in (mirrored, reversed_):
+            assert up_to_sign(in_hartley(other, points1, points2), in_hartley(F_mat, points1, points2)) < 1e-3
+
+    def test_default_is_crossview(self):
+        default, named = LearnedNormalizer.from_pretrained(), LearnedNormalizer.from_pretrained("crossview")
+        assert all(torch.equal(value, named.state_dict()[key]) for key, value in default.state_dict().items())
+
+    @pytest.mark.parametrize("name", ["nonsense", "", "nonsense.safetensors", "crossview.pt"])
+    def test_unknown_name(self, name):
+        message = rf"no weights {re.escape(repr(name))}: expected a .safetensors file or one of \[.*\]"
+        with pytest.raises(FileNotFoundError, match=message):
+            LearnedNormalizer.from_pretrained(name)
+
+    def test_unknown_name_lists_the_shipped_ones(self, tmp_path, monkeypatch):
+        for name in ("one", "two"):
+            (tmp_path / f"{name}.safetensors").touch()
+        monkeypatch.setattr(learned, "WEIGHTS", tmp_path)
+        with pytest.raises(FileNotFoundError, match=r"one of \['one', 'two'\]"):
+            LearnedNormalizer.from_pretrained("three")
+
+    def test_folder(self, tmp_path):
+        (tmp_path / "folder.safetensors").mkdir()
+        with pytest.raises(FileNotFoundError, match="no weights"):
+            LearnedNormalizer.from_pretrained(tmp_path / "folder.safetensors")
+
+
+class TestStrictness:
+    """Files that are nearly right, each with one thing wrong."""
+
+    def rewrite(self, file, change_state=None, change_metadata=None):
+        with safe_open(file, "pt") as opened:
+            metadata = opened.metadata()
+        state = load_file(file)
+        if change_state:
+            change_state(state)
+        if change_metadata:
+            change_metadata(metadata)
+        save_file(state, file, metadata=metadata)
+
+    def architecture(self, **changes):
+        def change(metadata):
+            metadata["architecture"] = json.dumps(json.loads(metadata["architecture"]) | changes)
+
+        return change
+
+    def fails(self, file, message):
+        with pytest.raises(ValueError, match=message) as caught:
+            LearnedNormalizer.from_pretrained(file)
+        assert file.name in str(caught.value)
+
+    def test_control(self, file):
+        self.rewrite(file)
+        LearnedNormalizer.from_pretrained(file)
+
+    def test_missing_tensor(self, file):
+        self.rewrite(file, lambda state: state.pop("network.set_network.head.2.bias"))
+        self.fails(file, r"the tensors do not fit the architecture(.|\n)*Missing key.*head\.2\.bias")
+
+    def test_extra_tensor(self, file):
+        self.rewrite(file, lambda state: state.update(extra=torch.zeros(1)))
+        self.fails(file, r"the tensors do not fit the architecture(.|\n)*Unexpected key.*extra")
+
+    def test_tensor_of_another_shape(self, file):
+        self.rewrite(file, lambda state: state.update({"network.set_network.head.2.bias": torch.zeros(4)}))
+        self.fails(file, r"the tensors do not fit the architecture(.|\n)*size mismatch")
+
+    def test_other_format(self, file):
+        self.rewrite(file, None, lambda metadata: metadata.update(format="another.v9"))
+        self.fails(file, r"expected format 'kornia_learnnorm.normalizer.v1', got 'another.v9'")
+
+    def test_no_metadata(self, file):
+        save_file({"weight": torch.zeros(2)}, file)
+        self.fails(file, "expected format .* got None")
+
+    def test_no_architecture(self, file):
+        self.rewrite(file, None, lambda metadata: metadata.pop("architecture"))
+        self.fails(file, "describes no normaliser of this version")
+
+    @pytest.mark.parametrize("text", ["", "no json", "[]", "3", "null", "{}"])
+    def test_garbled_architecture(self, file, text):
+        self.rewrite(file, None, lambda metadata: metadata.update(architecture=text))
+        self.fails(file, "describes no normaliser of this version")
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"base": {"name": "Unknown"}},
+            {"base": {"name": "os"}},
+            {"base": {"name": "Module"}},
+            {"base": {"floor": 1e-6}},
+            {"base": {"name": "Whitening", "ceiling": 3}},
+            {"base": {"name": "ReweightedWhitening", "iterations": -1, "damping": 0.1}},
+            {"base": "Whitening"},
+            {"network": {"name": "Whitening"}},
+            {"network": {"name": "CrossViewNetwork", "width": "wide"}},
+            {"network": None},
+            {"transform": "CrossViewNetwork"},
+            {"transform": "__builtins__"},
+            {"transform": 3},
+        ],
+    )
+    def test_other_architecture(self, file, changes):
+        self.rewrite(file, None, self.architecture(**changes))
+        self.fails(file, "describes no normaliser of this version")
+
+    def test_other_width(self, file):
+        self.rewrite(file, None, self.architecture(network={"name": "CrossViewNetwork", "width": 8, "depth": 2}))
+        self.fails(file, "the tensors do not fit the architecture")
+
+    @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 a zip", b"\x00" * 64, b"\xff" * 64])
+    def test_not_a_safetensors_file(self, file, content):
+        file.write_bytes(content)
+        self.fails(file, "is not a safetensors file")
+
+    def test_truncated(self, file):
+        file.write_bytes(file.read_bytes()[:-100])
+        self.fails(file, "is not a safetensors file")
+
+
+class TestSavingFails:
+    """A failure leaves what was there, and nothing else."""
+
+    def unchanged(self, file, error, message, call):
+        before = file.read_bytes()
+        with pytest.raises(error, match=message):
+            call()
+        assert file.read_bytes() == before
+        assert [entry.name for entry in file.parent.iterdir()] == [file.name]
+
+    @pytest.mark.parametrize(
+        "parts",
+        [
+            {"base": nn.Identity()},
+            {"network": nn.Linear(2, 5)},
+            {"transform": lambda params: spd_transform(params)},
+            {"base": PerView(normalize_points)},
+            {"base": type("Whitening", (Whitening,), {})()},  # the name is not enough
+        ],
+    )
+    def test_parts_of_others(self, file, parts):
+        self.unchanged(
+            file,
+            TypeError,
+            r"only this package's parts|not JSON serializable",
+            lambda: LearnedNormalizer(**parts).save_pretrained(file),
+        )
+
+    def test_parts_of_others_are_named(self, tmp_path):
+        with pytest.raises(TypeError, match=r"only this package's parts .* got <class '.*\.Linear'>"):
+            LearnedNormalizer(network=nn.Linear(2, 5)).save_pretrained(tmp_path / "weights.safetensors")
+        assert not list(tmp_path.iterdir())
+
+    def test_interrupted(self, normalizer, file, monkeypatch):
+        def half(state, path, metadata):
+            path.write_bytes(b"half")
+            raise OSError("no space left")
+
+        monkeypatch.setattr(learned, "save_file", half)
+        self.unchanged(file, OSError, "no space left", lambda: normalizer.save_pretrained(file))
+
+    def test_no_folder(self, normalizer, tmp_path):
+        with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
+            normalizer.save_pretrained(tmp_path / "nowhere" / "weights.safetensors")
+        assert not list(tmp_path.iterdir())
+
+    def test_target_is_a_folder(self, normalizer, tmp_path):
+        (tmp_path / "weights.safetensors").mkdir()
+        with pytest.raises(ValueError, match="it is not a regular file"):
+            normalizer.save_pretrained(tmp_path / "weights.safetensors")
+
+
+class TestModule:
+    def same(self, found, expected):
+        points = correspondences("driving", 5)
+        for T, want in zip(found(*points), expected(*points), strict=True):
+            assert torch.equal(T, want)
+
+    def test_state_dict(self, normalizer):
+        other = small()
+        other.load_state_dict(normalizer.state_dict())
+        self.same(other, normalizer)
+
+    def test_deepcopy_is_independent(self, normalizer):
+        other = copy.deepcopy(normalizer)
+        self.same(other, normalizer)
+        with torch.no_grad():
+            normalizer.network.set_network.head[-1].bias.add_(1)
+        with pytest.raises(AssertionError):
+            self.same(other, normalizer)
+
+    def test_pickle(self, normalizer):
+        self.same(pickle.loads(pickle.dumps(normalizer)), normalizer)
+
+    def test_parameters_are_the_networks(self, normalizer):
+        assert [n for n, _ in normalizer.named_parameters()] == [
+            f"network.{n}" for n, _ in normalizer.network.named_parameters()
+        ]

@@ -1,0 +1,147 @@
+"""Losses against hand computation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+from two_view import epipolar_distances, scenes, uniform
+
+from kornia_learnnorm import EpipolarLoss, algebraic_distance, find_fundamental, sampson_distance
+
+ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # symmetric distance: twice |y1 - y2|
+
+
+def rows(*differences, dtype=torch.float32):
+    """Correspondences whose symmetric distances are twice the given numbers, ``(B, N)``."""
+    y = torch.tensor(differences, dtype=dtype)
+    points1 = torch.stack([torch.arange(y.numel(), dtype=dtype).view_as(y), torch.zeros_like(y)], -1)
+    return points1, points1 + torch.stack([7 * torch.ones_like(y), y], -1), ROWS.to(dtype).expand(len(y), 3, 3)
+
+
+class TestEpipolarLoss:
+    def test_mean(self, dtype, device):
+        values = [v.to(device) for v in rows([1.0, 2.0], [3.0, 0.0], dtype=dtype)]
+        loss = EpipolarLoss(log=False)(*values)
+        assert loss.shape == ()
+        assert loss.dtype == dtype
+        assert loss.item() == pytest.approx((3 + 3) / 2)  # distances 2, 4 and 6, 0
+
+    @pytest.mark.parametrize("floor", [1e-3, 0.5])
+    def test_log(self, floor):
+        loss = EpipolarLoss(floor=floor)(*rows([1.0, 2.0], [4.0, 0.0], dtype=torch.float64))
+        assert loss.item() == pytest.approx((math.log(3 + floor) + math.log(4 + floor)) / 2)
+
+    def test_log_of_exact_points_is_that_of_the_floor(self):
+        assert EpipolarLoss()(*rows([0.0] * 8)).item() == pytest.approx(math.log(1e-3))
+
+    @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+    @pytest.mark.parametrize("log", [False, True])
+    def test_heldout_part(self, share, log):
+        points1, points2, F_mat = rows([1.0, 2.0], [4.0, 0.0], dtype=torch.float64)
+        heldout1, heldout2, _ = rows([5.0, 0.5, 0.0], [1.0, 1.0, 2.0], dtype=torch.float64)
+        loss = EpipolarLoss(log=log, heldout_weight=share, floor=0.01, heldout_floor=0.2)
+        if log:  # of samples' means, but of each held-out distance
+            own = (math.log(3.01) + math.log(4.01)) / 2
+            rest = sum(math.log(d + 0.2) for d in (10, 1, 0, 2, 2, 4)) / 6
+        else:
+            own, rest = (3 + 4) / 2, (10 + 1 + 0 + 2 + 2 + 4) / 6
+        found = loss(points1, points2, F_mat, heldout1, heldout2)
+        assert found.item() == pytest.approx((1 - share) * own + share * rest)
+
+    def test_heldout_points_are_not_looked_at_without_weight(self):
+        values = rows([1.0, 2.0])
+        assert EpipolarLoss()(*values, None, None) == EpipolarLoss()(
+            *values, torch.zeros(1, 0, 2), torch.zeros(1, 0, 2)
+        )
+
+    @pytest.mark.parametrize("residual", [sampson_distance, algebraic_distance])
+    def test_other_residuals(self, residual):
+        scene = scenes("handheld", 5, 10)
+        loss = EpipolarLoss(residual, log=False)(scene.points1, scene.points2, scene.F_mat)
+        assert loss.item() == pytest.approx(residual(scene.points1, scene.points2, scene.F_mat).mean().item())
+
+    def test_equation_seven(self):
+        scene = scenes("driving", 5, 10)
+        loss = EpipolarLoss(log=False)(scene.points1, scene.points2, scene.F_mat)
+        assert loss.item() == pytest.approx(epipolar_distances(scene.points1, scene.points2, scene.F_mat).mean())
+
+    @pytest.mark.parametrize("log", [False, True])
+    @pytest.mark.parametrize("where", ["own", "heldout"])
+    def test_infinite_residual_counts_as_the_ceiling_and_sends_no_gradient(self, log, where):
+        # x2^T F x1 = v x - u y; a point at the origin is on the epipole.
+        F_mat = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]]).double().requires_grad_()
+        points2 = torch.tensor([[[3.0, 4.0], [2.0, 1.0]]]).double()
+        whole, epipole = (
+            torch.tensor([[[1.0, 2.0], [1.0, 2.0]]]).double(),
+            torch.tensor([[[0.0, 0.0], [1.0, 2.0]]]).double(),
+        )
+        whole, epipole = whole.requires_grad_(), epipole.requires_grad_()
+        points1, heldout1 = (epipole, whole) if where == "own" else (whole, epipole)
+        options = {"log": log, "heldout_weight": 0.5, "floor": 1.0, "heldout_floor": 2.0, "ceiling": 50.0}
+        loss = EpipolarLoss(**options)(points1, points2, F_mat, heldout1, points2)
+        # Distances: |4 - 6| (1 / 5 + 1 / 5 ** 0.5) or infinite, and |1 - 4| 2 / 5 ** 0.5.
+        a, b = 2 / 5 + 2 / 5**0.5, 6 / 5**0.5
+        own, rest = ((50, b), (a, b)) if where == "own" else ((a, b), (50, b))
+        if log:
+            expected = (math.log(np.mean(own) + 1) + np.mean(np.log(np.array(rest) + 2))) / 2
+        else:
+            expected = (np.mean(own) + np.mean(rest)) / 2
+        assert loss.item() == pytest.approx(expected)
+        gradients = torch.autograd.grad(loss, [F_mat, whole, epipole])
+        assert all(torch.isfinite(gradient).all() for gradient in gradients)
+        assert gradients[2][0, 0].count_nonzero() == 0
+        assert gradients[2][0, 1].count_nonzero() > 0
+
+    @pytest.mark.parametrize("step", [0.0, 1e-30, 1e-22, 1e-20, 1e-15, 1e-10])
+    def test_gradients_are_finite_next_to_the_epipole(self, step, dtype):
+        F_mat = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]], dtype=dtype).requires_grad_()
+        points1 = torch.tensor([[[step, 0.0], [1.0, 2.0]]], dtype=dtype).requires_grad_()
+        loss = EpipolarLoss()(points1, torch.tensor([[[3.0, 4.0], [2.0, 1.0]]], dtype=dtype), F_mat)
+        for value in (loss, *torch.autograd.grad(loss, [F_mat, points1])):
+            assert torch.isfinite(value).all()
+
+    def test_residuals_above_the_ceiling_send_no_gradient(self):
+        points1, points2, F_mat = rows([1.0, 400.0])
+        points1.requires_grad_()
+        EpipolarLoss(log=False, ceiling=100.0)(points1, points2, F_mat).backward()
+        assert points1.grad[0, 0, 1] == pytest.approx(-1)  # of half of twice the difference
+        assert points1.grad[0, 1].count_nonzero() == 0
+
+    @pytest.mark.parametrize("log", [False, True])
+    @pytest.mark.parametrize("heldout_weight", [0.0, 0.5])
+    def test_gradcheck(self, log, heldout_weight):
+        points = [uniform(2, 5, 2, low=-1, seed=k).requires_grad_() for k in range(4)]
+        loss = EpipolarLoss(log=log, heldout_weight=heldout_weight)
+        F_mat = uniform(2, 3, 3, low=-1, seed=4).requires_grad_()
+        points = points if heldout_weight else points[:2]
+        assert gradcheck(lambda F_mat, a, b, *rest: loss(a, b, F_mat, *rest), [F_mat, *points])
+
+    def test_the_truth_has_the_least_heldout_loss(self):
+        scene, loss = scenes("orbit", 50, 40), EpipolarLoss(heldout_weight=1.0)
+        own, rest = slice(0, 8), slice(8, None)
+        F_mat = find_fundamental(scene.points1[:, own], scene.points2[:, own])
+        estimate, truth = (
+            loss(scene.points1[:, own], scene.points2[:, own], F, scene.points1[:, rest], scene.points2[:, rest])
+            for F in (F_mat, scene.F_mat)
+        )
+        assert truth < estimate
+
+    @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+    def test_share_must_be_one(self, share):
+        with pytest.raises(ValueError, match=rf"heldout_weight must be in \[0, 1\], got {share}"):
+            EpipolarLoss(heldout_weight=share)
+
+    @pytest.mark.parametrize("name", ["floor", "heldout_floor", "ceiling"])
+    @pytest.mark.parametrize("value", [0.0, -1.0])
+    def test_floors_and_ceiling_must_be_positive(self, name, value):
+        with pytest.raises(ValueError, match=rf"must be positive, got .*{value}"):
+            EpipolarLoss(**{name: value})
+
+    @pytest.mark.parametrize("heldout", [(), (None, None), (torch.zeros(1, 3, 2), None), (torch.zeros(1, 0, 2),) * 2])
+    def test_heldout_points_are_needed(self, heldout):
+        with pytest.raises(ValueError, match=r"heldout_weight=0\.5 needs held-out correspondences, got none"):
+            EpipolarLoss(heldout_weight=0.5)(*rows([1.0, 2.0]), *heldout)

@@ -1,0 +1,64 @@
+"""The better rate against counting by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kornia_learnnorm import BetterRate, better_rate
+
+INF, NAN = float("inf"), float("nan")
+NUMBERS = st.sampled_from([0.0, 0.5, 1.0, 2.0, INF, NAN])
+
+
+class TestBetterRate:
+    @pytest.mark.parametrize(
+        ("residual", "baseline", "expected"),
+        [
+            ([1.0, 2.0, 3.0, 4.0], [2.0, 1.0, 4.0, 5.0], (0.75, 0, 0, 4)),
+            ([1.0, 2.0], [1.0, 2.0], (0.0, 2, 0, 2)),  # ties are not better
+            ([0.0, 0.0, 1.0], [0.0, 1.0, 0.0], (1 / 3, 1, 0, 3)),
+            ([1.0, NAN, 1.0, NAN], [2.0, 1.0, NAN, NAN], (1.0, 0, 3, 1)),
+            ([INF, 1.0, INF], [1.0, INF, INF], (0.5, 0, 1, 2)),  # one infinite residual is worse than any other
+            ([-INF, NAN, 1.0], [1.0, INF, 2.0], (1.0, 0, 1, 2)),
+        ],
+    )
+    def test_by_hand(self, residual, baseline, expected, dtype, device):
+        tensors = (torch.tensor(values, dtype=dtype, device=device) for values in (residual, baseline))
+        assert better_rate(*tensors) == BetterRate(*expected)
+
+    @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=30))
+    def test_counts(self, pairs):
+        finite = [(a, b) for a, b in pairs if a == a and b == b and not a == b == INF]
+        residual, baseline = torch.tensor(pairs).unbind(-1)
+        if not finite:
+            with pytest.raises(ValueError, match=f"none of {len(pairs)} samples can be compared"):
+                better_rate(residual, baseline)
+            return
+        found = better_rate(residual, baseline)
+        assert found.rate == sum(a < b for a, b in finite) / len(finite)
+        assert found.ties == sum(a == b for a, b in finite)
+        assert found.degenerate == len(pairs) - len(finite)
+        assert found.compared == len(finite)
+        reverse = better_rate(baseline, residual)
+        assert found.rate + reverse.rate + found.ties / found.compared == pytest.approx(1)
+
+    def test_is_a_named_tuple_of_numbers(self):
+        rate, ties, degenerate, compared = better_rate(torch.tensor([1.0]), torch.tensor([2.0]))
+        assert [type(value) for value in (rate, ties, degenerate, compared)] == [float, int, int, int]
+
+    @pytest.mark.parametrize(
+        ("residual", "baseline", "message"),
+        [
+            (torch.rand(3), torch.rand(4), r"two \(S,\) tensors, got \[3\] and \[4\]"),
+            (torch.rand(3, 2), torch.rand(3, 2), r"two \(S,\) tensors, got \[3, 2\] and \[3, 2\]"),
+            (torch.tensor(1.0), torch.tensor(2.0), r"two \(S,\) tensors, got \[\] and \[\]"),
+            (torch.rand(0), torch.rand(0), "none of 0 samples can be compared"),
+            (torch.full((3,), NAN), torch.rand(3), "none of 3 samples can be compared"),
+        ],
+    )
+    def test_exceptions(self, residual, baseline, message):
+        with pytest.raises(ValueError, match=message):
+            better_rate(residual, baseline)

@@ -1,0 +1,167 @@
+"""Residuals of correspondences against formulas in NumPy and OpenCV."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from torch.autograd import gradcheck
+from two_view import SCENES, epipolar_distances, homogeneous, scenes, uniform
+
+from kornia_learnnorm import algebraic_distance, sampson_distance, symmetric_epipolar_distance
+
+ALL = [symmetric_epipolar_distance, sampson_distance, algebraic_distance]
+ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x2^T F x1 = y1 - y2
+
+
+def numpy_sampson(points1, points2, F):
+    x1, x2 = homogeneous(points1.numpy()), homogeneous(points2.numpy())
+    lines2, lines1 = x1 @ F.numpy().swapaxes(-1, -2), x2 @ F.numpy()
+    squared = (lines1[..., :2] ** 2).sum(-1) + (lines2[..., :2] ** 2).sum(-1)
+    return np.abs((x2 * lines2).sum(-1)) / np.sqrt(squared)
+
+
+def numpy_algebraic(points1, points2, F):
+    x1, x2 = homogeneous(points1.numpy()), homogeneous(points2.numpy())
+    return np.abs(np.einsum("bni,bij,bnj->bn", x2, F / np.linalg.norm(F, axis=(1, 2), keepdims=True), x1))
+
+
+REFERENCES = {
+    symmetric_epipolar_distance: epipolar_distances,
+    sampson_distance: numpy_sampson,
+    algebraic_distance: lambda points1, points2, F: numpy_algebraic(points1, points2, F.numpy()),
+}
+
+
+class TestAll:
+    @pytest.mark.parametrize("distance", ALL)
+    @pytest.mark.parametrize("shape", [(0, 8), (1, 1), (3, 20)])
+    def test_smoke(self, distance, shape, device, dtype):
+        points1, points2 = (uniform(*shape, 2, high=600, seed=k).to(device, dtype) for k in (0, 1))
+        found = distance(points1, points2, uniform(shape[0], 3, 3, seed=2).to(device, dtype))
+        assert found.shape == shape
+        assert found.dtype == dtype
+        assert found.device.type == device.type
+        assert (found >= 0).all()
+
+    @pytest.mark.parametrize("distance", ALL)
+    @pytest.mark.parametrize("name", SCENES)
+    def test_agrees_with_numpy(self, distance, name, device):
+        scene = scenes(name, 20, 30)
+        found = distance(scene.points1.to(device), scene.points2.to(device), scene.F_mat.to(device)).cpu()
+        expected = REFERENCES[distance](scene.points1, scene.points2, scene.F_mat)
+        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-8, atol=1e-10)
+
+    @pytest.mark.parametrize("distance", ALL)
+    @given(st.integers(0, 2**31), st.sampled_from([1e-6, -1.0, 3.0, 1e6]))
+    def test_scale_of_the_matrix_does_not_matter(self, distance, seed, factor):
+        points1, points2, F_mat = (uniform(2, *s, seed=seed + k) for k, s in enumerate([(5, 2), (5, 2), (3, 3)]))
+        expected = distance(points1, points2, F_mat)
+        assert torch.allclose(distance(points1, points2, factor * F_mat), expected, rtol=1e-9)
+        assert torch.allclose(distance(points2, points1, F_mat.mT), expected, rtol=1e-9)  # views swapped
+
+    @pytest.mark.parametrize("distance", ALL)
+    def test_one_pair_without_batch(self, distance):
+        scene = scenes("handheld", 2, 10)
+        alone = distance(scene.points1[0], scene.points2[0], scene.F_mat[0])
+        assert alone.shape == (10,)
+        assert torch.allclose(alone, distance(scene.points1, scene.points2, scene.F_mat)[0])
+
+    @pytest.mark.parametrize("distance", ALL)
+    def test_exact_correspondences_have_none_and_no_gradient(self, distance):
+        points1 = torch.tensor([[[1.0, 5.0], [2.0, 7.0]]]).requires_grad_()
+        points2 = torch.tensor([[[9.0, 5.0], [-2.0, 7.0]]]).requires_grad_()
+        F_mat = ROWS[None].clone().requires_grad_()
+        found = distance(points1, points2, F_mat)
+        assert found.count_nonzero() == 0
+        for gradient in torch.autograd.grad(found.sum(), [points1, points2, F_mat]):
+            assert gradient.count_nonzero() == 0
+
+    @pytest.mark.parametrize("distance", ALL)
+    def test_gradcheck(self, distance):
+        values = [uniform(2, *s, low=-1, seed=k).requires_grad_() for k, s in enumerate([(5, 2), (5, 2), (3, 3)])]
+        assert gradcheck(distance, values)
+
+    @pytest.mark.parametrize("distance", ALL)
+    def test_shape_errors(self, distance):
+        points, F_mat = torch.rand(2, 8, 2), torch.rand(2, 3, 3)
+        for wrong in [
+            (torch.rand(2, 8, 3), points, F_mat),
+            (points, torch.rand(8), F_mat),
+            (points, points, F_mat[:, 0]),
+        ]:
+            with pytest.raises(ShapeError):
+                distance(*wrong)
+
+    @pytest.mark.parametrize("distance", ALL)
+    def test_type_errors(self, distance):
+        points, F_mat = torch.rand(2, 8, 2), torch.rand(2, 3, 3)
+        for wrong, message in [
+            ((points.long(), points, F_mat), "points1 must be a floating-point tensor, got torch.int64"),
+            ((points, points.numpy(), F_mat), "points2 must be a floating-point tensor, got float32"),
+            ((points, points, None), "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
+        ]:
+            with pytest.raises(TypeError, match=message):
+                distance(*wrong)
+
+
+class TestSymmetricEpipolarDistance:
+    def test_by_hand(self):
+        """Distances 3 and 4 pixels: a line y = 3 in one view, x = y / 2 in the other."""
+        F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, -1.0, 0.0]]])
+        # l2 = F (x, y, 1) = (0, 1, x - y), l1 = F^T (u, v, 1) = (1, -1, v); x2^T F x1 = v + x - y.
+        found = symmetric_epipolar_distance(torch.tensor([[[4.0, 1.0]]]), torch.tensor([[[7.0, 2.0]]]), F_mat)
+        assert found.item() == pytest.approx(5 + 5 / 2**0.5)
+
+    def test_is_what_opencv_measures(self):
+        cv2 = pytest.importorskip("cv2")
+        scene = scenes("driving", 5, 20)
+        found = symmetric_epipolar_distance(scene.points1, scene.points2, scene.F_mat)
+        for p1, p2, F, distances in zip(scene.points1, scene.points2, scene.F_mat, found, strict=True):
+            lines2 = cv2.computeCorrespondEpilines(p1.numpy(), 1, F.numpy())[:, 0]  # of unit normals
+            lines1 = cv2.computeCorrespondEpilines(p2.numpy(), 2, F.numpy())[:, 0]
+            expected = np.abs((lines2 * homogeneous(p2.numpy())).sum(-1)) + np.abs(
+                (lines1 * homogeneous(p1.numpy())).sum(-1)
+            )
+            np.testing.assert_allclose(distances.numpy(), expected, rtol=1e-3, atol=1e-3)  # lines in float32
+
+    def test_is_infinite_on_the_epipole_without_gradient(self):
+        F_mat = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]]).requires_grad_()
+        points1 = torch.tensor([[[0.0, 0.0], [1.0, 2.0]]]).requires_grad_()
+        found = symmetric_epipolar_distance(points1, torch.tensor([[[3.0, 4.0], [2.0, 1.0]]]), F_mat)
+        # x2^T F x1 = v x - u y = 1 - 4; both normals have the length of the point, 5 ** 0.5.
+        assert found[0].tolist() == [torch.inf, pytest.approx(6 / 5**0.5)]
+        for gradient in torch.autograd.grad(found[0, 0], [F_mat, points1]):
+            assert gradient.count_nonzero() == 0
+
+
+class TestSampsonDistance:
+    def test_is_opencvs(self):
+        cv2 = pytest.importorskip("cv2")
+        scene = scenes("handheld", 5, 20)
+        found = sampson_distance(scene.points1, scene.points2, scene.F_mat)
+        for k in range(5):
+            x1, x2 = homogeneous(scene.points1[k].numpy()), homogeneous(scene.points2[k].numpy())
+            expected = [
+                cv2.sampsonDistance(a[:, None], b[:, None], scene.F_mat[k].numpy()) for a, b in zip(x1, x2, strict=True)
+            ]
+            np.testing.assert_allclose(found[k].square().numpy(), expected, rtol=1e-8)
+
+    def test_is_nearly_the_distance_to_the_nearest_exact_correspondence(self):
+        """Move a pair along the gradient of its constraint by a known length."""
+        scene = scenes("orbit", 10, 20, noise=0.0)
+        x1, x2 = homogeneous(scene.points1.numpy()), homogeneous(scene.points2.numpy())
+        F = scene.F_mat.numpy()
+        direction = np.concatenate([(x2 @ F)[..., :2], (x1 @ F.swapaxes(1, 2))[..., :2]], -1)
+        moved = 0.01 * torch.from_numpy(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+        found = sampson_distance(scene.points1 + moved[..., :2], scene.points2 + moved[..., 2:], scene.F_mat)
+        np.testing.assert_allclose(found.numpy(), 0.01, rtol=1e-3)
+
+
+class TestAlgebraicDistance:
+    def test_by_hand(self):
+        found = algebraic_distance(torch.tensor([[[1.0, 5.0]]]), torch.tensor([[[2.0, 8.0]]]), 10 * ROWS[None])
+        assert found.item() == pytest.approx(3 / 2**0.5)  # y1 - y2 over the norm of (1, -1)
