@@ -14,10 +14,11 @@ from kornia_learnnorm.learned import LearnedNormalizer
 from kornia_learnnorm.losses import EpipolarLoss
 from kornia_learnnorm.metrics import BetterRate, better_rate
 from kornia_learnnorm.networks import CrossViewNetwork
-from kornia_learnnorm.normalizers import Hartley, Identity, PerView, Whitening, paper_transform, spd_transform
+from kornia_learnnorm.normalizers import Hartley, Identity, PerView, Whitening
 from kornia_learnnorm.residuals import algebraic_distance, sampson_distance, symmetric_epipolar_distance
 from kornia_learnnorm.reweighting import ReweightedWhitening
 from kornia_learnnorm.solver import design_matrix, find_fundamental, null_vector, rank2_projection
+from kornia_learnnorm.transforms import paper_transform, spd_transform
 
 __version__ = "0.1.0"
 

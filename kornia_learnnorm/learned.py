@@ -12,10 +12,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from kornia_learnnorm import networks, normalizers, reweighting
+from kornia_learnnorm import networks, normalizers, reweighting, transforms
+from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
 from kornia_learnnorm.files import replacing
 from kornia_learnnorm.networks import CrossViewNetwork
-from kornia_learnnorm.normalizers import Whitening, check_correspondences, solve_dtype, spd_transform
+from kornia_learnnorm.normalizers import Whitening
+from kornia_learnnorm.transforms import spd_transform
 
 __all__ = ["LearnedNormalizer"]
 
@@ -97,7 +99,7 @@ class LearnedNormalizer(nn.Module):
         architecture = {
             "base": _describe(self.base, normalizers, reweighting),
             "network": _describe(self.network, networks),
-            "transform": _name(self.transform, normalizers),
+            "transform": _name(self.transform, transforms),
         }
         state = {key: value.detach().cpu().contiguous() for key, value in self.state_dict().items()}
         with replacing(path) as beside:
@@ -134,6 +136,7 @@ class LearnedNormalizer(nn.Module):
         if metadata.get("format") != FORMAT:
             raise ValueError(f"{path} is not a normaliser: expected format {FORMAT!r}, got {metadata.get('format')!r}")
         normalizer = cls(**_build(path, metadata.get("architecture", "")))
+        normalizer.to(next(iter(state.values())).dtype if state else None)
         try:
             normalizer.load_state_dict(state, strict=True)
         except RuntimeError as error:
@@ -157,7 +160,11 @@ def _describe(part: nn.Module, *modules: Any) -> dict[str, Any]:
     name, arguments = _name(type(part), *modules), inspect.signature(type(part)).parameters.values()
     # A part without a constructor of its own shows the `*args, **kwargs` of `nn.Module`.
     keys = [argument.name for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD]
-    return {"name": name, **{key: getattr(part, key) for key in keys}}
+    values = {key: getattr(part, key) for key in keys}
+    for key, value in values.items():
+        if not isinstance(value, bool | int | float | str | None):
+            raise TypeError(f"{name} cannot be saved with its architecture: {key} is {value!r}, not a number or a text")
+    return {"name": name, **values}
 
 
 def _build(path: Path, architecture: str) -> dict[str, Any]:
@@ -175,7 +182,7 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
         return {
             "base": find(base.pop("name"), normalizers, reweighting)(**base),
             "network": find(network.pop("name"), networks)(**network),
-            "transform": find(parts["transform"], normalizers),
+            "transform": find(parts["transform"], transforms),
         }
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} describes no normaliser of this version: {error}") from error

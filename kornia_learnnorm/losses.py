@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
-from kornia_learnnorm.normalizers import solve_dtype
+from kornia_learnnorm.correspondences import solve_dtype
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
 
 __all__ = ["EpipolarLoss"]

@@ -25,6 +25,8 @@ def _check(points1: Tensor, points2: Tensor, F_mat: Tensor) -> None:
     KORNIA_CHECK_SHAPE(points1, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(points2, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(F_mat, ["*", "3", "3"])
+    if points1.shape[-2] != points2.shape[-2]:
+        raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
 
 
 def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
@@ -44,6 +46,7 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
     Raises:
         TypeError: if an argument is not a floating-point tensor.
         ShapeError: if a shape is wrong.
+        ValueError: if the points do not pair up.
 
     Example:
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])  # lines are rows
@@ -73,6 +76,7 @@ def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
     Raises:
         TypeError: if an argument is not a floating-point tensor.
         ShapeError: if a shape is wrong.
+        ValueError: if the points do not pair up.
 
     Example:
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
@@ -98,6 +102,7 @@ def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tenso
     Raises:
         TypeError: if an argument is not a floating-point tensor.
         ShapeError: if a shape is wrong.
+        ValueError: if the points do not pair up.
 
     Example:
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])

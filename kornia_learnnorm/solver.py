@@ -14,7 +14,9 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.normalizers import Hartley, check_correspondences, solve_dtype, transform_fundamental
+from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
+from kornia_learnnorm.normalizers import Hartley
+from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["design_matrix", "find_fundamental", "null_vector", "rank2_projection", "smallest_right_singular_vector"]
 
@@ -48,7 +50,8 @@ def find_fundamental(
     Raises:
         TypeError: if the points are not floating-point tensors of one dtype.
         ShapeError: if the shapes do not agree with the above.
-        ValueError: if there are fewer than eight correspondences.
+        ValueError: if there are fewer than eight correspondences, the views do not pair up, a value is not finite, or a
+            weight is negative.
 
     Reference:
         R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; B. Fan, Y. Dai, Y. Seo, M. He, A revisit of the

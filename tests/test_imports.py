@@ -12,6 +12,7 @@ import kornia_learnnorm
 
 HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "rich"]
 CORE = [
+    "correspondences",
     "estimators",
     "files",
     "learned",
@@ -22,6 +23,7 @@ CORE = [
     "residuals",
     "reweighting",
     "solver",
+    "transforms",
 ]
 
 

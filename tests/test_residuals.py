@@ -97,6 +97,11 @@ class TestAll:
                 distance(*wrong)
 
     @pytest.mark.parametrize("distance", ALL)
+    def test_views_that_do_not_pair_up(self, distance):
+        with pytest.raises(ValueError, match=r"must pair up, got shapes \[2, 8, 2\] and \[2, 1, 2\]"):
+            distance(torch.rand(2, 8, 2), torch.rand(2, 1, 2), torch.rand(2, 3, 3))
+
+    @pytest.mark.parametrize("distance", ALL)
     def test_type_errors(self, distance):
         points, F_mat = torch.rand(2, 8, 2), torch.rand(2, 3, 3)
         for wrong, message in [

@@ -1,0 +1,140 @@
+r"""Transforms of the plane: builders of normalising transforms, and how a fundamental matrix follows them."""
+
+from __future__ import annotations
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from torch import Tensor
+
+__all__ = ["affine_transform", "inverse_sqrt", "paper_transform", "spd_transform", "transform_fundamental"]
+
+
+def affine_transform(linear: Tensor, origin: Tensor) -> Tensor:
+    r"""Build the transform that moves ``origin`` to zero and then applies ``linear``.
+
+    Args:
+        linear: matrices with shape :math:`(*, 2, 2)`.
+        origin: points with shape :math:`(*, 2)`.
+
+    Returns:
+        homogeneous transforms with shape :math:`(*, 3, 3)`.
+
+    Example:
+        >>> affine_transform(2 * torch.eye(2), torch.tensor([3.0, 4.0]))
+        tensor([[ 2.,  0., -6.],
+                [ 0.,  2., -8.],
+                [ 0.,  0.,  1.]])
+
+    """
+    KORNIA_CHECK_SHAPE(linear, ["*", "2", "2"])
+    KORNIA_CHECK_SHAPE(origin, ["*", "2"])
+    top = torch.cat([linear, -linear @ origin[..., None]], -1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 2] = 1
+    return torch.cat([top, bottom], -2)
+
+
+def transform_fundamental(F_mat: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
+    r"""Return :math:`T_2^\top F T_1`: a fundamental matrix of transformed points, brought back to the points.
+
+    Args:
+        F_mat: fundamental matrices of the transformed points with shape :math:`(*, 3, 3)`.
+        T1: transforms of the first view with shape :math:`(*, 3, 3)`.
+        T2: transforms of the second view with shape :math:`(*, 3, 3)`.
+
+    Returns:
+        fundamental matrices with shape :math:`(*, 3, 3)`.
+
+    """
+    return T2.mT @ F_mat @ T1
+
+
+def paper_transform(params: Tensor, origin: Tensor | None = None) -> Tensor:
+    r"""Build the paper's transform :math:`T_L = \mathrm{diag}(\alpha_1, \alpha_2, 1)\, R(\theta)\, C(o)`.
+
+    Args:
+        params: :math:`(\log\alpha_1, \log\alpha_2, \theta)` with shape :math:`(*, 3)`; zero gives :math:`C(o)`.
+        origin: the points :math:`o` moved to zero, with shape :math:`(*, 2)`; zero when not given, for points that are
+            centred already.
+
+    Returns:
+        transforms with shape :math:`(*, 3, 3)`.
+
+    Reference:
+        Fan et al., section 4, the equation of :math:`T_L`.
+
+    Example:
+        >>> paper_transform(torch.tensor([0.6931472, 0.0, 0.0]))
+        tensor([[2., -0., 0.],
+                [0., 1., 0.],
+                [0., 0., 1.]])
+
+    """
+    KORNIA_CHECK_SHAPE(params, ["*", "3"])
+    alpha, (c, s) = params[..., :2].exp(), (params[..., 2].cos(), params[..., 2].sin())
+    rotation = torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
+    origin = torch.zeros_like(params[..., :2]) if origin is None else origin
+    return affine_transform(alpha[..., None] * rotation, origin)
+
+
+def spd_transform(params: Tensor) -> Tensor:
+    r"""Build a transform with a symmetric positive definite linear part from its matrix logarithm.
+
+    With five parameters the transform reaches every metric :math:`T^\top T` of the homogeneous plane up to scale; with
+    three it keeps the origin. Unlike :math:`T_L` it has no rotation, which would leave :math:`F` unchanged.
+
+    Args:
+        params: :math:`(a, b, c)` or :math:`(a, b, c, o_1, o_2)` with shape :math:`(*, 3)` or :math:`(*, 5)`; the linear
+            part is :math:`\exp [[a, b], [b, c]]` and :math:`o` the point moved to zero. Zero gives the identity.
+
+    Returns:
+        transforms with shape :math:`(*, 3, 3)`.
+
+    Raises:
+        ValueError: if there are not three or five parameters.
+
+    Example:
+        >>> spd_transform(torch.zeros(5))
+        tensor([[1., 0., 0.],
+                [0., 1., 0.],
+                [0., 0., 1.]])
+
+    """
+    if params.shape[-1] not in (3, 5):
+        raise ValueError(f"an SPD transform has 3 or 5 parameters a view, got shape {[*params.shape]}")
+    a, b, c = params[..., :3].unbind(-1)
+    mean, half = (a + c) / 2, (a - c) / 2
+    square = half.square() + b.square()
+    # exp of a traceless symmetric 2x2 matrix S with S^2 = d^2 I is cosh(d) I + sinh(d) / d S. Both are smooth in d^2,
+    # sqrt is not at zero: there the series takes over.
+    small = square < 1e-4
+    d = torch.where(small, 1.0, square).sqrt()
+    cosh = torch.where(small, 1 + square / 2 + square.square() / 24, d.cosh())
+    sinhc = torch.where(small, 1 + square / 6 + square.square() / 120, d.sinh() / d)
+    scale = mean.exp()
+    row1 = torch.stack([scale * (cosh + sinhc * half), scale * sinhc * b], -1)
+    row2 = torch.stack([scale * sinhc * b, scale * (cosh - sinhc * half)], -1)
+    origin = params[..., 3:] if params.shape[-1] == 5 else torch.zeros_like(params[..., :2])
+    return affine_transform(torch.stack([row1, row2], -2), origin)
+
+
+def inverse_sqrt(covariance: Tensor, floor: float = 1e-6) -> Tensor:
+    r"""Return :math:`\Sigma^{-1/2}` of symmetric matrices :math:`(*, 2, 2)`, the identity where :math:`\Sigma = 0`.
+
+    :math:`(\mathrm{adj}\,\Sigma + s I) / (s \sqrt{\mathrm{tr}\,\Sigma + 2 s})` with :math:`s^2 = \det\Sigma`: no
+    eigenvectors, so smooth where the eigenvalues meet.
+    """
+    a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    trace = a + c
+    empty = trace <= 0
+    # Both eigenvalues are raised together by what the smaller one lacks; it changes the larger by less than `floor`.
+    spread = ((a - c) / 2).square() + b.square()
+    flat = spread <= 0
+    largest = trace / 2 + torch.where(flat, 0.0, torch.where(flat, 1.0, spread).sqrt())
+    largest = torch.where(empty, 1.0, largest)
+    lift = torch.relu(floor * largest - (a * c - b.square()) / largest)
+    a, c = torch.where(empty, 1.0, a + lift), torch.where(empty, 1.0, c + lift)
+    b = torch.where(empty, 0.0, b)
+    s = (a * c - b.square()).sqrt()
+    adjugate_plus = torch.stack([torch.stack([c + s, -b], -1), torch.stack([-b, a + s], -1)], -2)
+    return adjugate_plus / (s * (a + c + 2 * s).sqrt())[..., None, None]

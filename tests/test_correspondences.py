@@ -1,0 +1,30 @@
+"""The checks, the dtype and the averages that all modules share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from two_view import uniform
+
+from kornia_learnnorm.correspondences import check_correspondences, solve_dtype, weighted_mean
+
+
+class TestCorrespondences:
+    def test_weighted_mean(self):
+        values, weights = uniform(3, 6, 2), uniform(3, 6, seed=1)
+        expected = [np.average(v, axis=0, weights=w) for v, w in zip(values, weights, strict=True)]
+        np.testing.assert_allclose(weighted_mean(values, weights).numpy(), expected)
+        np.testing.assert_allclose(weighted_mean(values, None).numpy(), values.numpy().mean(1))
+        np.testing.assert_allclose(weighted_mean(values, 0 * weights).numpy(), values.numpy().mean(1))
+
+    def test_solve_dtype(self):
+        assert solve_dtype(torch.device("cpu")) == torch.float64
+        assert solve_dtype(torch.device("cuda:0")) == torch.float64
+        assert solve_dtype(torch.device("mps")) == torch.float32
+
+    def test_check_correspondences_takes_a_number(self):
+        points = torch.rand(2, 5, 2)
+        check_correspondences(points, points, torch.ones(2, 5), at_least=5)
+        with pytest.raises(ValueError, match="at least 6 correspondences are needed, got 5"):
+            check_correspondences(points, points, at_least=6)
