@@ -94,8 +94,11 @@ class LearnedNormalizer(nn.Module):
         Raises:
             TypeError: if the base, the network or the builder is not one of this package, so that the file could not
                 say how to build it; use ``state_dict`` for those.
+            ValueError: if ``path`` does not end in ``.safetensors``.
 
         """
+        if Path(path).suffix != ".safetensors":
+            raise ValueError(f"weights are written to a .safetensors file, got {str(path)!r}")
         architecture = {
             "base": _describe(self.base, normalizers, reweighting),
             "network": _describe(self.network, networks),
@@ -124,6 +127,8 @@ class LearnedNormalizer(nn.Module):
 
         """
         path = Path(name) if Path(name).suffix == ".safetensors" else WEIGHTS / f"{name}.safetensors"
+        if not path.is_file() and Path(name).is_file():
+            raise ValueError(f"{name} is not a .safetensors file by its name")
         if not path.is_file():
             shipped = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
             raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {shipped}")

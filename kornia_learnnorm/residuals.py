@@ -25,6 +25,8 @@ def _check(points1: Tensor, points2: Tensor, F_mat: Tensor) -> None:
     KORNIA_CHECK_SHAPE(points1, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(points2, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(F_mat, ["*", "3", "3"])
+    if not points1.dtype == points2.dtype == F_mat.dtype:
+        raise TypeError(f"one dtype is needed, got {points1.dtype}, {points2.dtype} and {F_mat.dtype}")
     if points1.shape[-2] != points2.shape[-2]:
         raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
 
@@ -44,7 +46,7 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
         distances in pixels with shape :math:`(*, N)`; infinite for a point on an epipole.
 
     Raises:
-        TypeError: if an argument is not a floating-point tensor.
+        TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
         ShapeError: if a shape is wrong.
         ValueError: if the points do not pair up.
 
@@ -74,7 +76,7 @@ def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         distances in pixels with shape :math:`(*, N)`.
 
     Raises:
-        TypeError: if an argument is not a floating-point tensor.
+        TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
         ShapeError: if a shape is wrong.
         ValueError: if the points do not pair up.
 
@@ -100,7 +102,7 @@ def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tenso
         algebraic residuals with shape :math:`(*, N)`; their unit depends on the coordinates of the points.
 
     Raises:
-        TypeError: if an argument is not a floating-point tensor.
+        TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
         ShapeError: if a shape is wrong.
         ValueError: if the points do not pair up.
 

@@ -20,12 +20,14 @@ from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["design_matrix", "find_fundamental", "null_vector", "rank2_projection", "smallest_right_singular_vector"]
 
+Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
+
 
 def find_fundamental(
     points1: Tensor,
     points2: Tensor,
     weights: Tensor | None = None,
-    normalizer: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]] | None = None,
+    normalizer: Normalizer | None = None,
 ) -> Tensor:
     r"""Compute the fundamental matrix from eight or more correspondences by the normalised eight-point algorithm.
 
@@ -48,10 +50,10 @@ def find_fundamental(
         gradient towards the others.
 
     Raises:
-        TypeError: if the points are not floating-point tensors of one dtype.
+        TypeError: if the points are not floating-point tensors of one dtype, or the normaliser cannot be called.
         ShapeError: if the shapes do not agree with the above.
-        ValueError: if there are fewer than eight correspondences, the views do not pair up, a value is not finite, or a
-            weight is negative.
+        ValueError: if there are fewer than eight correspondences, the views do not pair up, a value is not finite, a
+            weight is negative, or the normaliser does not return two finite transforms :math:`(B, 3, 3)`.
 
     Reference:
         R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; B. Fan, Y. Dai, Y. Seo, M. He, A revisit of the
@@ -68,14 +70,28 @@ def find_fundamental(
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     w = None if weights is None else weights.to(dtype)
-    T1, T2 = (normalizer or Hartley())(x1, x2, w)
-    T1, T2 = T1.to(dtype), T2.to(dtype)
+    T1, T2 = (T.to(dtype) for T in _transforms(normalizer or Hartley(), x1, x2, w))
     x1 = convert_points_to_homogeneous(x1) @ T1.mT
     x2 = convert_points_to_homogeneous(x2) @ T2.mT
     f = null_vector(design_matrix(x1, x2), w)
     F = transform_fundamental(rank2_projection(torch.unflatten(f, -1, (3, 3))), T1, T2)
     F_mat: Tensor = F / torch.linalg.matrix_norm(F, keepdim=True)
     return F_mat.to(points1.dtype)
+
+
+def _transforms(normalizer: Normalizer, x1: Tensor, x2: Tensor, w: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Call a normaliser, which may be the user's own, and check what it returns."""
+    if isinstance(normalizer, type) or not callable(normalizer):
+        raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
+    result = normalizer(x1, x2, w)
+    expected = (x1.shape[0], 3, 3)
+    shapes = [tuple(getattr(T, "shape", ())) for T in result] if isinstance(result, tuple | list) else [type(result)]
+    if shapes != [expected, expected]:
+        raise ValueError(f"a normalizer must return two transforms of shape {expected}, got {shapes}")
+    T1, T2 = result
+    if not torch.compiler.is_compiling() and not bool(torch.isfinite(T1).all() & torch.isfinite(T2).all()):
+        raise ValueError(f"the transforms of {type(normalizer).__name__} are not finite")
+    return T1, T2
 
 
 def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:

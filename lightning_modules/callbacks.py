@@ -8,6 +8,7 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback, ModelCheckpoint
+from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -24,13 +25,21 @@ class Checkpoints(ModelCheckpoint):
         every_n_train_steps: steps between checkpoints.
     """
 
-    def __init__(self, every_n_train_steps: int = 250) -> None:
+    def __init__(self, every_n_train_steps: int = 100) -> None:
         super().__init__(save_last=True, every_n_train_steps=every_n_train_steps, enable_version_counter=False)
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Choose the folder."""
         self.dirpath = str(Path(trainer.default_root_dir) / "checkpoints")
         super().setup(trainer, pl_module, stage)
+
+    def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
+        """Say from where an interrupted run can be resumed."""
+        super().on_exception(trainer, pl_module, exception)
+        last = (
+            f"resume with --ckpt_path {self.last_model_path}" if self.last_model_path else "no checkpoint was written"
+        )
+        rank_zero_info(f"stopped at step {trainer.global_step}; {last}")
 
 
 class ExportWeights(Callback):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
-import warnings
 from collections.abc import Sequence
+
+import kornia_learnnorm
 
 __all__ = ["main"]
 
@@ -30,13 +32,22 @@ def main(args: Sequence[str] | None = None) -> int:
         args: command line without the program's name; ``sys.argv`` when not given.
 
     Returns:
-        the exit code, 0, or 2 after an error, of which one line is printed.
+        the exit code, 0, or 2 after an error, of which one line is printed, or 130 when interrupted.
 
     """
-    given, args = args, list(sys.argv[1:] if args is None else args)
-    if args and args[0] in TRAINING:
-        return _train(args[0], None if given is None else args)
+    words = list(sys.argv[1:] if args is None else args)
+    try:
+        if words and words[0] in TRAINING:
+            return _train(words[0], None if args is None else words)
+        return _run_tool(words)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+def _run_tool(args: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="learnnorm", description="Learned normalisation of the eight-point algorithm")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {kornia_learnnorm.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in TRAINING.items():
         commands.add_parser(name, help=text, add_help=False)
@@ -53,29 +64,21 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _train(command: str, args: list[str] | None) -> int:
     try:
-        from pytorch_lightning.cli import LightningCLI
-
-        from lightning_modules.datamodule import CorrespondenceDataModule
-        from lightning_modules.task import NormalizerTask
+        training = importlib.import_module("lightning_modules.training")
     except ImportError as error:
         return _fail(command, ImportError(f"{error}: pip install 'kornia-learnnorm[train]'"))
-    warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")  # Lightning's own call of torch
     try:
-        LightningCLI(
-            NormalizerTask,
-            CorrespondenceDataModule,
-            args=args,
-            auto_configure_optimizers=False,
-            parser_kwargs={"prog": "learnnorm"},
-            save_config_kwargs={"overwrite": True},
-        )
-    except (ValueError, FileNotFoundError) as error:
+        training.run(args)
+    except (ValueError, OSError) as error:
         return _fail(command, error)
     return 0
 
 
 def _fail(command: str, error: Exception) -> int:
-    print(f"learnnorm {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
+    # jsonargparse lists what each type that it tried had to say: the first is the one that was meant.
+    first = re.search(r"Does not validate against.*?Errors:\s*- (.*?)\n", str(error), flags=re.DOTALL)
+    text = first[1] if first else str(error)
+    print(f"learnnorm {command}: error: {' '.join(text.split())}", file=sys.stderr)
     return 2
 
 

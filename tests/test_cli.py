@@ -54,7 +54,70 @@ def test_unset_variable(tmp_path, monkeypatch, capsys):
     config = next(path for path in CONFIGS if path.stem == "crossview")
     code = main(["fit", "--config", str(config), *SMALL, f"--trainer.default_root_dir={tmp_path}"])
     assert code == 2
-    assert "environment variable LEARNNORM_DATA" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert error.startswith("learnnorm fit: error: the environment variable LEARNNORM_DATA, named in ")
+    assert error.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of a few steps, and the options that it was made with."""
+    folder = tmp_path_factory.mktemp("run")
+    config = next(path for path in CONFIGS if path.stem == "crossview-synthetic")
+    numbers = [f"--data.{stage}.init_args.number=100" for stage in ("train", "val", "test")]
+    options = ["--config", str(config), *SMALL, *numbers, f"--trainer.default_root_dir={folder}"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["learnnorm"])
+        assert main(["fit", *options]) == 0
+    return folder, options
+
+
+@pytest.mark.parametrize("command", ["validate", "test", "predict"])
+def test_a_checkpoint_is_needed(trained, command, capsys):
+    assert main([command, *trained[1]]) == 2
+    assert "give the checkpoint by --ckpt_path" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        ("weights.safetensors", "is not a checkpoint of a training run"),
+        ("text.ckpt", "is not a checkpoint of a training run"),
+        ("none.ckpt", "no checkpoint at"),
+    ],
+)
+@pytest.mark.parametrize("command", ["fit", "test"])
+def test_wrong_checkpoints(trained, command, file, message, capsys):
+    folder, options = trained
+    (folder / "text.ckpt").write_text("not a checkpoint")
+    assert main([command, *options, f"--ckpt_path={folder / file}"]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_checkpoint_of_another_network(trained, capsys):
+    folder, options = trained
+    other = "--model.normalizer.init_args.network.init_args.width=32"
+    assert main(["test", *options, other, f"--ckpt_path={folder / 'checkpoints/last.ckpt'}"]) == 2
+    assert "holds another network than the one configured" in capsys.readouterr().err
+
+
+def test_interrupted(monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("kornia_learnnorm.evaluation.evaluate.run", interrupt)
+    assert main(["evaluate", "store.h5"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_stores_and_weights_are_checked_first(tmp_path, capsys):
+    write_store(tmp_path / "s.h5", synthetic_store(pairs=1, points=40))
+    assert main(["evaluate", str(tmp_path / "s.h5"), str(tmp_path / "missing.h5")]) == 2
+    assert main(["evaluate", str(tmp_path / "s.h5"), "--weights", str(tmp_path / "s.h5")]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "no store at" in printed.err
+    assert "not a .safetensors file by its name" in printed.err
 
 
 def test_synthesize_evaluate_estimate(tmp_path, capsys):

@@ -391,3 +391,14 @@ class TestRealImages:
         assert result.median_distance < 0.5
         # Images are not undistorted and poses the nearest in time: the ground truth is good to about 3 px.
         assert np.median(distances(F, result.points1.numpy()[inliers], result.points2.numpy()[inliers])) < 4.0
+
+
+@pytest.mark.parametrize(("inliers", "chance"), [(12, True), (16, True), (29, False), (60, False)])
+def test_support_that_chance_would_give(inliers, chance):
+    """By hand for 12 of 100 in 1226 x 370: 10^(15.0 + 2.9 + 2.0 - 5 * 2.25) models expected, far more than one."""
+    arguments = (100, inliers, 1.0, (370, 1226))
+    if chance:
+        with pytest.raises(ValueError, match=f"{inliers} of 100 matches agree .* no more than chance would give"):
+            module._check_chance(*arguments)
+    else:
+        module._check_chance(*arguments)

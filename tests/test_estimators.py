@@ -85,3 +85,18 @@ class TestEightPoint:
     def test_errors_are_those_of_the_function(self):
         with pytest.raises(ValueError, match="at least 8 correspondences are needed, got 7"):
             EightPoint()(torch.rand(2, 7, 2), torch.rand(2, 7, 2))
+
+
+@pytest.mark.parametrize(
+    ("normalizer", "error", "message"),
+    [
+        (Hartley, TypeError, "normalizer must be a module or function, got <class"),
+        ("hartley", TypeError, "normalizer must be a module or function, got 'hartley'"),
+        (lambda *_: (torch.eye(3), torch.eye(3)), ValueError, r"two transforms of shape \(2, 3, 3\), got \[\(3, 3\)"),
+        (lambda *_: torch.zeros(2, 3, 3), ValueError, r"two transforms of shape \(2, 3, 3\), got .*Tensor"),
+        (lambda *_: (torch.full((2, 3, 3), torch.nan),) * 2, ValueError, "the transforms of function are not finite"),
+    ],
+)
+def test_a_normaliser_that_breaks_the_contract(normalizer, error, message):
+    with pytest.raises(error, match=message):
+        EightPoint(normalizer)(torch.rand(2, 8, 2), torch.rand(2, 8, 2))

@@ -38,6 +38,8 @@ def synthetic_store(
         ValueError: if a number is out of range.
 
     """
+    if pairs < 1 or points < 8:
+        raise ValueError(f"at least 1 pair of each scene and 8 points are needed, got {pairs} and {points}")
     generator = torch.Generator().manual_seed(seed)
     made = [make(pairs, points, generator, noise, outliers) for make in SCENES.values()]
     scene = TwoViewScene(*map(torch.cat, zip(*made, strict=True)))

@@ -83,8 +83,10 @@ def run(args: argparse.Namespace) -> int:
         ValueError: if a store or weights cannot be read.
 
     """
-    for path in args.stores:
-        store = read_store(path)
+    stores = {path: read_store(path) for path in args.stores}
+    for name in args.weights:
+        LearnedNormalizer.from_pretrained(name)
+    for path, store in stores.items():
         print(f"\n{path}: {store.dataset or 'no description'}, {len(store)} pairs")
         for max_ratio in (RATIO, None):
             about, rows = evaluate_store(store, args.weights, max_ratio, args.max_residual, args.seed)

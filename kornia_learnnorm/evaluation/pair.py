@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from kornia_learnnorm.solver import find_fundamental
 __all__ = ["PairEstimate", "estimate_pair", "write_json"]
 
 MIN_DISPLACEMENT = 0.1  # pixels, median over the matches: below it the camera has not moved
+MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the number of models that random matches would support as well
 MIN_PARALLAX = 0.05  # share of the inliers that no single homography may explain
 
 
@@ -95,8 +97,8 @@ def estimate_pair(
     Raises:
         FileNotFoundError: if a file does not exist.
         ValueError: if a file is not an image, ``ratio`` or ``threshold`` is out of range, or the images do not
-            determine a fundamental matrix: blank, fewer than eight matches or inliers, no motion, or all inliers on
-            one homography.
+            determine a fundamental matrix: blank, fewer than eight matches or inliers, no motion, all inliers on one
+            homography, or no more of them than random matches would have.
         ImportError: if OpenCV is not installed.
 
     """
@@ -110,6 +112,7 @@ def estimate_pair(
         inliers = _robust_inliers(points1, points2, threshold, seed)
         F_mat, inliers = _fit(points1, points2, inliers, normalizer, threshold)
         _check_parallax(points1[inliers], points2[inliers], threshold)
+        _check_chance(len(inliers), int(inliers.sum()), threshold, image2.shape)
     except ValueError as error:
         raise ValueError(f"{path1} and {path2}: {error}") from error
     distances = symmetric_epipolar_distance(points1[inliers], points2[inliers], F_mat)
@@ -204,6 +207,23 @@ def _check_parallax(points1: Tensor, points2: Tensor, threshold: float) -> None:
         raise ValueError(
             f"degenerate: one homography explains {explained} of {len(points1)} inliers within {threshold:g} px (a "
             "plane, or a camera that only turns): the fundamental matrix is not determined"
+        )
+
+
+def _check_chance(matches: int, inliers: int, threshold: float, shape: tuple[int, ...]) -> None:
+    """Complain if so many inliers are to be expected among random matches.
+
+    The number of false alarms of Moisan and Stival (A probabilistic criterion to detect rigid point matches between two
+    images and estimate the fundamental matrix, IJCV 2004): models from seven matches, and the chance of a random point
+    to lie within the threshold of a line.
+    """
+    strip = min(1.0, 2 * threshold * math.hypot(*shape) / math.prod(shape))
+    tests = (matches - 7) * math.comb(matches, inliers) * math.comb(inliers, 7)
+    log_false_alarms = math.log10(max(1, tests)) + (inliers - 7) * math.log10(strip)
+    if log_false_alarms > MAX_LOG_FALSE_ALARMS:
+        raise ValueError(
+            f"{inliers} of {matches} matches agree on a fundamental matrix within {threshold:g} px, no more than "
+            "chance would give: the fundamental matrix is not determined"
         )
 
 
