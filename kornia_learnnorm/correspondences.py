@@ -14,7 +14,7 @@ def solve_dtype(device: torch.device) -> torch.dtype:
     return torch.float32 if device.type == "mps" else torch.float64
 
 
-def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | None = None, at_least: int = 8) -> None:
+def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> None:
     """Raise a clear error for anything but finite correspondences ``(B, N, 2)`` x 2 and weights ``(B, N)``.
 
     Raises:
@@ -33,8 +33,8 @@ def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | No
         raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
     if points1.shape != points2.shape:
         raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
-    if points1.shape[1] < at_least:
-        raise ValueError(f"at least {at_least} correspondences are needed, got {points1.shape[1]}")
+    if points1.shape[1] < 8:
+        raise ValueError(f"at least 8 correspondences are needed, got {points1.shape[1]}")
     finite = [points1, points2]
     if weights is not None:
         if not isinstance(weights, Tensor) or not weights.is_floating_point():

@@ -23,8 +23,8 @@ class TestCorrespondences:
         assert solve_dtype(torch.device("cuda:0")) == torch.float64
         assert solve_dtype(torch.device("mps")) == torch.float32
 
-    def test_check_correspondences_takes_a_number(self):
-        points = torch.rand(2, 5, 2)
-        check_correspondences(points, points, torch.ones(2, 5), at_least=5)
-        with pytest.raises(ValueError, match="at least 6 correspondences are needed, got 5"):
-            check_correspondences(points, points, at_least=6)
+    def test_check_correspondences(self):
+        points = torch.rand(2, 8, 2)
+        check_correspondences(points, points, torch.ones(2, 8))
+        with pytest.raises(ValueError, match="at least 8 correspondences are needed, got 7"):
+            check_correspondences(points[:, :7], points[:, :7])

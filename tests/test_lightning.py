@@ -8,7 +8,7 @@ from safetensors.torch import load_file
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import SyntheticSamples
 from lightning_modules.callbacks import Checkpoints, ExportWeights, WritePredictions
-from lightning_modules.datamodule import CorrespondenceDataModule, SampleLoader
+from lightning_modules.datamodule import EVALUATION_SEED, CorrespondenceDataModule, SampleLoader
 from lightning_modules.task import NormalizerTask
 
 
@@ -66,7 +66,7 @@ def test_export_and_predictions(tmp_path):
     exported = kln.LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
     trainer.predict(task, data)
     written = load_file(tmp_path / "predictions.safetensors")
-    samples = data.test.draw(0)
+    samples = data.test.draw(EVALUATION_SEED)
     expected = kln.find_fundamental(samples.points1, samples.points2, normalizer=exported)
     assert written["F_mat"].shape == (len(samples.pair), 3, 3)
     torch.testing.assert_close(written["F_mat"], expected)
@@ -78,7 +78,7 @@ def test_metrics_of_an_untrained_network_are_whitening_s(tmp_path):
     task, data = make_task(), make_data()
     trainer = make_trainer(tmp_path, enable_checkpointing=False)
     (got,) = trainer.test(task, data, verbose=False)
-    x1, x2 = (p.double() for p in data.test.draw(0)[:2])
+    x1, x2 = (p.double() for p in data.test.draw(EVALUATION_SEED)[:2])
     hartley, whitening = (
         kln.symmetric_epipolar_distance(x1, x2, kln.find_fundamental(x1, x2, normalizer=n)).mean(-1)
         for n in (kln.Hartley(), kln.Whitening())
@@ -143,3 +143,11 @@ def test_bad_loaders():
     with pytest.raises(ValueError, match=r"data\.train is not set"):
         CorrespondenceDataModule().train_dataloader()
     assert CorrespondenceDataModule().val_dataloader() == []
+
+
+def test_validation_shares_no_sample_with_training():
+    source = SyntheticSamples(number=64, max_residual=None)
+    data = CorrespondenceDataModule(source, source, source, batch_size=64)
+    (validated,) = (batch.points1 for batch in data.val_dataloader())
+    (trained,) = (batch.points1 for batch in data.train_dataloader())
+    assert not (validated[:, None] == trained[None]).flatten(2).all(-1).any()
