@@ -11,8 +11,8 @@ from pytorch_lightning.utilities import rank_zero_info
 
 from kornia_learnnorm.data.samples import Samples
 
-# Far from the seeds of training epochs, since the synthetic source gives the same scenes for the same seed; a generator on
-# the CPU reads 32 bits of it.
+# Far from the seeds of training epochs, since the synthetic source gives the same scenes for the same seed. A generator
+# on the CPU reads 32 bits of it.
 EVALUATION_SEED = 4_000_000_007
 
 __all__ = ["CorrespondenceDataModule", "SampleLoader", "SampleSource"]

@@ -118,9 +118,10 @@ class NormalizerTask(pl.LightningModule):
 
     def predict_step(self, batch: Samples, batch_idx: int) -> dict[str, Tensor]:
         """Return transforms, fundamental matrices and mean residuals of a batch."""
-        T1, T2 = self.normalizer(batch.points1, batch.points2)
-        F_mat = self(batch.points1, batch.points2)
-        residual = symmetric_epipolar_distance(batch.points1, batch.points2, F_mat).mean(-1)
+        x1, x2 = batch.points1.double(), batch.points2.double()  # in float32, F itself loses digits of the residual
+        T1, T2 = self.normalizer(x1, x2)
+        F_mat = self(x1, x2)
+        residual = symmetric_epipolar_distance(x1, x2, F_mat).mean(-1)
         return {"T1": T1, "T2": T2, "F_mat": F_mat, "residual": residual, "pair": batch.pair}
 
     def on_validation_epoch_end(self) -> None:

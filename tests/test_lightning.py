@@ -67,11 +67,13 @@ def test_export_and_predictions(tmp_path):
     trainer.predict(task, data)
     written = load_file(tmp_path / "predictions.safetensors")
     samples = data.test.draw(EVALUATION_SEED)
-    expected = kln.find_fundamental(samples.points1, samples.points2, normalizer=exported)
-    assert written["F_mat"].shape == (len(samples.pair), 3, 3)
-    torch.testing.assert_close(written["F_mat"], expected)
-    residual = kln.symmetric_epipolar_distance(samples.points1, samples.points2, expected).mean(-1)
-    torch.testing.assert_close(written["residual"], residual)
+    assert torch.equal(written["pair"], samples.pair)
+    for rows in torch.arange(len(samples.pair)).split(32):  # as in the run: rounding in the network depends on it
+        x1, x2 = samples.points1[rows].double(), samples.points2[rows].double()
+        F_mat = kln.find_fundamental(x1, x2, normalizer=exported)
+        torch.testing.assert_close(written["F_mat"][rows], F_mat)
+        residual = kln.symmetric_epipolar_distance(x1, x2, F_mat).mean(-1)
+        torch.testing.assert_close(written["residual"][rows], residual)
 
 
 def test_metrics_of_an_untrained_network_are_whitening_s(tmp_path):
