@@ -9,14 +9,17 @@ Example:
 
 """
 
+from kornia_learnnorm.diagnostics import Diagnostics, diagnose
 from kornia_learnnorm.estimators import EightPoint
 from kornia_learnnorm.learned import LearnedNormalizer
 from kornia_learnnorm.losses import EpipolarLoss
 from kornia_learnnorm.metrics import BetterRate, better_rate
 from kornia_learnnorm.networks import CrossViewNetwork
 from kornia_learnnorm.normalizers import Hartley, Identity, PerView, Whitening
+from kornia_learnnorm.paper_network import PaperNetwork
 from kornia_learnnorm.residuals import algebraic_distance, sampson_distance, symmetric_epipolar_distance
 from kornia_learnnorm.reweighting import ReweightedWhitening
+from kornia_learnnorm.search import SearchedNormalizer
 from kornia_learnnorm.solver import design_matrix, find_fundamental, null_vector, rank2_projection
 from kornia_learnnorm.transforms import paper_transform, spd_transform
 
@@ -25,17 +28,21 @@ __version__ = "0.1.0"
 __all__ = [
     "BetterRate",
     "CrossViewNetwork",
+    "Diagnostics",
     "EightPoint",
     "EpipolarLoss",
     "Hartley",
     "Identity",
     "LearnedNormalizer",
+    "PaperNetwork",
     "PerView",
     "ReweightedWhitening",
+    "SearchedNormalizer",
     "Whitening",
     "algebraic_distance",
     "better_rate",
     "design_matrix",
+    "diagnose",
     "find_fundamental",
     "null_vector",
     "paper_transform",

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from kornia_learnnorm import networks, normalizers, reweighting, transforms
+from kornia_learnnorm import networks, normalizers, paper_network, reweighting, transforms
 from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
 from kornia_learnnorm.files import replacing
 from kornia_learnnorm.networks import CrossViewNetwork
@@ -101,7 +101,7 @@ class LearnedNormalizer(nn.Module):
             raise ValueError(f"weights are written to a .safetensors file, got {str(path)!r}")
         architecture = {
             "base": _describe(self.base, normalizers, reweighting),
-            "network": _describe(self.network, networks),
+            "network": _describe(self.network, networks, paper_network),
             "transform": _name(self.transform, transforms),
         }
         state = {key: value.detach().cpu().contiguous() for key, value in self.state_dict().items()}
@@ -186,7 +186,7 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
         base, network = dict(parts["base"]), dict(parts["network"])
         return {
             "base": find(base.pop("name"), normalizers, reweighting)(**base),
-            "network": find(network.pop("name"), networks)(**network),
+            "network": find(network.pop("name"), networks, paper_network)(**network),
             "transform": find(parts["transform"], transforms),
         }
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
-__all__ = ["BetterRate", "better_rate"]
+__all__ = ["BetterRate", "better_rate", "bootstrap_interval"]
 
 
 class BetterRate(NamedTuple):
@@ -53,3 +54,48 @@ def better_rate(residual: Tensor, baseline: Tensor) -> BetterRate:
     better = int((residual < baseline)[valid].sum())
     ties = int((residual == baseline)[valid].sum())
     return BetterRate(better / compared, ties, len(residual) - compared, compared)
+
+
+def bootstrap_interval(
+    values: Tensor, groups: Tensor, level: float = 0.95, draws: int = 2000, seed: int = 0
+) -> tuple[float, float]:
+    """Return the percentile bootstrap interval of a mean whose samples come in groups.
+
+    Samples of one image pair share its motion and scene, so the groups are drawn with replacement, each with all its
+    samples (the cluster bootstrap).
+
+    Args:
+        values: one value per sample with shape (S,).
+        groups: index of each sample's group, its image pair, with shape (S,), integers.
+        level: share of the draws within the interval.
+        draws: number of draws.
+        seed: seed of the draws.
+
+    Returns:
+        lower and upper end.
+
+    Raises:
+        ValueError: if the shapes differ, there are fewer than two groups, or ``level`` is not between 0 and 1.
+
+    Reference:
+        A. Davison, D. Hinkley, Bootstrap Methods and their Application, 1997, sections 3.8 and 5.3.
+
+    Example:
+        >>> bootstrap_interval(torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([0, 0, 1, 1]))
+        (0.0, 1.0)
+
+    """
+    if values.shape != groups.shape or values.ndim != 1:
+        raise ValueError(f"values and groups must be two (S,) tensors, got {[*values.shape]} and {[*groups.shape]}")
+    if not 0 < level < 1:
+        raise ValueError(f"level must be between 0 and 1, got {level}")
+    present, group = torch.unique(groups, return_inverse=True)
+    if len(present) < 2:
+        raise ValueError(f"at least two groups are needed, got {len(present)}")
+    counts = torch.bincount(group).double()
+    sums = torch.zeros_like(counts).index_add_(0, group, values.double())
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.randint(len(present), (draws, len(present)), generator=generator)
+    means = sums[drawn].sum(1) / counts[drawn].sum(1)
+    low, high = torch.quantile(means, torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)).tolist()
+    return low, high

@@ -16,7 +16,8 @@ from kornia_learnnorm.solver import design_matrix, null_vector, smallest_right_s
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 
-_POINT_FEATURES, _SET_FEATURES = 13, 10
+# What the network sees of a correspondence and of the set.
+_POINT_FEATURES, _SET_FEATURES = {"own": 2, "both": 4, "epipolar": 13}, {"own": 1, "both": 1, "epipolar": 10}
 
 
 class CrossViewNetwork(nn.Module):
@@ -33,6 +34,11 @@ class CrossViewNetwork(nn.Module):
         depth: residual layers.
         num_parameters: parameters per view, as the transform builder wants them.
         bound: the parameters stay within plus and minus this.
+        features: what a view's pass sees, to compare: ``"epipolar"`` all of the above, ``"both"`` only the points of
+            both views, ``"own"`` only its own points.
+
+    Raises:
+        ValueError: if ``features`` is none of these.
 
     Example:
         >>> network = CrossViewNetwork(width=16, depth=2)
@@ -42,10 +48,15 @@ class CrossViewNetwork(nn.Module):
 
     """
 
-    def __init__(self, width: int = 64, depth: int = 4, num_parameters: int = 5, bound: float = 3.0) -> None:
+    def __init__(
+        self, width: int = 64, depth: int = 4, num_parameters: int = 5, bound: float = 3.0, features: str = "epipolar"
+    ) -> None:
         super().__init__()
+        if features not in _POINT_FEATURES:
+            raise ValueError(f"features must be one of {', '.join(_POINT_FEATURES)}, got {features!r}")
         self.width, self.depth, self.num_parameters, self.bound = width, depth, num_parameters, bound
-        self.set_network = SetNetwork(_POINT_FEATURES, _SET_FEATURES, width, depth, num_parameters)
+        self.features = features
+        self.set_network = SetNetwork(_POINT_FEATURES[features], _SET_FEATURES[features], width, depth, num_parameters)
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the parameters of both views.
@@ -59,16 +70,27 @@ class CrossViewNetwork(nn.Module):
             parameters with shape :math:`(B, P)` of view 1 and view 2, in the dtype of the points.
 
         """
-        x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
-        F = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
-        F = F * _sign(F)
-        v, u = smallest_right_singular_vector(F), smallest_right_singular_vector(F.mT)
-        views = _view_features(x1, x2, F, v, u, weights), _view_features(x2, x1, F.mT, u, v, weights)
+        views = self._views(points1, points2, weights)
         point, whole = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
         doubled = None if weights is None else torch.cat([weights, weights]).to(self.dtype)
         params = self.set_network(point, whole, doubled).to(points1.dtype)
         params1, params2 = (self.bound * torch.tanh(params / self.bound)).chunk(2)
         return params1, params2
+
+    def _views(
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None
+    ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """Features of the points and of the set, as either view sees them."""
+        if self.features != "epipolar":
+            nothing = torch.ones_like(points1[:, 0, :1])
+            if self.features == "own":
+                return (points1, nothing), (points2, nothing)
+            return (torch.cat([points1, points2], -1), nothing), (torch.cat([points2, points1], -1), nothing)
+        x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
+        F = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
+        F = F * _sign(F)
+        v, u = smallest_right_singular_vector(F), smallest_right_singular_vector(F.mT)
+        return _epipolar_features(x1, x2, F, v, u, weights), _epipolar_features(x2, x1, F.mT, u, v, weights)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -82,7 +104,7 @@ def _sign(F: Tensor) -> Tensor:
     return entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
 
 
-def _view_features(
+def _epipolar_features(
     own: Tensor, other: Tensor, F: Tensor, v: Tensor, u: Tensor, weights: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Describe the problem as one view sees it, where ``other^T F own = 0``.

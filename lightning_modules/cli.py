@@ -21,6 +21,7 @@ TRAINING = {
 TOOLS = {
     "estimate": ("kornia_learnnorm.evaluation.estimate", "the fundamental matrix of two images"),
     "evaluate": ("kornia_learnnorm.evaluation.evaluate", "better rates and errors on stores of correspondences"),
+    "compare": ("kornia_learnnorm.evaluation.compare", "trained weights side by side, with confidence intervals"),
     "synthesize": ("kornia_learnnorm.data.synthesize", "a synthetic store and a rendered image pair"),
 }
 

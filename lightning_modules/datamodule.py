@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import pytorch_lightning as pl
@@ -33,27 +33,30 @@ class SampleLoader:
 
     Args:
         source: where the samples come from.
-        batch_size: samples in a batch.
+        batch_size: samples in a batch, or image pairs.
         seed: seed of all draws.
         shuffle: draw and shuffle anew each epoch (training) or keep one draw in order (evaluation).
+        by_pair: count and shuffle image pairs, each with all its samples, instead of samples.
 
     Raises:
         ValueError: if the batch size is not positive, or a shuffled draw does not fill one batch.
     """
 
-    def __init__(self, source: SampleSource, batch_size: int, seed: int, shuffle: bool) -> None:
+    def __init__(self, source: SampleSource, batch_size: int, seed: int, shuffle: bool, by_pair: bool = False) -> None:
         if batch_size < 1:
-            raise ValueError(f"batch_size must be positive, got {batch_size}")
+            raise ValueError(f"a batch must hold at least one sample or image pair, got {batch_size}")
         self.source = source
         self.batch_size = batch_size
         self.seed = seed
         self.shuffle = shuffle
+        self.by_pair = by_pair
         self.epoch, self.batch = 0, 0
         self._drawn: tuple[int, Samples] | None = None
-        number = len(self._draw(0).pair)
+        number = len(self._units(self._draw(0)))
         self._length = number // batch_size if shuffle else -(-number // batch_size)
         if self._length == 0:
-            raise ValueError(f"a batch takes {batch_size} samples, the source gives {number}")
+            unit = "image pairs" if by_pair else "samples"
+            raise ValueError(f"a batch takes {batch_size} {unit}, the source gives {number}")
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
@@ -63,7 +66,8 @@ class SampleLoader:
         """Yield the batches of the current epoch from the current batch on."""
         epoch, start = self.epoch, self.batch
         samples = self._draw(epoch)
-        number = len(samples.pair)
+        units = self._units(samples)
+        number = len(units)
         order = torch.arange(number)
         if self.shuffle:
             order = torch.randperm(number, generator=torch.Generator().manual_seed(self.seed + epoch))
@@ -72,7 +76,8 @@ class SampleLoader:
         for index in range(start, self._length):
             last = index + 1 == self._length
             self.epoch, self.batch = (epoch + 1, 0) if last else (epoch, index + 1)
-            yield samples.select(order[index * self.batch_size : min((index + 1) * self.batch_size, len(order))])
+            chosen = order[index * self.batch_size : min((index + 1) * self.batch_size, len(order))]
+            yield samples.select(torch.cat([units[i] for i in chosen]) if self.by_pair else chosen)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position: the epoch and the next batch."""
@@ -81,6 +86,13 @@ class SampleLoader:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go to a saved position."""
         self.epoch, self.batch = state["epoch"], state["batch"]
+
+    def _units(self, samples: Samples) -> Sequence[Any]:
+        """Rows of ``samples`` that stay together: those of a pair, or each alone."""
+        if not self.by_pair:
+            return range(len(samples.pair))
+        counts = torch.unique(samples.pair, return_counts=True)[1]
+        return torch.split(torch.argsort(samples.pair, stable=True), counts.tolist())
 
     def _draw(self, epoch: int) -> Samples:
         epoch = epoch if self.shuffle else 0
@@ -97,6 +109,7 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         val: source of the validation samples.
         test: source of the samples for test and predict.
         batch_size: samples in a batch.
+        batch_pairs: image pairs in a training batch, each with all its samples; replaces ``batch_size`` there.
         seed: seed of the training draws; validation and test are drawn once, from a seed of their own.
     """
 
@@ -106,11 +119,13 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         val: SampleSource | None = None,
         test: SampleSource | None = None,
         batch_size: int = 1024,
+        batch_pairs: int | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.train, self.val, self.test = train, val, test
         self.batch_size = batch_size
+        self.batch_pairs = batch_pairs
         self.seed = seed
 
     def train_dataloader(self) -> SampleLoader:
@@ -132,6 +147,10 @@ class CorrespondenceDataModule(pl.LightningDataModule):
     def _loader(self, stage: str, source: SampleSource | None, seed: int, shuffle: bool) -> SampleLoader:
         if source is None:
             raise ValueError(f"data.{stage} is not set: give it a source of samples")
-        loader = SampleLoader(source, self.batch_size, seed, shuffle)
-        rank_zero_info(f"{stage}: {len(loader)} batches of up to {self.batch_size} samples")
+        if shuffle and self.batch_pairs is not None:
+            loader = SampleLoader(source, self.batch_pairs, seed, shuffle, by_pair=True)
+            rank_zero_info(f"{stage}: {len(loader)} batches of {self.batch_pairs} image pairs")
+        else:
+            loader = SampleLoader(source, self.batch_size, seed, shuffle)
+            rank_zero_info(f"{stage}: {len(loader)} batches of up to {self.batch_size} samples")
         return loader

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.data.synthetic import random_scenes
+from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
 from kornia_learnnorm.normalizers import Identity
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
 from kornia_learnnorm.solver import find_fundamental
@@ -140,7 +140,8 @@ class StoreSamples:
     """Draw samples from stores of correspondences, each store once per ratio.
 
     Args:
-        paths: store files; environment variables such as ``$LEARNNORM_DATA`` are filled in.
+        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
+            ``$LEARNNORM_DATA`` are filled in.
         max_ratios: ratio tests; 0.8 gives the filtered samples, None the unfiltered ones, both a mix.
         size: correspondences in a sample.
         num_heldout: held-out correspondences per sample.
@@ -180,20 +181,27 @@ class StoreSamples:
 
 
 class SyntheticSamples:
-    """Draw samples from :func:`~kornia_learnnorm.data.synthetic.random_scenes`, a scene for each.
+    """Draw samples from synthetic scenes, a scene for each.
 
     Args:
         number: scenes per draw; the residual filter drops some of them.
         size: correspondences in a sample.
         num_heldout: held-out correspondences per sample, inliers and outliers alike.
         max_residual: drop samples whose :func:`plain_residual` is at least this many pixels; None keeps all.
+        scenes: makes scenes from their number, the points of each and a generator; one of
+            :mod:`kornia_learnnorm.data.synthetic`.
 
     Raises:
         ValueError: if ``number`` is not positive or ``size`` is below 8.
     """
 
     def __init__(
-        self, number: int = 262_144, size: int = 8, num_heldout: int = 0, max_residual: float | None = 60.0
+        self,
+        number: int = 262_144,
+        size: int = 8,
+        num_heldout: int = 0,
+        max_residual: float | None = 60.0,
+        scenes: Callable[[int, int, torch.Generator], TwoViewScene] = random_scenes,
     ) -> None:
         if number < 1 or size < 8:
             raise ValueError(f"number must be positive and size at least 8, got {number} and {size}")
@@ -201,6 +209,7 @@ class SyntheticSamples:
         self.size = size
         self.num_heldout = num_heldout
         self.max_residual = max_residual
+        self.scenes = scenes
 
     def draw(self, seed: int) -> Samples:
         """Return fresh samples."""
@@ -210,7 +219,7 @@ class SyntheticSamples:
         return samples._replace(pair=torch.arange(len(samples.pair)))
 
     def _chunk(self, number: int, generator: torch.Generator) -> Samples:
-        scenes = random_scenes(number, self.size + self.num_heldout, generator)
+        scenes = self.scenes(number, self.size + self.num_heldout, generator)
         sizes = [self.size, self.num_heldout]
         points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
         points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)

@@ -1,11 +1,13 @@
 r"""The file of correspondences: one HDF5 file, ragged arrays, one run of rows per image pair.
 
-Pair ``i`` owns the rows ``offsets[i]:offsets[i + 1]`` of ``points1``, ``points2`` and ``ratio``.
+Pair ``i`` owns the rows ``offsets[i]:offsets[i + 1]`` of ``points1``, ``points2`` and ``ratio``. Where a command or a
+configuration takes a store, ``file.h5@3:10`` means its pairs 3 to 9.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,6 +73,27 @@ class CorrespondenceStore:
         """Return the number of image pairs."""
         return len(self.offsets) - 1
 
+    def select(self, first: int, stop: int) -> CorrespondenceStore:
+        """Return the pairs from ``first`` up to, not with, ``stop``.
+
+        Args:
+            first: index of the first pair.
+            stop: index after the last pair.
+
+        Raises:
+            ValueError: if there are no such pairs.
+
+        """
+        if not 0 <= first < stop <= len(self):
+            raise ValueError(f"pairs {first}:{stop} were asked for, the store has 0:{len(self)}")
+        rows = slice(int(self.offsets[first]), int(self.offsets[stop]))
+        cut: dict[str, Any] = {
+            name: getattr(self, name)[rows if axis == "M" else slice(first, stop)]
+            for name, (_, _, axis) in _LAYOUT.items()
+        }
+        offsets = self.offsets[first : stop + 1] - self.offsets[first]
+        return replace(self, offsets=offsets, names=self.names[first:stop], **cut)
+
 
 def _h5py() -> Any:
     try:
@@ -81,28 +104,31 @@ def _h5py() -> Any:
 
 
 def read_store(path: str | Path) -> CorrespondenceStore:
-    """Read a store of correspondences and check it.
+    """Read a store of correspondences, or some of its pairs, and check it.
 
     Args:
-        path: an HDF5 file in the format that this module describes.
+        path: an HDF5 file in the format that this module describes; ``file.h5@3:10`` for its pairs 3 to 9.
 
     Returns:
         the store, in memory.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is not a store of this version, is truncated, or its arrays do not fit together.
+        ValueError: if the file is not a store of this version, is truncated, its arrays do not fit together, or it
+            lacks the pairs.
 
     """
-    path = Path(path)
+    part = re.fullmatch(r"(.+)@(\d+):(\d+)", str(path))
+    path = Path(part[1] if part else path)
     if not path.is_file():
         raise FileNotFoundError(f"no store at {path}")
     h5py = _h5py()
     try:
         with h5py.File(path, "r") as file:
-            return _read(path, file)
+            store = _read(path, file)
     except (OSError, RuntimeError) as error:
         raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
+    return store.select(int(part[2]), int(part[3])) if part else store
 
 
 def _read(path: Path, file: h5py.File) -> CorrespondenceStore:

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 
 import torch
 
-from kornia_learnnorm.data.samples import RATIO, draw_samples, plain_residual
+from kornia_learnnorm.data.samples import RATIO, Samples, draw_samples, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.predict import Normalizer, evaluate_normalizers
 from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows
 from kornia_learnnorm.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers import Hartley, Identity, Whitening
 from kornia_learnnorm.reweighting import ReweightedWhitening
+from kornia_learnnorm.search import SearchedNormalizer
 
-__all__ = ["add_arguments", "evaluate_store", "run"]
+__all__ = ["add_arguments", "beside_closed_forms", "evaluate_store", "evaluation_samples", "run"]
 
 
 def evaluate_store(
     store: CorrespondenceStore, weights: list[str], max_ratio: float | None, max_residual: float = 60.0, seed: int = 0
 ) -> tuple[str, list[list[str]]]:
-    """Evaluate none, Hartley, whitening, reweighted whitening and trained weights on all samples of a seeded shuffle.
+    """Evaluate the closed forms, trained weights and the searched optimum on all samples of a seeded shuffle.
 
     Args:
         store: correspondences of image pairs.
@@ -36,29 +38,50 @@ def evaluate_store(
         ValueError: if no pair fills a sample or no sample passes the filter.
 
     """
-    samples = draw_samples(store, torch.Generator().manual_seed(seed), max_ratio=max_ratio)
-    kept = plain_residual(samples.points1, samples.points2) < max_residual
-    if not bool(kept.any()):
-        raise ValueError(f"none of {len(kept)} samples has an un-normalised residual below {max_residual:g} px")
-    normalizers: dict[str, Normalizer] = {
-        "none": Identity(),
-        "Hartley": Hartley(),
-        "whitening": Whitening(),
-        "reweighted whitening": ReweightedWhitening(),
-        **{f"learned: {name}": LearnedNormalizer.from_pretrained(name) for name in weights},
-    }
-    residuals = evaluate_normalizers(samples.select(kept), store, normalizers)
+    samples, drawn = evaluation_samples(store, max_ratio, max_residual, seed)
+    learned = {f"learned: {name}": LearnedNormalizer.from_pretrained(name) for name in weights}
+    residuals = evaluate_normalizers(samples, store, beside_closed_forms(learned))
     infinite = int(torch.stack([r.own for r in residuals.values()]).isinf().any(0).sum())
     kind = "unfiltered matches" if max_ratio is None else f"matches with ratio below {max_ratio:g}"
-    about = f"{kind}: {int(kept.sum())} of {len(kept)} samples, un-normalised residual below {max_residual:g} px"
+    about = f"{kind}: {len(samples.pair)} of {drawn} samples, un-normalised residual below {max_residual:g} px"
     if infinite:
         about += f"; {infinite} with a point on an epipole, not in the means"
     return about, method_rows(residuals)
 
 
+def evaluation_samples(
+    store: CorrespondenceStore, max_ratio: float | None, max_residual: float, seed: int
+) -> tuple[Samples, int]:
+    """Draw the samples of a seeded shuffle that pass the residual filter, and say how many there were before it.
+
+    Raises:
+        ValueError: if no pair fills a sample or no sample passes the filter.
+
+    """
+    samples = draw_samples(store, torch.Generator().manual_seed(seed), max_ratio=max_ratio)
+    kept = plain_residual(samples.points1, samples.points2) < max_residual
+    if not bool(kept.any()):
+        raise ValueError(f"none of {len(kept)} samples has an un-normalised residual below {max_residual:g} px")
+    return samples.select(kept), len(kept)
+
+
+def beside_closed_forms(learned: Mapping[str, Normalizer]) -> dict[str, Normalizer]:
+    """Put learned normalisers between the closed forms and the searched optimum, their limit."""
+    return {
+        "none": Identity(),
+        "Hartley": Hartley(),
+        "whitening": Whitening(),
+        "reweighted whitening": ReweightedWhitening(),
+        **learned,
+        "searched optimum": SearchedNormalizer(),
+    }
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm evaluate`` to a parser."""
-    parser.add_argument("stores", metavar="STORE", nargs="+", help="stores of correspondences (.h5)")
+    parser.add_argument(
+        "stores", metavar="STORE", nargs="+", help="stores of correspondences (.h5); FILE.h5@3:10 for some pairs"
+    )
     parser.add_argument(
         "--weights",
         metavar="NAME_OR_PATH",

@@ -1,0 +1,161 @@
+r"""Diagnostics of a normalisation: what it does to the design matrix, to the rank-2 projection and to the points."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from torch import Tensor
+
+from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
+from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.solver import Normalizer, design_matrix, null_vector, rank2_projection
+from kornia_learnnorm.transforms import transform_fundamental
+
+__all__ = ["Diagnostics", "condition_number", "diagnose", "normalized_distance", "singularity_ratio"]
+
+
+class Diagnostics(NamedTuple):
+    r"""One number per sample, each with shape :math:`(B,)`.
+
+    Attributes:
+        condition_number: of the design matrix, see :func:`condition_number`.
+        singularity_ratio: of the DLT's matrix before the projection, see :func:`singularity_ratio`.
+        distance1: mean normalised distance from the origin in the first view, see :func:`normalized_distance`.
+        distance2: the same in the second view.
+        rank2_share: share of the mean symmetric epipolar distance that the projection adds,
+            :math:`1 - e_{DLT} / e`. With eight points the DLT leaves nothing and the share is one; it is negative where
+            the projection lowers the distance.
+    """
+
+    condition_number: Tensor
+    singularity_ratio: Tensor
+    distance1: Tensor
+    distance2: Tensor
+    rank2_share: Tensor
+
+
+def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagnostics:
+    r"""Measure what a normaliser does to samples on their way through the eight-point algorithm.
+
+    Args:
+        points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
+        points2: pixels in the second view with shape :math:`(B, N, 2)`.
+        normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views.
+
+    Returns:
+        the diagnostics, float64 where the device has it.
+
+    Raises:
+        TypeError: if the points are not floating-point tensors of one dtype.
+        ShapeError: if a shape is wrong.
+        ValueError: if there are fewer than eight correspondences or a value is not finite.
+
+    Reference:
+        Fan et al., sections 3 and 4, and their figures of normalised distances, condition numbers and :math:`\rho`.
+
+    Example:
+        >>> from kornia_learnnorm import Hartley
+        >>> _ = torch.manual_seed(0)
+        >>> diagnose(torch.rand(2, 8, 2), torch.rand(2, 8, 2), Hartley()).distance1
+        tensor([1.4142, 1.4142], dtype=torch.float64)
+
+    """
+    check_correspondences(points1, points2, None)
+    dtype = solve_dtype(points1.device)
+    points1, points2 = points1.to(dtype), points2.to(dtype)
+    T1, T2 = (T.to(dtype) for T in normalizer(points1, points2, None))
+    x1, x2 = convert_points_to_homogeneous(points1) @ T1.mT, convert_points_to_homogeneous(points2) @ T2.mT
+    A = design_matrix(x1, x2)
+    F_hat = torch.unflatten(null_vector(A), -1, (3, 3))
+    before = _distance(points1, points2, transform_fundamental(F_hat, T1, T2))
+    after = _distance(points1, points2, transform_fundamental(rank2_projection(F_hat), T1, T2))
+    return Diagnostics(
+        condition_number(A),
+        singularity_ratio(F_hat),
+        normalized_distance(points1, T1),
+        normalized_distance(points2, T2),
+        1 - before / after,
+    )
+
+
+def condition_number(A: Tensor) -> Tensor:
+    r"""Return :math:`\kappa(A) = \sqrt{d_1 / d_8}` with the descending eigenvalues :math:`d_i` of :math:`A^\top A`.
+
+    The ninth is left out: it is zero, or the residual (Fan et al., section 3).
+
+    Args:
+        A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
+
+    Returns:
+        condition numbers with shape :math:`(*)`, at least 1; infinite for a matrix of lower rank.
+
+    Raises:
+        ShapeError: if the shape is wrong.
+        ValueError: if there are fewer than eight rows.
+
+    Example:
+        >>> condition_number(torch.eye(9)[:8])
+        tensor(1.)
+
+    """
+    KORNIA_CHECK_SHAPE(A, ["*", "N", "9"])
+    if A.shape[-2] < 8:
+        raise ValueError(f"a design matrix has at least eight rows, got shape {[*A.shape]}")
+    s: Tensor = torch.linalg.svdvals(A)
+    return s[..., 0] / s[..., 7]
+
+
+def singularity_ratio(F_mat: Tensor) -> Tensor:
+    r"""Return :math:`\rho = r_2 / r_3`, the two smaller singular values of matrices before the rank-2 projection.
+
+    The larger, the less the projection takes away (Fan et al., section 4).
+
+    Args:
+        F_mat: matrices with shape :math:`(*, 3, 3)`.
+
+    Returns:
+        ratios with shape :math:`(*)`, at least 1; infinite for a singular matrix.
+
+    Raises:
+        ShapeError: if the shape is wrong.
+
+    Example:
+        >>> singularity_ratio(torch.diag(torch.tensor([5.0, 2.0, 0.5])))
+        tensor(4.)
+
+    """
+    KORNIA_CHECK_SHAPE(F_mat, ["*", "3", "3"])
+    s: Tensor = torch.linalg.svdvals(F_mat)
+    return s[..., 1] / s[..., 2]
+
+
+def normalized_distance(points: Tensor, T: Tensor) -> Tensor:
+    r"""Return the mean distance of the normalised points from the origin; Hartley's is always :math:`\sqrt 2`.
+
+    Args:
+        points: pixels with shape :math:`(*, N, 2)`.
+        T: affine transforms with shape :math:`(*, 3, 3)`.
+
+    Returns:
+        mean distances with shape :math:`(*)`, without unit.
+
+    Raises:
+        ShapeError: if a shape is wrong.
+
+    Example:
+        >>> normalized_distance(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.eye(3))
+        tensor(2.5000)
+
+    """
+    KORNIA_CHECK_SHAPE(points, ["*", "N", "2"])
+    KORNIA_CHECK_SHAPE(T, ["*", "3", "3"])
+    x = convert_points_to_homogeneous(points) @ T.mT
+    distances: Tensor = torch.linalg.vector_norm(x[..., :2], dim=-1)
+    return distances.mean(-1)
+
+
+def _distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+    return symmetric_epipolar_distance(points1, points2, F_mat).mean(-1)

@@ -1,0 +1,129 @@
+r"""The network of Fan et al.: each view's transform from that view's points alone."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import batch_norm, layer_norm
+
+__all__ = ["PaperNetwork"]
+
+_EPSILON = 1e-5
+
+
+class PaperNetwork(nn.Module):
+    r"""Predict each view's parameters from its own points, as Fan et al. do (section 4, network architecture).
+
+    A linear layer shared by the points, residual blocks with instance normalisation over the points, the maximum over
+    the points before the first block and after each, a convolution over the stack of these maxima, and two fully
+    connected layers. Both views share all weights. Any number of points goes in, and their order does not matter.
+
+    Where the text leaves a choice: the first layer has no activation; a block is twice a linear layer, instance
+    normalisation and ReLU, plus the skip; no normalisation has parameters of its own; each maximum is normalised over
+    its channels; the convolution is not padded; the last layer starts at zero, so that an untrained network is the
+    base.
+
+    Args:
+        width: channels of a point, 128 in the paper.
+        depth: residual blocks, 12 in the paper.
+        num_parameters: parameters per view; the three of :func:`~kornia_learnnorm.paper_transform` in the paper.
+
+    Raises:
+        ValueError: if the stack of maxima is smaller than the convolution's kernel, 3x3.
+
+    Reference:
+        Fan et al., section 4 and its figure of the network; the points enter in the coordinates of
+        :class:`~kornia_learnnorm.Hartley`.
+
+    Example:
+        >>> network = PaperNetwork()
+        >>> network(torch.rand(2, 8, 2), torch.rand(2, 8, 2))[0]
+        tensor([[0., 0., 0.],
+                [0., 0., 0.]], grad_fn=...)
+
+    """
+
+    def __init__(self, width: int = 128, depth: int = 12, num_parameters: int = 3) -> None:
+        super().__init__()
+        if width < 3 or depth < 2:
+            raise ValueError(f"the 3x3 convolution needs width >= 3 and depth >= 2, got {width} and {depth}")
+        self.width, self.depth, self.num_parameters = width, depth, num_parameters
+        self.stem = nn.Linear(2, width)
+        self.blocks = nn.ModuleList(ResidualBlock(width) for _ in range(depth))
+        self.convolution = nn.Conv2d(1, 8, kernel_size=3, stride=(1, 4))
+        features = 8 * (depth - 1) * ((width - 3) // 4 + 1)
+        last = nn.Linear(256, num_parameters)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.head = nn.Sequential(nn.Linear(features, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), last)
+
+    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the parameters of both views.
+
+        Args:
+            points1: points of the first view in base coordinates with shape :math:`(B, N, 2)`.
+            points2: points of the second view in base coordinates with shape :math:`(B, N, 2)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+
+        Returns:
+            parameters with shape :math:`(B, P)` of view 1 and view 2, in the dtype of the points.
+
+        """
+        dtype = self.stem.weight.dtype
+        points = torch.cat([points1, points2]).to(dtype)
+        doubled = None if weights is None else torch.cat([weights, weights]).to(dtype)
+        maxima = self.global_features(points, doubled)
+        params = self.head(self.convolution(maxima[:, None]).flatten(1)).to(points1.dtype)
+        params1, params2 = params.chunk(2)
+        return params1, params2
+
+    def global_features(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Return the normalised maxima over the points before the first block and after each.
+
+        Args:
+            points: points of one view with shape :math:`(B, N, 2)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+
+        Returns:
+            features with shape :math:`(B, D + 1, C)` for depth :math:`D` and width :math:`C`.
+
+        """
+        w = None if weights is None else weights.T[..., None]
+        # Points come first: statistics over them are then sums of whole rows, which is what a processor likes.
+        h = self.stem(points.transpose(0, 1))
+        maxima = [_maximum(h, w)]
+        for block in self.blocks:
+            h = block(h, w)
+            maxima.append(_maximum(h, w))
+        return layer_norm(torch.stack(maxima, 1), (self.width,), eps=_EPSILON)
+
+
+class ResidualBlock(nn.Module):
+    """Linear layer, instance normalisation over the points and ReLU, twice, plus the skip."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
+
+    def forward(self, h: Tensor, weights: Tensor | None) -> Tensor:
+        """Return the features after the block, ``(N, B, C)``; weights are ``(N, B, 1)``."""
+        z = torch.relu(_instance_norm(self.first(h), weights))
+        return h + torch.relu(_instance_norm(self.second(z), weights))
+
+
+def _instance_norm(h: Tensor, weights: Tensor | None) -> Tensor:
+    """Give each channel of each sample zero mean and unit variance over the points, ``(N, B, C)``."""
+    if weights is None:  # every channel of every sample is a channel of its own, the points are the batch
+        return batch_norm(h.flatten(1), None, None, training=True, eps=_EPSILON).view_as(h)
+    total = weights.sum(0)
+    share = weights / torch.where(total > 0, total, 1.0)
+    centred = h - (share * h).sum(0)
+    return centred * ((share * centred.square()).sum(0) + _EPSILON).rsqrt()
+
+
+def _maximum(h: Tensor, weights: Tensor | None) -> Tensor:
+    """Maximum over the present points, ``(B, C)``; zero where all are absent."""
+    if weights is None:
+        return h.amax(0)
+    absent = weights <= 0
+    return torch.where(absent.all(0), 0.0, torch.where(absent, -torch.inf, h).amax(0))
