@@ -2,15 +2,18 @@
 # make test   set up, run all tests
 # make lint   set up, run the linters and the type checker
 # make docs   set up, build the documentation in docs/_build/html
+# make ablations DATA=<folder>, make table1 DATA=<folder>   train what is not trained yet, print the tables; -j 2 for two at once
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUN := runs/demo
 SHORT := --trainer.max_steps 500 --trainer.default_root_dir $(RUN)
-WEIGHTS := --weights $(RUN)/weights.safetensors crossview crossview-synthetic
+WEIGHTS := --weights $(RUN)/weights.safetensors paper crossview crossview-synthetic
 KITTI = "$(DATA)"/kitti/sequences/06/image_0
 
-.PHONY: demo test lint docs wheel clean
+STORES = "$(DATA)"/correspondences
+
+.PHONY: demo test lint docs wheel clean ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -44,6 +47,38 @@ lint: $(VENV)/.ready
 
 docs: $(VENV)/.ready
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+# A run that was cut goes on from its checkpoint.
+FIT = LEARNNORM_DATA="$(DATA)" $(BIN)/learnnorm fit
+INTO = --trainer.default_root_dir $(@D) $(addprefix --ckpt_path ,$(wildcard $(@D)/checkpoints/last.ckpt))
+ABLATIONS := $(filter-out reduction-log,$(patsubst configs/ablations/%.yaml,%,$(wildcard configs/ablations/*.yaml)))
+ABLATIONS += paper-loss-sampson paper-loss-algebraic paper-reduction-log
+TABLE1 := $(patsubst configs/table1/%.yaml,%,$(wildcard configs/table1/*.yaml))
+ABLATION_RUNS := $(ABLATIONS:%=runs/ablations/%/weights.safetensors)
+TABLE1_RUNS := $(TABLE1:%=runs/table1/%/weights.safetensors)
+.PRECIOUS: $(ABLATION_RUNS) $(TABLE1_RUNS)
+
+ablations: $(VENV)/.ready $(ABLATION_RUNS)
+	$(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
+		--weights $(ABLATION_RUNS) paper crossview
+
+table1: $(VENV)/.ready $(TABLE1_RUNS)
+	$(BIN)/learnnorm synthesize runs/table1 --scenes hand-held --pairs 60
+	$(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5@10:19 \
+		$(STORES)/tum_fr3_office_kitti_size.h5@10:19 runs/table1/synthetic.h5 \
+		--weights paper crossview $(TABLE1_RUNS)
+
+runs/ablations/paper-%/weights.safetensors: | $(VENV)/.ready
+	$(FIT) --config configs/paper-short.yaml --config configs/ablations/$*.yaml $(INTO)
+
+runs/ablations/%/weights.safetensors: | $(VENV)/.ready
+	$(FIT) --config configs/ablations/base.yaml --config configs/ablations/$*.yaml $(INTO)
+
+runs/table1/paper-%/weights.safetensors: | $(VENV)/.ready
+	$(FIT) --config configs/paper-short.yaml --config configs/table1/paper-$*.yaml $(INTO)
+
+runs/table1/crossview-%/weights.safetensors: | $(VENV)/.ready
+	$(FIT) --config configs/crossview.yaml --config configs/table1/crossview-$*.yaml $(INTO)
 
 wheel: $(VENV)/.ready
 	$(BIN)/python -m build --no-isolation --wheel

@@ -113,7 +113,7 @@ class LearnedNormalizer(nn.Module):
         """Load a trained normaliser: one that ships with the package, by name, or a safetensors file.
 
         Args:
-            name: ``"crossview"``, ``"crossview-synthetic"``, or the path of a ``.safetensors`` file.
+            name: ``"crossview"``, ``"crossview-synthetic"``, ``"paper"``, or the path of a ``.safetensors`` file.
 
         Returns:
             the normaliser, in evaluation mode.

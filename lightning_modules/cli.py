@@ -21,6 +21,7 @@ TRAINING = {
 TOOLS = {
     "estimate": ("kornia_learnnorm.evaluation.estimate", "the fundamental matrix of two images"),
     "evaluate": ("kornia_learnnorm.evaluation.evaluate", "better rates and errors on stores of correspondences"),
+    "diagnose": ("kornia_learnnorm.evaluation.diagnose", "condition number, rank-2 error and other diagnostics"),
     "compare": ("kornia_learnnorm.evaluation.compare", "trained weights side by side, with confidence intervals"),
     "synthesize": ("kornia_learnnorm.data.synthesize", "a synthetic store and a rendered image pair"),
 }

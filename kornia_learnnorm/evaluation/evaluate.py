@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--weights",
         metavar="NAME_OR_PATH",
         nargs="+",
-        default=["crossview", "crossview-synthetic"],
+        default=["paper", "crossview", "crossview-synthetic"],
         help="weights to evaluate (default: those that ship: %(default)s)",
     )
     parser.add_argument(
