@@ -68,8 +68,12 @@ table1: $(VENV)/.ready $(TABLE1_RUNS)
 		$(STORES)/tum_fr3_office_kitti_size.h5@10:19 runs/table1/synthetic.h5 \
 		--weights paper crossview $(TABLE1_RUNS)
 
+PAPER_BASE = --config configs/paper-short.yaml --config configs/ablations/paper-base.yaml
+runs/ablations/paper-base/weights.safetensors: | $(VENV)/.ready
+	$(FIT) $(PAPER_BASE) $(INTO)
+
 runs/ablations/paper-%/weights.safetensors: | $(VENV)/.ready
-	$(FIT) --config configs/paper-short.yaml --config configs/ablations/$*.yaml $(INTO)
+	$(FIT) $(PAPER_BASE) --config configs/ablations/$*.yaml $(INTO)
 
 runs/ablations/%/weights.safetensors: | $(VENV)/.ready
 	$(FIT) --config configs/ablations/base.yaml --config configs/ablations/$*.yaml $(INTO)

@@ -13,7 +13,7 @@ from kornia_learnnorm.diagnostics import Diagnostics, diagnose
 from kornia_learnnorm.estimators import EightPoint
 from kornia_learnnorm.learned import LearnedNormalizer
 from kornia_learnnorm.losses import EpipolarLoss
-from kornia_learnnorm.metrics import BetterRate, better_rate
+from kornia_learnnorm.metrics import BetterRate, better_rate, bootstrap_interval
 from kornia_learnnorm.networks import CrossViewNetwork
 from kornia_learnnorm.normalizers import Hartley, Identity, PerView, Whitening
 from kornia_learnnorm.paper_network import PaperNetwork
@@ -41,6 +41,7 @@ __all__ = [
     "Whitening",
     "algebraic_distance",
     "better_rate",
+    "bootstrap_interval",
     "design_matrix",
     "diagnose",
     "find_fundamental",

@@ -95,7 +95,6 @@ def bootstrap_interval(
     counts = torch.bincount(group).double()
     sums = torch.zeros_like(counts).index_add_(0, group, values.double())
     generator = torch.Generator().manual_seed(seed)
-    drawn = torch.randint(len(present), (draws, len(present)), generator=generator)
+    drawn = torch.randint(len(present), (draws, len(present)), generator=generator).to(counts.device)
     means = sums[drawn].sum(1) / counts[drawn].sum(1)
-    low, high = torch.quantile(means, torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)).tolist()
-    return low, high
+    return means.quantile((1 - level) / 2).item(), means.quantile((1 + level) / 2).item()

@@ -71,7 +71,7 @@ class SampleLoader:
         order = torch.arange(number)
         if self.shuffle:
             order = torch.randperm(number, generator=torch.Generator().manual_seed(self.seed + epoch))
-            # The filter keeps a slightly different number each epoch: a shorter one starts over.
+            # The filter keeps slightly different numbers each epoch: a shorter epoch starts over.
             order = order.repeat(1 + self._length * self.batch_size // number)
         for index in range(start, self._length):
             last = index + 1 == self._length

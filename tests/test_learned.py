@@ -312,7 +312,14 @@ class TestFiles:
             metadata = opened.metadata()
         assert json.loads(metadata["architecture"]) == {
             "base": {"name": "Whitening", "floor": 1e-6},
-            "network": {"name": "CrossViewNetwork", "width": 16, "depth": 2, "num_parameters": 5, "bound": 3.0},
+            "network": {
+                "name": "CrossViewNetwork",
+                "width": 16,
+                "depth": 2,
+                "num_parameters": 5,
+                "bound": 3.0,
+                "features": "epipolar",
+            },
             "transform": "spd_transform",
         }
         state = load_file(file)

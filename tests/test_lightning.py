@@ -17,8 +17,19 @@ def make_task(**arguments):
     return NormalizerTask(kln.LearnedNormalizer(network=kln.CrossViewNetwork(width=8, depth=1)), **arguments)
 
 
-def make_data(**arguments):
-    source = SyntheticSamples(number=400, num_heldout=4)
+class Pairs(SyntheticSamples):
+    """Ten image pairs, of pair k the samples of k + 1 scenes, mixed."""
+
+    def __init__(self, **arguments):
+        super().__init__(number=55, num_heldout=4, max_residual=None, **arguments)
+
+    def draw(self, seed):
+        pair = torch.repeat_interleave(torch.arange(10), torch.arange(1, 11))
+        return super().draw(seed)._replace(pair=pair[torch.arange(55) * 8 % 55])
+
+
+def make_data(source=None, **arguments):
+    source = source or SyntheticSamples(number=400, num_heldout=4)
     return CorrespondenceDataModule(source, source, source, batch_size=32, **arguments)
 
 
@@ -44,17 +55,20 @@ def test_training_lowers_the_loss(tmp_path):
     assert task.compute_loss(batch).item() < before - 0.02
 
 
-@pytest.mark.parametrize("interrupted_at", [5, 17])
-def test_resumes_to_the_same_curve(tmp_path, interrupted_at):
+@pytest.mark.parametrize(
+    ("interrupted_at", "source", "arguments"), [(5, None, {}), (17, None, {}), (5, Pairs(), {"batch_pairs": 3})]
+)
+def test_resumes_to_the_same_curve(tmp_path, interrupted_at, source, arguments):
     """An epoch has about nine batches: the run is cut in the middle of the first and of the second."""
     whole = make_task()
-    make_trainer(tmp_path / "whole", max_steps=20, enable_checkpointing=False).fit(whole, make_data())
+    data = make_data(source, **arguments)
+    make_trainer(tmp_path / "whole", max_steps=20, enable_checkpointing=False).fit(whole, data)
     first, second = make_task(), make_task()
     callbacks = [Checkpoints(every_n_train_steps=2), Interrupt(interrupted_at)]
     with pytest.raises(InterruptedError):
-        make_trainer(tmp_path / "cut", callbacks, max_steps=20).fit(first, make_data())
+        make_trainer(tmp_path / "cut", callbacks, max_steps=20).fit(first, make_data(source, **arguments))
     trainer = make_trainer(tmp_path / "cut", [Checkpoints(every_n_train_steps=2)], max_steps=20)
-    trainer.fit(second, make_data(), ckpt_path=tmp_path / "cut/checkpoints/last.ckpt")
+    trainer.fit(second, make_data(source, **arguments), ckpt_path=tmp_path / "cut/checkpoints/last.ckpt")
     for (name, expected), got in zip(whole.state_dict().items(), second.state_dict().values(), strict=True):
         assert torch.equal(got, expected), name
 
@@ -140,8 +154,13 @@ def test_bad_loaders():
     source = SyntheticSamples(number=10, max_residual=None)
     with pytest.raises(ValueError, match="a batch takes 64 samples, the source gives 10"):
         SampleLoader(source, 64, seed=0, shuffle=True)
-    with pytest.raises(ValueError, match="batch_size must be positive"):
-        SampleLoader(source, 0, seed=0, shuffle=True)
+    with pytest.raises(ValueError, match="a batch takes 11 image pairs, the source gives 10"):
+        SampleLoader(source, 11, seed=0, shuffle=True, by_pair=True)
+    with pytest.raises(ValueError, match="a batch takes 16 image pairs, the source gives 10"):
+        CorrespondenceDataModule(train=Pairs(), batch_pairs=16).train_dataloader()
+    for by_pair in (False, True):
+        with pytest.raises(ValueError, match="a batch must hold at least one sample or image pair, got 0"):
+            SampleLoader(source, 0, seed=0, shuffle=True, by_pair=by_pair)
     with pytest.raises(ValueError, match=r"data\.train is not set"):
         CorrespondenceDataModule().train_dataloader()
     assert CorrespondenceDataModule().val_dataloader() == []
@@ -153,3 +172,72 @@ def test_validation_shares_no_sample_with_training():
     (validated,) = (batch.points1 for batch in data.val_dataloader())
     (trained,) = (batch.points1 for batch in data.train_dataloader())
     assert not (validated[:, None] == trained[None]).flatten(2).all(-1).any()
+
+
+def same(batches, expected):
+    return all(torch.equal(a, b) for pair in zip(batches, expected, strict=True) for a, b in zip(*pair, strict=True))
+
+
+@pytest.mark.parametrize("batch_pairs", [1, 3, 4, 10])
+def test_batches_of_whole_pairs(batch_pairs):
+    source = Pairs()
+    loader = SampleLoader(source, batch_pairs, seed=5, shuffle=True, by_pair=True)
+    assert len(loader) == 10 // batch_pairs
+    orders = []
+    for epoch in range(3):
+        batches = list(loader)
+        assert len(batches) == len(loader)
+        drawn, order = source.draw(5 + epoch), []
+        for batch in batches:
+            pairs = batch.pair.unique()
+            assert len(pairs) == batch_pairs
+            rows = torch.isin(drawn.pair, pairs)
+            for got, expected in zip(batch, drawn.select(rows), strict=True):  # all samples of these pairs, once
+                assert sorted(got.tolist()) == sorted(expected.tolist())
+            order += batch.pair.unique_consecutive().tolist()
+        assert len(order) == len(set(order)) == len(loader) * batch_pairs
+        orders.append(order)
+    assert orders[0] != orders[1] != orders[2] != orders[0]
+
+
+def test_batches_of_pairs_resume():
+    straight = SampleLoader(Pairs(), 3, seed=2, shuffle=True, by_pair=True)
+    whole = [[*straight], [*straight], [*straight]]
+    cut = SampleLoader(Pairs(), 3, seed=2, shuffle=True, by_pair=True)
+    list(cut)
+    batches = iter(cut)
+    assert same([next(batches), next(batches)], whole[1][:2])
+    again = SampleLoader(Pairs(), 3, seed=2, shuffle=True, by_pair=True)
+    again.load_state_dict(cut.state_dict())
+    assert same(list(again), whole[1][2:])
+    assert same(list(again), whole[2])
+
+
+def test_one_sample_a_pair_is_counting_samples():
+    source = SyntheticSamples(number=100)
+    by_sample, by_pair = (SampleLoader(source, 16, 0, shuffle=True, by_pair=flag) for flag in (False, True))
+    for _ in range(3):  # the filter leaves another number each epoch
+        assert same(list(by_pair), list(by_sample))
+
+
+def test_batch_pairs_are_for_training_alone():
+    plain, paired = make_data(Pairs()), make_data(Pairs(), batch_pairs=3)
+    for stage in ("val", "test", "predict"):
+        batches, expected = (list(getattr(data, f"{stage}_dataloader")()) for data in (paired, plain))
+        assert [len(batch.pair) for batch in batches] == [32, 23]
+        assert same(batches, expected)
+    assert [len(batch.pair.unique()) for batch in paired.train_dataloader()] == [3, 3, 3]
+    assert [len(batch.pair) for batch in plain.train_dataloader()] == [32]
+
+
+def test_training_by_pairs(tmp_path):
+    seen = []
+    watch = pl.callbacks.LambdaCallback(on_train_batch_start=lambda *args: seen.append(len(args[2].pair.unique())))
+    task = make_task()
+    before = [p.clone() for p in task.parameters()]
+    trainer = make_trainer(tmp_path, [watch], max_steps=7, enable_checkpointing=False)
+    trainer.fit(task, make_data(Pairs(), batch_pairs=3))
+    assert seen == [3] * 7
+    assert trainer.num_training_batches == 3
+    assert all(torch.isfinite(p).all() for p in task.parameters())
+    assert not all(torch.equal(p, old) for p, old in zip(task.parameters(), before, strict=True))

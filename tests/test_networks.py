@@ -10,11 +10,15 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from torch.autograd import gradcheck
 from two_view import correspondences, numpy_whitening, shaken, uniform
 
-from kornia_learnnorm import CrossViewNetwork
+from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer, networks
 from kornia_learnnorm.networks import SetNetwork
+
+FEATURES = ["epipolar", "both", "own"]
 
 
 def whitened(name="handheld", batch_size=6, num_points=12, seed=0):
@@ -26,7 +30,7 @@ def whitened(name="handheld", batch_size=6, num_points=12, seed=0):
 
 def network(**options) -> CrossViewNetwork:
     """A small network in float64 whose answers are not zero."""
-    return shaken().network.double() if not options else CrossViewNetwork(**options)
+    return shaken(LearnedNormalizer(network=CrossViewNetwork(width=16, depth=2, **options))).network.double()
 
 
 def set_network(outputs: int = 3) -> SetNetwork:
@@ -95,9 +99,11 @@ class TestCrossViewNetwork:
     @pytest.mark.parametrize("batch_size", [0, 1, 3])
     @pytest.mark.parametrize("num_points", [8, 9, 30])
     @pytest.mark.parametrize("weighted", [False, True])
-    @pytest.mark.parametrize("num_parameters", [3, 5])
-    def test_untrained_answers_zero(self, batch_size, num_points, weighted, num_parameters, device, dtype):
-        net = CrossViewNetwork(width=8, depth=1, num_parameters=num_parameters).to(device)
+    @pytest.mark.parametrize(
+        ("num_parameters", "features"), [(3, "epipolar"), (5, "epipolar"), (5, "both"), (5, "own")]
+    )
+    def test_untrained_answers_zero(self, batch_size, num_points, weighted, num_parameters, features, device, dtype):
+        net = CrossViewNetwork(width=8, depth=1, num_parameters=num_parameters, features=features).to(device)
         points = [uniform(batch_size, num_points, 2, low=-1, seed=k).to(device, dtype) for k in (0, 1)]
         weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
         for params in net(*points, weights):
@@ -107,8 +113,9 @@ class TestCrossViewNetwork:
 
     @pytest.mark.parametrize("num_points", [8, 20])
     @pytest.mark.parametrize("weighted", [False, True])
-    def test_swapped_views_swap_the_answers(self, num_points, weighted):
-        net, (points1, points2) = network(), whitened("driving", 10, num_points)
+    @pytest.mark.parametrize("features", FEATURES)
+    def test_swapped_views_swap_the_answers(self, num_points, weighted, features):
+        net, (points1, points2) = network(features=features), whitened("driving", 10, num_points)
         weights = uniform(10, num_points, low=0.1) if weighted else None
         params1, params2 = net(points1, points2, weights)
         swapped2, swapped1 = net(points2, points1, weights)
@@ -116,24 +123,26 @@ class TestCrossViewNetwork:
         assert torch.allclose(swapped1, params1, atol=1e-8)
         assert torch.allclose(swapped2, params2, atol=1e-8)
 
-    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.randoms())
-    def test_order_does_not_matter(self, seed, num_points, random):
-        net, (points1, points2) = network(), whitened("handheld", 3, num_points, seed)
+    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.randoms(), st.sampled_from(FEATURES))
+    def test_order_does_not_matter(self, seed, num_points, random, features):
+        net, (points1, points2) = network(features=features), whitened("handheld", 3, num_points, seed)
         order = random.sample(range(num_points), num_points)
         for found, expected in zip(net(points1[:, order], points2[:, order]), net(points1, points2), strict=True):
             assert torch.allclose(found, expected, atol=1e-5)
 
     @pytest.mark.parametrize("num_points", [8, 9, 20])
-    def test_zero_weight_is_absence(self, num_points):
-        net, (points1, points2) = network(), whitened("handheld", 10, num_points)
+    @pytest.mark.parametrize("features", FEATURES)
+    def test_zero_weight_is_absence(self, num_points, features):
+        net, (points1, points2) = network(features=features), whitened("handheld", 10, num_points)
         weights = uniform(10, num_points, low=0.5) if num_points > 8 else torch.ones(10, 8).double()
         junk1, junk2 = (uniform(10, 5, 2, low=-20, high=20, seed=seed) for seed in (1, 2))
         extended = [torch.cat(p, 1) for p in [(junk1, points1), (junk2, points2), (weights[:, :5] * 0, weights)]]
         for found, expected in zip(net(*extended), net(points1, points2, weights), strict=True):
             assert torch.allclose(found, expected, atol=1e-8)
 
-    def test_whole_weights_are_repetitions(self):
-        net, (points1, points2) = network(), whitened("handheld", 10, 9)
+    @pytest.mark.parametrize("features", FEATURES)
+    def test_whole_weights_are_repetitions(self, features):
+        net, (points1, points2) = network(features=features), whitened("handheld", 10, 9)
         counts = torch.tensor([1, 2, 3, 1, 2, 1, 1, 4, 1])
         repeated = [p.repeat_interleave(counts, 1) for p in (points1, points2)]
         weighted = net(points1, points2, counts.double().expand(10, -1))
@@ -160,9 +169,10 @@ class TestCrossViewNetwork:
 
     def test_size(self):
         net = CrossViewNetwork(width=24, depth=3, num_parameters=3)
-        assert (net.width, net.depth, net.num_parameters, net.bound) == (24, 3, 3, 3.0)
+        arguments = ["width", "depth", "num_parameters", "bound", "features"]
+        assert [getattr(net, name) for name in arguments] == [24, 3, 3, 3.0, "epipolar"]
         assert len(net.set_network.layers) == 3
-        assert list(inspect.signature(CrossViewNetwork).parameters) == ["width", "depth", "num_parameters", "bound"]
+        assert list(inspect.signature(CrossViewNetwork).parameters) == arguments
 
     def test_computes_in_its_own_dtype(self):
         points = whitened()
@@ -175,12 +185,14 @@ class TestCrossViewNetwork:
             assert not torch.equal(rounded, exact)
 
     @pytest.mark.parametrize("num_points", [8, 11])
-    def test_gradcheck(self, num_points):
-        net, points = network(), [p.requires_grad_() for p in whitened("orbit", 1, num_points)]
+    @pytest.mark.parametrize("features", FEATURES)
+    def test_gradcheck(self, num_points, features):
+        net, points = network(features=features), [p.requires_grad_() for p in whitened("orbit", 1, num_points)]
         assert gradcheck(net, points, eps=1e-7, atol=1e-4, rtol=1e-3)
 
-    def test_every_parameter_learns(self):
-        net, (points1, points2) = network(), whitened()
+    @pytest.mark.parametrize("features", FEATURES)
+    def test_every_parameter_learns(self, features):
+        net, (points1, points2) = network(features=features), whitened()
         torch.cat(net(points1, points2)).square().sum().backward()
         for name, parameter in net.named_parameters():
             assert parameter.grad.count_nonzero() > 0, name
@@ -190,3 +202,78 @@ class TestCrossViewNetwork:
         torch.cat(net(points1, points2)).sum().backward()
         assert net.set_network.head[-1].weight.grad.abs().sum() > 0
         assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters())
+
+
+class TestFeatures:
+    """What a view's answer depends on."""
+
+    @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_the_other_view(self, features, sees, num_points):
+        net, (points1, points2) = network(features=features), whitened("handheld", 6, num_points)
+        params1, params2 = net(points1, points2)
+        other = whitened("driving", 6, num_points, seed=1)[1]
+        (found1, moved2), (moved1, found2) = net(points1, other), net(other, points2)
+        for found, expected in [(found1, params1), (found2, params2)]:
+            assert torch.allclose(found, expected, rtol=1e-12) is not sees
+        for moved, before in [(moved1, params1), (moved2, params2)]:
+            assert not torch.isclose(moved, before, atol=1e-4).all(-1).any()
+
+    @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
+    def test_gradient_of_the_other_view(self, features, sees):
+        net, points = network(features=features), [p.requires_grad_() for p in whitened()]
+        for params, others in zip(net(*points), points[::-1], strict=True):
+            (gradient,) = torch.autograd.grad(params.sum(), others, retain_graph=True)
+            assert (gradient.flatten(1).any(1) == sees).all()
+
+    @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
+    def test_who_corresponds_to_whom(self, features, sees):
+        net, (points1, points2) = network(features=features), whitened()
+        for found, expected in zip(net(points1, points2.roll(1, 1)), net(points1, points2), strict=True):
+            assert torch.allclose(found, expected, rtol=1e-10) is not sees
+
+    @pytest.mark.parametrize(("features", "solves"), [("own", False), ("both", False), ("epipolar", True)])
+    def test_only_epipolar_features_need_the_null_vector(self, features, solves, monkeypatch):
+        class Solved(Exception):  # noqa: N818
+            pass
+
+        def solve(*_):
+            raise Solved
+
+        net, points = network(features=features), whitened()
+        monkeypatch.setattr(networks, "null_vector", solve)
+        if solves:
+            with pytest.raises(Solved):
+                net(*points)
+        else:
+            net(*points)
+
+    @pytest.mark.parametrize(("features", "numbers"), [("own", (2, 1)), ("both", (4, 1)), ("epipolar", (13, 10))])
+    def test_numbers_that_enter(self, features, numbers):
+        net = CrossViewNetwork(width=8, depth=1, features=features)
+        assert (net.set_network.point_stem.in_features, net.set_network.set_stem.in_features) == numbers
+
+    @pytest.mark.parametrize("name", ["Own", "", "F", None])
+    def test_unknown(self, name):
+        with pytest.raises(ValueError, match=f"features must be one of own, both, epipolar, got {name!r}"):
+            CrossViewNetwork(features=name)
+
+    @pytest.mark.parametrize("features", FEATURES)
+    def test_files_keep_them(self, features, tmp_path):
+        saved = shaken(LearnedNormalizer(network=CrossViewNetwork(width=8, depth=1, features=features)))
+        saved.save_pretrained(tmp_path / "weights.safetensors")
+        loaded = LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
+        assert loaded.network.features == features
+        points = correspondences("driving", 5, 9)
+        for T, expected in zip(loaded(*points), saved(*points), strict=True):
+            assert torch.equal(T, expected)
+
+    def test_files_from_before_them_have_epipolar_ones(self, tmp_path):
+        saved, file = LearnedNormalizer(network=CrossViewNetwork(width=8, depth=1)), tmp_path / "weights.safetensors"
+        saved.save_pretrained(file)
+        with safe_open(file, "pt") as opened:
+            metadata = opened.metadata()
+        metadata["architecture"] = metadata["architecture"].replace(', "features": "epipolar"', "")
+        assert "features" not in metadata["architecture"]
+        save_file(load_file(file), file, metadata=metadata)
+        assert LearnedNormalizer.from_pretrained(file).network.features == "epipolar"

@@ -1,3 +1,7 @@
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
@@ -119,3 +123,67 @@ def test_ground_truth_of_the_synthetic_store(store):
     line = x1 @ store.F[0].T
     distance = np.abs((x2 * line).sum(1)) / np.hypot(line[:, 0], line[:, 1])
     assert np.sort(distance)[:24].max() < 4
+
+
+ARRAYS = ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t")
+
+
+@pytest.fixture
+def ragged(store):
+    """The same rows, given to the six pairs unevenly; one pair has none."""
+    return replace(store, offsets=np.array([0, 10, 10, 50, 90, 150, 180]))
+
+
+def same(got, expected):
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
+    for name in ("names", "dataset", "pairs", "detector"):
+        assert getattr(got, name) == getattr(expected, name)
+
+
+@pytest.mark.parametrize(("first", "stop"), [(0, 1), (0, 3), (1, 2), (2, 5), (5, 6)])
+def test_select(ragged, first, stop):
+    part = ragged.select(first, stop)
+    assert len(part) == stop - first
+    assert part.offsets[0] == 0
+    assert part.names == ragged.names[first:stop]
+    assert (part.dataset, part.pairs, part.detector) == (ragged.dataset, ragged.pairs, ragged.detector)
+    for new, old in enumerate(range(first, stop)):
+        for name in ("points1", "points2", "ratio"):
+            rows = getattr(part, name)[part.offsets[new] : part.offsets[new + 1]]
+            np.testing.assert_array_equal(rows, getattr(ragged, name)[ragged.offsets[old] : ragged.offsets[old + 1]])
+        for name in ("image_size", "F", "K", "R", "t"):
+            np.testing.assert_array_equal(getattr(part, name)[new], getattr(ragged, name)[old])
+    assert len(part.points1) == len(part.points2) == len(part.ratio) == part.offsets[-1]
+    same(part.select(0, len(part)), part)
+
+
+def test_select_everything(ragged):
+    same(ragged.select(0, 6), ragged)
+
+
+def test_read_some_pairs(ragged, tmp_path):
+    path = tmp_path / "store.h5"
+    write_store(path, ragged)
+    for part in (read_store(f"{path}@2:5"), read_store(Path(f"{path}@2:5"))):
+        same(part, ragged.select(2, 5))
+    same(read_store(f"{path}@0:6"), ragged)
+    same(read_store(f"{path}@03:04"), ragged.select(3, 4))
+    write_store(tmp_path / "part.h5", part)
+    same(read_store(tmp_path / "part.h5"), part)
+
+
+@pytest.mark.parametrize(("first", "stop"), [(0, 0), (6, 6), (4, 2), (0, 7), (6, 9), (-1, 2), (-2, -1)])
+def test_pairs_that_are_not_there(store, tmp_path, first, stop):
+    message = f"pairs {first}:{stop} were asked for, the store has 0:6"
+    with pytest.raises(ValueError, match=message):
+        store.select(first, stop)
+    if first >= 0:
+        write_store(tmp_path / "store.h5", store)
+        with pytest.raises(ValueError, match=message):
+            read_store(f"{tmp_path / 'store.h5'}@{first}:{stop}")
+
+
+def test_missing_file_with_pairs(tmp_path):
+    with pytest.raises(FileNotFoundError, match=f"no store at {re.escape(str(tmp_path / 'none.h5'))}"):
+        read_store(f"{tmp_path / 'none.h5'}@0:2")

@@ -121,14 +121,20 @@ def read_store(path: str | Path) -> CorrespondenceStore:
     part = re.fullmatch(r"(.+)@(\d+):(\d+)", str(path))
     path = Path(part[1] if part else path)
     if not path.is_file():
-        raise FileNotFoundError(f"no store at {path}")
+        hint = "" if part or "@" not in path.name else "; some pairs of a store are FILE.h5@FIRST:STOP, as in s.h5@3:10"
+        raise FileNotFoundError(f"no store at {path}{hint}")
     h5py = _h5py()
     try:
         with h5py.File(path, "r") as file:
             store = _read(path, file)
     except (OSError, RuntimeError) as error:
         raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
-    return store.select(int(part[2]), int(part[3])) if part else store
+    if part is None:
+        return store
+    try:
+        return store.select(int(part[2]), int(part[3]))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _read(path: Path, file: h5py.File) -> CorrespondenceStore:

@@ -45,7 +45,8 @@ def compare(
         and its 95 % bootstrap interval over image pairs.
 
     Raises:
-        ValueError: if no pair of a store fills a sample or no sample passes the filter.
+        ValueError: if no pair of a store fills a sample, no sample passes the filter, or a normaliser has the name of a
+            closed form.
 
     """
     normalizers = beside_closed_forms(learned)
@@ -53,7 +54,7 @@ def compare(
     for name, store in stores.items():
         samples, drawn = evaluation_samples(store, RATIO, max_residual, seed)
         pairs = len(torch.unique(samples.pair))
-        header.append(f"{name}: {len(samples.pair)} of {drawn} samples, {pairs} pairs")
+        header.append(f"{name}: {len(samples.pair)} of {drawn} samples, {pairs} pair{'s' * (pairs > 1)}")
         columns.append((samples.pair, evaluate_normalizers(samples, store, normalizers)))
     return {
         title: (header, [[method, *_cells(method, columns, field, baseline)] for method in normalizers])
@@ -104,18 +105,18 @@ def run(args: argparse.Namespace) -> int:
         ValueError: if a store or weights cannot be read, or two have the same name.
 
     """
-    stores = {_unique(path, args.stores): read_store(path) for path in args.stores}
-    learned = {_unique(path, args.weights): LearnedNormalizer.from_pretrained(path) for path in args.weights}
+    stores = dict(zip(_names(args.stores), map(read_store, args.stores), strict=True))
+    learned = dict(zip(_names(args.weights), map(LearnedNormalizer.from_pretrained, args.weights), strict=True))
     for title, (header, rows) in compare(stores, learned).items():
         print(f"\n{title}\n\n{format_table(header, rows)}", flush=True)
     return 0
 
 
-def _unique(path: str, paths: Sequence[str]) -> str:
-    """Short name of a file, or of the run that left it."""
-    names = [Path(p).parent.name if Path(p).name == "weights.safetensors" else Path(p).name for p in paths]
+def _names(paths: Sequence[str]) -> list[str]:
+    """Short names of files, or of the runs that left them."""
+    files = [Path(path) for path in paths]
+    names = [f.resolve().parent.name if f.name == "weights.safetensors" else f.name for f in files]
     names = [name.removesuffix(".safetensors").replace(".h5", "") for name in names]
-    name = names[paths.index(path)]
-    if names.count(name) > 1:
-        raise ValueError(f"two files have the same name, {name}: {', '.join(paths)}")
-    return name
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: {', '.join(paths)}")
+    return names

@@ -66,15 +66,22 @@ def evaluation_samples(
 
 
 def beside_closed_forms(learned: Mapping[str, Normalizer]) -> dict[str, Normalizer]:
-    """Put learned normalisers between the closed forms and the searched optimum, their limit."""
-    return {
+    """Put learned normalisers between the closed forms and the searched optimum, their limit.
+
+    Raises:
+        ValueError: if one has the name of a closed form.
+
+    """
+    closed_forms: dict[str, Normalizer] = {
         "none": Identity(),
         "Hartley": Hartley(),
         "whitening": Whitening(),
         "reweighted whitening": ReweightedWhitening(),
-        **learned,
-        "searched optimum": SearchedNormalizer(),
     }
+    limit: dict[str, Normalizer] = {"searched optimum": SearchedNormalizer()}
+    if taken := learned.keys() & {*closed_forms, *limit}:
+        raise ValueError(f"a row of every table is called {', '.join(sorted(taken))} already: rename the weights")
+    return {**closed_forms, **learned, **limit}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
