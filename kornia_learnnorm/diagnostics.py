@@ -11,7 +11,13 @@ from torch import Tensor
 
 from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
-from kornia_learnnorm.solver import Normalizer, design_matrix, null_vector, rank2_projection
+from kornia_learnnorm.solver import (
+    Normalizer,
+    design_matrix,
+    normalizing_transforms,
+    null_vector,
+    rank2_projection,
+)
 from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["Diagnostics", "condition_number", "diagnose", "normalized_distance", "singularity_ratio"]
@@ -27,7 +33,7 @@ class Diagnostics(NamedTuple):
         distance2: the same in the second view.
         rank2_share: share of the mean symmetric epipolar distance that the projection adds,
             :math:`1 - e_{DLT} / e`. With eight points the DLT leaves nothing and the share is one; it is negative where
-            the projection lowers the distance.
+            the projection lowers the distance, and means nothing where both distances are rounding errors.
     """
 
     condition_number: Tensor
@@ -51,7 +57,8 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
     Raises:
         TypeError: if the points are not floating-point tensors of one dtype.
         ShapeError: if a shape is wrong.
-        ValueError: if there are fewer than eight correspondences or a value is not finite.
+        ValueError: if there are fewer than eight correspondences, a value is not finite, or the normaliser does not
+            return two finite transforms :math:`(B, 3, 3)`.
 
     Reference:
         Fan et al., sections 3 and 4, and their figures of normalised distances, condition numbers and :math:`\rho`.
@@ -66,7 +73,7 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
     check_correspondences(points1, points2, None)
     dtype = solve_dtype(points1.device)
     points1, points2 = points1.to(dtype), points2.to(dtype)
-    T1, T2 = (T.to(dtype) for T in normalizer(points1, points2, None))
+    T1, T2 = (T.to(dtype) for T in normalizing_transforms(normalizer, points1, points2, None))
     x1, x2 = convert_points_to_homogeneous(points1) @ T1.mT, convert_points_to_homogeneous(points2) @ T2.mT
     A = design_matrix(x1, x2)
     F_hat = torch.unflatten(null_vector(A), -1, (3, 3))
@@ -90,7 +97,8 @@ def condition_number(A: Tensor) -> Tensor:
         A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
 
     Returns:
-        condition numbers with shape :math:`(*)`, at least 1; infinite for a matrix of lower rank.
+        condition numbers with shape :math:`(*)`, at least 1. Up to rounding, that of a matrix of lower rank is
+        infinite and that of zero NaN.
 
     Raises:
         ShapeError: if the shape is wrong.
@@ -117,7 +125,8 @@ def singularity_ratio(F_mat: Tensor) -> Tensor:
         F_mat: matrices with shape :math:`(*, 3, 3)`.
 
     Returns:
-        ratios with shape :math:`(*)`, at least 1; infinite for a singular matrix.
+        ratios with shape :math:`(*)`, at least 1. Up to rounding, that of a matrix of rank 2 is infinite and of
+        lower rank NaN.
 
     Raises:
         ShapeError: if the shape is wrong.

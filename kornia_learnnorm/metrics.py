@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["BetterRate", "better_rate", "bootstrap_interval"]
+__all__ = ["BetterRate", "better_rate", "bootstrap_interval", "comparable"]
 
 
 class BetterRate(NamedTuple):
@@ -47,13 +47,18 @@ def better_rate(residual: Tensor, baseline: Tensor) -> BetterRate:
     """
     if residual.shape != baseline.shape or residual.ndim != 1:
         raise ValueError(f"residuals must be two (S,) tensors, got {[*residual.shape]} and {[*baseline.shape]}")
-    valid = ~(residual.isnan() | baseline.isnan() | (residual.isinf() & baseline.isinf()))
+    valid = comparable(residual, baseline)
     compared = int(valid.sum())
     if compared == 0:
         raise ValueError(f"none of {len(residual)} samples can be compared")
     better = int((residual < baseline)[valid].sum())
     ties = int((residual == baseline)[valid].sum())
     return BetterRate(better / compared, ties, len(residual) - compared, compared)
+
+
+def comparable(residual: Tensor, baseline: Tensor) -> Tensor:
+    """Return where two residuals can be compared: neither is NaN and one at least is finite, boolean."""
+    return ~(residual.isnan() | baseline.isnan() | (residual.isinf() & baseline.isinf()))
 
 
 def bootstrap_interval(

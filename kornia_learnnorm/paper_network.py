@@ -16,7 +16,8 @@ class PaperNetwork(nn.Module):
 
     A linear layer shared by the points, residual blocks with instance normalisation over the points, the maximum over
     the points before the first block and after each, a convolution over the stack of these maxima, and two fully
-    connected layers. Both views share all weights. Any number of points goes in, and their order does not matter.
+    connected layers. Both views share all weights. Any number of points from two on goes in, and their order does not
+    matter.
 
     Where the text leaves a choice: the first layer has no activation; a block is twice a linear layer, instance
     normalisation and ReLU, plus the skip; no normalisation has parameters of its own; each maximum is normalised over

@@ -15,15 +15,18 @@ from kornia_learnnorm.transforms import spd_transform
 
 __all__ = ["SearchedNormalizer"]
 
+_BOUND = 3.0
+
 
 class SearchedNormalizer(nn.Module):
     r"""Search each sample's transforms by gradient descent on its own symmetric epipolar distance.
 
     :math:`T_i = B(p_i)\, T_i^{base}` with parameters :math:`p_i` of its own for every sample, from zero. Adam lowers
     the logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters met are kept, so that no sample ends
-    above its base. It is a limit to compare with, not a method to use: it fits the sample's own points, noise
-    included, costs hundreds of solutions and its result carries no gradient. It is a local search, so the true optimum
-    may be lower still.
+    above its base. They stay within plus and minus 3: beyond, rounding errors of :math:`F` would pass for gains.
+
+    It is a limit to compare with, not a method to use: it fits the sample's own points, noise included, costs a
+    hundred solutions and its result carries no gradient. It is a local search, so the true optimum may be lower still.
 
     Args:
         base: normaliser to start from; :class:`~kornia_learnnorm.ReweightedWhitening` when not given.
@@ -76,22 +79,24 @@ class SearchedNormalizer(nn.Module):
         """
         check_correspondences(points1, points2, weights)
         dtype = solve_dtype(points1.device)
-        x1, x2 = points1.detach().to(dtype), points2.detach().to(dtype)
-        w = None if weights is None else weights.detach().to(dtype)
-        with torch.no_grad():
-            T1, T2 = self.base(x1, x2, w)
-        with torch.enable_grad():
-            params1, params2 = self._search(x1, x2, w, T1, T2)
+        with torch.inference_mode(False):  # a caller's inference mode has no gradients to offer
+            x1, x2 = points1.detach().to(dtype).clone(), points2.detach().to(dtype).clone()
+            w = None if weights is None else weights.detach().to(dtype).clone()
+            with torch.no_grad():
+                T1, T2 = self.base(x1, x2, w)
+            with torch.enable_grad():
+                params1, params2 = self._search(x1, x2, w, T1, T2)
         T1, T2 = self.transform(params1) @ T1, self.transform(params2) @ T2
         return T1.to(points1.dtype), T2.to(points2.dtype)
 
     def _search(self, x1: Tensor, x2: Tensor, w: Tensor | None, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best parameters met, ``(B, P)`` of each view."""
-        params = x1.new_zeros(2, len(x1), self.num_parameters, requires_grad=True)
-        best, least = torch.zeros_like(params), x1.new_full((len(x1),), torch.inf)
-        optimizer = torch.optim.Adam([params], lr=self.learning_rate)
+        free = x1.new_zeros(2, len(x1), self.num_parameters, requires_grad=True)
+        best, least = torch.zeros_like(free), x1.new_full((len(x1),), torch.inf)
+        optimizer = torch.optim.Adam([free], lr=self.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
         for _ in range(self.steps):
+            params = _BOUND * torch.tanh(free / _BOUND)
             transforms = self.transform(params[0]) @ T1, self.transform(params[1]) @ T2
             F_mat = find_fundamental(x1, x2, w, lambda *_, found=transforms: found)
             distance = weighted_mean(symmetric_epipolar_distance(x1, x2, F_mat)[..., None], w)[:, 0]
@@ -99,8 +104,7 @@ class SearchedNormalizer(nn.Module):
             least = torch.where(better, distance.detach(), least)
             best = torch.where(better[:, None], params.detach(), best)
             # Adam works on every number by itself: the sum keeps the samples apart.
-            (params.grad,) = torch.autograd.grad((distance + torch.finfo(x1.dtype).tiny).log().sum(), params)
-            params.grad = params.grad.nan_to_num(0.0, 0.0, 0.0)
+            (free.grad,) = torch.autograd.grad((distance + torch.finfo(x1.dtype).tiny).log().sum(), free)
             optimizer.step()
             schedule.step()
         return best[0], best[1]

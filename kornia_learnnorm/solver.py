@@ -18,7 +18,14 @@ from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
 from kornia_learnnorm.normalizers import Hartley
 from kornia_learnnorm.transforms import transform_fundamental
 
-__all__ = ["design_matrix", "find_fundamental", "null_vector", "rank2_projection", "smallest_right_singular_vector"]
+__all__ = [
+    "design_matrix",
+    "find_fundamental",
+    "normalizing_transforms",
+    "null_vector",
+    "rank2_projection",
+    "smallest_right_singular_vector",
+]
 
 Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
@@ -70,7 +77,7 @@ def find_fundamental(
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     w = None if weights is None else weights.to(dtype)
-    T1, T2 = (T.to(dtype) for T in _transforms(normalizer or Hartley(), x1, x2, w))
+    T1, T2 = (T.to(dtype) for T in normalizing_transforms(normalizer or Hartley(), x1, x2, w))
     x1 = convert_points_to_homogeneous(x1) @ T1.mT
     x2 = convert_points_to_homogeneous(x2) @ T2.mT
     f = null_vector(design_matrix(x1, x2), w)
@@ -79,8 +86,14 @@ def find_fundamental(
     return F_mat.to(points1.dtype)
 
 
-def _transforms(normalizer: Normalizer, x1: Tensor, x2: Tensor, w: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Call a normaliser, which may be the user's own, and check what it returns."""
+def normalizing_transforms(normalizer: Normalizer, x1: Tensor, x2: Tensor, w: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Call a normaliser, which may be the user's own, and check what it returns.
+
+    Raises:
+        TypeError: if it cannot be called.
+        ValueError: if it does not return two finite transforms :math:`(B, 3, 3)`.
+
+    """
     if isinstance(normalizer, type) or not callable(normalizer):
         raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
     result = normalizer(x1, x2, w)

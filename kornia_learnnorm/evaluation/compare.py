@@ -15,7 +15,7 @@ from kornia_learnnorm.evaluation.evaluate import beside_closed_forms, evaluation
 from kornia_learnnorm.evaluation.predict import Normalizer, Residuals, evaluate_normalizers
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.learned import LearnedNormalizer
-from kornia_learnnorm.metrics import better_rate, bootstrap_interval
+from kornia_learnnorm.metrics import better_rate, bootstrap_interval, comparable
 
 __all__ = ["add_arguments", "compare", "run"]
 
@@ -73,7 +73,7 @@ def _cells(method: str, columns: Sequence[tuple[Tensor, dict[str, Residuals]]], 
 
 def _cell(residual: Tensor, baseline: Tensor, pair: Tensor) -> str:
     """A better rate and its interval, over the samples that can be compared."""
-    valid = ~(residual.isnan() | baseline.isnan() | (residual.isinf() & baseline.isinf()))
+    valid = comparable(residual, baseline)
     if not bool(valid.any()):
         return "-"
     rate = f"{100 * better_rate(residual, baseline).rate:.1f}"

@@ -1,0 +1,274 @@
+"""Diagnostics of a normalisation against NumPy, and what does not change them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from torch.autograd import gradcheck
+from two_view import SCENES, correspondences, epipolar_distances, homogeneous, shaken, uniform
+
+from kornia_learnnorm import Diagnostics, Hartley, Identity, LearnedNormalizer, ReweightedWhitening, Whitening, diagnose
+from kornia_learnnorm.diagnostics import condition_number, normalized_distance, singularity_ratio
+
+NORMALIZERS = [Identity(), Hartley(), Whitening(), ReweightedWhitening(3)]
+
+
+def numpy_diagnose(points1, points2, T1, T2) -> np.ndarray:
+    """All five numbers, sample by sample: eigenvalues of A^T A, and the eight-point algorithm in two steps."""
+    rows = []
+    for p1, p2, t1, t2 in zip(*(np.asarray(v, dtype=np.float64) for v in (points1, points2, T1, T2)), strict=True):
+        x1, x2 = homogeneous(p1) @ t1.T, homogeneous(p2) @ t2.T
+        A = np.stack([np.kron(b, a) for a, b in zip(x1, x2, strict=True)])
+        d = np.linalg.eigvalsh(A.T @ A)[::-1]
+        U, s, Vh = np.linalg.svd(np.linalg.svd(A, full_matrices=True)[2][-1].reshape(3, 3))
+        before, after = (
+            epipolar_distances(p1[None], p2[None], (t2.T @ U @ np.diag(r) @ Vh @ t1)[None]).mean()
+            for r in (s, [s[0], s[1], 0])
+        )
+        distances = [np.hypot(*x[:, :2].T).mean() for x in (x1, x2)]
+        rows.append([np.sqrt(d[0] / d[7]), s[1] / s[2], *distances, 1 - before / after])
+    return np.array(rows)
+
+
+class TestConditionNumber:
+    @pytest.mark.parametrize("num_rows", [8, 9, 30])
+    def test_agrees_with_numpy(self, num_rows, device, dtype):
+        A = uniform(20, num_rows, 9, low=-1, dtype=dtype)
+        d = np.linalg.eigvalsh((A.mT.double() @ A.double()).numpy())[:, ::-1]
+        found = condition_number(A.to(device)).cpu()
+        assert found.dtype == dtype
+        np.testing.assert_allclose(
+            found.numpy(), np.sqrt(d[:, 0] / d[:, 7]), rtol=1e-4 if found.itemsize == 4 else 1e-8
+        )
+
+    @pytest.mark.parametrize("shape", [(), (0,), (2, 3)])
+    def test_shapes(self, shape):
+        assert condition_number(uniform(*shape, 10, 9)).shape == shape
+
+    def test_of_a_diagonal(self):
+        values = torch.tensor([7.0, 3.0, 3.0, 9.0, 5.0, 5.0, 4.0, 2.0, 8.0])
+        assert condition_number(torch.diag(values)).item() == 3.0  # 9 / 3: the ninth, 2, is left out
+        assert condition_number(torch.diag(values)[:8]).item() == 4.5  # 9 / 2
+
+    def test_the_null_vector_does_not_count(self):
+        """A ninth singular value does not change it, be it zero or nearly the eighth."""
+        Q = torch.linalg.qr(uniform(9, 9, low=-1))[0]
+        for last in (0.0, 0.5, 0.999):
+            s = torch.tensor([4.0, 3, 3, 3, 2, 2, 2, 1, last], dtype=torch.float64)
+            assert condition_number(Q * s @ Q.mT).item() == pytest.approx(4, abs=1e-12)
+
+    def test_lower_rank_is_infinite(self):
+        assert condition_number(torch.zeros(8, 9).index_fill(1, torch.tensor([2]), 1.0)).item() > 1e15
+
+    def test_too_few_rows(self):
+        with pytest.raises(ValueError, match=r"at least eight rows, got shape \[2, 7, 9\]"):
+            condition_number(torch.rand(2, 7, 9))
+
+    def test_wrong_shape(self):
+        with pytest.raises(ShapeError, match="2, 8, 8"):
+            condition_number(torch.rand(2, 8, 8))
+
+    @pytest.mark.parametrize("num_rows", [8, 11])
+    def test_gradcheck(self, num_rows):
+        assert gradcheck(condition_number, [uniform(2, num_rows, 9, low=-1).requires_grad_()])
+
+    @given(st.integers(0, 2**31), st.sampled_from([1e-6, -3.0, 1e6]))
+    def test_scale_and_rotations_do_not_matter(self, seed, factor):
+        A, Q = uniform(10, 9, low=-1, seed=seed), torch.linalg.qr(uniform(9, 9, low=-1, seed=seed + 1))[0]
+        assert condition_number(factor * A @ Q).item() == pytest.approx(condition_number(A).item(), rel=1e-9)
+
+
+class TestSingularityRatio:
+    def test_agrees_with_numpy(self, device, dtype):
+        F_mat = uniform(20, 3, 3, low=-1, dtype=dtype)
+        s = np.linalg.svd(F_mat.double().numpy())[1]
+        found = singularity_ratio(F_mat.to(device)).cpu()
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found.numpy(), s[:, 1] / s[:, 2], rtol=1e-3 if found.itemsize == 4 else 1e-9)
+
+    @pytest.mark.parametrize("shape", [(), (0,), (2, 3)])
+    def test_shapes(self, shape):
+        assert singularity_ratio(uniform(*shape, 3, 3)).shape == shape
+
+    def test_the_largest_does_not_count(self):
+        assert singularity_ratio(torch.diag(torch.tensor([100.0, 6.0, 2.0]))).item() == 3.0
+
+    def test_singular_is_infinite(self):
+        assert singularity_ratio(torch.diag(torch.tensor([5.0, 2.0, 0.0]))).item() == math.inf
+
+    def test_wrong_shape(self):
+        with pytest.raises(ShapeError, match="3, 4"):
+            singularity_ratio(torch.rand(2, 3, 4))
+
+    def test_gradcheck(self):
+        assert gradcheck(singularity_ratio, [uniform(3, 3, 3, low=-1).requires_grad_()])
+
+
+class TestNormalizedDistance:
+    def test_by_hand(self, device, dtype):
+        points = torch.tensor([[[5.0, 3.0], [2.0, 5.0], [2.0, 1.0]]], dtype=dtype, device=device)
+        T = torch.tensor([[[2.0, 0.0, -4.0], [0.0, 4.0, -4.0], [0.0, 0.0, 1.0]]], dtype=dtype, device=device)
+        # The first lands on (6, 8), the second on (0, 16), the third on the origin.
+        assert normalized_distance(points, T).tolist() == pytest.approx([26 / 3])
+        assert normalized_distance(points[0], T[0]).item() == pytest.approx(26 / 3)
+
+    @pytest.mark.parametrize("name", SCENES)
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_of_hartley(self, name, num_points):
+        points = correspondences(name, 20, num_points)
+        for p, T in zip(points, Hartley()(*points), strict=True):
+            np.testing.assert_allclose(normalized_distance(p, T).numpy(), math.sqrt(2), rtol=1e-12)
+
+    def test_of_whitening(self):
+        """The mean square is two, so the mean is less than its root, Hartley's."""
+        points = correspondences("driving", 20, 20)
+        for p, T in zip(points, Whitening()(*points), strict=True):
+            assert (normalized_distance(p, T) < math.sqrt(2)).all()
+
+    def test_wrong_shapes(self):
+        with pytest.raises(ShapeError, match="8, 3"):
+            normalized_distance(torch.rand(2, 8, 3), torch.eye(3).expand(2, 3, 3))
+        with pytest.raises(ShapeError, match="2, 2"):
+            normalized_distance(torch.rand(2, 8, 2), torch.eye(2).expand(2, 2, 2))
+
+    def test_gradcheck(self):
+        T = torch.eye(3).double() + 0.3 * uniform(2, 3, 3, low=-1, seed=1)
+        assert gradcheck(normalized_distance, [uniform(2, 8, 2, low=-1).requires_grad_(), T.requires_grad_()])
+
+
+class TestDiagnose:
+    @pytest.mark.parametrize("batch_size", [0, 1, 3])
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_smoke(self, batch_size, num_points, device, dtype):
+        points = [p.to(device, dtype) for p in correspondences("handheld", 3, num_points)]
+        found = diagnose(*(p[:batch_size] for p in points), Hartley())
+        assert isinstance(found, Diagnostics)
+        for values in found:
+            assert values.shape == (batch_size,)
+            assert values.dtype == torch.float64
+            assert values.device.type == device.type
+            assert torch.isfinite(values).all()
+
+    @pytest.mark.parametrize("name", SCENES)
+    @pytest.mark.parametrize("num_points", [8, 20])
+    @pytest.mark.parametrize("normalizer", NORMALIZERS)
+    def test_agrees_with_numpy(self, name, num_points, normalizer, device):
+        options = {} if name == "random" else {"noise": 0.5}
+        points = correspondences(name, 10, num_points, **options)
+        found = torch.stack(diagnose(*(p.to(device) for p in points), normalizer), 1).cpu().numpy()
+        expected = numpy_diagnose(*points, *normalizer(*points))
+        # In pixels, eigenvalues of A^T A lose twice the digits.
+        loose = isinstance(normalizer, Identity)
+        np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=1e-2 if loose else 1e-5)
+        np.testing.assert_allclose(found[:, 1:], expected[:, 1:], rtol=1e-3 if loose else 1e-6, atol=1e-6)
+
+    @pytest.mark.parametrize("normalizer", NORMALIZERS[1:])
+    def test_eight_points_leave_all_to_the_projection(self, normalizer):
+        points = correspondences("handheld", 50, noise=1.0)
+        np.testing.assert_allclose(diagnose(*points, normalizer).rank2_share.numpy(), 1, atol=1e-6)
+
+    def test_more_points_leave_less_to_the_projection(self):
+        shares = [
+            diagnose(*correspondences("handheld", 200, n, noise=1.0), Hartley()).rank2_share for n in (9, 20, 100)
+        ]
+        means = [share.mean().item() for share in shares]
+        assert 0.9 > means[0] > means[1] > means[2]
+
+    def test_hartley_helps(self):
+        points = correspondences("driving", 50)
+        pixels, hartley = diagnose(*points, Identity()), diagnose(*points, Hartley())
+        assert (hartley.condition_number < 0.1 * pixels.condition_number).all()
+        for distance in (hartley.distance1, hartley.distance2):
+            np.testing.assert_allclose(distance.numpy(), math.sqrt(2), rtol=1e-12)
+
+    def test_any_normalizer_of_the_contract(self):
+        points, seen = correspondences("driving", 5), []
+
+        def doubled(points1, points2, weights):
+            seen.append((points1, points2, weights))
+            T = torch.diag(torch.tensor([2.0, 2.0, 1.0])).expand(5, 3, 3)  # float32
+            return T, T
+
+        found = diagnose(*points, doubled)
+        assert all(torch.equal(s, p) for s, p in zip(seen[0][:2], points, strict=True))
+        assert seen[0][2] is None
+        np.testing.assert_allclose(found.distance1.numpy(), 2 * points[0].norm(dim=-1).mean(1).numpy(), rtol=1e-12)
+
+    def test_float32_points(self):
+        points = [p.float() for p in correspondences("handheld", 5)]
+        doubled = [p.double() for p in points]
+        for single, double in zip(diagnose(*points, Hartley()), diagnose(*doubled, Hartley()), strict=True):
+            assert torch.equal(single, double)
+
+    def test_learned(self):
+        points = correspondences("driving", 5, 20)
+        with torch.no_grad():
+            normalizer = shaken()
+            assert isinstance(normalizer, LearnedNormalizer)
+            found = torch.stack(diagnose(*points, normalizer), 1).numpy()
+            np.testing.assert_allclose(found, numpy_diagnose(*points, *normalizer(*points)), rtol=1e-5)
+
+    @pytest.mark.parametrize("num_points", [8, 12])
+    def test_gradients_reach_the_points(self, num_points):
+        points = [p.requires_grad_() for p in correspondences("handheld", 3, num_points, noise=1.0)]
+        for values in diagnose(*points, Hartley())[:2]:
+            for gradient in torch.autograd.grad(values.log().sum(), points, retain_graph=True):
+                assert torch.isfinite(gradient).all()
+                assert gradient.count_nonzero() > 0
+
+    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.randoms())
+    def test_order_does_not_matter(self, seed, num_points, random):
+        points1, points2 = correspondences("handheld", 3, num_points, seed, noise=1.0)
+        order = random.sample(range(num_points), num_points)
+        shuffled = diagnose(points1[:, order], points2[:, order], Hartley())
+        for found, expected in zip(shuffled, diagnose(points1, points2, Hartley()), strict=True):
+            np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=1e-6, atol=1e-6)
+
+    @given(
+        st.integers(0, 2**31),
+        st.sampled_from([8, 9, 20]),
+        st.floats(-2, 2),
+        st.tuples(*[st.floats(-2e3, 2e3)] * 4),
+    )
+    def test_scale_and_shift_do_not_matter_to_hartley(self, seed, num_points, log_scale, shifts):
+        """One scale for both views, which the sum of their distances asks for; the share has no unit."""
+        points = correspondences("handheld", 3, num_points, seed, noise=1.0)
+        shifts = torch.tensor(shifts).double().view(2, 2)
+        moved = [10**log_scale * (p + o) for p, o in zip(points, shifts, strict=True)]
+        for found, expected in zip(diagnose(*moved, Hartley()), diagnose(*points, Hartley()), strict=True):
+            np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=1e-5, atol=1e-5)
+
+    @given(st.integers(0, 2**31), st.sampled_from([8, 20]))
+    def test_swapped_views_swap_the_distances(self, seed, num_points):
+        points1, points2 = correspondences("handheld", 3, num_points, seed, noise=1.0)
+        found, swapped = (diagnose(*p, Whitening()) for p in ((points1, points2), (points2, points1)))
+        swapped = swapped._replace(distance1=swapped.distance2, distance2=swapped.distance1)
+        for value, expected in zip(swapped, found, strict=True):
+            np.testing.assert_allclose(value.numpy(), expected.numpy(), rtol=1e-6, atol=1e-6)
+        assert not torch.allclose(found.distance1, found.distance2, rtol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("points1", "points2", "error", "message"),
+        [
+            (torch.rand(2, 7, 2), torch.rand(2, 7, 2), ValueError, "at least 8 correspondences are needed, got 7"),
+            (torch.rand(2, 8, 2), torch.rand(2, 9, 2), ValueError, "pair up"),
+            (torch.rand(2, 8, 3), torch.rand(2, 8, 3), ShapeError, "2, 8, 3"),
+            (torch.rand(2, 8, 2), torch.rand(2, 8, 2).double(), TypeError, "one dtype"),
+            (torch.full((2, 8, 2), torch.nan), torch.rand(2, 8, 2), ValueError, "points1 must be finite"),
+        ],
+    )
+    def test_exceptions(self, points1, points2, error, message):
+        with pytest.raises(error, match=message):
+            diagnose(points1, points2, Hartley())
+
+
+def test_wrong_normalizers_are_refused():
+    points = torch.rand(2, 8, 2)
+    with pytest.raises(ValueError, match="two transforms of shape"):
+        diagnose(points, points, lambda *_: (torch.eye(3), torch.eye(3)))

@@ -1,0 +1,343 @@
+"""The paper's network: its size, its answers against NumPy, what it is blind to and what it sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import nn
+from torch.autograd import gradcheck
+from two_view import correspondences, in_hartley, numpy_hartley, uniform, up_to_sign
+
+from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork, find_fundamental, paper_transform
+
+
+def network(width: int = 16, depth: int = 3) -> PaperNetwork:
+    """A small network in float64 whose answers are not zero."""
+    torch.manual_seed(0)
+    net = PaperNetwork(width, depth).double()
+    with torch.no_grad():
+        for value in net.head[-1].parameters():
+            value.normal_(0, 0.3)
+    return net.eval()
+
+
+def composed(net: PaperNetwork | None = None) -> LearnedNormalizer:
+    return LearnedNormalizer(Hartley(), network() if net is None else net, paper_transform)
+
+
+def normalized(name="handheld", batch_size=6, num_points=12, seed=0):
+    """Correspondences in the coordinates that the network gets."""
+    points = correspondences(name, batch_size, num_points, seed)
+    T = [torch.from_numpy(numpy_hartley(p)) for p in points]
+    return tuple(p @ t[:, :2, :2].mT + t[:, None, :2, 2] for p, t in zip(points, T, strict=True))
+
+
+def numpy_features(net, points, weights=None):
+    """The normalised maxima of one view of one sample, from the formulas."""
+    state = {name: value.numpy() for name, value in net.state_dict().items()}
+    weights = np.ones(len(points)) if weights is None else weights
+    points, weights = points[weights > 0], weights[weights > 0]
+    share = weights / weights.sum()
+
+    def linear(name, h):
+        return h @ state[f"{name}.weight"].T + state[f"{name}.bias"]
+
+    def instance_norm(h):
+        centred = h - share @ h
+        return centred / np.sqrt(share @ centred**2 + 1e-5)
+
+    h = linear("stem", points)
+    maxima = [h.max(0)]
+    for k in range(net.depth):
+        z = np.maximum(instance_norm(linear(f"blocks.{k}.first", h)), 0)
+        h = h + np.maximum(instance_norm(linear(f"blocks.{k}.second", z)), 0)
+        maxima.append(h.max(0))
+    M = np.stack(maxima)
+    return (M - M.mean(1, keepdims=True)) / np.sqrt(M.var(1, keepdims=True) + 1e-5)
+
+
+def numpy_params(net, points, weights=None):
+    """The parameters of one view of one sample."""
+    state, M = {name: value.numpy() for name, value in net.state_dict().items()}, numpy_features(net, points, weights)
+    kernel, bias = state["convolution.weight"][:, 0], state["convolution.bias"]
+    rows, columns = range(M.shape[0] - 2), range(0, M.shape[1] - 2, 4)
+    patches = np.array([[M[i : i + 3, j : j + 3] for j in columns] for i in rows])
+    h = (np.einsum("kab,ijab->kij", kernel, patches) + bias[:, None, None]).ravel()
+    for layer in (0, 2, 4):
+        h = state[f"head.{layer}.weight"] @ h + state[f"head.{layer}.bias"]
+        h = h if layer == 4 else np.maximum(h, 0)
+    return h
+
+
+class TestArchitecture:
+    def test_number_of_parameters(self):
+        block = 2 * (128 * 128 + 128)
+        head = (8 * 11 * 32) * 256 + 256 + 256 * 256 + 256 + 256 * 3 + 3
+        expected = (2 * 128 + 128) + 12 * block + (8 * 9 + 8) + head
+        assert expected == 1_184_467
+        assert sum(parameter.numel() for parameter in PaperNetwork().parameters()) == expected
+
+    def test_shapes_on_the_way(self):
+        """Points first, both views of the batch side by side."""
+        net, shapes = PaperNetwork(), {}
+        for name, module in net.named_modules():
+            module.register_forward_hook(lambda _, args, output, name=name: shapes.update({name: output}))
+        net(*(uniform(4, 9, 2, low=-1, seed=k, dtype=torch.float32) for k in (0, 1)))
+        shapes = {name: tuple(output.shape) for name, output in shapes.items() if name}
+        assert shapes.pop("stem") == (9, 8, 128)
+        for k in range(12):
+            for part in ("", ".first", ".second"):
+                assert shapes.pop(f"blocks.{k}{part}") == (9, 8, 128)
+        assert shapes.pop("convolution") == (8, 8, 11, 32)
+        assert [shapes.pop(f"head.{k}") for k in (0, 2, 4)] == [(8, 256), (8, 256), (8, 3)]
+        assert set(shapes) == {"head", "head.1", "head.3"}  # the rectifiers
+        assert net.global_features(uniform(4, 9, 2, dtype=torch.float32)).shape == (4, 13, 128)
+
+    @pytest.mark.parametrize(("width", "depth", "num_parameters"), [(3, 2, 3), (16, 3, 5), (6, 4, 1), (7, 4, 1)])
+    def test_other_sizes(self, width, depth, num_parameters):
+        net = PaperNetwork(width, depth, num_parameters)
+        assert (net.width, net.depth, net.num_parameters) == (width, depth, num_parameters)
+        assert net(torch.rand(2, 8, 2), torch.rand(2, 8, 2))[0].shape == (2, num_parameters)
+
+    @pytest.mark.parametrize(("width", "depth"), [(2, 12), (128, 1), (0, 0)])
+    def test_exceptions(self, width, depth):
+        with pytest.raises(ValueError, match=f"width >= 3 and depth >= 2, got {width} and {depth}"):
+            PaperNetwork(width, depth)
+
+
+class TestForward:
+    @pytest.mark.parametrize("batch_size", [0, 1, 3])
+    @pytest.mark.parametrize("num_points", [8, 9, 30])
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_untrained_answers_zero(self, batch_size, num_points, weighted, device, dtype):
+        net = PaperNetwork(16, 3).to(device)
+        points = [uniform(batch_size, num_points, 2, low=-1, seed=k).to(device, dtype) for k in (0, 1)]
+        weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
+        for params in net(*points, weights):
+            assert params.shape == (batch_size, 3)
+            assert params.dtype == dtype
+            assert params.device.type == device.type
+            assert params.count_nonzero() == 0
+
+    @pytest.mark.parametrize("name", ["driving", "handheld"])
+    @pytest.mark.parametrize("num_points", [8, 30])
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_agrees_with_numpy(self, name, num_points, weighted, device):
+        net, points = network().to(device), normalized(name, 5, num_points)
+        weights = uniform(5, num_points) * (torch.arange(num_points) % 4 > 0) if weighted else None
+        on_device = [None if v is None else v.to(device) for v in (*points, weights)]
+        features = net.global_features(on_device[0], on_device[2]).detach().cpu()
+        answers = [params.detach().cpu() for params in net(*on_device)]
+        net = net.cpu()
+        for k in range(5):
+            w = None if weights is None else weights[k].numpy()
+            np.testing.assert_allclose(features[k].numpy(), numpy_features(net, points[0][k].numpy(), w), atol=1e-9)
+            for params, p in zip(answers, points, strict=True):
+                expected = numpy_params(net, p[k].numpy(), w)
+                np.testing.assert_allclose(params[k].numpy(), expected, rtol=1e-8, atol=1e-10)
+
+    def test_full_size_agrees_with_numpy(self):
+        net, points = network(128, 12), normalized("driving", 1, 8)
+        for params, p in zip(net(*points), points, strict=True):
+            np.testing.assert_allclose(params[0].detach().numpy(), numpy_params(net, p[0].numpy()), rtol=1e-8)
+
+    def test_maxima_are_normalized_over_the_channels(self):
+        features = network().global_features(normalized()[0])
+        assert torch.allclose(features.mean(-1), torch.zeros(6, 4).double(), atol=1e-12)
+        assert torch.allclose(features.var(-1, correction=0), torch.ones(6, 4).double(), rtol=1e-3)
+
+    def test_instance_norm_is_that_of_torch(self):
+        """The first block, built of the layers of PyTorch, points last."""
+        net, points = network(), normalized()[0]
+        h = net.stem(points)
+        norm = nn.InstanceNorm1d(16)
+        z = norm(net.blocks[0].first(h).mT).relu().mT
+        expected = h + norm(net.blocks[0].second(z).mT).relu().mT
+        found = net.blocks[0](h.transpose(0, 1), None).transpose(0, 1)
+        assert torch.allclose(found, expected, atol=1e-12)
+
+    def test_computes_in_its_own_dtype(self):
+        points, net = normalized(), network()
+        double = net(*points)
+        for single, exact in zip(net.float()(*points), double, strict=True):
+            assert single.dtype == torch.float64  # that of the points
+            assert torch.allclose(single, exact, atol=1e-4)
+            assert not torch.equal(single, exact)
+
+    def test_training_and_evaluation_agree(self):
+        """The statistics are always the sample's own."""
+        net, points = network(), normalized()
+        for first, second in zip(net.train()(*points), net.eval()(*points), strict=True):
+            assert torch.equal(first, second)
+
+    def test_samples_do_not_influence_each_other(self):
+        net, points = network(), normalized()
+        together = net(*points)
+        for k in range(6):
+            for alone, params in zip(net(*(p[k : k + 1] for p in points)), together, strict=True):
+                assert torch.allclose(alone[0], params[k], atol=1e-12)
+
+
+class TestBlindness:
+    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.booleans(), st.randoms())
+    def test_order_does_not_matter(self, seed, num_points, weighted, random):
+        net, (points1, points2) = network(), normalized("handheld", 3, num_points, seed)
+        weights = uniform(3, num_points, low=0.1, seed=seed) if weighted else None
+        order = random.sample(range(num_points), num_points)
+        shuffled = net(points1[:, order], points2[:, order], None if weights is None else weights[:, order])
+        for found, expected in zip(shuffled, net(points1, points2, weights), strict=True):
+            assert (found - expected).abs().max() < 1e-10
+
+    def test_each_view_is_on_its_own(self):
+        net, (points1, points2) = network(), normalized()
+        params1, params2 = net(points1, points2)
+        assert torch.equal(net(points1, points2.flip(0) ** 2)[0], params1)
+        assert torch.equal(net(points1.flip(0) ** 2, points2)[1], params2)
+        assert not torch.allclose(params1, params2, atol=1e-3)
+
+    def test_swapped_views_swap_the_answers(self):
+        net, (points1, points2), weights = network(), normalized(), uniform(6, 12)
+        for w in (None, weights):
+            (params1, params2), (swapped2, swapped1) = net(points1, points2, w), net(points2, points1, w)
+            assert torch.allclose(swapped1, params1, atol=1e-12)
+            assert torch.allclose(swapped2, params2, atol=1e-12)
+
+    @pytest.mark.parametrize("num_points", [8, 20])
+    @pytest.mark.parametrize("size", [1.0, 1e4])
+    def test_zero_weight_is_absence(self, num_points, size):
+        net, points = network(), normalized("handheld", 6, num_points)
+        weights = uniform(6, num_points, low=0.1)
+        junk = [uniform(6, 5, 2, low=-size, high=size, seed=seed) for seed in (1, 2)]
+        extended = [torch.cat(p, 1) for p in zip((*junk, 0 * weights[:, :5]), (*points, weights), strict=True)]
+        for found, expected in zip(net(*extended), net(*points, weights), strict=True):
+            assert torch.allclose(found, expected, atol=1e-10)
+
+    @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_equal_weights_are_none(self, factor, num_points):
+        net, points = network(), normalized("handheld", 6, num_points)
+        weights = torch.full((6, num_points), factor).double()
+        for found, expected in zip(net(*points, weights), net(*points), strict=True):
+            assert torch.allclose(found, expected, atol=1e-11)
+
+    def test_whole_weights_are_repetitions(self):
+        net, points = network(), normalized("handheld", 6, 9)
+        counts = torch.tensor([1, 2, 3, 1, 2, 1, 1, 4, 1])
+        repeated = [p.repeat_interleave(counts, 1) for p in points]
+        for found, expected in zip(net(*points, counts.double().expand(6, -1)), net(*repeated), strict=True):
+            assert torch.allclose(found, expected, atol=1e-10)
+
+
+class TestSight:
+    def test_sees_the_points_and_the_weights(self):
+        net, points = network(), normalized()
+        (expected, _), weights = net(*points), uniform(6, 12)
+        assert not torch.allclose(net(1.1 * points[0], points[1])[0], expected, atol=1e-4)
+        assert not torch.allclose(net(*points, weights)[0], expected, atol=1e-4)
+
+    def test_every_parameter_learns_but_those_that_cannot(self):
+        """A bias in front of instance normalisation is subtracted again."""
+        net = network()
+        torch.cat(net(*normalized())).square().sum().backward()
+        largest = {name: parameter.grad.abs().max().item() for name, parameter in net.named_parameters()}
+        blind = {f"blocks.{k}.{layer}.bias" for k in range(3) for layer in ("first", "second")}
+        assert {name for name, gradient in largest.items() if gradient < 1e-12} == blind
+        assert min(gradient for name, gradient in largest.items() if name not in blind) > 1e-6
+
+    def test_an_untrained_network_can_start_to_learn(self):
+        net = PaperNetwork(8, 2)
+        torch.cat(net(*normalized())).sum().backward()
+        assert net.head[-1].weight.grad.abs().sum() > 0
+        assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters())
+
+    @pytest.mark.parametrize("num_points", [8, 10])
+    def test_gradcheck(self, num_points):
+        net, weights = network(8, 2), uniform(1, num_points, low=0.2)
+        points = normalized("orbit", 1, num_points)
+        assert gradcheck(net, [p.clone().requires_grad_() for p in points])
+        assert gradcheck(net, [p.clone().requires_grad_() for p in (*points, weights)])
+
+    @pytest.mark.parametrize("weights", [None, torch.zeros(3, 8), torch.eye(8)[:3]], ids=["none", "zeros", "one"])
+    @pytest.mark.parametrize("spread", [0.0, 1e-8, 1.0])
+    def test_finite_on_absent_and_coincident_points(self, weights, spread, dtype):
+        net = network().to(dtype)
+        values = [spread * uniform(3, 8, 2, low=-1, seed=k).to(dtype) + 1 for k in (0, 1)]
+        values = [v.requires_grad_() for v in (*values, *([] if weights is None else [weights.to(dtype)]))]
+        answers = net(*values)
+        assert all(torch.isfinite(params).all() for params in answers)
+        for gradient in torch.autograd.grad(torch.cat(answers).sum(), [*values, *net.parameters()]):
+            assert torch.isfinite(gradient).all()
+
+
+class TestComposed:
+    """With Hartley's base and the paper's transform, as a normaliser."""
+
+    @pytest.mark.parametrize("num_points", [8, 20])
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_untrained_is_exactly_hartley(self, num_points, weighted, dtype):
+        points = [p.to(dtype) for p in correspondences("handheld", 5, num_points)]
+        weights = uniform(5, num_points, low=0.1) if weighted else None
+        expected = Hartley()(*(p.double() for p in points), weights)
+        for T, H in zip(composed(PaperNetwork(16, 3))(*points, weights), expected, strict=True):
+            assert torch.equal(T, H.to(dtype))
+
+    def test_transforms_are_those_of_the_paper(self):
+        """diag(alpha1, alpha2, 1) R(theta) of Hartley's coordinates."""
+        points, net = correspondences("driving", 5, 8), network()
+        for T, p, h in zip(composed(net)(*points), points, normalized("driving", 5, 8), strict=True):
+            H = numpy_hartley(p)
+            for k in range(5):
+                log1, log2, theta = numpy_params(net, h[k].numpy())
+                c, s = np.cos(theta), np.sin(theta)
+                rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+                expected = np.diag([np.exp(log1), np.exp(log2), 1]) @ rotation @ H[k]
+                np.testing.assert_allclose(T[k].detach().numpy(), expected, rtol=1e-8, atol=1e-10)
+
+    @given(
+        st.integers(0, 2**31),
+        st.sampled_from([8, 20]),
+        st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
+        st.tuples(*[st.floats(-2e3, 2e3)] * 4),
+    )
+    def test_scale_and_shift_of_either_view(self, seed, num_points, log_scales, shifts):
+        normalizer, points = composed(), correspondences("driving", 3, num_points, seed)
+        S = torch.eye(3).double().repeat(2, 1, 1)
+        S[:, 0, 0] = S[:, 1, 1] = 10 ** torch.tensor(log_scales).double()
+        S[:, :2, 2] = S[:, :1, 0] * torch.tensor(shifts).double().view(2, 2)
+        moved = [p @ s[:2, :2] + s[:2, 2] for p, s in zip(points, S, strict=True)]
+        with torch.no_grad():
+            pulled_back = S[1].mT @ find_fundamental(*moved, normalizer=normalizer) @ S[0]
+            expected = find_fundamental(*points, normalizer=normalizer)
+        assert up_to_sign(in_hartley(pulled_back, *points), in_hartley(expected, *points)) < 1e-6
+
+    def test_swapped_views_transpose_the_matrix(self):
+        normalizer, (points1, points2) = composed(), correspondences("driving", 20)
+        with torch.no_grad():
+            mirrored = find_fundamental(points2, points1, normalizer=normalizer).mT
+            F_mat = find_fundamental(points1, points2, normalizer=normalizer)
+        assert up_to_sign(in_hartley(mirrored, points1, points2), in_hartley(F_mat, points1, points2)) < 1e-8
+
+    def test_differs_from_hartley_once_trained(self):
+        points = correspondences("driving", 10)
+        with torch.no_grad():
+            found, hartley = (find_fundamental(*points, normalizer=n) for n in (composed(), Hartley()))
+        assert np.abs(in_hartley(found, *points) - in_hartley(hartley, *points)).max(axis=(1, 2)).min() > 1e-6
+
+    def test_round_trip(self, tmp_path):
+        normalizer = composed()
+        normalizer.save_pretrained(tmp_path / "weights.safetensors")
+        loaded = LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
+        assert (type(loaded.base), type(loaded.network)) == (Hartley, PaperNetwork)
+        assert (loaded.network.width, loaded.network.depth, loaded.network.num_parameters) == (16, 3, 3)
+        assert loaded.transform is paper_transform
+        assert not loaded.training
+        points = correspondences("driving", 5, 9)
+        for T, expected in zip(loaded(*points), normalizer(*points), strict=True):
+            assert torch.equal(T, expected)
+
+    def test_too_few_points(self):
+        with pytest.raises(ValueError, match="at least 8 correspondences are needed, got 7"):
+            composed()(torch.rand(2, 7, 2), torch.rand(2, 7, 2))

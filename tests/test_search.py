@@ -1,0 +1,315 @@
+"""The searched normaliser: never worse than its base, as good as a random search, and what it may not do."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from two_view import SCENES, correspondences, eight_point, epipolar_distances, numpy_hartley, shaken, uniform
+
+from kornia_learnnorm import (
+    Hartley,
+    ReweightedWhitening,
+    SearchedNormalizer,
+    Whitening,
+    find_fundamental,
+    paper_transform,
+    spd_transform,
+)
+
+BASES = {"hartley": Hartley(), "whitening": Whitening(), "reweighted": ReweightedWhitening()}
+
+
+def mean_distances(points1, points2, normalizer, weights=None) -> np.ndarray:
+    """Mean symmetric epipolar distance of every sample, by NumPy from the transforms on."""
+    T1, T2 = normalizer(points1, points2, weights)
+    found = epipolar_distances(points1, points2, eight_point(points1, points2, T1, T2, weights))
+    return np.average(found, axis=1, weights=None if weights is None else weights.numpy())
+
+
+@cache
+def searched(base, scene, num_points):
+    """A search and the points that it was made for."""
+    points = correspondences(scene, 12, num_points)
+    return points, SearchedNormalizer(BASES[base], steps=50)(*points)
+
+
+def numpy_spd(params) -> np.ndarray:
+    """exp [[a, b], [b, c]] by eigenvectors, after moving (o1, o2) to zero."""
+    values, vectors = np.linalg.eigh(params[:, [[0, 1], [1, 2]]])
+    T = np.zeros((len(params), 3, 3))
+    T[:, :2, :2] = np.einsum("bij,bj,bkj->bik", vectors, np.exp(values), vectors)
+    T[:, :2, 2] = -np.einsum("bij,bj->bi", T[:, :2, :2], params[:, 3:])
+    T[:, 2, 2] = 1
+    return T
+
+
+class TestSmoke:
+    @pytest.mark.parametrize("batch_size", [0, 1, 3])
+    @pytest.mark.parametrize("num_points", [8, 20])
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_smoke(self, batch_size, num_points, weighted, device, dtype):
+        points = [uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
+        weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
+        for T in SearchedNormalizer(steps=2)(*points, weights):
+            assert T.shape == (batch_size, 3, 3)
+            assert T.dtype == dtype
+            assert T.device.type == device.type
+            assert torch.isfinite(T).all()
+            assert torch.equal(T[:, 2].cpu(), torch.tensor([[0, 0, 1]], dtype=dtype).expand(batch_size, 3))
+
+    def test_defaults(self):
+        normalizer = SearchedNormalizer()
+        assert isinstance(normalizer.base, ReweightedWhitening)
+        assert normalizer.transform is spd_transform
+        assert (normalizer.num_parameters, normalizer.steps, normalizer.learning_rate) == (5, 100, 0.1)
+        assert list(normalizer.parameters()) == []
+
+    def test_one_step_is_exactly_the_base(self, dtype):
+        """The first transforms tried are the base's own."""
+        points = [p.to(dtype) for p in correspondences("handheld", 5)]
+        expected = Hartley()(*(p.double() for p in points))
+        for T, H in zip(SearchedNormalizer(Hartley(), steps=1)(*points), expected, strict=True):
+            assert torch.equal(T, H.to(dtype))
+
+    def test_float32_points_get_float64_arithmetic(self):
+        points = [p.float() for p in correspondences("handheld", 5)]
+        normalizer = SearchedNormalizer(steps=5)
+        for T, expected in zip(normalizer(*points), normalizer(*(p.double() for p in points)), strict=True):
+            assert torch.equal(T, expected.float())
+
+    @pytest.mark.parametrize(("steps", "learning_rate"), [(0, 0.1), (-1, 0.1), (10, 0.0), (10, -1.0)])
+    def test_exceptions(self, steps, learning_rate):
+        with pytest.raises(ValueError, match=f"must be positive, got {steps} and {learning_rate}"):
+            SearchedNormalizer(steps=steps, learning_rate=learning_rate)
+
+    @pytest.mark.parametrize(
+        ("points1", "points2", "weights", "error", "message"),
+        [
+            (torch.rand(2, 7, 2), torch.rand(2, 7, 2), None, ValueError, "at least 8 correspondences .* got 7"),
+            (torch.rand(2, 8, 2), torch.rand(2, 9, 2), None, ValueError, "pair up"),
+            (torch.rand(2, 8, 3), torch.rand(2, 8, 3), None, ShapeError, "2, 8, 3"),
+            (torch.rand(2, 8, 2), torch.rand(2, 8, 2).double(), None, TypeError, "one dtype"),
+            (torch.ones(2, 8, 2).int(), torch.rand(2, 8, 2), None, TypeError, "points1 must be .* got torch.int32"),
+            (np.ones((2, 8, 2)), torch.rand(2, 8, 2), None, TypeError, "points1 must be .* got .*ndarray"),
+            (torch.full((2, 8, 2), torch.nan), torch.rand(2, 8, 2), None, ValueError, "points1 must be finite"),
+            (torch.rand(2, 8, 2), torch.rand(2, 8, 2), -torch.ones(2, 8), ValueError, "must not be negative"),
+        ],
+    )
+    def test_wrong_correspondences(self, points1, points2, weights, error, message):
+        with pytest.raises(error, match=message):
+            SearchedNormalizer(steps=1)(points1, points2, weights)
+
+
+class TestSearch:
+    @pytest.mark.parametrize("base", BASES)
+    @pytest.mark.parametrize("scene", SCENES)
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_never_worse_than_its_base(self, base, scene, num_points):
+        points, transforms = searched(base, scene, num_points)
+        found = mean_distances(*points, lambda *_: transforms)
+        assert (found <= mean_distances(*points, BASES[base]) * (1 + 1e-6) + 1e-6).all()
+
+    @pytest.mark.parametrize(("base", "most"), [("hartley", 0.7), ("whitening", 0.8), ("reweighted", 0.98)])
+    @pytest.mark.parametrize("scene", ["driving", "handheld"])
+    def test_lowers_the_distance(self, base, most, scene):
+        points, transforms = searched(base, scene, 8)
+        found, expected = mean_distances(*points, lambda *_: transforms), mean_distances(*points, BASES[base])
+        assert (found < expected).mean() > 0.9
+        assert np.exp(np.log(found / expected).mean()) < most
+
+    @pytest.mark.parametrize("scene", ["driving", "handheld"])
+    def test_no_worse_than_a_random_search(self, scene):
+        """Thousands of random parameters for one sample, each through the eight-point algorithm in NumPy."""
+        points = correspondences(scene, 3)
+        found = mean_distances(*points, SearchedNormalizer(Hartley()))
+        random = np.random.default_rng(0)
+        for p1, p2, least in zip(*points, found, strict=True):
+            spread = 10 ** random.uniform(-2, 0.3, (1500, 1))
+            T1, T2 = (numpy_spd(spread * random.normal(size=(1500, 5))) @ numpy_hartley(p[None])[0] for p in (p1, p2))
+            p1, p2 = (p.expand(1500, 8, 2) for p in (p1, p2))
+            assert least < epipolar_distances(p1, p2, eight_point(p1, p2, T1, T2)).mean(1).min()
+
+    def test_more_steps_find_less(self):
+        points = correspondences("handheld", 30)
+        means = [
+            np.log(mean_distances(*points, SearchedNormalizer(Hartley(), steps=steps))).mean() for steps in (1, 10, 60)
+        ]
+        assert means == sorted(means, reverse=True)
+        assert means[-1] < means[0] - 0.2
+
+    def test_steps_that_are_too_long_do_no_harm(self):
+        """The best parameters met are kept, not the last."""
+        points = correspondences("handheld", 12)
+        found = mean_distances(*points, SearchedNormalizer(ReweightedWhitening(), steps=4, learning_rate=0.5))
+        assert (found <= mean_distances(*points, ReweightedWhitening()) * (1 + 1e-6)).all()
+
+    def test_steps_fall_to_zero_as_half_a_cosine(self):
+        """Adam's first step has the learning rate's length in every number, and none is much longer."""
+        seen = []
+
+        def spy(params):
+            seen.append(params.detach().clone())
+            return spd_transform(params)
+
+        SearchedNormalizer(Hartley(), spy, steps=40, learning_rate=0.05)(*correspondences("handheld", 3))
+        path = torch.stack(seen[:-2:2])  # view 1, without the transforms returned
+        lengths = path.diff(dim=0).abs().amax((1, 2))
+        assert path[0].count_nonzero() == 0
+        np.testing.assert_allclose((path[1] - path[0]).abs(), 0.05, rtol=1e-4)
+        cosine = 0.05 * (1 + np.cos(np.pi * np.arange(39) / 40)) / 2
+        assert (lengths.numpy() < 3 * cosine).all()
+
+    @pytest.mark.parametrize(("transform", "num_parameters"), [(paper_transform, 3), (spd_transform, 3)])
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_with_other_builders(self, transform, num_parameters, num_points):
+        points = correspondences("handheld", 10, num_points)
+        normalizer = SearchedNormalizer(Hartley(), transform, num_parameters, steps=30)
+        found, hartley = mean_distances(*points, normalizer), mean_distances(*points, Hartley())
+        assert (found <= hartley * (1 + 1e-6)).all()
+        assert np.log(found / hartley).mean() < (-0.1 if num_points == 8 else -0.03)
+        for T, H in zip(normalizer(*points), Hartley()(*points), strict=True):
+            B = T.numpy() @ np.linalg.inv(H.numpy())
+            np.testing.assert_allclose(B[:, :2, 2], 0, atol=1e-9)  # three parameters keep the centroid
+            gram = B[:, :2, :2] @ B[:, :2, :2].swapaxes(1, 2) if transform is paper_transform else B[:, :2, :2]
+            np.testing.assert_allclose(gram[:, 0, 1], 0 if transform is paper_transform else gram[:, 1, 0], atol=1e-9)
+
+    def test_the_result_is_built_from_parameters_and_base(self):
+        """Transforms of the five parameters: symmetric positive definite linear parts, upon the base."""
+        points, transforms = searched("hartley", "handheld", 8)
+        for T, H in zip(transforms, Hartley()(*points), strict=True):
+            linear = (T.numpy() @ np.linalg.inv(H.numpy()))[:, :2, :2]
+            np.testing.assert_allclose(linear, linear.swapaxes(1, 2), atol=1e-9)
+            assert (np.linalg.eigvalsh(linear) > 0).all()
+
+    def test_any_base_of_the_contract(self):
+        points = correspondences("handheld", 5)
+        found = mean_distances(*points, SearchedNormalizer(shaken(), steps=10))
+        with torch.no_grad():
+            assert (found <= mean_distances(*points, shaken()) * (1 + 1e-6)).all()
+
+
+class TestInvariances:
+    """Rounding grows with every step, so few steps are compared."""
+
+    def same(self, found, expected, tolerance=1e-6):
+        for T, want in zip(found, expected, strict=True):
+            difference = (T - want).norm(dim=(-2, -1)) / want.norm(dim=(-2, -1))
+            assert difference.max() < tolerance
+
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_samples_do_not_influence_each_other(self, num_points):
+        points, normalizer = correspondences("handheld", 6, num_points), SearchedNormalizer(steps=10)
+        together = normalizer(*points)
+        for k in range(6):
+            self.same(normalizer(*(p[k : k + 1] for p in points)), [T[k : k + 1] for T in together])
+
+    def test_a_degenerate_sample_does_not_influence_the_others(self):
+        points, normalizer = correspondences("handheld", 6), SearchedNormalizer(steps=10)
+        spoilt = [torch.cat([torch.ones(1, 8, 2), p]) for p in points]
+        self.same([T[1:] for T in normalizer(*spoilt)], normalizer(*points))
+
+    @settings(max_examples=8)
+    @given(st.integers(0, 2**31), st.sampled_from([8, 20]), st.randoms())
+    def test_order_does_not_matter(self, seed, num_points, random):
+        (points1, points2), normalizer = correspondences("handheld", 3, num_points, seed), SearchedNormalizer(steps=5)
+        order = random.sample(range(num_points), num_points)
+        self.same(normalizer(points1[:, order], points2[:, order]), normalizer(points1, points2), 1e-4)
+
+    @pytest.mark.parametrize("scale", [1e-9, 1e-3, 1e6])
+    def test_unit_of_the_pixels_does_not_matter(self, scale):
+        points, normalizer = correspondences("handheld", 6), SearchedNormalizer(steps=10)
+        S = torch.diag(torch.tensor([scale, scale, 1.0])).double()
+        self.same([T @ S for T in normalizer(*(scale * p for p in points))], normalizer(*points), 1e-4)
+
+    def test_swapped_views_swap_the_transforms(self):
+        (points1, points2), normalizer = correspondences("driving", 6), SearchedNormalizer(steps=5)
+        self.same(normalizer(points2, points1)[::-1], normalizer(points1, points2), 1e-4)
+
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_zero_weight_is_absence(self, num_points):
+        points, normalizer = correspondences("handheld", 6, num_points), SearchedNormalizer(steps=5)
+        weights = uniform(6, num_points, low=0.5) if num_points > 8 else torch.ones(6, 8).double()
+        junk = [uniform(6, 4, 2, high=600, seed=seed) for seed in (1, 2)]
+        extended = [torch.cat(p, 1) for p in zip((*junk, 0 * weights[:, :4]), (*points, weights), strict=True)]
+        self.same(normalizer(*extended), normalizer(*points, weights), 1e-4)
+
+    def test_equal_weights_are_none(self):
+        points, normalizer = correspondences("handheld", 6, 12), SearchedNormalizer(steps=5)
+        self.same(normalizer(*points, torch.full((6, 12), 0.25).double()), normalizer(*points), 1e-4)
+
+    def test_weights_are_those_of_the_mean_and_of_the_solution(self):
+        points, weights = correspondences("handheld", 20, 12), uniform(20, 12)
+        normalizer = SearchedNormalizer(Hartley(), steps=30)
+        found, hartley = (mean_distances(*points, n, weights) for n in (normalizer, Hartley()))
+        unweighted = mean_distances(*points, lambda *_: normalizer(*points), weights)
+        assert (found <= hartley * (1 + 1e-6)).all()
+        assert np.log(found).mean() < np.log(unweighted).mean()
+
+
+class TestGradients:
+    @pytest.mark.parametrize("learned", [False, True])
+    def test_the_result_carries_none(self, learned):
+        base = shaken() if learned else ReweightedWhitening()
+        values = [v.requires_grad_() for v in (*correspondences("handheld", 3), uniform(3, 8, low=0.5))]
+        for T in SearchedNormalizer(base, steps=3)(*values):
+            assert not T.requires_grad
+        assert all(v.grad is None for v in values)
+        assert all(parameter.grad is None for parameter in base.parameters())
+
+    def test_works_where_gradients_are_off_and_leaves_them_off(self):
+        points, normalizer = correspondences("handheld", 3), SearchedNormalizer(Hartley(), steps=10)
+        expected = normalizer(*points)
+        with torch.no_grad():
+            found = normalizer(*points)
+            assert not torch.is_grad_enabled()
+        for T, want, H in zip(found, expected, Hartley()(*points), strict=True):
+            assert torch.equal(T, want)
+            assert not torch.allclose(T, H)
+
+    def test_works_in_inference_mode(self):
+        points, normalizer = correspondences("handheld", 3), SearchedNormalizer(steps=5)
+        expected = normalizer(*points)
+        with torch.inference_mode():
+            found = normalizer(*(p + 0 for p in points))
+        assert all(torch.equal(f, e) for f, e in zip(found, expected, strict=True))
+
+    def test_the_matrix_still_depends_on_the_points(self):
+        """With the transforms held, the eight-point algorithm has its derivatives."""
+        points = [p.requires_grad_() for p in correspondences("handheld", 3)]
+        find_fundamental(*points, normalizer=SearchedNormalizer(steps=2)).sum().backward()
+        for p in points:
+            assert torch.isfinite(p.grad).all()
+            assert p.grad.count_nonzero() > 0
+
+    def test_the_points_stay_as_they_are(self):
+        points = correspondences("handheld", 3)
+        before = [p.clone() for p in points]
+        SearchedNormalizer(steps=2)(*points)
+        assert all(torch.equal(p, b) for p, b in zip(points, before, strict=True))
+
+
+LINE = uniform(4, 20, 1, high=600) * torch.tensor([1.0, 0.5])
+DEGENERATE = {
+    "all equal": (torch.full((4, 20, 2), 7.0).double(), torch.full((4, 20, 2), -3.0).double()),
+    "all zero": (torch.zeros(4, 20, 2).double(), torch.zeros(4, 20, 2).double()),
+    "collinear": (LINE, LINE + 7),
+    "one view collinear": (LINE, uniform(4, 20, 2, high=600, seed=1)),
+    "identical views": (uniform(4, 20, 2, high=600), uniform(4, 20, 2, high=600)),
+    "four places": tuple(uniform(4, 20, 2, high=600, seed=k)[:, torch.arange(20) % 4] for k in (0, 1)),
+}
+
+
+@pytest.mark.parametrize("num_points", [8, 20])
+@pytest.mark.parametrize("sample", DEGENERATE)
+def test_finite_on_degenerate_samples(sample, num_points, dtype):
+    points = [p[:, :num_points].to(dtype) for p in DEGENERATE[sample]]
+    for weights in (None, torch.zeros(4, num_points)):
+        T1, T2 = SearchedNormalizer(steps=5)(*points, weights)
+        assert torch.isfinite(T1).all()
+        assert torch.isfinite(T2).all()
