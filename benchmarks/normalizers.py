@@ -28,6 +28,7 @@ normalizers = {
     "Hartley": kln.Hartley(),
     "whitening": kln.Whitening(),
     "reweighted whitening": kln.ReweightedWhitening(),
+    "learned: paper": kln.LearnedNormalizer.from_pretrained("paper").to(args.device),
     "learned: crossview": kln.LearnedNormalizer.from_pretrained().to(args.device),
 }
 methods = {"kornia (Hartley)": lambda: find_fundamental(points1, points2)}
