@@ -57,7 +57,7 @@ class Frame:
         """Camera matrix of the image that is matched, (3, 3); resizing keeps the outer edges of the image in place."""
         x, y = (new / old for new, old in zip(self.matched_size, self.size, strict=True))
         scale = np.array([[x, 0.0, x / 2 - 0.5], [0.0, y, y / 2 - 0.5], [0.0, 0.0, 1.0]])
-        return scale @ self.camera
+        return np.asarray(scale @ self.camera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class FramePair:
         """Rotation R (3, 3) and translation t (3,) of x2 = R x1 + t, NaN where a pose is unknown."""
         if not (np.isfinite(self.frame1.pose).all() and np.isfinite(self.frame2.pose).all()):
             return _unknown(3, 3), _unknown(3)
-        relative = np.linalg.solve(self.frame2.pose, self.frame1.pose)
+        relative: NDArray[np.float64] = np.linalg.solve(self.frame2.pose, self.frame1.pose)
         return relative[:3, :3], relative[:3, 3]
 
     @property
@@ -89,8 +89,8 @@ class FramePair:
             return _unknown(3, 3)
         x, y, z = t
         E = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ R
-        F = np.linalg.solve(K2.T, E) @ np.linalg.inv(K1)
-        return F / np.linalg.norm(F)
+        F: NDArray[np.float64] = np.linalg.solve(K2.T, E) @ np.linalg.inv(K1)
+        return np.asarray(F / np.linalg.norm(F))
 
 
 def pair_frames(frames: Iterable[Frame], gap: int = 1) -> Iterator[FramePair]:
