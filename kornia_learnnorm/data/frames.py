@@ -30,7 +30,7 @@ class Frame:
         path: the image file.
         name: what stores call it: its path below the root of the dataset, with slashes.
         sequence: what it belongs to; only frames of one sequence are paired by their order.
-        size: (width, height) of the file, pixels.
+        size: (width, height) of the file, pixels; (0, 0) where it cannot be read.
         camera: camera matrix of the file's pixels, (3, 3) float64, NaN where unknown.
         pose: camera to world, metres, (4, 4) float64, NaN where unknown.
         distortion: OpenCV's ``k1, k2, p1, p2[, k3]`` of the file's pixels, which are undistorted before matching;
@@ -55,7 +55,7 @@ class Frame:
     @property
     def K(self) -> NDArray[np.float64]:  # noqa: N802
         """Camera matrix of the image that is matched, (3, 3); resizing keeps the outer edges of the image in place."""
-        x, y = (new / old for new, old in zip(self.matched_size, self.size, strict=True))
+        x, y = (new / old if old else 1.0 for new, old in zip(self.matched_size, self.size, strict=True))
         scale = np.array([[x, 0.0, x / 2 - 0.5], [0.0, y, y / 2 - 0.5], [0.0, 0.0, 1.0]])
         return np.asarray(scale @ self.camera)
 
@@ -77,7 +77,7 @@ class FramePair:
         """Rotation R (3, 3) and translation t (3,) of x2 = R x1 + t, NaN where a pose is unknown."""
         if not (np.isfinite(self.frame1.pose).all() and np.isfinite(self.frame2.pose).all()):
             return _unknown(3, 3), _unknown(3)
-        relative: NDArray[np.float64] = np.linalg.solve(self.frame2.pose, self.frame1.pose)
+        relative = np.asarray(np.linalg.solve(self.frame2.pose, self.frame1.pose), np.float64)
         return relative[:3, :3], relative[:3, 3]
 
     @property
@@ -89,8 +89,8 @@ class FramePair:
             return _unknown(3, 3)
         x, y, z = t
         E = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ R
-        F: NDArray[np.float64] = np.linalg.solve(K2.T, E) @ np.linalg.inv(K1)
-        return np.asarray(F / np.linalg.norm(F))
+        F = np.linalg.solve(K2.T, E) @ np.linalg.inv(K1)
+        return np.asarray(F / np.linalg.norm(F), np.float64)
 
 
 def pair_frames(frames: Iterable[Frame], gap: int = 1) -> Iterator[FramePair]:
