@@ -59,12 +59,12 @@ TABLE1_RUNS := $(TABLE1:%=runs/table1/%/weights.safetensors)
 .PRECIOUS: $(ABLATION_RUNS) $(TABLE1_RUNS)
 
 ablations: $(VENV)/.ready $(ABLATION_RUNS)
-	$(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
+	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
 		--weights $(ABLATION_RUNS) paper crossview
 
 table1: $(VENV)/.ready $(TABLE1_RUNS)
 	$(BIN)/learnnorm synthesize runs/table1 --scenes hand-held --pairs 60
-	$(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5@10:19 \
+	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5@10:19 \
 		$(STORES)/tum_fr3_office_kitti_size.h5@10:19 runs/table1/synthetic.h5 \
 		--weights paper crossview $(TABLE1_RUNS)
 

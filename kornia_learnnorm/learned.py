@@ -95,6 +95,7 @@ class LearnedNormalizer(nn.Module):
             TypeError: if the base, the network or the builder is not one of this package, so that the file could not
                 say how to build it; use ``state_dict`` for those.
             ValueError: if ``path`` does not end in ``.safetensors``.
+            OSError: if it cannot be written.
 
         """
         if Path(path).suffix != ".safetensors":
@@ -106,7 +107,10 @@ class LearnedNormalizer(nn.Module):
         }
         state = {key: value.detach().cpu().contiguous() for key, value in self.state_dict().items()}
         with replacing(path) as beside:
-            save_file(state, beside, metadata={"format": FORMAT, "architecture": json.dumps(architecture)})
+            try:
+                save_file(state, beside, metadata={"format": FORMAT, "architecture": json.dumps(architecture)})
+            except SafetensorError as error:
+                raise OSError(f"{path} could not be written: {error}") from error
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "crossview") -> LearnedNormalizer:
@@ -146,6 +150,9 @@ class LearnedNormalizer(nn.Module):
             normalizer.load_state_dict(state, strict=True)
         except RuntimeError as error:
             raise ValueError(f"{path}: the tensors do not fit the architecture: {error}") from error
+        broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
+        if broken:
+            raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
         return normalizer.eval()
 
 

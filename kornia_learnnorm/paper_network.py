@@ -48,6 +48,8 @@ class PaperNetwork(nn.Module):
         super().__init__()
         if width < 3 or depth < 2:
             raise ValueError(f"the 3x3 convolution needs width >= 3 and depth >= 2, got {width} and {depth}")
+        if num_parameters < 1:
+            raise ValueError(f"a transform has at least one parameter, got {num_parameters}")
         self.width, self.depth, self.num_parameters = width, depth, num_parameters
         self.stem = nn.Linear(2, width)
         self.blocks = nn.ModuleList(ResidualBlock(width) for _ in range(depth))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pickle
+import sys
 import warnings
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -75,5 +77,11 @@ def run(args: list[str] | None) -> None:
             parser_kwargs={"prog": "learnnorm"},
             save_config_kwargs={"overwrite": True},
         )
-    except pickle.UnpicklingError as error:  # the parser has a look at the checkpoint too, before the hooks run
-        raise ValueError("the file given by --ckpt_path is not a checkpoint of a training run") from error
+    # The parser has a look at the checkpoint too, before the hooks run.
+    except (pickle.UnpicklingError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "PytorchStreamReader" not in str(error):
+            raise
+        words = [part for word in (sys.argv if args is None else args) for part in word.split("=", 1)]
+        given = [second for first, second in pairwise(words) if first == "--ckpt_path"]
+        path = given[-1] if given else "the file given by --ckpt_path"
+        raise ValueError(f"{path} is not a checkpoint of a training run, or not a whole one") from error
