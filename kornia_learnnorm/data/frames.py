@@ -77,8 +77,11 @@ class FramePair:
         """Rotation R (3, 3) and translation t (3,) of x2 = R x1 + t, NaN where a pose is unknown."""
         if not (np.isfinite(self.frame1.pose).all() and np.isfinite(self.frame2.pose).all()):
             return _unknown(3, 3), _unknown(3)
-        relative = np.asarray(np.linalg.solve(self.frame2.pose, self.frame1.pose), np.float64)
-        return relative[:3, :3], relative[:3, 3]
+        pose1, pose2 = self.frame1.pose, self.frame2.pose
+        R = np.linalg.solve(pose2[:3, :3], pose1[:3, :3])
+        # The difference first: a camera that stood still has a translation of exactly zero.
+        t = np.linalg.solve(pose2[:3, :3], pose1[:3, 3] - pose2[:3, 3])
+        return np.asarray(R, np.float64), np.asarray(t, np.float64)
 
     @property
     def F(self) -> NDArray[np.float64]:  # noqa: N802

@@ -1,0 +1,122 @@
+r"""COLMAP models: their frames, and the pairs of frames that see the same points.
+
+pycolmap reads the model. It comes with the ``colmap`` extra and is imported only when a function here is called.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_learnnorm.data.frames import Frame, FramePair
+from kornia_learnnorm.data.sequences import image_size
+
+__all__ = ["covisible_pairs", "read_colmap"]
+
+# Where the distortion starts among a model's parameters; COLMAP's source, sensor/models.h. Its terms are the first of
+# OpenCV's k1, k2, p1, p2 in this order.
+_DISTORTION = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4}
+
+
+def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
+    """Read the frames of a COLMAP model (https://colmap.github.io/format.html).
+
+    COLMAP puts the centre of the top left pixel at (0.5, 0.5), a frame has it at (0, 0). Each folder of images is a
+    sequence. COLMAP ignores the orientation in an image's EXIF.
+
+    Args:
+        model: folder with cameras, images and points3D, as ``.bin`` or ``.txt``; its unit of length is arbitrary.
+        images: the folder that the images' names start from.
+
+    Returns:
+        the frames by folder and name; poses are NaN where the model has none.
+
+    Raises:
+        FileNotFoundError: if a file of the model is missing, or an image.
+        ValueError: if the model is malformed or empty, a camera's model has distortion other than k1, k2, p1, p2, or an
+            image's size is not its camera's.
+        ImportError: if pycolmap or Pillow is not installed; the message names the extra that brings it.
+
+    """
+    images, reconstruction = Path(images), _reconstruction(Path(model))
+    found = sorted(reconstruction.images.values(), key=lambda image: (image.name.rpartition("/")[0], image.name))
+    if not found:
+        raise ValueError(f"the model {model} has no images")
+    missing = [image.name for image in found if not (images / image.name).is_file()]
+    if missing:
+        raise FileNotFoundError(f"{len(missing)} of {len(found)} images are not in {images}, the first is {missing[0]}")
+    return [_frame(image, images / image.name) for image in found]
+
+
+def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int = 30) -> Iterator[FramePair]:
+    """Pair the frames that see enough of the same 3D points of a COLMAP model.
+
+    Args:
+        model: folder with cameras, images and points3D, as ``.bin`` or ``.txt``.
+        frames: frames whose names are those of the model's images.
+        min_points: how many points both frames of a pair see at least.
+
+    Yields:
+        the pairs by the name of the first frame, then of the second.
+
+    Raises:
+        FileNotFoundError: if a file of the model is missing.
+        ValueError: if the model is malformed or lacks a frame, or ``min_points`` is not positive.
+        ImportError: if pycolmap is not installed.
+
+    """
+    if min_points < 1:
+        raise ValueError(f"the frames of a pair must share at least 1 point, got min_points {min_points}")
+    reconstruction = _reconstruction(Path(model))
+    named = {image.name: image for image in reconstruction.images.values()}
+    ordered = sorted(frames, key=lambda frame: frame.name)
+    seen: list[set[int]] = []
+    observers: defaultdict[int, list[int]] = defaultdict(list)
+    for index, frame in enumerate(ordered):
+        if frame.name not in named:
+            raise ValueError(f"no image {frame.name!r} among the {len(named)} of the model {model}")
+        seen.append({point.point3D_id for point in named[frame.name].get_observation_points2D()})
+        for point in seen[-1]:
+            observers[point].append(index)
+    for index, points in enumerate(seen):
+        shared = Counter(chain.from_iterable(observers[point] for point in points))
+        for other in sorted(other for other, count in shared.items() if other > index and count >= min_points):
+            yield FramePair(ordered[index], ordered[other])
+
+
+def _reconstruction(model: Path) -> Any:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ImportError("COLMAP models need pycolmap: pip install 'kornia-learnnorm[colmap]'") from error
+    for name in ("cameras", "images", "points3D"):
+        if not any((model / f"{name}.{suffix}").is_file() for suffix in ("bin", "txt")):
+            raise FileNotFoundError(f"no COLMAP model at {model}: it lacks {name}.bin or {name}.txt")
+    try:
+        return pycolmap.Reconstruction(str(model))
+    except (ValueError, IndexError, RuntimeError) as error:  # IndexError of references to nothing
+        raise ValueError(f"the COLMAP model {model} cannot be read: {error}") from error
+
+
+def _frame(image: Any, path: Path) -> Frame:
+    camera, size = image.camera, image_size(path)
+    if camera.model_name not in _DISTORTION:
+        known = ", ".join(_DISTORTION)
+        raise ValueError(f"camera model of {image.name} must be one of {known}, got {camera.model_name}")
+    if size not in ((0, 0), (camera.width, camera.height)):
+        expected, got = f"{camera.width} x {camera.height}", f"{size[0]} x {size[1]}"
+        raise ValueError(f"image {path} must have its camera's size, {expected} pixels, got {got}")
+    K: NDArray[np.float64] = np.array(camera.calibration_matrix(), np.float64)
+    K[:2, 2] -= 0.5
+    terms = [float(term) for term in camera.params[_DISTORTION[camera.model_name] :]]
+    distortion = (*terms, 0.0, 0.0, 0.0)[:4] if terms else ()
+    pose = np.full((4, 4), np.nan)
+    if image.has_pose:
+        pose = np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]])
+    return Frame(path, image.name, image.name.rpartition("/")[0], size, K, pose, distortion)

@@ -1,0 +1,214 @@
+"""COLMAP models, read by pycolmap."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+
+from data.make_sequences import FOCAL, FRAMES, SIZE, STEP, metres, write_colmap  # noqa: E402
+
+from kornia_learnnorm.data.colmap import covisible_pairs, read_colmap  # noqa: E402
+from kornia_learnnorm.data.frames import listed_pairs  # noqa: E402
+
+NAMES = ["one/0.png", "one/1.png", "two/2.png", "two/3.png"]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A model and its images, not to be changed."""
+    folder = tmp_path_factory.mktemp("colmap")
+    write_colmap(folder)
+    return folder
+
+
+@pytest.fixture
+def colmap(written, tmp_path):
+    return shutil.copytree(written, tmp_path / "colmap")
+
+
+def read(folder):
+    return read_colmap(folder / "model", folder / "images")
+
+
+def set_camera(folder, camera: str) -> None:
+    (folder / "model" / "cameras.txt").write_text(f"1 {camera}\n")
+
+
+def names(pairs) -> list[tuple[str, str]]:
+    return [(pair.frame1.name, pair.frame2.name) for pair in pairs]
+
+
+class TestReadColmap:
+    def test_frames(self, written):
+        frames = read(written)
+        assert [frame.name for frame in frames] == NAMES
+        for number, frame in enumerate(frames):
+            pose = np.eye(4)
+            pose[0, 3] = metres(STEP * number)
+            assert frame.path == written / "images" / frame.name
+            assert frame.sequence == frame.name[:3]
+            assert frame.size == SIZE
+            assert frame.distortion == ()
+            assert np.allclose(frame.K, [[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1]])
+            assert np.allclose(frame.pose, pose, atol=1e-7)
+
+    def test_binary_model(self, written, tmp_path):
+        pycolmap.Reconstruction(str(written / "model")).write_binary(str(tmp_path))
+        for text, binary in zip(read(written), read_colmap(str(tmp_path), str(written / "images")), strict=True):
+            assert text.name == binary.name
+            assert np.array_equal(text.K, binary.K)
+            assert np.array_equal(text.pose, binary.pose)
+
+    @pytest.mark.parametrize(
+        ("model", "distortion"),
+        [
+            ("SIMPLE_PINHOLE 160 120 130 80 60", ()),
+            ("PINHOLE 160 120 130 131 80 60", ()),
+            ("SIMPLE_RADIAL 160 120 130 80 60 0.1", (0.1, 0, 0, 0)),
+            ("RADIAL 160 120 130 80 60 0.1 -0.02", (0.1, -0.02, 0, 0)),
+            ("OPENCV 160 120 130 131 80 60 0.1 -0.02 0.003 -0.004", (0.1, -0.02, 0.003, -0.004)),
+        ],
+    )
+    def test_projection_is_that_of_colmap(self, colmap, model, distortion):
+        cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+        set_camera(colmap, model)
+        frame = read(colmap)[3]
+        assert frame.distortion == distortion
+        image = pycolmap.Reconstruction(str(colmap / "model")).find_image_with_name(frame.name)
+        points = np.array([[0.1, -0.3, 4.0], [1.0, 1.0, 3.0], [-0.5, 0.8, 2.5]])
+        expected = np.array([image.project_point(point) for point in points]) - 0.5
+        in_camera = (np.linalg.inv(frame.pose) @ np.column_stack([points, np.ones(3)]).T)[:3].T
+        coefficients = np.array(distortion, float) if distortion else None
+        pixels = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), frame.K, coefficients)[0][:, 0]
+        assert np.allclose(pixels, expected, atol=1e-6)
+
+    def test_rotation(self, colmap):
+        path = colmap / "model" / "images.txt"
+        lines = path.read_text().splitlines()
+        lines[1] = "1 0.5 0.5 -0.5 0.5 1 2 3 1 one/0.png"
+        path.write_text("\n".join(lines) + "\n")
+        # By hand: w = x = -y = z = 1/2 turns the axes into each other.
+        expected = np.array([[0, -1.0, 0, 1], [0, 0, -1, 2], [1, 0, 0, 3], [0, 0, 0, 1]])
+        assert np.allclose(np.linalg.inv(read(colmap)[0].pose), expected)
+
+    def test_unsupported_camera(self, colmap):
+        set_camera(colmap, "OPENCV_FISHEYE 160 120 130 130 80 60 0 0 0 0")
+        with pytest.raises(
+            ValueError, match=r"model of one/0\.png must be one of SIMPLE_PINHOLE, .* got OPENCV_FISHEYE"
+        ):
+            read(colmap)
+
+    def test_size(self, colmap):
+        set_camera(colmap, "PINHOLE 320 240 130 130 160 120")
+        with pytest.raises(ValueError, match=r"0\.png must have its camera's size, 320 x 240 pixels, got 160 x 120"):
+            read(colmap)
+
+    def test_an_image_that_its_exif_turns(self, colmap):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.new("L", SIZE).save(colmap / "images/one/1.png", exif=exif)
+        with pytest.raises(ValueError, match=r"1\.png must have its camera's size, 160 x 120 pixels, got 120 x 160"):
+            read(colmap)
+
+    def test_unreadable_image(self, colmap):
+        (colmap / "images/one/1.png").write_bytes(b"")
+        assert [frame.size for frame in read(colmap)] == [SIZE, (0, 0), SIZE, SIZE]
+
+    def test_missing_images(self, colmap):
+        shutil.rmtree(colmap / "images/two")
+        with pytest.raises(FileNotFoundError, match=r"2 of 4 images are not in .*images, the first is two/2\.png"):
+            read(colmap)
+
+    @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+    def test_missing_file(self, colmap, name):
+        (colmap / "model" / f"{name}.txt").unlink()
+        with pytest.raises(
+            FileNotFoundError, match=rf"no COLMAP model at .*model: it lacks {name}\.bin or {name}\.txt"
+        ):
+            read(colmap)
+
+    @pytest.mark.parametrize(
+        ("name", "text"),
+        [
+            ("cameras", "hello\n"),
+            ("cameras", "1 UNKNOWN 160 120 1 2 3\n"),
+            ("cameras", "1 PINHOLE 160 120 1\n"),
+            ("cameras", "7 PINHOLE 160 120 130 130 80 60\n"),
+            ("images", "hello\n\n"),
+            ("points3D", "1 0 0 1 0 0 0 0.5 77 0 2 9\n"),
+        ],
+    )
+    def test_malformed(self, colmap, name, text):
+        (colmap / "model" / f"{name}.txt").write_text(text)
+        with pytest.raises(ValueError, match=r"the COLMAP model .*model cannot be read: "):
+            read(colmap)
+
+    def test_no_images(self, colmap):
+        for name in ("images", "points3D"):
+            (colmap / "model" / f"{name}.txt").write_text("")
+        with pytest.raises(ValueError, match=r"the model .*model has no images"):
+            read(colmap)
+
+    def test_without_pycolmap(self, written, monkeypatch):
+        monkeypatch.setitem(sys.modules, "pycolmap", None)
+        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[colmap\]'"):
+            read(written)
+
+
+class TestCovisiblePairs:
+    def shared(self, folder) -> dict[tuple[str, str], int]:
+        """Common points by pair, counted in the text of the model."""
+        lines = (folder / "model" / "images.txt").read_text().splitlines()[1:]
+        seen = {
+            image.split()[-1]: set(points.split()[2::3]) - {"-1"}
+            for image, points in zip(lines[::2], lines[1::2], strict=True)
+        }
+        return {(a, b): len(seen[a] & seen[b]) for a in seen for b in seen if a < b}
+
+    @pytest.mark.parametrize("min_points", [1, 30, 88, 96, 97, 500])
+    def test_common_points(self, written, min_points):
+        expected = [pair for pair, count in sorted(self.shared(written).items()) if count >= min_points]
+        assert names(covisible_pairs(written / "model", read(written), min_points)) == expected
+
+    def test_by_name_whatever_the_order_of_the_frames(self, written):
+        frames = read(written)
+        assert names(covisible_pairs(written / "model", frames[::-1])) == names(
+            covisible_pairs(written / "model", frames)
+        )
+
+    def test_some_frames(self, written):
+        frames = [frame for frame in read(written) if frame.sequence == "two"]
+        assert names(covisible_pairs(str(written / "model"), frames)) == [("two/2.png", "two/3.png")]
+
+    def test_points_without_3d_do_not_count(self, colmap):
+        path = colmap / "model" / "images.txt"
+        lines = path.read_text().splitlines()
+        lines[2] = " ".join(f"{n} {n} -1" for n in range(50))
+        path.write_text("\n".join(lines) + "\n")
+        (colmap / "model" / "points3D.txt").write_text("")
+        frames = read(colmap)
+        assert not any("one/0.png" in pair for pair in names(covisible_pairs(colmap / "model", frames, 1)))
+
+    def test_errors(self, written, tmp_path):
+        frames = read(written)
+        with pytest.raises(ValueError, match="at least 1 point, got min_points 0"):
+            list(covisible_pairs(written / "model", frames, 0))
+        with pytest.raises(FileNotFoundError, match="no COLMAP model at"):
+            list(covisible_pairs(tmp_path, frames))
+        write_colmap(tmp_path)
+        path = tmp_path / "model" / "images.txt"
+        path.write_text(path.read_text().replace("one/0.png", "one/9.png"))
+        with pytest.raises(ValueError, match=r"no image 'one/0\.png' among the 4 of the model"):
+            list(covisible_pairs(tmp_path / "model", frames))
+
+
+def test_pairs_file_names_the_frames(written):
+    assert names(listed_pairs(read(written), written / "pairs.txt")) == [
+        (NAMES[n], NAMES[n + 1]) for n in range(FRAMES - 1)
+    ]

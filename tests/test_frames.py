@@ -1,0 +1,196 @@
+"""Frames, their cameras and pairs of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kornia_learnnorm.data.frames import Frame, FramePair, listed_pairs, pair_frames, resize_frames
+
+CAMERA = np.array([[500.0, 0, 310], [0, 510, 250], [0, 0, 1]])
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def rigid(rng: np.random.Generator) -> np.ndarray:
+    """A random rotation and translation, (4, 4)."""
+    Q, R = np.linalg.qr(rng.normal(size=(3, 3)))
+    Q = Q * np.sign(np.diag(R))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Q * np.linalg.det(Q), rng.normal(size=3)
+    return pose
+
+
+def frame(name: str = "a.png", sequence: str = "", size: tuple[int, int] = (640, 480), **values) -> Frame:
+    return Frame(Path(name), name, sequence, size, **values)
+
+
+def random_pair(seed: int, **values) -> FramePair:
+    rng = np.random.default_rng(seed)
+    return FramePair(*(frame(camera=CAMERA, pose=rigid(rng), **values) for _ in range(2)))
+
+
+def projections(pair: FramePair, count: int = 20, seed: int = 0) -> list[np.ndarray]:
+    """Homogeneous pixels (N, 3) of random points in both views, with depths of either sign."""
+    world = np.column_stack([np.random.default_rng(seed).normal(size=(count, 3)) * 5, np.ones(count)])
+    pixels = [world @ np.linalg.inv(f.pose)[:3].T @ f.K.T for f in (pair.frame1, pair.frame2)]
+    return [x / x[:, 2:] for x in pixels]
+
+
+def numbered(*sequences: str) -> list[Frame]:
+    return [frame(f"{sequence}/{n}.png", sequence) for sequence in sequences for n in range(4)]
+
+
+def names(pairs) -> list[tuple[str, str]]:
+    return [(pair.frame1.name, pair.frame2.name) for pair in pairs]
+
+
+class TestFrame:
+    def test_unknown_by_default(self):
+        one = frame()
+        assert np.isnan(one.camera).all()
+        assert one.camera.shape == (3, 3)
+        assert np.isnan(one.pose).all()
+        assert one.pose.shape == (4, 4)
+        assert (one.distortion, one.resized, one.matched_size) == ((), None, (640, 480))
+
+    def test_frames_do_not_share_their_unknown_camera(self):
+        assert frame().camera is not frame().camera
+
+    def test_camera_is_that_of_the_file_without_resizing(self):
+        assert np.array_equal(frame(camera=CAMERA).K, CAMERA)
+
+    def test_halved(self):
+        # By hand: pixel edges go from -0.5 .. 639.5 to -0.5 .. 319.5, so x' = (x + 0.5) / 2 - 0.5.
+        expected = [[250, 0, 154.75], [0, 255, 124.75], [0, 0, 1]]
+        assert np.allclose(frame(camera=CAMERA, resized=(320, 240)).K, expected)
+
+    def test_unreadable(self):
+        broken = frame(size=(0, 0), camera=CAMERA)
+        assert np.array_equal(broken.K, CAMERA)
+        assert np.isfinite(replace(broken, resized=(320, 240)).K).all()
+        assert replace(broken, resized=(320, 240)).matched_size == (320, 240)
+
+
+class TestFramePair:
+    @given(seed=SEEDS)
+    def test_motion_takes_points_of_the_first_camera_to_the_second(self, seed):
+        pair = random_pair(seed)
+        R, t = pair.motion
+        world = np.array([0.3, -2.0, 5.0, 1.0])
+        first, second = (np.linalg.inv(f.pose) @ world for f in (pair.frame1, pair.frame2))
+        assert np.allclose(R @ first[:3] + t, second[:3])
+        assert np.allclose(R @ R.T, np.eye(3))
+
+    @given(seed=SEEDS)
+    def test_epipolar_constraint(self, seed):
+        pair = random_pair(seed)
+        x1, x2 = projections(pair)
+        scale = np.linalg.norm(x1, axis=1) * np.linalg.norm(x2, axis=1)
+        assert np.abs((x2 @ pair.F * x1).sum(1) / scale).max() < 1e-9
+        assert np.linalg.norm(pair.F) == pytest.approx(1)
+        assert abs(np.linalg.det(pair.F)) < 1e-12
+
+    @given(seed=SEEDS)
+    def test_the_world_does_not_matter(self, seed):
+        pair, world = random_pair(seed), rigid(np.random.default_rng(seed + 1))
+        moved = FramePair(*(replace(f, pose=world @ f.pose) for f in (pair.frame1, pair.frame2)))
+        assert np.allclose(moved.F, pair.F, atol=1e-9)
+
+    @given(seed=SEEDS)
+    def test_swapping_the_views_transposes(self, seed):
+        pair = random_pair(seed)
+        swapped = FramePair(pair.frame2, pair.frame1).F.T
+        assert min(np.abs(swapped - pair.F).max(), np.abs(swapped + pair.F).max()) < 1e-9
+
+    @given(seed=SEEDS, width=st.integers(1, 2000), height=st.integers(1, 2000))
+    def test_resizing_moves_pixels_with_it(self, seed, width, height):
+        pair = random_pair(seed)
+        small = FramePair(*resize_frames([pair.frame1, pair.frame2], (width, height)))
+        sx, sy = width / 640, height / 480
+        S = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+        expected = np.linalg.inv(S).T @ pair.F @ np.linalg.inv(S)
+        assert np.allclose(small.F, expected / np.linalg.norm(expected), atol=1e-9)
+
+    def test_sideways_by_hand(self):
+        # R = I, t = (-1, 0, 0): x2^T [t]x x1 = y1 - y2 up to scale.
+        shifted = np.eye(4)
+        shifted[0, 3] = 1.0
+        F = FramePair(frame(camera=np.eye(3), pose=np.eye(4)), frame(camera=np.eye(3), pose=shifted)).F
+        assert np.allclose(F, np.array([[0, 0, 0], [0, 0, 1], [0, -1, 0]]) / np.sqrt(2))
+
+    @pytest.mark.parametrize("missing", ["camera", "pose"])
+    @pytest.mark.parametrize("which", ["frame1", "frame2"])
+    def test_unknown(self, missing, which):
+        pair = random_pair(0)
+        shape = getattr(pair.frame1, missing).shape
+        pair = replace(pair, **{which: replace(getattr(pair, which), **{missing: np.full(shape, np.nan)})})
+        assert np.isnan(pair.F).all()
+        assert np.isfinite(pair.motion[0]).all() == (missing == "camera")
+
+    def test_a_camera_that_stands_still_has_no_fundamental_matrix(self):
+        for seed in range(5):
+            pair = random_pair(seed)
+            turned = replace(pair.frame2, pose=np.column_stack([pair.frame2.pose[:, :3], pair.frame1.pose[:, 3]]))
+            for still in (pair.frame1, turned):
+                assert np.isnan(FramePair(pair.frame1, still).F).all()
+
+
+class TestPairFrames:
+    def test_neighbours_of_one_sequence(self):
+        pairs = names(pair_frames(numbered("x", "y")))
+        assert pairs == [(f"{s}/{n}.png", f"{s}/{n + 1}.png") for s in "xy" for n in range(3)]
+
+    @given(gap=st.integers(1, 6))
+    def test_gap(self, gap):
+        assert names(pair_frames(numbered("x"), gap)) == [(f"x/{n}.png", f"x/{n + gap}.png") for n in range(4 - gap)]
+
+    def test_nothing(self):
+        assert names(pair_frames([])) == []
+
+    @pytest.mark.parametrize("gap", [0, -1])
+    def test_wrong_gap(self, gap):
+        with pytest.raises(ValueError, match=f"at least 1, got {gap}"):
+            list(pair_frames(numbered("x"), gap))
+
+
+class TestListedPairs:
+    def test_order_of_the_lines(self, tmp_path):
+        (tmp_path / "pairs.txt").write_text("x/3.png  x/0.png\n\nx/1.png\ty/2.png\n")
+        pairs = listed_pairs(numbered("x", "y"), str(tmp_path / "pairs.txt"))
+        assert names(pairs) == [("x/3.png", "x/0.png"), ("x/1.png", "y/2.png")]
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("x/0.png x/1.png\nx/0.png\n", r"pairs\.txt, line 2: two names expected, got 'x/0\.png'"),
+            ("x/0.png x/1.png x/2.png", r"line 1: two names expected"),
+            ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
+        ],
+    )
+    def test_malformed(self, tmp_path, text, message):
+        (tmp_path / "pairs.txt").write_text(text)
+        with pytest.raises(ValueError, match=message):
+            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
+
+    def test_missing(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"no list of pairs at .*pairs\.txt"):
+            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
+
+
+class TestResizeFrames:
+    def test_the_last_size_counts(self):
+        once = resize_frames([frame(camera=CAMERA)], (100, 50))
+        twice = resize_frames(resize_frames([frame(camera=CAMERA)], (7, 9)), (100, 50))
+        assert np.array_equal(once[0].K, twice[0].K)
+        assert once[0].matched_size == (100, 50)
+        assert once[0].size == (640, 480)
+
+    @pytest.mark.parametrize("size", [(0, 5), (5, -1)])
+    def test_wrong_size(self, size):
+        with pytest.raises(ValueError, match=f"positive width and height, got {size[0]} x {size[1]}"):
+            resize_frames([frame()], size)
