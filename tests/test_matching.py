@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.data.matching import match_images, read_image
+from kornia_learnnorm.data.images import read_image
+from kornia_learnnorm.data.matching import match_images
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
@@ -139,7 +140,7 @@ class TestMatchImages:
     def test_blank(self, blank):
         images = [texture(), texture()]
         images[blank] = np.full((180, 240), 7, np.uint8)
-        with pytest.raises(ValueError, match=rf"image {blank + 1} is blank .* 0 SIFT features"):
+        with pytest.raises(ValueError, match=rf"image {blank + 1} is blank .* 0 features"):
             match_images(*images)
 
     def test_tiny(self):
@@ -147,11 +148,11 @@ class TestMatchImages:
             match_images(np.zeros((1, 1), np.uint8), texture())
 
     def test_wrong_arguments(self):
-        with pytest.raises(TypeError, match=r"image 1 must be an array of uint8, got float64"):
+        with pytest.raises(TypeError, match=r"an image must be an array of uint8, got float64"):
             match_images(texture() / 255.0, texture())
-        with pytest.raises(TypeError, match="image 2 must be an array of uint8"):
+        with pytest.raises(TypeError, match="an image must be an array of uint8"):
             match_images(texture(), "right.png")
-        with pytest.raises(ValueError, match=r"image 2 must be grey .* got \(180, 240, 3\)"):
+        with pytest.raises(ValueError, match=r"an image must be grey .* got \(180, 240, 3\)"):
             match_images(texture(), np.zeros((180, 240, 3), np.uint8))
         with pytest.raises(ValueError, match="num_features must be at least 2, got 0"):
             match_images(texture(), texture(), num_features=0)

@@ -1,28 +1,28 @@
-"""Reading grey images and matching them: SIFT features, nearest neighbours, Lowe's ratio.
-
-OpenCV does the work. It comes with the ``images`` extra and is imported only when a function here is called.
-"""
+"""Matching the features of two images: nearest neighbours with Lowe's ratio, or LightGlue."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import ModuleType
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["Matches", "import_cv2", "match_images", "read_image"]
+from kornia_learnnorm.data.features import Features, detect_sift, pretrained
+from kornia_learnnorm.data.images import import_cv2
+
+__all__ = ["MATCHERS", "Matches", "match_images", "match_lightglue", "match_nearest"]
 
 
 class Matches(NamedTuple):
-    """Correspondences of two images, one row per feature of image 1.
+    """Correspondences of two images, one row per match.
 
     Attributes:
         points1: pixels ``(x, y)`` in image 1 with shape :math:`(N, 2)`, float32.
-        points2: pixels of the nearest neighbours in image 2 with shape :math:`(N, 2)`, float32.
+        points2: pixels of their matches in image 2 with shape :math:`(N, 2)`, float32.
         ratio: distance of the nearest over that of the second-nearest descriptor with shape :math:`(N,)`, float32, in
             :math:`[0, 1]`; small is distinctive (D. Lowe, Distinctive image features from scale-invariant keypoints,
             IJCV 2004, section 7.1).
@@ -34,83 +34,74 @@ class Matches(NamedTuple):
     ratio: Tensor
 
 
-def import_cv2() -> ModuleType:
-    """Return the module ``cv2``.
+def match_nearest(features1: Features, features2: Features) -> Matches:
+    """Match each feature of image 1 to its nearest neighbour in image 2, by brute force.
 
-    Raises:
-        ImportError: if OpenCV is not installed; the message names the extra that brings it.
-
-    """
-    try:
-        import cv2
-    except ImportError as error:
-        message = "reading and matching images needs OpenCV: pip install 'kornia-learnnorm[images]'"
-        raise ImportError(message) from error
-    return cv2
-
-
-def read_image(path: str | Path) -> npt.NDArray[np.uint8]:
-    """Read an image file as grey values; colours and deeper pixels are converted.
+    No match is dropped: keep ``ratio < 0.8`` for Lowe's ratio test. Several features of image 1 may share one of
+    image 2.
 
     Args:
-        path: a file in any format that OpenCV decodes.
+        features1: features of image 1.
+        features2: features of image 2.
 
     Returns:
-        grey values with shape :math:`(H, W)`, uint8.
+        as many matches as image 1 has features.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is a folder, not an image, or a truncated or corrupt image.
+        ValueError: if an image has fewer than two features, as a blank one, or the descriptors differ in length.
         ImportError: if OpenCV is not installed.
 
     """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"image {path} does not exist")
-    if path.is_dir():
-        raise ValueError(f"image {path} is a folder, expected an image file")
-    data = path.read_bytes()
-    if not data:
-        raise ValueError(f"image {path} is empty (0 bytes)")
-    image = _decode(data) if _jpeg_ends(data) else None
-    if image is None:
-        raise ValueError(f"image {path} cannot be decoded: {len(data)} bytes, not an image or truncated or corrupt")
-    return image
+    _check(features1, features2)
+    descriptors1, descriptors2 = (features.descriptors.astype(np.float32) for features in (features1, features2))
+    pairs = import_cv2().BFMatcher().knnMatch(descriptors1, descriptors2, k=2)
+    index1, index2 = np.array([(nearest.queryIdx, nearest.trainIdx) for nearest, _ in pairs]).T
+    distances = torch.tensor([[nearest.distance, second.distance] for nearest, second in pairs])
+    # Two equal neighbours are a tie, a ratio of one, at distance zero too.
+    ratio = torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
+    return Matches(torch.from_numpy(features1.points[index1]), torch.from_numpy(features2.points[index2]), ratio)
 
 
-def _decode(data: bytes) -> npt.NDArray[np.uint8] | None:
-    """Decode a file's bytes to grey values, None where OpenCV cannot; its log stays quiet meanwhile."""
-    cv2 = import_cv2()
-    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 5 and 4
-    level = log.setLogLevel(0)
-    try:
-        image: npt.NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:
-        return None
-    finally:
-        log.setLogLevel(level)
-    return image
+def match_lightglue(features1: Features, features2: Features) -> Matches:
+    """Match DISK features with Kornia's LightGlue.
 
+    LightGlue gives a match a score instead of a ratio; ``ratio`` is one minus the score, so that small is sure and the
+    usual 0.8 keeps scores above 0.2.
 
-def _jpeg_ends(data: bytes) -> bool:
-    """Tell whether a JPEG has its end marker after its pixels; True for other formats.
+    Args:
+        features1: features of image 1, from :func:`~kornia_learnnorm.data.features.detect_disk`.
+        features2: features of image 2.
 
-    OpenCV 4 fills the missing part of a truncated JPEG with grey and says nothing.
+    Returns:
+        the matches that LightGlue makes, none of them twice.
+
+    Raises:
+        ValueError: if an image has fewer than two features, or the descriptors are not of 128 columns of float32.
+        OSError: if the weights cannot be loaded.
+
+    References:
+        P. Lindenberger, P.-E. Sarlin and M. Pollefeys, LightGlue: local feature matching at light speed, ICCV 2023.
+
     """
-    if data[:2] != b"\xff\xd8":
-        return True
-    position = 2
-    while data[position : position + 1] == b"\xff" and data[position + 1 : position + 2] != b"\xda":
-        filler = data[position + 1 : position + 2] == b"\xff"
-        position += 1 if filler else 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-    return b"\xff\xd9" in data[position:]
+    _check(features1, features2)
+    for features in (features1, features2):
+        if features.descriptors.dtype != np.float32 or features.descriptors.shape[1] != 128:
+            got = f"{features.descriptors.dtype} with {features.descriptors.shape[1]} columns"
+            raise ValueError(f"LightGlue takes the descriptors of DISK, float32 with 128 columns, got {got}")
+    data = {f"image{index}": _lightglue_input(features) for index, features in enumerate((features1, features2))}
+    with torch.inference_mode():
+        found = _lightglue()(data)
+    index1, index2 = found["matches"][0].numpy().T
+    points1, points2 = torch.from_numpy(features1.points[index1]), torch.from_numpy(features2.points[index2])
+    return Matches(points1, points2, (1.0 - found["scores"][0]).clamp(0.0, 1.0).float().clone())
 
 
-def match_images(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8], num_features: int = 4000) -> Matches:
-    """Match the SIFT features of image 1 to their nearest neighbours in image 2, by brute force.
+# What a command line may call them.
+MATCHERS: dict[str, Callable[[Features, Features], Matches]] = {"nearest": match_nearest, "lightglue": match_lightglue}
 
-    No match is dropped: keep ``ratio < 0.8`` for Lowe's ratio test. A place with several orientations gives several
-    features, so correspondences can repeat, and several features of image 1 may share one of image 2.
+
+def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_features: int = 4000) -> Matches:
+    """Match the SIFT features of image 1 to their nearest neighbours in image 2.
 
     Args:
         image1: grey values with shape :math:`(H_1, W_1)`, uint8.
@@ -118,7 +109,7 @@ def match_images(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8], n
         num_features: how many of the strongest features to keep in each image.
 
     Returns:
-        as many matches as image 1 has features.
+        as many matches as image 1 has features; see :func:`match_nearest`.
 
     Raises:
         TypeError: if an image is not an array of uint8.
@@ -127,29 +118,29 @@ def match_images(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8], n
         ImportError: if OpenCV is not installed.
 
     """
-    if num_features < 2:
-        raise ValueError(f"num_features must be at least 2, got {num_features}")
-    sift = import_cv2().SIFT_create(num_features)
-    points1, descriptors1 = _features(sift, image1, "image 1")
-    points2, descriptors2 = _features(sift, image2, "image 2")
-    pairs = import_cv2().BFMatcher().knnMatch(descriptors1, descriptors2, k=2)
-    index1, index2 = np.array([(nearest.queryIdx, nearest.trainIdx) for nearest, _ in pairs]).T
-    distances = torch.tensor([[nearest.distance, second.distance] for nearest, second in pairs])
-    # Two equal neighbours are a tie, a ratio of one, at distance zero too.
-    ratio = torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
-    return Matches(torch.from_numpy(points1[index1]), torch.from_numpy(points2[index2]), ratio)
+    return match_nearest(detect_sift(image1, num_features), detect_sift(image2, num_features))
 
 
-def _features(
-    sift: Any, image: npt.NDArray[np.uint8], name: str
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Return the pixels (N, 2) and the descriptors (N, 128) of an image's features."""
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
-        raise TypeError(f"{name} must be an array of uint8, got {getattr(image, 'dtype', type(image))}")
-    if image.ndim != 2 or image.size == 0:
-        raise ValueError(f"{name} must be grey with shape (H, W), got {image.shape}")
-    keypoints, descriptors = sift.detectAndCompute(image, None)
-    if len(keypoints) < 2:
-        size = f"{image.shape[1]} x {image.shape[0]} pixels, values {image.min()} to {image.max()}"
-        raise ValueError(f"{name} is blank or nearly so: {len(keypoints)} SIFT features in it ({size})")
-    return np.array([keypoint.pt for keypoint in keypoints], np.float32), descriptors
+def _check(features1: Features, features2: Features) -> None:
+    for number, features in enumerate((features1, features2), 1):
+        if len(features.points) < 2:
+            size = f"{features.size[0]} x {features.size[1]} pixels"
+            raise ValueError(f"image {number} is blank or nearly so: {len(features.points)} features in it ({size})")
+    columns1, columns2 = (features.descriptors.shape[1] for features in (features1, features2))
+    if columns1 != columns2:
+        raise ValueError(f"descriptors of the same length expected, got {columns1} and {columns2} columns")
+
+
+def _lightglue_input(features: Features) -> dict[str, Tensor]:
+    return {
+        "keypoints": torch.from_numpy(features.points)[None],
+        "descriptors": torch.from_numpy(features.descriptors)[None],
+        "image_size": torch.tensor([features.size], dtype=torch.float32),
+    }
+
+
+@lru_cache(maxsize=1)
+def _lightglue() -> Any:
+    from kornia.feature import LightGlue
+
+    return pretrained("LightGlue for DISK", lambda: LightGlue("disk").eval())

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.files import replacing
 
 __all__ = ["RenderedPair", "render_pair", "write_pair"]
@@ -85,7 +86,7 @@ def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedP
         raise ValueError(f"seed must not be negative, got {seed}")
     if not 64 <= height <= width:
         raise ValueError(f"images must be at least 64 pixels high and no higher than wide, got {width} x {height}")
-    cv2 = _import_cv2()
+    cv2 = import_cv2()
     rng = np.random.default_rng(seed)
     K = np.array([[0.9 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]])
     yaw, pitch, roll = np.deg2rad([rng.uniform(-5, -3), rng.uniform(-1, 1), rng.uniform(-1.5, 1.5)])
@@ -115,7 +116,7 @@ def write_pair(folder: str | Path, pair: RenderedPair) -> None:
         ['ground_truth.json', 'image1.png', 'image2.png']
 
     """
-    cv2, folder = _import_cv2(), Path(folder)
+    cv2, folder = import_cv2(), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     height, width = pair.image1.shape
     truth = {name: getattr(pair, name).tolist() for name in ("K", "R", "t", "F_mat")}
@@ -124,14 +125,6 @@ def write_pair(folder: str | Path, pair: RenderedPair) -> None:
             temporary.write_bytes(cv2.imencode(".png", getattr(pair, name))[1].tobytes())
     with replacing(folder / "ground_truth.json") as temporary:
         temporary.write_text(json.dumps({"width": width, "height": height, **truth}, indent=2) + "\n")
-
-
-def _import_cv2() -> Any:
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("rendering needs OpenCV: pip install 'kornia-learnnorm[images]'") from error
-    return cv2
 
 
 def _rotation(yaw: float, pitch: float, roll: float) -> Array:

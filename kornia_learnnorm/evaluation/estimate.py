@@ -6,7 +6,7 @@ import argparse
 from contextlib import ExitStack
 from pathlib import Path
 
-from kornia_learnnorm.data.matching import read_image
+from kornia_learnnorm.data.images import read_image
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
 from kornia_learnnorm.files import replacing
 from kornia_learnnorm.learned import LearnedNormalizer

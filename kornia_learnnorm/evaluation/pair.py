@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.data.matching import import_cv2, match_images, read_image
+from kornia_learnnorm.data.images import import_cv2, read_image
+from kornia_learnnorm.data.matching import match_images
 from kornia_learnnorm.files import replacing
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
 from kornia_learnnorm.solver import find_fundamental

@@ -1,0 +1,190 @@
+"""Features of an image: where they are and how their surroundings look.
+
+SIFT is OpenCV's (extra ``images``). The learned detectors are Kornia's; they load their weights through
+:mod:`torch.hub`, from its cache or from where Kornia's authors put them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kornia_learnnorm.data.images import import_cv2
+
+__all__ = ["DETECTORS", "Features", "detect_disk", "detect_keynet", "detect_rootsift", "detect_sift", "pretrained"]
+
+
+class Features(NamedTuple):
+    """Features of one image.
+
+    Attributes:
+        points: pixels ``(x, y)`` with shape :math:`(N, 2)`, float32.
+        descriptors: one row a feature, :math:`(N, D)`; rows are compared by their Euclidean distance.
+        size: (width, height) of the image, pixels.
+
+    """
+
+    points: NDArray[np.float32]
+    descriptors: NDArray[Any]
+    size: tuple[int, int]
+
+
+def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+    """Find the strongest SIFT features.
+
+    A place with several orientations gives several features at the same pixel.
+
+    Args:
+        image: grey values with shape :math:`(H, W)`, uint8.
+        num_features: how many to keep.
+
+    Returns:
+        up to ``num_features`` features, descriptors uint8 with 128 columns.
+
+    Raises:
+        TypeError: if the image is not an array of uint8.
+        ValueError: if it is not of two dimensions, or ``num_features`` is below 2.
+        ImportError: if OpenCV is not installed.
+
+    References:
+        D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004.
+
+    """
+    _check(image, num_features)
+    keypoints, descriptors = import_cv2().SIFT_create(num_features).detectAndCompute(image, None)
+    points = np.array([keypoint.pt for keypoint in keypoints], np.float32).reshape(-1, 2)
+    # OpenCV's descriptors are whole numbers up to 255 in float32.
+    rows = np.zeros((0, 128), np.uint8) if descriptors is None else descriptors.astype(np.uint8)
+    return Features(points, rows, (image.shape[1], image.shape[0]))
+
+
+def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+    """Find SIFT features and take the square root of each descriptor of unit sum.
+
+    The Euclidean distance of these is the Hellinger distance of SIFT's histograms.
+
+    Args:
+        image: as for :func:`detect_sift`.
+        num_features: how many to keep.
+
+    Returns:
+        as :func:`detect_sift`, descriptors float32.
+
+    References:
+        R. Arandjelovic and A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012.
+
+    """
+    features = detect_sift(image, num_features)
+    rows = features.descriptors.astype(np.float32)
+    return features._replace(descriptors=np.sqrt(rows / np.maximum(rows.sum(1, keepdims=True), 1.0)))
+
+
+def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+    """Find features with Kornia's DISK, trained with depth.
+
+    Args:
+        image: as for :func:`detect_sift`.
+        num_features: how many to keep.
+
+    Returns:
+        up to ``num_features`` features, descriptors float32 with 128 columns.
+
+    Raises:
+        TypeError: if the image is not an array of uint8.
+        ValueError: if it is not of two dimensions, or ``num_features`` is below 2.
+        OSError: if the weights cannot be loaded.
+
+    References:
+        M. Tyszkiewicz, P. Fua and E. Trulls, DISK: learning local features with policy gradient, NeurIPS 2020.
+
+    """
+    _check(image, num_features)
+    with torch.inference_mode():
+        found = _disk()(_tensor(image).expand(-1, 3, -1, -1), num_features, pad_if_not_divisible=True)[0]
+    return Features(found.keypoints.float().numpy(), found.descriptors.numpy(), (image.shape[1], image.shape[0]))
+
+
+def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+    """Find features with Kornia's KeyNet, AffNet and HardNet.
+
+    Args:
+        image: as for :func:`detect_sift`.
+        num_features: how many to keep.
+
+    Returns:
+        up to ``num_features`` features, descriptors float32 with 128 columns.
+
+    Raises:
+        TypeError: if the image is not an array of uint8.
+        ValueError: if it is not of two dimensions, or ``num_features`` is below 2.
+        OSError: if the weights cannot be loaded.
+
+    References:
+        A. Barroso-Laguna et al., Key.Net, ICCV 2019; D. Mishkin et al., AffNet, ECCV 2018; A. Mishchuk et al.,
+        HardNet, NeurIPS 2017.
+
+    """
+    _check(image, num_features)
+    with torch.inference_mode():
+        frames, _, descriptors = _keynet(num_features)(_tensor(image))
+    return Features(frames[0, :, :, 2].float().numpy(), descriptors[0].numpy(), (image.shape[1], image.shape[0]))
+
+
+# What a command line may call them.
+DETECTORS: dict[str, Callable[[NDArray[np.uint8], int], Features]] = {
+    "sift": detect_sift,
+    "rootsift": detect_rootsift,
+    "disk": detect_disk,
+    "keynet": detect_keynet,
+}
+
+
+def pretrained(name: str, load: Callable[[], Any]) -> Any:
+    """Return what ``load`` makes; say so where its weights are not at hand.
+
+    Args:
+        name: what the message calls it.
+        load: makes a network of Kornia with its weights.
+
+    Raises:
+        OSError: if the weights are neither in the cache of :mod:`torch.hub` nor to be downloaded.
+
+    """
+    try:
+        return load()
+    except (OSError, RuntimeError) as error:
+        folder = f"{torch.hub.get_dir()}/checkpoints"
+        raise OSError(f"the weights of {name} are not in {folder} and could not be loaded: {error}") from error
+
+
+@lru_cache(maxsize=1)
+def _disk() -> Any:
+    from kornia.feature import DISK
+
+    return pretrained("DISK", DISK.from_pretrained)
+
+
+@lru_cache(maxsize=1)
+def _keynet(num_features: int) -> Any:
+    from kornia.feature import KeyNetAffNetHardNet
+
+    return pretrained("KeyNet, AffNet and HardNet", lambda: KeyNetAffNetHardNet(num_features))
+
+
+def _tensor(image: NDArray[np.uint8]) -> torch.Tensor:
+    """Grey values in [0, 1], (1, 1, H, W)."""
+    return torch.from_numpy(image)[None, None].float() / 255.0
+
+
+def _check(image: NDArray[np.uint8], num_features: int) -> None:
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        raise TypeError(f"an image must be an array of uint8, got {getattr(image, 'dtype', type(image))}")
+    if image.ndim != 2 or image.size == 0:
+        raise ValueError(f"an image must be grey with shape (H, W), got {image.shape}")
+    if num_features < 2:
+        raise ValueError(f"num_features must be at least 2, got {num_features}")
