@@ -1,0 +1,75 @@
+"""The subcommand that converts stores, from the command line's words on."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+import pytest
+
+from kornia_learnnorm.data.convert import add_arguments, run
+from kornia_learnnorm.data.store import read_store, write_store
+from kornia_learnnorm.data.synthesize import synthetic_store
+
+
+def convert(*words):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    return run(parser.parse_args([str(word) for word in words]))
+
+
+@pytest.fixture
+def path(tmp_path):
+    write_store(tmp_path / "store.h5", synthetic_store(pairs=1, points=30, seed=1))
+    return tmp_path / "store.h5"
+
+
+@pytest.mark.parametrize("kind", ["kitti-flow", "ngransac", "hloc"])
+def test_there_and_back(path, tmp_path, capsys, kind):
+    folder, back = tmp_path / "new" / "folder", tmp_path / "back.h5"
+    assert convert(path, folder, "--to", kind) == 0
+    line = capsys.readouterr().out
+    assert line.startswith(f"wrote {folder} from 3 pairs with 90 matches")
+    assert line.count("\n") == 1
+    assert ("; names with white space or empty, written with _: 2" in line) == (kind == "kitti-flow")
+    assert convert(folder, back, "--from", kind) == 0
+    got = read_store(back)
+    assert capsys.readouterr().out == f"wrote {back} from 3 pairs with {len(got.ratio)} matches\n"
+    assert len(got) == 3
+    if kind != "kitti-flow":
+        assert len(got.ratio) == 90
+        assert np.isin(got.ratio, read_store(path).ratio).all()
+    with pytest.raises(ValueError, match="already holds"):
+        convert(path, folder, "--to", kind)
+
+
+def test_some_pairs(path, tmp_path, capsys):
+    convert(f"{path}@1:2", tmp_path / "folder", "--to", "ngransac")
+    assert "from 1 pairs with 30 matches" in capsys.readouterr().out
+    assert [file.name for file in (tmp_path / "folder").iterdir()] == ["pair_0_1.npy"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "one of the arguments --from --to is required"),
+        (["--from", "hloc", "--to", "hloc"], "not allowed with argument"),
+        (["--to", "colmap"], "invalid choice: 'colmap'"),
+    ],
+)
+def test_wrong_words(words, message, capsys):
+    with pytest.raises(SystemExit):
+        convert("a", "b", *words)
+    assert message in capsys.readouterr().err
+
+
+def test_errors(path, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no store at"):
+        convert(tmp_path, tmp_path / "new", "--to", "hloc")
+    with pytest.raises(FileNotFoundError, match=r"no file of hloc at .*features\.h5"):
+        convert(tmp_path, tmp_path / "back.h5", "--from", "hloc")
+    with pytest.raises(FileNotFoundError, match="no folder at"):
+        convert(tmp_path / "none", tmp_path / "back.h5", "--from", "ngransac")
+    with pytest.raises(ValueError, match="it is a file, expected a folder"):
+        convert(path, path, "--to", "hloc")
+    assert [file.name for file in tmp_path.iterdir()] == ["store.h5"]
