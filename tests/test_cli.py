@@ -204,12 +204,15 @@ def test_a_checkpoint_is_needed(trained, command, capsys):
         ("weights.safetensors", "is not a checkpoint of a training run"),
         ("text.ckpt", "is not a checkpoint of a training run"),
         ("none.ckpt", "no checkpoint at"),
+        ("cut.ckpt", "cut.ckpt is not a checkpoint of a training run, or not a whole one"),
     ],
 )
 @pytest.mark.parametrize("command", ["fit", "test"])
 def test_wrong_checkpoints(trained, command, file, message, capsys):
     folder, options = trained
     (folder / "text.ckpt").write_text("not a checkpoint")
+    whole = (folder / "checkpoints/last.ckpt").read_bytes()
+    (folder / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
     assert main([command, *options, f"--ckpt_path={folder / file}"]) == 2
     assert message in capsys.readouterr().err
 

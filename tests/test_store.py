@@ -79,7 +79,10 @@ def _change(path, name, value):
         ("points2", np.zeros((10, 2)), r"points2 must have shape \(180, 2\)"),
         ("offsets", np.array([0, 9, 3, 4, 5, 6, 180]), "offsets must rise"),
         ("offsets", np.array([0]), "offsets must rise"),
-        ("points1", np.full((180, 2), np.nan), "NaN or infinite"),
+        ("points1", np.full((180, 2), np.nan), "points1 holds NaN or infinite"),
+        ("ratio", np.full(180, np.nan), "ratio holds NaN or infinite"),
+        ("points1", np.zeros((180, 2), int), "points1 must be float32, got int64"),
+        ("points1", np.full((180, 2), b"a"), "points1 must be float32"),
     ],
 )
 def test_inconsistent_arrays(store, tmp_path, name, value, message):
@@ -87,6 +90,16 @@ def test_inconsistent_arrays(store, tmp_path, name, value, message):
     write_store(path, store)
     _change(path, name, value)
     with pytest.raises(ValueError, match=message):
+        read_store(path)
+
+
+def test_a_group_in_place_of_a_dataset(store, tmp_path):
+    path = tmp_path / "store.h5"
+    write_store(path, store)
+    with h5py.File(path, "r+") as file:
+        del file["ratio"]
+        file.create_group("ratio")
+    with pytest.raises(ValueError, match="lacks the datasets ratio"):
         read_store(path)
 
 
@@ -109,7 +122,7 @@ def test_a_failed_write_leaves_the_old_file(store, tmp_path):
     write_store(path, store)
     before = path.read_bytes()
     broken = CorrespondenceStore(**{**vars(store), "K": "not an array"})
-    with pytest.raises(AttributeError):
+    with pytest.raises(ValueError, match="could not convert"):
         write_store(path, broken)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["store.h5"]

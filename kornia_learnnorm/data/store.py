@@ -6,8 +6,10 @@ configuration takes a store, ``file.h5@3:10`` means its pairs 3 to 9.
 
 from __future__ import annotations
 
+import json
 import re
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +21,7 @@ from kornia_learnnorm.files import replacing
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["CorrespondenceStore", "read_store", "write_store"]
+__all__ = ["CorrespondenceStore", "join_stores", "read_store", "write_store"]
 
 FORMAT, VERSION = "correspondences", 1
 # name: shape behind the first axis, dtype, "M" correspondences or "P" pairs
@@ -53,6 +55,7 @@ class CorrespondenceStore:
         dataset: what the images are.
         pairs: how the pairs were chosen.
         detector: how the correspondences were found.
+        provenance: what made the store: options, versions, pairs left out; of JSON's types.
     """
 
     points1: NDArray[np.float32]
@@ -68,6 +71,7 @@ class CorrespondenceStore:
     dataset: str
     pairs: str
     detector: str
+    provenance: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of image pairs."""
@@ -139,25 +143,28 @@ def read_store(path: str | Path) -> CorrespondenceStore:
 
 def _read(path: Path, file: h5py.File) -> CorrespondenceStore:
     if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
-        got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')!r}"
+        got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')}"
         raise ValueError(f"{path} is not a store: expected format={FORMAT!r}, version={VERSION}, got {got}")
-    missing = [name for name in (*_LAYOUT, "offsets", "names") if name not in file]
+    missing = [name for name in (*_LAYOUT, "offsets", "names") if not hasattr(file.get(name), "shape")]
     if missing:
         raise ValueError(f"{path} lacks the datasets {', '.join(missing)}")
     offsets = np.asarray(file["offsets"][:], np.int64)
     if offsets.ndim != 1 or len(offsets) < 2 or offsets[0] != 0 or (np.diff(offsets) < 0).any():
         raise ValueError(f"{path}: offsets must rise from 0 over at least one pair, got {offsets[:4]}...")
     rows = {"M": int(offsets[-1]), "P": len(offsets) - 1}
-    for name, (tail, _, axis) in _LAYOUT.items():
+    for name, (tail, dtype, axis) in _LAYOUT.items():
         if file[name].shape != (rows[axis], *tail):
             raise ValueError(f"{path}: {name} must have shape {(rows[axis], *tail)}, got {file[name].shape}")
+        if file[name].dtype.kind != np.dtype(dtype).kind:
+            raise ValueError(f"{path}: {name} must be {dtype}, got {file[name].dtype}")
     arrays: dict[str, Any] = {name: np.asarray(file[name][:], dtype) for name, (_, dtype, _) in _LAYOUT.items()}
-    for name in ("points1", "points2"):
+    for name in ("points1", "points2", "ratio"):
         if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{path}: {name} holds NaN or infinite pixels")
+            raise ValueError(f"{path}: {name} holds NaN or infinite numbers")
     names = [(str(first), str(second)) for first, second in file["names"].asstr()[:]]
     about: dict[str, Any] = {key: str(file.attrs.get(key, "")) for key in ("dataset", "pairs", "detector")}
-    return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about)
+    provenance = json.loads(file.attrs.get("provenance", "{}"))
+    return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about, provenance=provenance)
 
 
 def write_store(path: str | Path, store: CorrespondenceStore) -> None:
@@ -168,14 +175,53 @@ def write_store(path: str | Path, store: CorrespondenceStore) -> None:
         store: the correspondences.
 
     Raises:
-        FileNotFoundError: if the folder does not exist.
+        OSError: if the folder does not exist or cannot be written, or the disk is full.
+
+    """
+    join_stores(path, [store], store.provenance)
+
+
+def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provenance: dict[str, Any]) -> None:
+    """Write one store of all pairs of ``stores``, which are taken one after the other and need not fit in memory.
+
+    Args:
+        path: the HDF5 file to write, beside it first, then renamed; an existing one is replaced.
+        stores: at least one; what they are of is taken from the first.
+        provenance: that of the whole.
+
+    Raises:
+        ValueError: if there is no store.
+        OSError: if the folder does not exist or cannot be written, or the disk is full.
 
     """
     h5py = _h5py()
-    with replacing(path) as beside, h5py.File(beside, "w") as file:
-        file.attrs.update({"format": FORMAT, "version": VERSION})
-        file.attrs.update({key: getattr(store, key) for key in ("dataset", "pairs", "detector")})
-        file["offsets"] = store.offsets.astype(np.int64)
-        file["names"] = np.array(store.names, dtype=h5py.string_dtype())
-        for name, (_, dtype, _) in _LAYOUT.items():
-            file[name] = getattr(store, name).astype(dtype)
+    with replacing(path) as beside:
+        try:
+            with h5py.File(beside, "w") as file:
+                _append_all(h5py, file, stores)
+                if "offsets" not in file:
+                    raise ValueError(f"no pairs to write to {path}")
+                file.attrs.update({"format": FORMAT, "version": VERSION, "provenance": json.dumps(provenance)})
+        except RuntimeError as error:  # h5py's word for a disk that fills while a file is closed
+            raise OSError(f"{path} could not be written: {error}") from error
+
+
+def _append_all(h5py: Any, file: h5py.File, stores: Iterable[CorrespondenceStore]) -> None:
+    for store in stores:
+        if "offsets" not in file:
+            file.attrs.update({key: getattr(store, key) for key in ("dataset", "pairs", "detector")})
+            file.create_dataset("offsets", (1,), np.int64, maxshape=(None,), chunks=(1024,))
+            file.create_dataset("names", (0, 2), h5py.string_dtype(), maxshape=(None, 2), chunks=(1024, 2))
+            for name, (tail, dtype, axis) in _LAYOUT.items():
+                rows = 8192 if axis == "M" else 256
+                file.create_dataset(name, (0, *tail), dtype, maxshape=(None, *tail), chunks=(rows, *tail))
+        _append(file["offsets"], store.offsets[1:] + file["offsets"][-1])
+        _append(file["names"], np.array(store.names, dtype=h5py.string_dtype()))
+        for name in _LAYOUT:
+            _append(file[name], getattr(store, name))
+
+
+def _append(dataset: h5py.Dataset, rows: NDArray[Any]) -> None:
+    if len(rows):
+        dataset.resize(len(dataset) + len(rows), axis=0)
+        dataset[-len(rows) :] = rows

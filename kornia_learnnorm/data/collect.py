@@ -1,0 +1,310 @@
+"""Matching all pairs of frames into a store, on all cores or on many machines.
+
+The features of a frame wait on disk from when they are computed until its last pair is matched: none is computed twice,
+and memory does not grow with the number of pairs.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kornia_learnnorm.data.features import DETECTORS, Features
+from kornia_learnnorm.data.frames import Frame, FramePair
+from kornia_learnnorm.data.images import import_cv2, read_frame
+from kornia_learnnorm.data.matching import MATCHERS
+from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.data.writer import StoreWriter
+
+__all__ = ["MatchOptions", "collect_matches", "match_pair"]
+
+RATIO = 0.8  # Lowe's
+WINDOW = 8  # pairs for each process between looks at which features are needed no more
+RESTARTS = 3  # in a row and without a pair done, after that something kills every process
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """How images are matched.
+
+    Attributes:
+        detector: a key of :data:`~kornia_learnnorm.data.features.DETECTORS`.
+        num_features: the strongest features of an image that are kept.
+        matcher: a key of :data:`~kornia_learnnorm.data.matching.MATCHERS`.
+        max_matches: how many matches of a pair pass Lowe's ratio test of 0.8, and how many that do not, are kept, drawn
+            at random; None keeps all.
+        seed: seed of that draw and of the order of a pair's matches.
+
+    Raises:
+        ValueError: if there is no such detector or matcher, or a number is out of range.
+    """
+
+    detector: str = "sift"
+    num_features: int = 4000
+    matcher: str = "nearest"
+    max_matches: int | None = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for kind, given, known in (("detector", self.detector, DETECTORS), ("matcher", self.matcher, MATCHERS)):
+            if given not in known:
+                raise ValueError(f"{kind} must be one of {', '.join(known)}, got {given!r}")
+        if self.num_features < 2 or self.seed < 0 or (self.max_matches is not None and self.max_matches < 8):
+            got = f"{self.num_features}, {self.max_matches} and {self.seed}"
+            raise ValueError(f"at least 2 features, 8 matches or None, and a seed from 0 are expected, got {got}")
+
+
+def match_pair(
+    pair: FramePair,
+    features1: Features,
+    features2: Features,
+    place: int = 0,
+    options: MatchOptions | None = None,
+    about: dict[str, str] | None = None,
+) -> CorrespondenceStore:
+    """Match two frames, in random order.
+
+    Args:
+        pair: the frames, for what a store says of them.
+        features1: features of the first frame.
+        features2: features of the second frame.
+        place: the pair's place in the store; with the seed it decides the order.
+        options: how to match.
+        about: ``dataset`` and ``pairs`` of the store.
+
+    Returns:
+        a store of this pair.
+
+    Raises:
+        ValueError: if a frame has fewer than two features.
+
+    """
+    options = options or MatchOptions()
+    points1, points2, ratio = (part.numpy() for part in MATCHERS[options.matcher](features1, features2))
+    order = np.random.default_rng([options.seed, place]).permutation(len(ratio))
+    if options.max_matches is not None:
+        passes = ratio[order] < RATIO
+        rank = np.where(passes, passes.cumsum(), (~passes).cumsum())  # from 1, within its class
+        order = order[rank <= options.max_matches]
+    R, t = pair.motion
+    return CorrespondenceStore(
+        points1=points1[order],
+        points2=points2[order],
+        ratio=ratio[order],
+        offsets=np.array([0, len(order)]),
+        image_size=np.array([[features1.size, features2.size]], np.int32),
+        names=[(pair.frame1.name, pair.frame2.name)],
+        F=pair.F[None],
+        K=np.stack([pair.frame1.K, pair.frame2.K])[None],
+        R=R[None],
+        t=t[None],
+        detector=f"{options.detector}, {options.num_features} features, {options.matcher}",
+        dataset=(about or {}).get("dataset", ""),
+        pairs=(about or {}).get("pairs", ""),
+    )
+
+
+def collect_matches(
+    pairs: Sequence[FramePair],
+    path: str | Path,
+    options: MatchOptions | None = None,
+    about: dict[str, str] | None = None,
+    jobs: int = 1,
+    dask: str | None = None,
+) -> dict[str, str]:
+    """Match all pairs into a store, with a progress bar; a run that was stopped goes on where it was.
+
+    Args:
+        pairs: pairs of frames, in the order of the store.
+        path: the store to write. Until it is whole, its pairs wait in ``<path>.parts``.
+        options: how to match.
+        about: ``dataset`` and ``pairs`` of the store.
+        jobs: processes on this machine; -1 for as many as it has cores.
+        dask: address of a Dask scheduler whose workers match instead; they see the images under the same paths.
+
+    Returns:
+        the pairs that could not be matched, ``"name1 name2"``, and why; the store leaves them out and lists them.
+
+    Raises:
+        ValueError: if there are no pairs, none of them could be matched, or ``path`` holds something else.
+        OSError: if something cannot be written, or processes die again and again.
+        ImportError: if OpenCV, h5py, joblib or, for ``dask``, Dask is not installed.
+
+    """
+    options, about = options or MatchOptions(), about or {}
+    if not pairs:
+        raise ValueError("no pairs of frames to match")
+    names = "\n".join(f"{pair.frame1.name} {pair.frame2.name}" for pair in pairs)
+    writer = StoreWriter(path, {**about, **asdict(options), "frames": sha256(names.encode()).hexdigest()})
+    if writer.complete:
+        print(f"{path} is there already, made with these options", file=sys.stderr)
+        return {}
+    with _parallel(jobs, dask) as parallel:
+        skipped = _match_all(pairs, writer, options, about, parallel)
+    if len(skipped) == len(pairs):
+        raise ValueError(f"none of the {len(pairs)} pairs could be matched; the first: {next(iter(skipped.values()))}")
+    versions = {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "numpy", "h5py")}
+    versions["opencv"] = import_cv2().__version__
+    writer.finish({"versions": versions, "skipped": skipped})
+    return skipped
+
+
+@contextmanager
+def _parallel(jobs: int, dask: str | None) -> Iterator[Any]:
+    """Yield joblib's ``Parallel``, in order and one result at a time."""
+    try:
+        import joblib
+    except ImportError as error:
+        raise ImportError("matching many pairs needs joblib: pip install 'kornia-learnnorm[images]'") from error
+    make = {"return_as": "generator", "batch_size": 1, "max_nbytes": None}
+    if dask is None:
+        yield joblib.Parallel(n_jobs=jobs, **make)
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ImportError("a Dask scheduler needs Dask: pip install 'kornia-learnnorm[dask]'") from error
+    client = Client(dask)  # type: ignore[no-untyped-call]
+    with client, joblib.parallel_config(backend="dask", client=client):
+        yield joblib.Parallel(n_jobs=-1, **make)
+
+
+def _match_all(
+    pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: dict[str, str], parallel: Any
+) -> dict[str, str]:
+    """Match what is not done; go on after a process was killed."""
+    from joblib.externals.loky.process_executor import BrokenProcessPool
+    from tqdm import tqdm
+
+    done = writer.done()
+    slow = None if sys.stderr.isatty() else 30.0
+    skipped: dict[str, str] = {}
+    restarts = 0
+    with tqdm(total=len(pairs), initial=len(done), unit="pair", mininterval=slow or 0.1) as bar:
+        while True:
+            todo = [place for place in range(len(pairs)) if place not in done]
+            try:
+                for place, result in _match_some(pairs, todo, writer.folder, options, about, parallel):
+                    if isinstance(result, str):
+                        skipped[f"{pairs[place].frame1.name} {pairs[place].frame2.name}"] = result
+                    else:
+                        writer.add(place, result)
+                    done.add(place)
+                    restarts = 0
+                    bar.update()
+                return skipped
+            except BrokenProcessPool as error:
+                restarts += 1
+                if restarts > RESTARTS:
+                    raise OSError(f"the processes that match were killed {restarts} times in a row: {error}") from error
+                print("a process was killed; going on with the others", file=sys.stderr)
+
+
+def _match_some(
+    pairs: Sequence[FramePair],
+    todo: Sequence[int],
+    folder: Path,
+    options: MatchOptions,
+    about: dict[str, str],
+    parallel: Any,
+) -> Iterator[tuple[int, CorrespondenceStore | str]]:
+    """Yield each place of ``todo`` with its pair's store, or why there is none."""
+    from joblib import delayed
+
+    cache = _FeatureCache(folder / "features", [pairs[place] for place in todo])
+    window = WINDOW * parallel._effective_n_jobs()
+    for first in range(0, len(todo), window):
+        places = todo[first : first + window]
+        missing = cache.missing([pairs[place] for place in places])
+        found = parallel(delayed(_detect)(frame, options) for frame in missing)
+        for frame, features in zip(missing, found, strict=True):
+            cache.put(frame, features)
+        tasks = (delayed(_match)(pairs[place], *cache.get(pairs[place]), place, options, about) for place in places)
+        for place, result in zip(places, parallel(tasks), strict=True):
+            yield place, result
+            cache.release(pairs[place])
+    cache.remove()
+
+
+def _detect(frame: Frame, options: MatchOptions) -> Features | str:
+    """Return a frame's features, or why it cannot be read."""
+    import_cv2().setNumThreads(1)
+    try:
+        image = read_frame(frame)
+    except (OSError, ValueError) as error:
+        return str(error)
+    return DETECTORS[options.detector](image, options.num_features)
+
+
+def _match(
+    pair: FramePair,
+    features1: Features | str,
+    features2: Features | str,
+    place: int,
+    options: MatchOptions,
+    about: dict[str, str],
+) -> CorrespondenceStore | str:
+    """Return a pair's store, or why there is none."""
+    for features in (features1, features2):
+        if isinstance(features, str):
+            return features
+    import_cv2().setNumThreads(1)
+    try:
+        return match_pair(pair, features1, features2, place, options, about)  # type: ignore[arg-type]
+    except ValueError as error:
+        return str(error)
+
+
+class _FeatureCache:
+    """Features on disk, each until the last of ``pairs`` that needs it is released."""
+
+    def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
+        self.folder = folder
+        self.uses = Counter(frame.name for pair in pairs for frame in (pair.frame1, pair.frame2))
+        self.held: dict[str, Path | str] = {}
+        self.remove()
+        folder.mkdir()
+
+    def missing(self, pairs: Sequence[FramePair]) -> list[Frame]:
+        frames = {frame.name: frame for pair in pairs for frame in (pair.frame1, pair.frame2)}
+        return [frame for name, frame in frames.items() if name not in self.held]
+
+    def put(self, frame: Frame, features: Features | str) -> None:
+        if isinstance(features, str):
+            self.held[frame.name] = features
+            return
+        path = self.folder / f"{sha256(frame.name.encode()).hexdigest()}.npz"
+        np.savez(path, points=features.points, descriptors=features.descriptors, size=features.size)
+        self.held[frame.name] = path
+
+    def get(self, pair: FramePair) -> tuple[Features | str, Features | str]:
+        return self._get(pair.frame1), self._get(pair.frame2)
+
+    def _get(self, frame: Frame) -> Features | str:
+        held = self.held[frame.name]
+        if isinstance(held, str):
+            return held
+        with np.load(held) as data:
+            width, height = data["size"].tolist()
+            return Features(data["points"], data["descriptors"], (width, height))
+
+    def release(self, pair: FramePair) -> None:
+        for frame in (pair.frame1, pair.frame2):
+            self.uses[frame.name] -= 1
+            held = self.held.get(frame.name)
+            if self.uses[frame.name] == 0 and isinstance(held, Path):
+                held.unlink()
+                del self.held[frame.name]
+
+    def remove(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)

@@ -1,0 +1,100 @@
+"""Writing a store pair by pair: what was added survives a crash."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from kornia_learnnorm.data.store import CorrespondenceStore, join_stores, read_store, write_store
+from kornia_learnnorm.files import replacing
+
+__all__ = ["StoreWriter"]
+
+
+class StoreWriter:
+    """Collect the pairs of a store in any order.
+
+    Each pair waits as a store of its own in the folder ``<path>.parts``. A run that was killed finds there what it had,
+    and what it was: other options are refused. :meth:`finish` joins the parts in their order and removes the folder.
+
+    Args:
+        path: the store to write, an HDF5 file.
+        options: what the store depends on, of JSON's types; a part that other options made must not mix with these.
+
+    Attributes:
+        path: the store to write.
+        folder: where the parts wait.
+        complete: the store is there already, made with the same options.
+
+    Raises:
+        FileNotFoundError: if the folder of the store does not exist.
+        PermissionError: if it cannot be written.
+        ValueError: if the store, or parts of it, are there but were made with other options or by other means.
+    """
+
+    def __init__(self, path: str | Path, options: dict[str, Any]) -> None:
+        self.path = Path(path)
+        self.folder = self.path.with_name(self.path.name + ".parts")
+        self.options: dict[str, Any] = json.loads(json.dumps(options))
+        self.complete = self.path.exists()
+        if self.complete:
+            _refuse(self.path, read_store(self.path).provenance.get("options"), self.options)
+            return
+        about = self.folder / "options.json"
+        if about.is_file():
+            _refuse(self.folder, json.loads(about.read_text(encoding="utf-8")), self.options)
+            return
+        if not self.path.parent.is_dir():
+            raise FileNotFoundError(f"cannot write {self.path}: the folder {self.path.parent} does not exist")
+        self.folder.mkdir(exist_ok=True)
+        with replacing(about) as beside:
+            beside.write_text(json.dumps(self.options, indent=1), encoding="utf-8")
+
+    def done(self) -> set[int]:
+        """Return the places of the pairs that are there."""
+        return {int(part.stem) for part in self._parts()}
+
+    def add(self, place: int, pair: CorrespondenceStore) -> None:
+        """Write a pair.
+
+        Args:
+            place: its place among the pairs of the store, from 0.
+            pair: a store of one pair.
+
+        Raises:
+            ValueError: if it is not one pair, or the place is negative.
+            OSError: if it cannot be written, as on a full disk.
+
+        """
+        if len(pair) != 1 or place < 0:
+            raise ValueError(f"one pair and a place from 0 on are expected, got {len(pair)} pairs and place {place}")
+        write_store(self.folder / f"{place:08d}.h5", pair)
+
+    def finish(self, provenance: dict[str, Any]) -> None:
+        """Write the store and remove the parts.
+
+        Args:
+            provenance: what made the store, of JSON's types; the options are added to it.
+
+        Raises:
+            ValueError: if no pair was added, or a part is no longer readable.
+            OSError: if the store cannot be written; the parts stay.
+
+        """
+        join_stores(self.path, map(read_store, self._parts()), {**provenance, "options": self.options})
+        shutil.rmtree(self.folder)
+
+    def _parts(self) -> Iterator[Path]:
+        return iter(sorted(self.folder.glob("[0-9]*.h5")))
+
+
+def _refuse(path: Path, had: Any, options: dict[str, Any]) -> None:
+    if not isinstance(had, dict):
+        raise ValueError(f"{path} is there, but not made by this command: remove it or write elsewhere")
+    other = [key for key in {**had, **options} if had.get(key) != options.get(key)]
+    if other:
+        differ = ", ".join(f"{key} was {had.get(key)!r} and is {options.get(key)!r}" for key in other)
+        raise ValueError(f"{path} was made with other options, remove it or write elsewhere: {differ}")
