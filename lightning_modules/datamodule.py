@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any, Protocol
 
+import numpy as np
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.utilities import rank_zero_info
+from torch.utils.data import DataLoader, Dataset
 
 from kornia_learnnorm.data.samples import Samples
+from kornia_learnnorm.data.sources import Block, block_generator
 
 # Far from the seeds of training epochs, since the synthetic source gives the same scenes for the same seed. A generator
 # on the CPU reads 32 bits of it.
@@ -19,44 +23,67 @@ __all__ = ["CorrespondenceDataModule", "SampleLoader", "SampleSource"]
 
 
 class SampleSource(Protocol):
-    """Anything that draws samples: stores of correspondences, the synthetic generator."""
+    """Anything that draws samples block by block: stores of correspondences, the synthetic generator."""
 
-    def draw(self, seed: int) -> Samples:
-        """Return samples that depend on nothing but ``seed``."""
+    def blocks(self, seed: int) -> list[Block]:
+        """Return what each block of a draw holds before any filter; the sums are the same for all seeds."""
+
+    def draw(self, seed: int, block: int) -> Samples:
+        """Return the samples of a block, which depend on nothing but ``seed`` and ``block``."""
 
 
 class SampleLoader:
     """Batches of samples, drawn anew each epoch; the state is the epoch and the batch, so training resumes exactly.
 
-    Every epoch has as many batches as the first draw fills. A shuffled loader drops the rest that fills none; an
-    ordered one draws once and keeps all.
+    A block is cut into batches of nearly equal size, so none of its samples is lost or comes twice. The number of
+    batches is the same in every epoch: how many samples the filter keeps is told from the first block of the first
+    epoch, and batches are as much smaller or larger than ``batch_size`` as other blocks differ from it. Of several
+    processes each takes its share of every batch.
 
     Args:
         source: where the samples come from.
-        batch_size: samples in a batch, or image pairs.
+        batch_size: samples in a batch, or image pairs, of all processes together.
         seed: seed of all draws.
         shuffle: draw and shuffle anew each epoch (training) or keep one draw in order (evaluation).
         by_pair: count and shuffle image pairs, each with all its samples, instead of samples.
+        workers: processes that draw the next blocks meanwhile; 0 draws in this one.
+        rank: number of this process.
+        world_size: number of processes.
 
     Raises:
-        ValueError: if the batch size is not positive, or a shuffled draw does not fill one batch.
+        ValueError: if the batch size is not positive or below the number of processes, or a shuffled draw does not fill
+            one batch.
     """
 
-    def __init__(self, source: SampleSource, batch_size: int, seed: int, shuffle: bool, by_pair: bool = False) -> None:
-        if batch_size < 1:
-            raise ValueError(f"a batch must hold at least one sample or image pair, got {batch_size}")
+    def __init__(
+        self,
+        source: SampleSource,
+        batch_size: int,
+        seed: int,
+        shuffle: bool,
+        by_pair: bool = False,
+        workers: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        unit = "image pair" if by_pair else "sample"
+        if batch_size < world_size:
+            raise ValueError(f"a batch must hold at least one {unit} for each process, got {batch_size}")
         self.source = source
         self.batch_size = batch_size
         self.seed = seed
         self.shuffle = shuffle
         self.by_pair = by_pair
+        self.workers = workers
+        self.rank, self.world_size = rank, world_size
         self.epoch, self.batch = 0, 0
-        self._drawn: tuple[int, Samples] | None = None
-        number = len(self._units(self._draw(0)))
-        self._length = number // batch_size if shuffle else -(-number // batch_size)
-        if self._length == 0:
-            unit = "image pairs" if by_pair else "samples"
-            raise ValueError(f"a batch takes {batch_size} {unit}, the source gives {number}")
+        self._drawn: tuple[int, int, Samples] | None = None
+        sizes = self._sizes(0)
+        kept = len(self._units(self._draw(0, 0))) / max(sizes[0], 1)
+        number = round(kept * sum(sizes))
+        if number < (batch_size if shuffle else 1):
+            raise ValueError(f"a batch takes {batch_size} {unit}s, the source gives {number}")
+        self._length = -(-number // batch_size)
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
@@ -65,19 +92,18 @@ class SampleLoader:
     def __iter__(self) -> Iterator[Samples]:
         """Yield the batches of the current epoch from the current batch on."""
         epoch, start = self.epoch, self.batch
-        samples = self._draw(epoch)
-        units = self._units(samples)
-        number = len(units)
-        order = torch.arange(number)
-        if self.shuffle:
-            order = torch.randperm(number, generator=torch.Generator().manual_seed(self.seed + epoch))
-            # The filter keeps slightly different numbers each epoch: a shorter epoch starts over.
-            order = order.repeat(1 + self._length * self.batch_size // number)
-        for index in range(start, self._length):
-            last = index + 1 == self._length
-            self.epoch, self.batch = (epoch + 1, 0) if last else (epoch, index + 1)
-            chosen = order[index * self.batch_size : min((index + 1) * self.batch_size, len(order))]
-            yield samples.select(torch.cat([units[i] for i in chosen]) if self.by_pair else chosen)
+        # Batch number i of the epoch belongs to the block whose share of all samples it falls into.
+        shares = np.cumsum([0, *self._sizes(epoch)])
+        bounds = [int(bound) for bound in np.rint(shares * (self._length / shares[-1]))]
+        first = max(block for block, bound in enumerate(bounds[:-1]) if bound <= start)
+        for block, samples in zip(range(first, len(bounds) - 1), self._blocks(epoch, first), strict=True):
+            number = bounds[block + 1] - bounds[block]
+            for index, batch in enumerate(self._cut(samples, number, epoch, block), bounds[block]):
+                if index >= start:
+                    last = index + 1 == self._length
+                    self.epoch, self.batch = (epoch + 1, 0) if last else (epoch, index + 1)
+                    yield batch
+        self.epoch, self.batch = epoch + 1, 0
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position: the epoch and the next batch."""
@@ -87,6 +113,17 @@ class SampleLoader:
         """Go to a saved position."""
         self.epoch, self.batch = state["epoch"], state["batch"]
 
+    def _cut(self, samples: Samples, number: int, epoch: int, block: int) -> Iterator[Samples]:
+        """Yield this process's shares of ``number`` batches, or of fewer where the samples are too few."""
+        units = self._units(samples)
+        order = torch.arange(len(units))
+        if self.shuffle:
+            order = torch.randperm(len(units), generator=block_generator(self._seed(epoch), block, 1))
+        number = min(number, len(units) // self.world_size)
+        for first, stop in pairwise(len(units) * i // number for i in range(number + 1)):
+            chosen = order[first + self.rank : stop : self.world_size]
+            yield samples.select(torch.cat([units[i] for i in chosen]) if self.by_pair else chosen)
+
     def _units(self, samples: Samples) -> Sequence[Any]:
         """Rows of ``samples`` that stay together: those of a pair, or each alone."""
         if not self.by_pair:
@@ -94,11 +131,38 @@ class SampleLoader:
         counts = torch.unique(samples.pair, return_counts=True)[1]
         return torch.split(torch.argsort(samples.pair, stable=True), counts.tolist())
 
-    def _draw(self, epoch: int) -> Samples:
-        epoch = epoch if self.shuffle else 0
-        if self._drawn is None or self._drawn[0] != epoch:
-            self._drawn = epoch, self.source.draw(self.seed + epoch)
-        return self._drawn[1]
+    def _sizes(self, epoch: int) -> list[int]:
+        blocks = self.source.blocks(self._seed(epoch))
+        return [block.pairs if self.by_pair else block.samples for block in blocks]
+
+    def _blocks(self, epoch: int, first: int) -> Iterator[Samples]:
+        """Yield the blocks of an epoch from ``first`` on."""
+        number = len(self.source.blocks(self._seed(epoch)))
+        if self.workers and number > first + 1:
+            drawn = _Blocks(self.source, self._seed(epoch))
+            yield from DataLoader(drawn, batch_size=None, sampler=range(first, number), num_workers=self.workers)
+        else:
+            for block in range(first, number):
+                yield self._draw(epoch, block)
+
+    def _draw(self, epoch: int, block: int) -> Samples:
+        seed = self._seed(epoch)
+        if self._drawn is None or self._drawn[:2] != (seed, block):
+            self._drawn = seed, block, self.source.draw(seed, block)
+        return self._drawn[2]
+
+    def _seed(self, epoch: int) -> int:
+        return self.seed + (epoch if self.shuffle else 0)
+
+
+class _Blocks(Dataset[Samples]):
+    """The blocks of a draw, for the processes of a DataLoader."""
+
+    def __init__(self, source: SampleSource, seed: int) -> None:
+        self.source, self.seed = source, seed
+
+    def __getitem__(self, block: int) -> Samples:
+        return self.source.draw(self.seed, block)
 
 
 class CorrespondenceDataModule(pl.LightningDataModule):
@@ -111,6 +175,7 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         batch_size: samples in a batch.
         batch_pairs: image pairs in a training batch, each with all its samples; replaces ``batch_size`` there.
         seed: seed of the training draws; validation and test are drawn once, from a seed of their own.
+        workers: processes that draw the next blocks of training samples meanwhile.
     """
 
     def __init__(
@@ -121,12 +186,14 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         batch_size: int = 1024,
         batch_pairs: int | None = None,
         seed: int = 0,
+        workers: int = 0,
     ) -> None:
         super().__init__()
         self.train, self.val, self.test = train, val, test
         self.batch_size = batch_size
         self.batch_pairs = batch_pairs
         self.seed = seed
+        self.workers = workers
 
     def train_dataloader(self) -> SampleLoader:
         """Return the shuffled loader of the training samples."""
@@ -147,10 +214,10 @@ class CorrespondenceDataModule(pl.LightningDataModule):
     def _loader(self, stage: str, source: SampleSource | None, seed: int, shuffle: bool) -> SampleLoader:
         if source is None:
             raise ValueError(f"data.{stage} is not set: give it a source of samples")
-        if shuffle and self.batch_pairs is not None:
-            loader = SampleLoader(source, self.batch_pairs, seed, shuffle, by_pair=True)
-            rank_zero_info(f"{stage}: {len(loader)} batches of {self.batch_pairs} image pairs")
-        else:
-            loader = SampleLoader(source, self.batch_size, seed, shuffle)
-            rank_zero_info(f"{stage}: {len(loader)} batches of up to {self.batch_size} samples")
+        by_pair = shuffle and self.batch_pairs is not None
+        batch = self.batch_pairs if by_pair and self.batch_pairs is not None else self.batch_size
+        rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        workers = self.workers if shuffle else 0
+        loader = SampleLoader(source, batch, seed, shuffle, by_pair, workers, rank, world_size)
+        rank_zero_info(f"{stage}: {len(loader)} batches of about {batch} {'image pairs' if by_pair else 'samples'}")
         return loader

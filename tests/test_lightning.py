@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.samples import SyntheticSamples
+from kornia_learnnorm.data.sources import SyntheticSamples
 from lightning_modules.callbacks import Checkpoints, ExportWeights, WritePredictions
 from lightning_modules.datamodule import EVALUATION_SEED, CorrespondenceDataModule, SampleLoader
 from lightning_modules.task import NormalizerTask

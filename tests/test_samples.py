@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.data.samples import StoreSamples, SyntheticSamples, draw_samples, plain_residual
+from kornia_learnnorm.data.samples import draw_samples, plain_residual
+from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
 from kornia_learnnorm.data.store import write_store
 from kornia_learnnorm.data.synthesize import synthetic_store
 from kornia_learnnorm.data.synthetic import forward_driving, handheld

@@ -6,12 +6,9 @@ and memory does not grow with the number of pairs.
 
 from __future__ import annotations
 
-import importlib.metadata
-import shutil
 import sys
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -19,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+import kornia_learnnorm
+from kornia_learnnorm.data.feature_cache import FeatureCache
 from kornia_learnnorm.data.features import DETECTORS, Features
 from kornia_learnnorm.data.frames import Frame, FramePair
 from kornia_learnnorm.data.images import import_cv2, read_frame
@@ -144,19 +143,34 @@ def collect_matches(
     options, about = options or MatchOptions(), about or {}
     if not pairs:
         raise ValueError("no pairs of frames to match")
-    names = "\n".join(f"{pair.frame1.name} {pair.frame2.name}" for pair in pairs)
-    writer = StoreWriter(path, {**about, **asdict(options), "frames": sha256(names.encode()).hexdigest()})
+    writer = StoreWriter(path, {**about, **asdict(options), "frames": _digest(pairs)})
     if writer.complete:
         print(f"{path} is there already, made with these options", file=sys.stderr)
-        return {}
+        return writer.skipped
     with _parallel(jobs, dask) as parallel:
         skipped = _match_all(pairs, writer, options, about, parallel)
-    if len(skipped) == len(pairs):
+    if not writer.done():
         raise ValueError(f"none of the {len(pairs)} pairs could be matched; the first: {next(iter(skipped.values()))}")
-    versions = {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "numpy", "h5py")}
-    versions["opencv"] = import_cv2().__version__
-    writer.finish({"versions": versions, "skipped": skipped})
+    writer.finish({"versions": _versions(), "skipped": skipped})
     return skipped
+
+
+def _digest(pairs: Sequence[FramePair]) -> str:
+    """Return what tells these pairs, their cameras and their poses from others."""
+    digest = sha256()
+    for pair in pairs:
+        for frame in (pair.frame1, pair.frame2):
+            digest.update(f"{frame.name}\n{frame.size} {frame.matched_size} {frame.distortion}\n".encode())
+            for array in (frame.camera, frame.pose):  # rounded: another machine may differ in the last digit
+                digest.update((array.round(6) + 0.0).tobytes())
+    return digest.hexdigest()
+
+
+def _versions() -> dict[str, str]:
+    import h5py
+
+    versions = {"kornia_learnnorm": kornia_learnnorm.__version__, "numpy": np.__version__, "h5py": h5py.__version__}
+    return {**versions, "opencv": import_cv2().__version__}
 
 
 @contextmanager
@@ -171,12 +185,15 @@ def _parallel(jobs: int, dask: str | None) -> Iterator[Any]:
         yield joblib.Parallel(n_jobs=jobs, **make)
         return
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker
     except ImportError as error:
         raise ImportError("a Dask scheduler needs Dask: pip install 'kornia-learnnorm[dask]'") from error
     client = Client(dask)  # type: ignore[no-untyped-call]
     with client, joblib.parallel_config(backend="dask", client=client):
-        yield joblib.Parallel(n_jobs=-1, **make)
+        try:
+            yield joblib.Parallel(n_jobs=-1, **make)
+        except KilledWorker as error:
+            raise OSError(f"workers of {dask} that match were killed again and again: {error}") from error
 
 
 def _match_all(
@@ -190,24 +207,25 @@ def _match_all(
     slow = None if sys.stderr.isatty() else 30.0
     skipped: dict[str, str] = {}
     restarts = 0
-    with tqdm(total=len(pairs), initial=len(done), unit="pair", mininterval=slow or 0.1) as bar:
+    with tqdm(total=len(pairs), initial=len(done), unit="pair", mininterval=slow or 0.1, maxinterval=slow or 10) as bar:
         while True:
             todo = [place for place in range(len(pairs)) if place not in done]
             try:
-                for place, result in _match_some(pairs, todo, writer.folder, options, about, parallel):
-                    if isinstance(result, str):
-                        skipped[f"{pairs[place].frame1.name} {pairs[place].frame2.name}"] = result
-                    else:
-                        writer.add(place, result)
-                    done.add(place)
-                    restarts = 0
-                    bar.update()
+                with closing(_match_some(pairs, todo, writer.folder, options, about, parallel)) as results:
+                    for place, result in results:
+                        if isinstance(result, str):
+                            skipped[f"{pairs[place].frame1.name} {pairs[place].frame2.name}"] = result
+                        else:
+                            writer.add(place, result)
+                        done.add(place)
+                        restarts = 0
+                        bar.update()
                 return skipped
             except BrokenProcessPool as error:
                 restarts += 1
                 if restarts > RESTARTS:
                     raise OSError(f"the processes that match were killed {restarts} times in a row: {error}") from error
-                print("a process was killed; going on with the others", file=sys.stderr)
+                bar.write("a process was killed; going on with the others", file=sys.stderr)
 
 
 def _match_some(
@@ -219,21 +237,21 @@ def _match_some(
     parallel: Any,
 ) -> Iterator[tuple[int, CorrespondenceStore | str]]:
     """Yield each place of ``todo`` with its pair's store, or why there is none."""
-    from joblib import delayed
+    from joblib import delayed, effective_n_jobs
 
-    cache = _FeatureCache(folder / "features", [pairs[place] for place in todo])
-    window = WINDOW * parallel._effective_n_jobs()
-    for first in range(0, len(todo), window):
-        places = todo[first : first + window]
-        missing = cache.missing([pairs[place] for place in places])
-        found = parallel(delayed(_detect)(frame, options) for frame in missing)
-        for frame, features in zip(missing, found, strict=True):
-            cache.put(frame, features)
-        tasks = (delayed(_match)(pairs[place], *cache.get(pairs[place]), place, options, about) for place in places)
-        for place, result in zip(places, parallel(tasks), strict=True):
-            yield place, result
-            cache.release(pairs[place])
-    cache.remove()
+    window = WINDOW * effective_n_jobs(parallel.n_jobs)
+    with FeatureCache(folder / "features", [pairs[place] for place in todo]) as cache:
+        for first in range(0, len(todo), window):
+            places = todo[first : first + window]
+            missing = cache.missing([pairs[place] for place in places])
+            with closing(parallel(delayed(_detect)(frame, options) for frame in missing)) as found:
+                for frame, features in zip(missing, found, strict=True):
+                    cache.put(frame, features)
+            tasks = (delayed(_match)(pairs[place], *map(cache.get, _frames(pairs[place])), place, options, about) for place in places)
+            with closing(parallel(tasks)) as results:
+                for place, result in zip(places, results, strict=True):
+                    yield place, result
+                    cache.release(pairs[place])
 
 
 def _detect(frame: Frame, options: MatchOptions) -> Features | str:
@@ -263,48 +281,3 @@ def _match(
         return match_pair(pair, features1, features2, place, options, about)  # type: ignore[arg-type]
     except ValueError as error:
         return str(error)
-
-
-class _FeatureCache:
-    """Features on disk, each until the last of ``pairs`` that needs it is released."""
-
-    def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
-        self.folder = folder
-        self.uses = Counter(frame.name for pair in pairs for frame in (pair.frame1, pair.frame2))
-        self.held: dict[str, Path | str] = {}
-        self.remove()
-        folder.mkdir()
-
-    def missing(self, pairs: Sequence[FramePair]) -> list[Frame]:
-        frames = {frame.name: frame for pair in pairs for frame in (pair.frame1, pair.frame2)}
-        return [frame for name, frame in frames.items() if name not in self.held]
-
-    def put(self, frame: Frame, features: Features | str) -> None:
-        if isinstance(features, str):
-            self.held[frame.name] = features
-            return
-        path = self.folder / f"{sha256(frame.name.encode()).hexdigest()}.npz"
-        np.savez(path, points=features.points, descriptors=features.descriptors, size=features.size)
-        self.held[frame.name] = path
-
-    def get(self, pair: FramePair) -> tuple[Features | str, Features | str]:
-        return self._get(pair.frame1), self._get(pair.frame2)
-
-    def _get(self, frame: Frame) -> Features | str:
-        held = self.held[frame.name]
-        if isinstance(held, str):
-            return held
-        with np.load(held) as data:
-            width, height = data["size"].tolist()
-            return Features(data["points"], data["descriptors"], (width, height))
-
-    def release(self, pair: FramePair) -> None:
-        for frame in (pair.frame1, pair.frame2):
-            self.uses[frame.name] -= 1
-            held = self.held.get(frame.name)
-            if self.uses[frame.name] == 0 and isinstance(held, Path):
-                held.unlink()
-                del self.held[frame.name]
-
-    def remove(self) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)

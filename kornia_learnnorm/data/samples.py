@@ -1,22 +1,18 @@
-r"""Samples: the correspondences of image pairs, shuffled and cut into sets of eight, and sources that draw them."""
+r"""Samples: the correspondences of image pairs, shuffled and cut into sets of eight or more."""
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
+from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.normalizers import Identity
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
 from kornia_learnnorm.solver import find_fundamental
 
-__all__ = ["Samples", "StoreSamples", "SyntheticSamples", "draw_samples", "plain_residual"]
+__all__ = ["Samples", "draw_samples", "plain_residual"]
 
 RATIO = 0.8
 
@@ -134,104 +130,3 @@ def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = 8192) -> 
         )
     ]
     return torch.cat(residuals) if residuals else points1.new_zeros(0, dtype=torch.float64)
-
-
-class StoreSamples:
-    """Draw samples from stores of correspondences, each store once per ratio.
-
-    Args:
-        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
-            ``$LEARNNORM_DATA`` are filled in.
-        max_ratios: ratio tests; 0.8 gives the filtered samples, None the unfiltered ones, both a mix.
-        size: correspondences in a sample.
-        num_heldout: held-out correspondences per sample.
-        max_residual: drop samples whose :func:`plain_residual` is at least this many pixels; None keeps all.
-
-    Raises:
-        ValueError: if no path is given or an environment variable is not set.
-        FileNotFoundError: if there is no such store.
-    """
-
-    def __init__(
-        self,
-        paths: Sequence[str],
-        max_ratios: Sequence[float | None] = (RATIO,),
-        size: int = 8,
-        num_heldout: int = 0,
-        max_residual: float | None = 60.0,
-    ) -> None:
-        if not paths or not max_ratios:
-            raise ValueError(f"at least one store and one ratio are needed, got {paths!r} and {max_ratios!r}")
-        self.stores = [read_store(_expand(path)) for path in paths]
-        self.max_ratios = max_ratios
-        self.size = size
-        self.num_heldout = num_heldout
-        self.max_residual = max_residual
-
-    def draw(self, seed: int) -> Samples:
-        """Return one shuffle of all stores; the pairs of later stores count on from those of earlier ones."""
-        generator = torch.Generator().manual_seed(seed)
-        parts, first = [], 0
-        for store in self.stores:
-            for ratio in self.max_ratios:
-                part = draw_samples(store, generator, self.size, ratio, self.num_heldout, self.max_residual)
-                parts.append(part._replace(pair=part.pair + first))
-            first += len(store)
-        return Samples(*map(torch.cat, zip(*parts, strict=True)))
-
-
-class SyntheticSamples:
-    """Draw samples from synthetic scenes, a scene for each.
-
-    Args:
-        number: scenes per draw; the residual filter drops some of them.
-        size: correspondences in a sample.
-        num_heldout: held-out correspondences per sample, inliers and outliers alike.
-        max_residual: drop samples whose :func:`plain_residual` is at least this many pixels; None keeps all.
-        scenes: makes scenes from their number, the points of each and a generator; one of
-            :mod:`kornia_learnnorm.data.synthetic`.
-
-    Raises:
-        ValueError: if ``number`` is not positive or ``size`` is below 8.
-    """
-
-    def __init__(
-        self,
-        number: int = 262_144,
-        size: int = 8,
-        num_heldout: int = 0,
-        max_residual: float | None = 60.0,
-        scenes: Callable[[int, int, torch.Generator], TwoViewScene] = random_scenes,
-    ) -> None:
-        if number < 1 or size < 8:
-            raise ValueError(f"number must be positive and size at least 8, got {number} and {size}")
-        self.number = number
-        self.size = size
-        self.num_heldout = num_heldout
-        self.max_residual = max_residual
-        self.scenes = scenes
-
-    def draw(self, seed: int) -> Samples:
-        """Return fresh samples."""
-        generator = torch.Generator().manual_seed(seed)
-        parts = [self._chunk(min(8192, self.number - done), generator) for done in range(0, self.number, 8192)]
-        samples = Samples(*map(torch.cat, zip(*parts, strict=True)))
-        return samples._replace(pair=torch.arange(len(samples.pair)))
-
-    def _chunk(self, number: int, generator: torch.Generator) -> Samples:
-        scenes = self.scenes(number, self.size + self.num_heldout, generator)
-        sizes = [self.size, self.num_heldout]
-        points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
-        points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
-        samples = Samples(points1, points2, heldout1, heldout2, torch.arange(number))
-        if self.max_residual is None:
-            return samples
-        return samples.select(plain_residual(points1, points2) < self.max_residual)
-
-
-def _expand(path: str) -> str:
-    expanded = os.path.expandvars(path)
-    unset = re.search(r"\$\{?(\w+)", expanded)
-    if unset:
-        raise ValueError(f"the environment variable {unset[1]}, named in {path!r}, is not set")
-    return expanded

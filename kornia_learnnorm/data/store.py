@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +23,7 @@ from kornia_learnnorm.files import replacing
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["CorrespondenceStore", "join_stores", "read_store", "write_store"]
+__all__ = ["CorrespondenceStore", "StoreReader", "join_stores", "read_store", "write_store"]
 
 FORMAT, VERSION = "correspondences", 1
 # name: shape behind the first axis, dtype, "M" correspondences or "P" pairs
@@ -122,26 +124,113 @@ def read_store(path: str | Path) -> CorrespondenceStore:
             lacks the pairs.
 
     """
-    part = re.fullmatch(r"(.+)@(\d+):(\d+)", str(path))
-    path = Path(part[1] if part else path)
-    if not path.is_file():
-        hint = "" if part or "@" not in path.name else "; some pairs of a store are FILE.h5@FIRST:STOP, as in s.h5@3:10"
-        raise FileNotFoundError(f"no store at {path}{hint}")
-    h5py = _h5py()
-    try:
-        with h5py.File(path, "r") as file:
-            store = _read(path, file)
-    except (OSError, RuntimeError) as error:
-        raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
-    if part is None:
-        return store
-    try:
-        return store.select(int(part[2]), int(part[3]))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    reader = StoreReader(path)
+    return reader.read(range(len(reader)))
 
 
-def _read(path: Path, file: h5py.File) -> CorrespondenceStore:
+class StoreReader:
+    """A store that stays on disk: some of its pairs at a time.
+
+    The file is open only while it is read, so that a reader can go to other processes.
+
+    Args:
+        path: as for :func:`read_store`; of a part, the first pair is 0.
+
+    Attributes:
+        path: the file.
+        offsets: pair ``i`` owns ``offsets[i + 1] - offsets[i]`` correspondences, (P + 1,) int64.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: as :func:`read_store`, but for what is in the rows, which :meth:`read` checks.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        part = re.fullmatch(r"(.+)@(\d+):(\d+)", str(path))
+        self.path = Path(part[1] if part else path)
+        if not self.path.is_file():
+            named = part or "@" not in self.path.name
+            hint = "" if named else "; some pairs of a store are FILE.h5@FIRST:STOP, as in s.h5@3:10"
+            raise FileNotFoundError(f"no store at {self.path}{hint}")
+        with self._open() as file:
+            offsets = _check(self.path, file)
+        first, stop = (int(part[2]), int(part[3])) if part else (0, len(offsets) - 1)
+        if not 0 <= first < stop < len(offsets):
+            raise ValueError(f"{self.path}: pairs {first}:{stop} were asked for, the store has 0:{len(offsets) - 1}")
+        self._first = first
+        self.offsets = offsets[first : stop + 1]
+
+    def __len__(self) -> int:
+        """Return the number of image pairs."""
+        return len(self.offsets) - 1
+
+    def read(self, pairs: Sequence[int]) -> CorrespondenceStore:
+        """Read some pairs, in the order given.
+
+        Args:
+            pairs: their indices; a range is read fastest, then a rising order.
+
+        Raises:
+            IndexError: if there is no such pair.
+            ValueError: if the file changed or points or ratios are not finite.
+
+        """
+        if len(pairs) and not 0 <= min(pairs) <= max(pairs) < len(self):
+            raise IndexError(f"pairs {min(pairs)} to {max(pairs)} were asked for, the store has 0 to {len(self) - 1}")
+        runs = _runs(pairs)
+        rows = {
+            "M": [slice(int(self.offsets[a]), int(self.offsets[b])) for a, b in runs],
+            "P": [slice(a + self._first, b + self._first) for a, b in runs],
+        }
+        with self._open() as file:
+            arrays: dict[str, Any] = {
+                name: np.concatenate([np.zeros((0, *tail), dtype), *(file[name][part] for part in rows[axis])])
+                for name, (tail, dtype, axis) in _LAYOUT.items()
+            }
+            names = [(str(a), str(b)) for part in rows["P"] for a, b in file["names"].asstr()[part]]
+            about: dict[str, Any] = {key: str(file.attrs.get(key, "")) for key in ("dataset", "pairs", "detector")}
+            provenance = json.loads(file.attrs.get("provenance", "{}"))
+        for name in ("points1", "points2", "ratio"):
+            if not np.isfinite(arrays[name]).all():
+                raise ValueError(f"{self.path}: {name} holds NaN or infinite numbers")
+        counts = np.diff(self.offsets)[list(pairs)]
+        offsets = np.concatenate([[0], counts.cumsum()]).astype(np.int64)
+        return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about, provenance=provenance)
+
+    def passing(self, max_ratio: float | None) -> NDArray[np.int64]:
+        """Count the correspondences of each pair with a ratio below ``max_ratio``, or all; (P,)."""
+        if max_ratio is None:
+            return np.diff(self.offsets)
+        counts = np.zeros(len(self), np.int64)
+        with self._open() as file:
+            for first in range(0, len(self), 4096):  # a part at a time: the ratios of all need not fit in memory
+                offsets = self.offsets[first : first + 4097]
+                passes = file["ratio"][int(offsets[0]) : int(offsets[-1])] < max_ratio
+                total = np.concatenate([[0], passes.cumsum()])
+                counts[first : first + 4096] = np.diff(total[offsets - offsets[0]])
+        return counts
+
+    @contextmanager
+    def _open(self) -> Iterator[h5py.File]:
+        h5py = _h5py()
+        try:
+            with h5py.File(self.path, "r") as file:
+                yield file
+        except (OSError, RuntimeError) as error:
+            text = f"{self.path} is not a readable HDF5 file (truncated or of another kind): {error}"
+            raise ValueError(text) from error
+
+
+def _runs(pairs: Sequence[int]) -> list[tuple[int, int]]:
+    """Split indices into runs of successive ones, (first, stop)."""
+    if not len(pairs):
+        return []
+    cuts = [0, *(np.flatnonzero(np.diff(pairs) != 1) + 1).tolist(), len(pairs)]
+    return [(int(pairs[a]), int(pairs[b - 1]) + 1) for a, b in pairwise(cuts)]
+
+
+def _check(path: Path, file: h5py.File) -> NDArray[np.int64]:
+    """Return the offsets of a store whose arrays fit together."""
     if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
         got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')}"
         raise ValueError(f"{path} is not a store: expected format={FORMAT!r}, version={VERSION}, got {got}")
@@ -152,19 +241,12 @@ def _read(path: Path, file: h5py.File) -> CorrespondenceStore:
     if offsets.ndim != 1 or len(offsets) < 2 or offsets[0] != 0 or (np.diff(offsets) < 0).any():
         raise ValueError(f"{path}: offsets must rise from 0 over at least one pair, got {offsets[:4]}...")
     rows = {"M": int(offsets[-1]), "P": len(offsets) - 1}
-    for name, (tail, dtype, axis) in _LAYOUT.items():
+    for name, (tail, dtype, axis) in {**_LAYOUT, "names": ((2,), "O", "P")}.items():
         if file[name].shape != (rows[axis], *tail):
             raise ValueError(f"{path}: {name} must have shape {(rows[axis], *tail)}, got {file[name].shape}")
         if file[name].dtype.kind != np.dtype(dtype).kind:
             raise ValueError(f"{path}: {name} must be {dtype}, got {file[name].dtype}")
-    arrays: dict[str, Any] = {name: np.asarray(file[name][:], dtype) for name, (_, dtype, _) in _LAYOUT.items()}
-    for name in ("points1", "points2", "ratio"):
-        if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{path}: {name} holds NaN or infinite numbers")
-    names = [(str(first), str(second)) for first, second in file["names"].asstr()[:]]
-    about: dict[str, Any] = {key: str(file.attrs.get(key, "")) for key in ("dataset", "pairs", "detector")}
-    provenance = json.loads(file.attrs.get("provenance", "{}"))
-    return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about, provenance=provenance)
+    return offsets
 
 
 def write_store(path: str | Path, store: CorrespondenceStore) -> None:

@@ -1,0 +1,83 @@
+"""Features of frames on disk, each for as long as pairs need it."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from hashlib import sha256
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from kornia_learnnorm.data.features import Features
+from kornia_learnnorm.data.frames import Frame, FramePair
+
+__all__ = ["FeatureCache"]
+
+
+class FeatureCache:
+    """Keep the features of frames in a folder, each until the last pair that needs it is released.
+
+    As a context it starts with an empty folder and removes it at the end, whatever happened.
+
+    Args:
+        folder: where the files lie; what a killed run left there is removed.
+        pairs: all pairs that will ask for features.
+    """
+
+    def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
+        self.folder = folder
+        self.uses = Counter(frame.name for pair in pairs for frame in (pair.frame1, pair.frame2))
+        self.held: dict[str, Path | str] = {}
+
+    def __enter__(self) -> FeatureCache:
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def missing(self, pairs: Sequence[FramePair]) -> list[Frame]:
+        """Return the frames of the pairs that were not put yet, each once."""
+        frames = {frame.name: frame for pair in pairs for frame in (pair.frame1, pair.frame2)}
+        return [frame for name, frame in frames.items() if name not in self.held]
+
+    def put(self, frame: Frame, features: Features | str) -> None:
+        """Keep the features of a frame, or why it has none.
+
+        Raises:
+            OSError: if they cannot be written, as on a full disk.
+
+        """
+        if isinstance(features, str):
+            self.held[frame.name] = features
+            return
+        path = self.folder / f"{sha256(frame.name.encode()).hexdigest()}.npz"
+        try:
+            np.savez(path, points=features.points, descriptors=features.descriptors, size=features.size)
+        except OSError as error:  # NumPy's own names neither the file nor, at times, the cause
+            raise OSError(f"cannot write the features of {frame.name} to {self.folder}, is the disk full? {error}") from error
+        self.held[frame.name] = path
+
+    def get(self, frame: Frame) -> Features | str:
+        """Return what was put for a frame."""
+        held = self.held[frame.name]
+        if isinstance(held, str):
+            return held
+        with np.load(held) as data:
+            width, height = data["size"].tolist()
+            return Features(data["points"], data["descriptors"], (width, height))
+
+    def release(self, pair: FramePair) -> None:
+        """Take note that a pair is done; what no other pair needs is deleted."""
+        for frame in (pair.frame1, pair.frame2):
+            self.uses[frame.name] -= 1
+            if self.uses[frame.name] == 0:
+                held = self.held.pop(frame.name)
+                if isinstance(held, Path):
+                    held.unlink()

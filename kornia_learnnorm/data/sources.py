@@ -1,0 +1,215 @@
+r"""Sources of samples for training: stores on disk and synthetic scenes, drawn block by block.
+
+A draw, of one epoch, is made of blocks, and a block is what has to fit in memory. It depends on nothing but the seed
+and its number, so that blocks can be drawn in any order, by any process.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Sequence
+from hashlib import sha256
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kornia_learnnorm.data.samples import RATIO, Samples, draw_samples, plain_residual
+from kornia_learnnorm.data.store import StoreReader
+from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
+from kornia_learnnorm.files import replacing
+
+__all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator"]
+
+SCENES = 8192  # in a block
+
+
+class Block(NamedTuple):
+    """What a block holds before samples are filtered.
+
+    Attributes:
+        samples: how many samples.
+        pairs: how many image pairs that have samples.
+    """
+
+    samples: int
+    pairs: int
+
+
+def block_generator(*key: int) -> torch.Generator:
+    """Return the generator of a key, such as the seed of a draw and the number of a block.
+
+    Args:
+        key: numbers from 0 on; other keys give independent generators.
+
+    """
+    # A generator on the CPU reads 32 bits of its seed.
+    return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
+
+
+class StoreSamples:
+    """Draw samples from stores of correspondences, each pair once per ratio.
+
+    The stores stay on disk. Where there are more pairs than fit in a block, each draw distributes them anew.
+
+    Args:
+        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
+            ``$LEARNNORM_DATA`` are filled in.
+        max_ratios: ratio tests; 0.8 gives the filtered samples, None the unfiltered ones, both a mix.
+        size: correspondences in a sample; of a range ``(low, high)`` each block takes one number, ends included.
+        num_heldout: held-out correspondences per sample.
+        max_residual: drop samples whose :func:`~kornia_learnnorm.data.samples.plain_residual` is at least this many
+            pixels; None keeps all.
+        block_pairs: the most image pairs in a block.
+        cache: folder for what the filter keeps, so that the same draw is not filtered twice; None for none.
+
+    Raises:
+        ValueError: if no path is given, an environment variable is not set, a number is out of range, or no pair fills
+            a sample.
+        FileNotFoundError: if there is no such store.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[str],
+        max_ratios: Sequence[float | None] = (RATIO,),
+        size: int | tuple[int, int] = 8,
+        num_heldout: int = 0,
+        max_residual: float | None = 60.0,
+        block_pairs: int = 1024,
+        cache: str | None = None,
+    ) -> None:
+        if not paths or not max_ratios:
+            raise ValueError(f"at least one store and one ratio are needed, got {paths!r} and {max_ratios!r}")
+        self.sizes = (size, size) if isinstance(size, int) else tuple(size)
+        if len(self.sizes) != 2 or not 8 <= self.sizes[0] <= self.sizes[1] or block_pairs < 1:
+            got = f"size={size}, block_pairs={block_pairs}"
+            raise ValueError(f"a sample needs at least 8 correspondences, a block at least one pair, got {got}")
+        self.stores = [StoreReader(_expand(path)) for path in paths]
+        self.max_ratios = tuple(max_ratios)
+        self.num_heldout = num_heldout
+        self.max_residual = max_residual
+        self.block_pairs = block_pairs
+        self.cache = None if cache is None else Path(cache)
+        self._first = np.cumsum([0, *map(len, self.stores)])
+        self._passing = [np.concatenate([store.passing(ratio) for store in self.stores]) for ratio in self.max_ratios]
+        if max(int(passing.max()) for passing in self._passing) < self.sizes[1]:
+            stores = ", ".join(str(store.path) for store in self.stores)
+            raise ValueError(f"no pair of {stores} has {self.sizes[1]} correspondences that pass the ratio test")
+
+    def blocks(self, seed: int) -> list[Block]:
+        """Return what the blocks of a draw hold before the filter."""
+        found = []
+        for number, pairs in enumerate(self._pairs(seed)):
+            size = self._size(block_generator(seed, number))
+            samples = sum(passing[pairs] // size for passing in self._passing)
+            found.append(Block(int(np.sum(samples)), int(np.count_nonzero(samples))))
+        return found
+
+    def draw(self, seed: int, block: int) -> Samples:
+        """Return the samples of a block; the pairs of later stores count on from those of earlier ones."""
+        generator = block_generator(seed, block)
+        size = self._size(generator)
+        pairs, parts = self._pairs(seed)[block], []
+        for store, first, stop in zip(self.stores, self._first, self._first[1:], strict=False):
+            own = pairs[(pairs >= first) & (pairs < stop)]
+            held = store.read((own - first).tolist()) if len(own) else None
+            for ratio, passing in zip(self.max_ratios, self._passing, strict=True):
+                if held is not None and passing[own].max() >= size:
+                    part = draw_samples(held, generator, size, ratio, self.num_heldout)
+                    parts.append(part._replace(pair=torch.from_numpy(own)[part.pair]))
+        if not parts:
+            empty = torch.zeros(0, size, 2), torch.zeros(0, self.num_heldout, 2)
+            return Samples(empty[0], empty[0], empty[1], empty[1], torch.zeros(0, dtype=torch.int64))
+        samples = Samples(*map(torch.cat, zip(*parts, strict=True)))
+        if self.max_residual is None:
+            return samples
+        return samples.select(self._kept(samples, self.max_residual, seed, block))
+
+    def _pairs(self, seed: int) -> list[NDArray[np.int64]]:
+        """Image pairs of each block, rising; all of them in the first where they fit."""
+        number = int(self._first[-1])
+        blocks = -(-number // self.block_pairs)
+        order = np.random.default_rng(seed).permutation(number)
+        return [np.sort(part) for part in np.array_split(order, blocks)]
+
+    def _size(self, generator: torch.Generator) -> int:
+        low, high = self.sizes
+        return low if low == high else int(torch.randint(low, high + 1, (), generator=generator))
+
+    def _kept(self, samples: Samples, max_residual: float, seed: int, block: int) -> Tensor:
+        """Mask (S,) of the samples that the filter keeps."""
+        if self.cache is None:
+            return plain_residual(samples.points1, samples.points2) < max_residual
+        files = [(str(s.path.resolve()), s.path.stat().st_mtime_ns, s.offsets[[0, -1]].tolist()) for s in self.stores]
+        about = [files, self.max_ratios, self.sizes, self.num_heldout, max_residual, self.block_pairs, seed, block]
+        path = self.cache / f"{sha256(json.dumps(about).encode()).hexdigest()[:32]}.npy"
+        if path.is_file():
+            return torch.from_numpy(np.load(path))
+        kept = plain_residual(samples.points1, samples.points2) < max_residual
+        self.cache.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as beside:
+            np.save(beside, kept.numpy())
+        return kept
+
+
+class SyntheticSamples:
+    """Draw samples from synthetic scenes, a scene for each.
+
+    Args:
+        number: scenes per draw; the residual filter drops some of them.
+        size: correspondences in a sample.
+        num_heldout: held-out correspondences per sample, inliers and outliers alike.
+        max_residual: drop samples whose :func:`~kornia_learnnorm.data.samples.plain_residual` is at least this many
+            pixels; None keeps all.
+        scenes: makes scenes from their number, the points of each and a generator; one of
+            :mod:`kornia_learnnorm.data.synthetic`.
+
+    Raises:
+        ValueError: if ``number`` is not positive or ``size`` is below 8.
+    """
+
+    def __init__(
+        self,
+        number: int = 262_144,
+        size: int = 8,
+        num_heldout: int = 0,
+        max_residual: float | None = 60.0,
+        scenes: Callable[[int, int, torch.Generator], TwoViewScene] = random_scenes,
+    ) -> None:
+        if number < 1 or size < 8:
+            raise ValueError(f"number must be positive and size at least 8, got {number} and {size}")
+        self.number = number
+        self.size = size
+        self.num_heldout = num_heldout
+        self.max_residual = max_residual
+        self.scenes = scenes
+
+    def blocks(self, seed: int) -> list[Block]:
+        """Return what the blocks of a draw hold before the filter."""
+        sizes = [min(SCENES, self.number - first) for first in range(0, self.number, SCENES)]
+        return [Block(size, size) for size in sizes]
+
+    def draw(self, seed: int, block: int) -> Samples:
+        """Return fresh samples, each a pair of its own."""
+        number = self.blocks(seed)[block].samples
+        scenes = self.scenes(number, self.size + self.num_heldout, block_generator(seed, block))
+        sizes = [self.size, self.num_heldout]
+        points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
+        points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
+        samples = Samples(points1, points2, heldout1, heldout2, block * SCENES + torch.arange(number))
+        if self.max_residual is None:
+            return samples
+        return samples.select(plain_residual(points1, points2) < self.max_residual)
+
+
+def _expand(path: str) -> str:
+    for name in re.findall(r"\$\{?(\w+)", path):
+        if not os.environ.get(name):
+            raise ValueError(f"the environment variable {name}, named in {path!r}, is not set")
+    return os.path.expandvars(path)
