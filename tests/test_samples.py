@@ -3,10 +3,7 @@ import pytest
 import torch
 
 from kornia_learnnorm.data.samples import draw_samples, plain_residual
-from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
-from kornia_learnnorm.data.store import write_store
 from kornia_learnnorm.data.synthesize import synthetic_store
-from kornia_learnnorm.data.synthetic import forward_driving, handheld
 
 
 @pytest.fixture(scope="module")
@@ -81,67 +78,3 @@ def test_bad_arguments(store, arguments, message):
 def test_too_few_to_hold_out(store):
     with pytest.raises(ValueError, match="held-out correspondences: a pair has only"):
         draw_samples(store, seeded(), size=96, max_ratio=None, num_heldout=4)
-
-
-def test_store_source(store, tmp_path, monkeypatch):
-    for name in ("a", "b"):
-        write_store(tmp_path / f"{name}.h5", store)
-    monkeypatch.setenv("SOME_DATA", str(tmp_path))
-    source = StoreSamples(["$SOME_DATA/a.h5", "$SOME_DATA/b.h5"], [0.8, None], num_heldout=2, max_residual=None)
-    samples = source.draw(3)
-    assert samples.pair.max() == 17  # pairs of the second store count on
-    assert torch.equal(samples.points1, source.draw(3).points1)
-    assert not torch.equal(samples.points1, source.draw(4).points1)
-    with pytest.raises(ValueError, match="environment variable UNSET_DATA"):
-        StoreSamples(["$UNSET_DATA/a.h5"])
-    with pytest.raises(FileNotFoundError):
-        StoreSamples(["$SOME_DATA/c.h5"])
-    with pytest.raises(ValueError, match="at least one store"):
-        StoreSamples([])
-
-
-def test_synthetic_source():
-    source = SyntheticSamples(number=9000, num_heldout=3, max_residual=None)
-    samples = source.draw(0)
-    assert samples.points1.shape == (9000, 8, 2)
-    assert samples.heldout2.shape == (9000, 3, 2)
-    assert samples.pair.tolist() == list(range(9000))
-    assert torch.equal(samples.points2, source.draw(0).points2)
-    filtered = SyntheticSamples(number=500).draw(0)
-    assert 0 < len(filtered.pair) < 500
-    assert plain_residual(filtered.points1, filtered.points2).max() < 60
-    with pytest.raises(ValueError, match="number must be positive"):
-        SyntheticSamples(number=0)
-
-
-def test_some_pairs_of_a_store(store, tmp_path, monkeypatch):
-    """Parts are stores of their own: their pairs count on, whatever they were in the file."""
-    write_store(tmp_path / "a.h5", store)
-    monkeypatch.setenv("SOME_DATA", str(tmp_path))
-    got = StoreSamples(["$SOME_DATA/a.h5@4:7", "$SOME_DATA/a.h5@0:2"], num_heldout=2, max_residual=None).draw(3)
-    generator = seeded(3)
-    first, second = (draw_samples(store.select(*part), generator, num_heldout=2) for part in ((4, 7), (0, 2)))
-    assert got.pair.tolist() == first.pair.tolist() + (second.pair + 3).tolist()
-    for field, a, b in zip(got[:4], first[:4], second[:4], strict=True):
-        assert torch.equal(field, torch.cat([a, b]))
-    pair = np.searchsorted(store.offsets, rows_of(store, got.points1, got.points2), side="right") - 1
-    assert set(pair) == {0, 1, 4, 5, 6}
-    with pytest.raises(ValueError, match="pairs 7:12 were asked for, the store has 0:9"):
-        StoreSamples(["$SOME_DATA/a.h5@7:12"])
-    with pytest.raises(FileNotFoundError, match=r"b\.h5"):
-        StoreSamples(["$SOME_DATA/b.h5@0:1"])
-
-
-@pytest.mark.parametrize("make", [handheld, forward_driving])
-def test_synthetic_source_of_one_kind(make):
-    samples = SyntheticSamples(number=60, num_heldout=3, max_residual=None, scenes=make).draw(5)
-    scene = make(60, 11, seeded(5))
-    for own, heldout, points in zip(samples[:2], samples[2:4], (scene.points1, scene.points2), strict=True):
-        assert torch.equal(own, points[:, :8].float())
-        assert torch.equal(heldout, points[:, 8:].float())
-    filtered = SyntheticSamples(number=60, size=9, max_residual=0.5, scenes=make).draw(6)
-    scene = make(60, 9, seeded(6))
-    kept = plain_residual(scene.points1.float(), scene.points2.float()) < 0.5
-    assert 0 < kept.sum() < 60
-    assert torch.equal(filtered.points2, scene.points2[kept].float())
-    assert filtered.pair.tolist() == list(range(int(kept.sum())))

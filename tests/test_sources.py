@@ -1,0 +1,186 @@
+"""Sources of samples: stores on disk and synthetic scenes, block by block."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.data.samples import draw_samples, plain_residual
+from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
+from kornia_learnnorm.data.store import read_store, write_store
+from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.data.synthetic import forward_driving, handheld
+
+
+@pytest.fixture(scope="module")
+def store():
+    return synthetic_store(pairs=3, points=101, seed=2)
+
+
+def rows_of(store, points1, points2):
+    """Row of each correspondence in the store, found by its coordinates."""
+    index = {tuple(row): i for i, row in enumerate(np.c_[store.points1, store.points2].tolist())}
+    return [index[tuple(row)] for row in torch.cat([points1, points2], -1).reshape(-1, 4).tolist()]
+
+
+def test_store_source(store, tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        write_store(tmp_path / f"{name}.h5", store)
+    monkeypatch.setenv("SOME_DATA", str(tmp_path))
+    source = StoreSamples(["$SOME_DATA/a.h5", "$SOME_DATA/b.h5"], [0.8, None], num_heldout=2, max_residual=None)
+    samples = source.draw(3, 0)
+    assert samples.pair.max() == 17  # pairs of the second store count on
+    assert torch.equal(samples.points1, source.draw(3, 0).points1)
+    assert not torch.equal(samples.points1, source.draw(4, 0).points1)
+    with pytest.raises(ValueError, match="environment variable UNSET_DATA"):
+        StoreSamples(["$UNSET_DATA/a.h5"])
+    with pytest.raises(FileNotFoundError):
+        StoreSamples(["$SOME_DATA/c.h5"])
+    with pytest.raises(ValueError, match="at least one store"):
+        StoreSamples([])
+
+
+def test_synthetic_source():
+    source = SyntheticSamples(number=9000, num_heldout=3, max_residual=None)
+    assert source.blocks(0) == [Block(8192, 8192), Block(808, 808)]
+    samples, rest = (source.draw(0, block) for block in range(2))
+    assert samples.points1.shape == (8192, 8, 2)
+    assert samples.heldout2.shape == (8192, 3, 2)
+    assert [*samples.pair, *rest.pair] == list(range(9000))
+    assert not torch.equal(samples.points1[:808], rest.points1)
+    assert torch.equal(samples.points2, source.draw(0, 0).points2)
+    filtered = SyntheticSamples(number=500).draw(0, 0)
+    assert 0 < len(filtered.pair) < 500
+    assert plain_residual(filtered.points1, filtered.points2).max() < 60
+    with pytest.raises(ValueError, match="number must be positive"):
+        SyntheticSamples(number=0)
+
+
+def test_some_pairs_of_a_store(store, tmp_path, monkeypatch):
+    """Parts are stores of their own: their pairs count on, whatever they were in the file."""
+    write_store(tmp_path / "a.h5", store)
+    monkeypatch.setenv("SOME_DATA", str(tmp_path))
+    got = StoreSamples(["$SOME_DATA/a.h5@4:7", "$SOME_DATA/a.h5@0:2"], num_heldout=2, max_residual=None).draw(3, 0)
+    generator = block_generator(3, 0)
+    first, second = (draw_samples(store.select(*part), generator, num_heldout=2) for part in ((4, 7), (0, 2)))
+    assert got.pair.tolist() == first.pair.tolist() + (second.pair + 3).tolist()
+    for field, a, b in zip(got[:4], first[:4], second[:4], strict=True):
+        assert torch.equal(field, torch.cat([a, b]))
+    pair = np.searchsorted(store.offsets, rows_of(store, got.points1, got.points2), side="right") - 1
+    assert set(pair) == {0, 1, 4, 5, 6}
+    with pytest.raises(ValueError, match="pairs 7:12 were asked for, the store has 0:9"):
+        StoreSamples(["$SOME_DATA/a.h5@7:12"])
+    with pytest.raises(FileNotFoundError, match=r"b\.h5"):
+        StoreSamples(["$SOME_DATA/b.h5@0:1"])
+
+
+@pytest.mark.parametrize("make", [handheld, forward_driving])
+def test_synthetic_source_of_one_kind(make):
+    samples = SyntheticSamples(number=60, num_heldout=3, max_residual=None, scenes=make).draw(5, 0)
+    scene = make(60, 11, block_generator(5, 0))
+    for own, heldout, points in zip(samples[:2], samples[2:4], (scene.points1, scene.points2), strict=True):
+        assert torch.equal(own, points[:, :8].float())
+        assert torch.equal(heldout, points[:, 8:].float())
+    filtered = SyntheticSamples(number=60, size=9, max_residual=0.5, scenes=make).draw(6, 0)
+    scene = make(60, 9, block_generator(6, 0))
+    kept = plain_residual(scene.points1.float(), scene.points2.float()) < 0.5
+    assert 0 < kept.sum() < 60
+    assert torch.equal(filtered.points2, scene.points2[kept].float())
+    assert filtered.pair.tolist() == torch.nonzero(kept)[:, 0].tolist()
+
+
+@pytest.fixture
+def sources(store, tmp_path):
+    """A source of two stores of nine pairs each, in blocks of at most five pairs."""
+    paths = [str(tmp_path / f"{name}.h5") for name in ("a", "b")]
+    for path in paths:
+        write_store(path, store)
+    return lambda **options: StoreSamples(paths, **{"max_residual": None, "block_pairs": 5, **options})
+
+
+def test_blocks_hold_every_sample_once(store, sources):
+    source = sources(max_ratios=[0.8, None], num_heldout=2)
+    for seed in range(3):
+        blocks = source.blocks(seed)
+        drawn = [source.draw(seed, block) for block in range(len(blocks))]
+        assert len(blocks) == 4
+        assert [block.samples for block in blocks] == [len(samples.pair) for samples in drawn]
+        assert [block.pairs for block in blocks] == [len(samples.pair.unique()) for samples in drawn]
+        pairs = torch.cat([samples.pair.unique() for samples in drawn])
+        assert sorted(pairs.tolist()) == list(range(18))
+        passing = [
+            int((store.ratio[a:b] < 0.8).sum()) // 8 for a, b in zip(store.offsets, store.offsets[1:], strict=False)
+        ]
+        expected = [number + 101 // 8 for number in passing] * 2
+        assert torch.bincount(torch.cat([samples.pair for samples in drawn])).tolist() == expected
+        for samples in drawn:  # of the right pair
+            rows = np.array(rows_of(store, samples.points1, samples.points2)).reshape(-1, 8)
+            own = np.searchsorted(store.offsets, rows, side="right") - 1
+            assert (own == samples.pair.numpy()[:, None] % 9).all()
+
+
+def test_draws_distribute_the_pairs_anew(sources):
+    source = sources()
+    first, again, other = (source.draw(seed, 0).pair.unique().tolist() for seed in (0, 0, 1))
+    assert first == again != other
+
+
+def test_a_range_of_sizes(sources):
+    source = sources(size=(8, 20), block_pairs=2)
+    sizes = [source.draw(0, block).points1.shape[1] for block in range(9)]
+    assert len(set(sizes)) > 3
+    assert 8 <= min(sizes) <= max(sizes) <= 20
+    assert [block.samples for block in source.blocks(0)] == [len(source.draw(0, block).pair) for block in range(9)]
+
+
+def test_the_filter_is_cached(sources, tmp_path, monkeypatch):
+    folder = tmp_path / "deep" / "cache"
+    plain, cached = sources(max_residual=5.0), sources(max_residual=5.0, cache=str(folder))
+    expected = [plain.draw(0, block) for block in range(4)]
+    for _ in range(2):  # the second time from the files
+        for block in range(4):
+            for got, field in zip(cached.draw(0, block), expected[block], strict=True):
+                assert torch.equal(got, field)
+        assert len(list(folder.iterdir())) == 4
+        monkeypatch.setattr("kornia_learnnorm.data.sources.plain_residual", None)
+    monkeypatch.undo()
+    assert not torch.equal(cached.draw(1, 0).points1, cached.draw(0, 0).points1)
+    assert len(list(folder.iterdir())) == 5
+    tight = sources(max_residual=0.5, cache=str(folder)).draw(0, 0)
+    assert len(tight.pair) < len(expected[0].pair)
+
+
+def test_blocks_without_samples(store, tmp_path):
+    """Pairs of fewer than eight correspondences fill no sample; a block of them is empty."""
+    few = synthetic_store(pairs=1, points=8, seed=0, scenes=["orbit"])
+    write_store(tmp_path / "few.h5", few)
+    write_store(tmp_path / "a.h5", store.select(0, 1))
+    source = StoreSamples([str(tmp_path / "few.h5"), str(tmp_path / "a.h5")], size=9, max_residual=None, block_pairs=1)
+    blocks = source.blocks(0)
+    assert sorted(block.pairs for block in blocks) == [0, 1]
+    for number, block in enumerate(blocks):
+        samples = source.draw(0, number)
+        assert samples.points1.shape == (block.samples, 9, 2)
+    with pytest.raises(ValueError, match=r"no pair of .*few\.h5 has 9 correspondences"):
+        StoreSamples([str(tmp_path / "few.h5")], size=9)
+
+
+@pytest.mark.parametrize("arguments", [{"size": 7}, {"size": (9, 8)}, {"size": (7, 8)}, {"block_pairs": 0}])
+def test_bad_sources(sources, arguments):
+    with pytest.raises(ValueError, match="at least 8 correspondences, a block at least one pair, got"):
+        sources(**arguments)
+
+
+def test_an_empty_variable_is_not_set(monkeypatch):
+    monkeypatch.setenv("EMPTY_DATA", "")
+    with pytest.raises(ValueError, match="environment variable EMPTY_DATA"):
+        StoreSamples(["${EMPTY_DATA}/a.h5"])
+
+
+def test_a_source_does_not_hold_the_stores(sources):
+    """What goes to other processes is small: the points stay on disk."""
+    import pickle
+
+    source = sources()
+    assert len(pickle.dumps(source)) < read_store(source.stores[0].path).points1.nbytes
