@@ -246,3 +246,42 @@ def test_training_by_pairs(tmp_path):
     assert trainer.num_training_batches == 4
     assert all(torch.isfinite(p).all() for p in task.parameters())
     assert not all(torch.equal(p, old) for p, old in zip(task.parameters(), before, strict=True))
+
+
+@pytest.mark.parametrize("by_pair", [False, True])
+@pytest.mark.parametrize("world_size", [1, 2, 3])
+def test_processes_share_an_epoch(by_pair, world_size):
+    """Every sample once in an epoch, in as many batches for each process."""
+    source, batch_size = (Pairs(), 4) if by_pair else (SyntheticSamples(number=9000), 512)
+    loaders = [
+        SampleLoader(source, batch_size, 0, True, by_pair, rank=rank, world_size=world_size)
+        for rank in range(world_size)
+    ]
+    whole = SampleLoader(source, batch_size, 0, True, by_pair)
+    for epoch in range(2):
+        shares = [list(loader) for loader in loaders]
+        assert {len(batches) for batches in shares} == {len(whole)}
+        for *parts, batch in zip(*shares, whole, strict=True):
+            assert max(len(p.pair.unique()) for p in parts) - min(len(p.pair.unique()) for p in parts) <= 1
+            got = torch.cat([part.points1 for part in parts]).flatten(1).tolist()
+            assert sorted(got) == sorted(batch.points1.flatten(1).tolist())
+        drawn = [source.draw(epoch, block) for block in range(len(source.blocks(epoch)))]
+        got = [row for batches in shares for batch in batches for row in batch.points1.flatten(1).tolist()]
+        assert sorted(got) == sorted(row for samples in drawn for row in samples.points1.flatten(1).tolist())
+
+
+def test_workers_change_nothing():
+    source = SyntheticSamples(number=20_000, max_residual=None)
+    plain, helped = (SampleLoader(source, 3000, 0, shuffle=True, workers=workers) for workers in (0, 2))
+    for _ in range(2):
+        assert same(list(helped), list(plain))
+    again = SampleLoader(source, 3000, 0, shuffle=True, workers=2)
+    again.load_state_dict({"epoch": 1, "batch": 3})
+    again_plain = SampleLoader(source, 3000, 0, shuffle=True)
+    again_plain.load_state_dict({"epoch": 1, "batch": 3})
+    assert same(list(again), list(again_plain))
+
+
+def test_a_smaller_batch_than_processes():
+    with pytest.raises(ValueError, match="at least one sample for each process, got 1"):
+        SampleLoader(SyntheticSamples(number=100), 1, seed=0, shuffle=True, rank=0, world_size=2)

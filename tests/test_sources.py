@@ -109,9 +109,7 @@ def test_blocks_hold_every_sample_once(store, sources):
         assert [block.pairs for block in blocks] == [len(samples.pair.unique()) for samples in drawn]
         pairs = torch.cat([samples.pair.unique() for samples in drawn])
         assert sorted(pairs.tolist()) == list(range(18))
-        passing = [
-            int((store.ratio[a:b] < 0.8).sum()) // 8 for a, b in zip(store.offsets, store.offsets[1:], strict=False)
-        ]
+        passing = [int((store.ratio[a:b] < 0.8).sum()) // 8 for a, b in pairwise(store.offsets)]
         expected = [number + 101 // 8 for number in passing] * 2
         assert torch.bincount(torch.cat([samples.pair for samples in drawn])).tolist() == expected
         for samples in drawn:  # of the right pair
