@@ -146,6 +146,6 @@ class NormalizerTask(pl.LightningModule):
         residuals = {name: torch.cat(parts) for name, parts in self._residuals.items()}
         self._residuals.clear()
         learned = residuals.pop("learned")
-        self.log(f"{stage}/log_sed", (learned + self.loss.floor).log().mean(), prog_bar=True)
+        self.log(f"{stage}/log_sed", (learned + self.loss.floor).log().mean(), prog_bar=True, sync_dist=True)
         for name, baseline in residuals.items():
-            self.log(f"{stage}/better_than_{name}", better_rate(learned, baseline).rate, prog_bar=True)
+            self.log(f"{stage}/better_than_{name}", better_rate(learned, baseline).rate, prog_bar=True, sync_dist=True)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.frames import Frame, FramePair
-from kornia_learnnorm.data.sequences import image_size
+from kornia_learnnorm.data.images import image_size
 
 __all__ = ["covisible_pairs", "read_colmap"]
 

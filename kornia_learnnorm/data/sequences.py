@@ -1,4 +1,4 @@
-r"""Readers of image sequences: KITTI odometry, TUM RGB-D, Cambridge Landmarks and plain folders of images.
+r"""Readers of image sequences: KITTI odometry, TUM RGB-D and plain folders of images.
 
 Each returns frames, sequence after sequence, in their order. Of the images only the headers are read, by Pillow; it
 comes with the ``images`` extra and is imported only when a function here is called. An image that cannot be read does
@@ -7,17 +7,26 @@ not stop a reader: its frame has size (0, 0).
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.frames import Frame, Size
+from kornia_learnnorm.data.frames import Frame
+from kornia_learnnorm.data.images import image_size
+from kornia_learnnorm.data.textfiles import (
+    camera_matrix,
+    listed_image,
+    parent_name,
+    parse_numbers,
+    rigid_motion,
+    rotation,
+    text_lines,
+)
 
-__all__ = ["SPLITS", "image_size", "read_cambridge", "read_folder", "read_kitti", "read_tum", "split_sequences"]
+__all__ = ["SPLITS", "read_folder", "read_kitti", "read_tum", "split_sequences"]
 
 Array = NDArray[np.float64]
 
@@ -28,10 +37,9 @@ SPLITS: dict[str, dict[str, tuple[str, ...] | None]] = {
 }
 """Sequences by dataset and split, as B. Fan et al. (A revisit of the normalized eight-point algorithm and a
 self-supervised deep solution, section 5.1) choose them; None for all that no other split of the dataset names. The
-scene of Cambridge Landmarks splits its images itself, see :func:`read_cambridge`."""
+scene of Cambridge Landmarks splits its images itself, see :func:`~kornia_learnnorm.data.cambridge.read_cambridge`."""
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
-_ORIENTATION, _QUARTER_TURNS = 0x0112, {5, 6, 7, 8}  # EXIF 2.32, section 4.6.4: width and height change places
 # fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3 of the three Kinects; https://cvg.cit.tum.de/data/datasets/rgbd-dataset,
 # file formats, calibration of the colour camera. The images of the third are already undistorted.
 _KINECTS: dict[str, tuple[tuple[float, float, float, float], tuple[float, ...]]] = {
@@ -39,40 +47,6 @@ _KINECTS: dict[str, tuple[tuple[float, float, float, float], tuple[float, ...]]]
     "freiburg2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "freiburg3": ((535.4, 539.2, 320.1, 247.6), ()),
 }
-
-
-def image_size(path: str | Path) -> Size:
-    """Return the size of an image as OpenCV decodes it, turned as its EXIF orientation says, from its header alone.
-
-    Args:
-        path: an image file.
-
-    Returns:
-        (width, height), pixels; (0, 0) where it cannot be read.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ImportError: if Pillow is not installed; the message names the extra that brings it.
-
-    """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        message = "reading sequences of images needs Pillow: pip install 'kornia-learnnorm[images]'"
-        raise ImportError(message) from error
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no image at {path}")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large images and odd metadata: nothing is decoded here
-            with Image.open(path) as image:
-                width, height = image.size
-                # getexif() without the test would decode a whole PNG; of a TIFF, Pillow has turned the size already
-                turned = "exif" in image.info and image.getexif().get(_ORIENTATION) in _QUARTER_TURNS
-    except Exception:  # a broken header can end in nearly any error of Pillow's parsers
-        return 0, 0
-    return (height, width) if turned else (width, height)
 
 
 def split_sequences(dataset: str, split: str, root: str | Path) -> list[str]:
@@ -148,22 +122,24 @@ def _kitti_folders(root: Path) -> dict[str, Path]:
 
 def _kitti_camera(path: Path, key: str) -> tuple[Array, Array]:
     """Read a camera's matrix (3, 3) and its pose in camera 0 (4, 4) from its projection K (I | b)."""
-    for number, line in _lines(path, "calibration"):
+    for number, line in text_lines(path, "calibration"):
         name, _, rest = line.partition(":")
         if name.strip() != key:
             continue
-        K, b = np.split(_numbers(path, number, rest.split(), 12, f"{key}: and 12 numbers", line).reshape(3, 4), [3], 1)
+        K, b = np.split(
+            parse_numbers(path, number, rest.split(), 12, f"{key}: and 12 numbers", line).reshape(3, 4), [3], 1
+        )
         if min(K[0, 0], K[1, 1]) <= 0 or K[1, 0] or K[2].tolist() != [0, 0, 1]:
             raise ValueError(f"{path}, line {number}: a camera matrix beside a fourth column expected, got {line!r}")
-        return K, _rigid(np.eye(3), np.asarray(-np.linalg.solve(K, b)[:, 0], np.float64))
+        return K, rigid_motion(np.eye(3), np.asarray(-np.linalg.solve(K, b)[:, 0], np.float64))
     raise ValueError(f"{path} has no line '{key}: 12 numbers'")
 
 
 def _kitti_poses(path: Path) -> dict[int, Array]:
     poses = {}
-    for number, line in _lines(path, "poses"):
-        rows = _numbers(path, number, line.split(), 12, "the 12 numbers of a pose").reshape(3, 4)
-        poses[number - 1] = _rigid(rows[:, :3], rows[:, 3])
+    for number, line in text_lines(path, "poses"):
+        rows = parse_numbers(path, number, line.split(), 12, "the 12 numbers of a pose").reshape(3, 4)
+        poses[number - 1] = rigid_motion(rows[:, :3], rows[:, 3])
     return poses
 
 
@@ -201,7 +177,7 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
     frames = []
     for name, folder in _chosen(_marked_folders(root, "rgb.txt"), sequences, root).items():
         kinect = next((kinect for key, kinect in _KINECTS.items() if key in name), None)
-        K, distortion = (_camera(*kinect[0]), kinect[1]) if kinect else (np.full((3, 3), np.nan), ())
+        K, distortion = (camera_matrix(*kinect[0]), kinect[1]) if kinect else (np.full((3, 3), np.nan), ())
         times, poses = _tum_trajectory(folder / "groundtruth.txt")
         for time, listed in _tum_images(folder):
             # Stamps have microseconds; at 1e9 s float64 resolves a quarter of one, which must not decide on ties.
@@ -215,10 +191,10 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
 
 def _tum_images(folder: Path) -> list[tuple[float, str]]:
     path, images = folder / "rgb.txt", []
-    for number, line in _lines(path, "list of images"):
+    for number, line in text_lines(path, "list of images"):
         time, _, listed = line.replace("\t", " ").partition(" ")
-        seconds = _numbers(path, number, [time] if listed else [], 1, "a timestamp and a file name", line)
-        images.append((float(seconds[0]), _listed(path, number, listed.strip())))
+        seconds = parse_numbers(path, number, [time] if listed else [], 1, "a timestamp and a file name", line)
+        images.append((float(seconds[0]), listed_image(path, number, listed.strip())))
     if not images:
         raise ValueError(f"{path} lists no images")
     return sorted(images)
@@ -229,77 +205,13 @@ def _tum_trajectory(path: Path) -> tuple[Array, Array]:
     if not path.exists():
         return np.empty(0), np.empty((0, 4, 4))
     rows = []
-    for number, line in _lines(path, "poses"):
-        row = _numbers(path, number, line.split(), 8, "timestamp tx ty tz qx qy qz qw")
-        rows.append((row[0], _rigid(_rotation(path, number, row[[7, 4, 5, 6]]), row[1:4])))
+    for number, line in text_lines(path, "poses"):
+        row = parse_numbers(path, number, line.split(), 8, "timestamp tx ty tz qx qy qz qw")
+        rows.append((row[0], rigid_motion(rotation(path, number, row[[7, 4, 5, 6]]), row[1:4])))
     if not rows:
         raise ValueError(f"{path} has no poses")
     rows.sort(key=lambda row: row[0])
     return np.array([time for time, _ in rows]), np.array([pose for _, pose in rows])
-
-
-def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
-    """Read a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015): camera centres, quaternions from the world.
-
-    Focal lengths are those of the scene's reconstruction by VisualSFM, ``reconstruction.nvm``, the principal point is
-    the centre of the image. The reconstruction's radial distortion is not applied.
-
-    Args:
-        root: the scene's folder, with ``dataset_train.txt`` and ``dataset_test.txt``, about metres.
-        split: ``train`` or ``test``; None for both.
-
-    Returns:
-        the frames by name, each folder a sequence; cameras are NaN where the reconstruction lacks the image or is not
-        there, and where the image cannot be read.
-
-    Raises:
-        FileNotFoundError: if a list is missing, or an image that it lists.
-        ValueError: if the split is unknown, a line malformed, a list without entries or an image listed twice.
-
-    """
-    root = Path(root)
-    if split not in (None, "train", "test"):
-        raise ValueError(f"a split of Cambridge Landmarks must be 'train', 'test' or None for both, got {split!r}")
-    model = root / "reconstruction.nvm"
-    focals = _nvm_focals(model) if model.exists() else {}
-    frames: dict[str, Frame] = {}
-    for part in (split,) if split else ("train", "test"):
-        path, before = root / f"dataset_{part}.txt", len(frames)
-        for number, line in _lines(path, "list of images"):
-            if number <= 3:  # the header
-                continue
-            name, *words = line.split()
-            row = _numbers(path, number, words, 7, "ImageFile X Y Z W P Q R", line)
-            if name in frames:
-                raise ValueError(f"{path}, line {number}: {name} is listed twice")
-            size = image_size(root / _listed(path, number, name))
-            focal, known = focals.get(_stem(name), np.nan), _stem(name) in focals and size != (0, 0)
-            K = _camera(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2) if known else np.full((3, 3), np.nan)
-            pose = _rigid(_rotation(path, number, row[3:]).T, row[:3])
-            frames[name] = Frame(root / name, name, _parent(name), size, K, pose)
-        if len(frames) == before:
-            raise ValueError(f"{path} lists no images after the three lines of its header")
-    return sorted(frames.values(), key=lambda frame: (frame.sequence, frame.name))
-
-
-def _nvm_focals(path: Path) -> dict[str, float]:
-    """Read the focal lengths by the images' names without suffix; the points after them are many and not read."""
-    lines = _lines(path, "reconstruction")
-    number, line = next(lines, (1, ""))
-    if line != "NVM_V3":
-        raise ValueError(f"{path}, line {number}: NVM_V3 expected, got {line!r}")
-    number, line = next(lines, (number, ""))
-    if not line.isdecimal():
-        raise ValueError(f"{path}, line {number}: the number of images expected, got {line!r}")
-    expected, focals = "an image, its focal length, quaternion, centre, radial distortion and 0", {}
-    for number, text in islice(lines, int(line)):
-        name, *words = text.split()
-        focals[_stem(name)] = float(_numbers(path, number, words, 10, expected, text)[0])
-        if focals[_stem(name)] <= 0:
-            raise ValueError(f"{path}, line {number}: a positive focal length expected, got {words[0]}")
-    if len(focals) < int(line):
-        raise ValueError(f"{path} announces {line} images and has {len(focals)}")
-    return focals
 
 
 def read_folder(root: str | Path) -> list[Frame]:
@@ -323,8 +235,8 @@ def read_folder(root: str | Path) -> list[Frame]:
     names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
     if not names:
         raise FileNotFoundError(f"no images ({', '.join(sorted(_SUFFIXES))}) in {root}")
-    names.sort(key=lambda name: (_parent(name), name))
-    return [Frame(root / name, name, _parent(name), image_size(root / name)) for name in names]
+    names.sort(key=lambda name: (parent_name(name), name))
+    return [Frame(root / name, name, parent_name(name), image_size(root / name)) for name in names]
 
 
 def _marked_folders(root: Path, marker: str) -> dict[str, Path]:
@@ -352,59 +264,3 @@ def _chosen(found: dict[str, Path], sequences: Sequence[str] | None, root: Path)
 
 def _some(names: dict[str, Path]) -> str:
     return ", ".join(islice(names, 30)) + (", ..." if len(names) > 30 else "") or "none"
-
-
-def _lines(path: Path, what: str) -> Iterator[tuple[int, str]]:
-    """Yield number, from 1, and text of each line that is neither empty nor a comment."""
-    if not path.is_file():
-        raise FileNotFoundError(f"no {what} at {path}")
-    with path.open(encoding="utf-8") as file:
-        try:
-            for number, line in enumerate(file, 1):
-                if line.strip() and not line.startswith("#"):
-                    yield number, line.strip()
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{path} is not a text file in UTF-8: {error}") from error
-
-
-def _numbers(path: Path, number: int, words: list[str], count: int, expected: str, line: str = "") -> Array:
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        values = np.empty(0)
-    if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{path}, line {number}: {expected} expected, got {line or ' '.join(words)!r}")
-    return values
-
-
-def _listed(path: Path, number: int, name: str) -> str:
-    """Return the name of an image that a file lists, if it exists beside that file."""
-    if not (path.parent / name).is_file():
-        raise FileNotFoundError(f"{path}, line {number}: no image at {path.parent / name}")
-    return name
-
-
-def _rotation(path: Path, number: int, wxyz: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a quaternion of any norm but zero."""
-    norm = np.linalg.norm(wxyz)
-    if norm == 0:
-        raise ValueError(f"{path}, line {number}: a quaternion must not be zero")
-    w, x, y, z = wxyz / norm
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + 2 * (w * cross + cross @ cross))
-
-
-def _rigid(R: Array, t: Array) -> Array:
-    return np.block([[R, t[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
-
-
-def _camera(fx: float, fy: float, cx: float, cy: float) -> Array:
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def _parent(name: str) -> str:
-    return name.rpartition("/")[0]
-
-
-def _stem(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix(""))

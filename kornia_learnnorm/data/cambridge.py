@@ -1,0 +1,87 @@
+"""Cambridge Landmarks as frames."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from kornia_learnnorm.data.frames import Frame
+from kornia_learnnorm.data.images import image_size
+from kornia_learnnorm.data.textfiles import (
+    camera_matrix,
+    listed_image,
+    parent_name,
+    parse_numbers,
+    rigid_motion,
+    rotation,
+    text_lines,
+    without_suffix,
+)
+
+__all__ = ["read_cambridge"]
+
+
+def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
+    """Read a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015): camera centres, quaternions from the world.
+
+    Focal lengths are those of the scene's reconstruction by VisualSFM, ``reconstruction.nvm``, the principal point is
+    the centre of the image. The reconstruction's radial distortion is not applied.
+
+    Args:
+        root: the scene's folder, with ``dataset_train.txt`` and ``dataset_test.txt``, about metres.
+        split: ``train`` or ``test``; None for both.
+
+    Returns:
+        the frames by name, each folder a sequence; cameras are NaN where the reconstruction lacks the image or is not
+        there, and where the image cannot be read.
+
+    Raises:
+        FileNotFoundError: if a list is missing, or an image that it lists.
+        ValueError: if the split is unknown, a line malformed, a list without entries or an image listed twice.
+
+    """
+    root = Path(root)
+    if split not in (None, "train", "test"):
+        raise ValueError(f"a split of Cambridge Landmarks must be 'train', 'test' or None for both, got {split!r}")
+    model = root / "reconstruction.nvm"
+    focals = _nvm_focals(model) if model.exists() else {}
+    frames: dict[str, Frame] = {}
+    for part in (split,) if split else ("train", "test"):
+        path, before = root / f"dataset_{part}.txt", len(frames)
+        for number, line in text_lines(path, "list of images"):
+            if number <= 3:  # the header
+                continue
+            name, *words = line.split()
+            row = parse_numbers(path, number, words, 7, "ImageFile X Y Z W P Q R", line)
+            if name in frames:
+                raise ValueError(f"{path}, line {number}: {name} is listed twice")
+            size = image_size(root / listed_image(path, number, name))
+            focal, known = focals.get(without_suffix(name), np.nan), without_suffix(name) in focals and size != (0, 0)
+            K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2) if known else np.full((3, 3), np.nan)
+            pose = rigid_motion(rotation(path, number, row[3:]).T, row[:3])
+            frames[name] = Frame(root / name, name, parent_name(name), size, K, pose)
+        if len(frames) == before:
+            raise ValueError(f"{path} lists no images after the three lines of its header")
+    return sorted(frames.values(), key=lambda frame: (frame.sequence, frame.name))
+
+
+def _nvm_focals(path: Path) -> dict[str, float]:
+    """Read the focal lengths by the images' names without suffix; the points after them are many and not read."""
+    lines = text_lines(path, "reconstruction")
+    number, line = next(lines, (1, ""))
+    if line != "NVM_V3":
+        raise ValueError(f"{path}, line {number}: NVM_V3 expected, got {line!r}")
+    number, line = next(lines, (number, ""))
+    if not line.isdecimal():
+        raise ValueError(f"{path}, line {number}: the number of images expected, got {line!r}")
+    expected, focals = "an image, its focal length, quaternion, centre, radial distortion and 0", {}
+    for number, text in islice(lines, int(line)):
+        name, *words = text.split()
+        focals[without_suffix(name)] = float(parse_numbers(path, number, words, 10, expected, text)[0])
+        if focals[without_suffix(name)] <= 0:
+            raise ValueError(f"{path}, line {number}: a positive focal length expected, got {words[0]}")
+    if len(focals) < int(line):
+        raise ValueError(f"{path} announces {line} images and has {len(focals)}")
+    return focals
