@@ -1,14 +1,11 @@
-"""Reading images and matching them."""
+"""Matching images."""
 
 from __future__ import annotations
-
-import sys
 
 import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.data.images import read_image
 from kornia_learnnorm.data.matching import match_images
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
@@ -19,79 +16,6 @@ def texture(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
     rng = np.random.default_rng(seed)
     image = sum(cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
     return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-
-
-class TestReadImage:
-    def test_grey_values_survive(self, tmp_path):
-        image = texture()
-        path = tmp_path / "näme with spaces.png"
-        path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-        assert np.array_equal(read_image(path), image)
-        assert np.array_equal(read_image(str(path)), image)
-
-    def test_colour_becomes_grey(self, tmp_path):
-        colour = np.zeros((4, 5, 3), np.uint8)
-        colour[..., 2] = 200  # red, the last channel in OpenCV's order
-        cv2.imwrite(str(tmp_path / "red.png"), colour)
-        image = read_image(tmp_path / "red.png")
-        assert image.shape == (4, 5)
-        assert abs(int(image[0, 0]) - 0.299 * 200) <= 1  # luma of ITU-R BT.601
-
-    def test_sixteen_bits_become_eight(self, tmp_path):
-        cv2.imwrite(str(tmp_path / "deep.png"), np.full((4, 5), 0x8000, np.uint16))
-        image = read_image(tmp_path / "deep.png")
-        assert image.dtype == np.uint8
-        assert abs(int(image[0, 0]) - 0x80) <= 1
-
-    def test_missing_file(self, tmp_path):
-        with pytest.raises(FileNotFoundError, match=r"nothing\.png does not exist"):
-            read_image(tmp_path / "nothing.png")
-
-    def test_folder(self, tmp_path):
-        with pytest.raises(ValueError, match="is a folder"):
-            read_image(tmp_path)
-
-    def test_empty_file(self, tmp_path):
-        (tmp_path / "empty.png").touch()
-        with pytest.raises(ValueError, match=r"empty\.png is empty"):
-            read_image(tmp_path / "empty.png")
-
-    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp"])
-    def test_truncated(self, tmp_path, suffix):
-        data = cv2.imencode(suffix, texture())[1].tobytes()
-        (tmp_path / f"half{suffix}").write_bytes(data[: len(data) // 2])
-        with pytest.raises(ValueError, match="truncated") as caught:
-            read_image(tmp_path / f"half{suffix}")
-        assert "\n" not in str(caught.value)
-
-    def test_jpeg_with_a_thumbnail_is_whole_and_noticed_when_cut(self, tmp_path):
-        thumbnail = cv2.imencode(".jpg", texture(width=32, height=24))[1].tobytes()
-        segment = b"\xff\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail  # a fill byte, APP1
-        data = cv2.imencode(".jpg", texture())[1].tobytes()
-        data = data[:2] + segment + data[2:]
-        (tmp_path / "whole.jpg").write_bytes(data)
-        assert read_image(tmp_path / "whole.jpg").shape == (180, 240)
-        (tmp_path / "cut.jpg").write_bytes(data[:-200])
-        with pytest.raises(ValueError, match="truncated"):
-            read_image(tmp_path / "cut.jpg")
-
-    def test_corrupt(self, tmp_path):
-        data = bytearray(cv2.imencode(".png", texture())[1].tobytes())
-        data[len(data) // 2 : len(data) // 2 + 50] = bytes(50)
-        (tmp_path / "corrupt.png").write_bytes(data)
-        with pytest.raises(ValueError, match="corrupt"):
-            read_image(tmp_path / "corrupt.png")
-
-    def test_text(self, tmp_path):
-        (tmp_path / "text.png").write_text("hello")
-        with pytest.raises(ValueError, match="not an image"):
-            read_image(tmp_path / "text.png")
-
-    def test_without_opencv(self, tmp_path, monkeypatch):
-        cv2.imwrite(str(tmp_path / "image.png"), texture())
-        monkeypatch.setitem(sys.modules, "cv2", None)
-        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[images\]'"):
-            read_image(tmp_path / "image.png")
 
 
 class TestMatchImages:

@@ -7,8 +7,8 @@ and memory does not grow with the number of pairs.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -23,6 +23,7 @@ from kornia_learnnorm.data.frames import Frame, FramePair
 from kornia_learnnorm.data.images import import_cv2, read_frame
 from kornia_learnnorm.data.matching import MATCHERS
 from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.data.workers import Workers, open_workers
 from kornia_learnnorm.data.writer import StoreWriter
 
 __all__ = ["MatchOptions", "collect_matches", "match_pair"]
@@ -45,7 +46,7 @@ class MatchOptions:
         seed: seed of that draw and of the order of a pair's matches.
 
     Raises:
-        ValueError: if there is no such detector or matcher, or a number is out of range.
+        ValueError: if there is no such detector or matcher, they do not go together, or a number is out of range.
     """
 
     detector: str = "sift"
@@ -61,6 +62,8 @@ class MatchOptions:
         if self.num_features < 2 or self.seed < 0 or (self.max_matches is not None and self.max_matches < 8):
             got = f"{self.num_features}, {self.max_matches} and {self.seed}"
             raise ValueError(f"at least 2 features, 8 matches or None, and a seed from 0 are expected, got {got}")
+        if self.matcher == "lightglue" and self.detector != "disk":
+            raise ValueError(f"the matcher lightglue takes features of the detector disk, got {self.detector}")
 
 
 def match_pair(
@@ -147,8 +150,8 @@ def collect_matches(
     if writer.complete:
         print(f"{path} is there already, made with these options", file=sys.stderr)
         return writer.skipped
-    with _parallel(jobs, dask) as parallel:
-        skipped = _match_all(pairs, writer, options, about, parallel)
+    with open_workers(jobs, dask) as workers:
+        skipped = _match_all(pairs, writer, options, about, workers)
     if not writer.done():
         raise ValueError(f"none of the {len(pairs)} pairs could be matched; the first: {next(iter(skipped.values()))}")
     writer.finish({"versions": _versions(), "skipped": skipped})
@@ -173,59 +176,41 @@ def _versions() -> dict[str, str]:
     return {**versions, "opencv": import_cv2().__version__}
 
 
-@contextmanager
-def _parallel(jobs: int, dask: str | None) -> Iterator[Any]:
-    """Yield joblib's ``Parallel``, in order and one result at a time."""
-    try:
-        import joblib
-    except ImportError as error:
-        raise ImportError("matching many pairs needs joblib: pip install 'kornia-learnnorm[images]'") from error
-    make = {"return_as": "generator", "batch_size": 1, "max_nbytes": None}
-    if dask is None:
-        yield joblib.Parallel(n_jobs=jobs, **make)
-        return
-    try:
-        from distributed import Client, KilledWorker
-    except ImportError as error:
-        raise ImportError("a Dask scheduler needs Dask: pip install 'kornia-learnnorm[dask]'") from error
-    client = Client(dask)  # type: ignore[no-untyped-call]
-    with client, joblib.parallel_config(backend="dask", client=client):
-        try:
-            yield joblib.Parallel(n_jobs=-1, **make)
-        except KilledWorker as error:
-            raise OSError(f"workers of {dask} that match were killed again and again: {error}") from error
-
-
 def _match_all(
-    pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: dict[str, str], parallel: Any
+    pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: dict[str, str], workers: Workers
 ) -> dict[str, str]:
     """Match what is not done; go on after a process was killed."""
     from joblib.externals.loky.process_executor import BrokenProcessPool
-    from tqdm import tqdm
 
     done = writer.done()
-    slow = None if sys.stderr.isatty() else 30.0
     skipped: dict[str, str] = {}
     restarts = 0
-    with tqdm(total=len(pairs), initial=len(done), unit="pair", mininterval=slow or 0.1, maxinterval=slow or 10) as bar:
-        while True:
-            todo = [place for place in range(len(pairs)) if place not in done]
+    with _progress(len(pairs), len(done)) as bar:
+        while todo := [place for place in range(len(pairs)) if place not in done]:
+            before = len(done)
             try:
-                with closing(_match_some(pairs, todo, writer.folder, options, about, parallel)) as results:
+                with closing(_match_some(pairs, todo, writer.folder, options, about, workers)) as results:
                     for place, result in results:
                         if isinstance(result, str):
                             skipped[f"{pairs[place].frame1.name} {pairs[place].frame2.name}"] = result
                         else:
                             writer.add(place, result)
                         done.add(place)
-                        restarts = 0
                         bar.update()
-                return skipped
             except BrokenProcessPool as error:
-                restarts += 1
+                restarts = restarts + 1 if len(done) == before else 1
                 if restarts > RESTARTS:
                     raise OSError(f"the processes that match were killed {restarts} times in a row: {error}") from error
                 bar.write("a process was killed; going on with the others", file=sys.stderr)
+    return skipped
+
+
+def _progress(total: int, done: int) -> Any:
+    """Return a progress bar on stderr; a log file gets a line of it now and then."""
+    from tqdm import tqdm
+
+    often = {} if sys.stderr.isatty() else {"mininterval": 30.0, "maxinterval": 30.0}
+    return tqdm(total=total, initial=done, unit="pair", **often)
 
 
 def _match_some(
@@ -234,21 +219,19 @@ def _match_some(
     folder: Path,
     options: MatchOptions,
     about: dict[str, str],
-    parallel: Any,
-) -> Iterator[tuple[int, CorrespondenceStore | str]]:
+    workers: Workers,
+) -> Generator[tuple[int, CorrespondenceStore | str], None, None]:
     """Yield each place of ``todo`` with its pair's store, or why there is none."""
-    from joblib import delayed, effective_n_jobs
-
-    window = WINDOW * effective_n_jobs(parallel.n_jobs)
+    window = WINDOW * workers.number
     with FeatureCache(folder / "features", [pairs[place] for place in todo]) as cache:
         for first in range(0, len(todo), window):
             places = todo[first : first + window]
             missing = cache.missing([pairs[place] for place in places])
-            with closing(parallel(delayed(_detect)(frame, options) for frame in missing)) as found:
+            with workers.results(_detect, ((frame, options) for frame in missing)) as found:
                 for frame, features in zip(missing, found, strict=True):
                     cache.put(frame, features)
-            tasks = (delayed(_match)(pairs[place], *map(cache.get, _frames(pairs[place])), place, options, about) for place in places)
-            with closing(parallel(tasks)) as results:
+            tasks = ((pairs[i], cache.get(pairs[i]), i, options, about) for i in places)
+            with workers.results(_match, tasks) as results:
                 for place, result in zip(places, results, strict=True):
                     yield place, result
                     cache.release(pairs[place])
@@ -266,18 +249,19 @@ def _detect(frame: Frame, options: MatchOptions) -> Features | str:
 
 def _match(
     pair: FramePair,
-    features1: Features | str,
-    features2: Features | str,
+    features: tuple[Features | str, Features | str],
     place: int,
     options: MatchOptions,
     about: dict[str, str],
 ) -> CorrespondenceStore | str:
     """Return a pair's store, or why there is none."""
-    for features in (features1, features2):
-        if isinstance(features, str):
-            return features
+    features1, features2 = features
+    if isinstance(features1, str):
+        return features1
+    if isinstance(features2, str):
+        return features2
     import_cv2().setNumThreads(1)
     try:
-        return match_pair(pair, features1, features2, place, options, about)  # type: ignore[arg-type]
+        return match_pair(pair, features1, features2, place, options, about)
     except ValueError as error:
         return str(error)

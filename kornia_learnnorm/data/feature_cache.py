@@ -61,11 +61,16 @@ class FeatureCache:
         try:
             np.savez(path, points=features.points, descriptors=features.descriptors, size=features.size)
         except OSError as error:  # NumPy's own names neither the file nor, at times, the cause
-            raise OSError(f"cannot write the features of {frame.name} to {self.folder}, is the disk full? {error}") from error
+            raise OSError(
+                f"cannot write the features of {frame.name} to {self.folder}, is the disk full? {error}"
+            ) from error
         self.held[frame.name] = path
 
-    def get(self, frame: Frame) -> Features | str:
-        """Return what was put for a frame."""
+    def get(self, pair: FramePair) -> tuple[Features | str, Features | str]:
+        """Return what was put for the frames of a pair."""
+        return self._get(pair.frame1), self._get(pair.frame2)
+
+    def _get(self, frame: Frame) -> Features | str:
         held = self.held[frame.name]
         if isinstance(held, str):
             return held

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,7 +45,7 @@ def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
         num_features: how many to keep.
 
     Returns:
-        up to ``num_features`` features, descriptors uint8 with 128 columns.
+        up to ``num_features`` features, and those that are as strong as the last; descriptors uint8 with 128 columns.
 
     Raises:
         TypeError: if the image is not an array of uint8.
@@ -132,7 +133,9 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
     _check(image, num_features)
     with torch.inference_mode():
         frames, _, descriptors = _keynet(num_features)(_tensor(image))
-    return Features(frames[0, :, :, 2].float().numpy(), descriptors[0].numpy(), (image.shape[1], image.shape[0]))
+    found = frames[0].flatten(1).any(1)  # where it finds fewer than it was asked for, Kornia fills up with zeros
+    points, rows = frames[0, found, :, 2].float(), descriptors[0, found].float()
+    return Features(points.numpy(), rows.numpy(), (image.shape[1], image.shape[0]))
 
 
 # What a command line may call them.
@@ -157,7 +160,7 @@ def pretrained(name: str, load: Callable[[], Any]) -> Any:
     """
     try:
         return load()
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, EOFError, UnpicklingError) as error:  # the last two: a cached file that is cut
         folder = f"{torch.hub.get_dir()}/checkpoints"
         raise OSError(f"the weights of {name} are not in {folder} and could not be loaded: {error}") from error
 

@@ -5,15 +5,18 @@ OpenCV does the work. It comes with the ``images`` extra and is imported only wh
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import numpy.typing as npt
 
-from kornia_learnnorm.data.frames import Frame
+from kornia_learnnorm.data.frames import Frame, Size
 
-__all__ = ["import_cv2", "read_frame", "read_image"]
+__all__ = ["image_size", "import_cv2", "read_frame", "read_image"]
+
+_ORIENTATION, _QUARTER_TURNS = 0x0112, {5, 6, 7, 8}  # EXIF 2.32, section 4.6.4: width and height change places
 
 
 def import_cv2() -> ModuleType:
@@ -117,3 +120,37 @@ def read_frame(frame: Frame) -> npt.NDArray[np.uint8]:
     if frame.matched_size != frame.size:
         image = cv2.resize(image, frame.matched_size, interpolation=cv2.INTER_AREA)
     return np.asarray(image, np.uint8)
+
+
+def image_size(path: str | Path) -> Size:
+    """Return the size of an image as OpenCV decodes it, turned as its EXIF orientation says, from its header alone.
+
+    Args:
+        path: an image file.
+
+    Returns:
+        (width, height), pixels; (0, 0) where it cannot be read.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ImportError: if Pillow is not installed; the message names the extra that brings it.
+
+    """
+    try:
+        from PIL import Image
+    except ImportError as error:
+        message = "reading sequences of images needs Pillow: pip install 'kornia-learnnorm[images]'"
+        raise ImportError(message) from error
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no image at {path}")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large images and odd metadata: nothing is decoded here
+            with Image.open(path) as image:
+                width, height = image.size
+                # getexif() without the test would decode a whole PNG; of a TIFF, Pillow has turned the size already
+                turned = "exif" in image.info and image.getexif().get(_ORIENTATION) in _QUARTER_TURNS
+    except Exception:  # a broken header can end in nearly any error of Pillow's parsers
+        return 0, 0
+    return (height, width) if turned else (width, height)

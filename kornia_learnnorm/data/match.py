@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from kornia_learnnorm.data.cambridge import read_cambridge
 from kornia_learnnorm.data.collect import MatchOptions, collect_matches
 from kornia_learnnorm.data.colmap import covisible_pairs, read_colmap
 from kornia_learnnorm.data.features import DETECTORS
 from kornia_learnnorm.data.frames import Frame, FramePair, listed_pairs, pair_frames, resize_frames
 from kornia_learnnorm.data.matching import MATCHERS
-from kornia_learnnorm.data.sequences import read_cambridge, read_folder, read_kitti, read_tum, split_sequences
+from kornia_learnnorm.data.sequences import read_folder, read_kitti, read_tum, split_sequences
 from kornia_learnnorm.data.store import read_store
 
 __all__ = ["add_arguments", "run"]
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames.add_argument(
         "--split", metavar="NAME", help="kitti, cambridge: train or test; tum: train or val (Fan et al.)"
     )
-    frames.add_argument("--camera", default="image_0", help="kitti: image_0 to image_3 (default: %(default)s)")
+    frames.add_argument("--camera", help="kitti: image_0 to image_3 (default: image_0)")
     frames.add_argument(
         "--model", metavar="FOLDER", type=Path, help="colmap: cameras, images and points; ROOT has images"
     )
@@ -48,7 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-difference",
         metavar="S",
         type=float,
-        default=0.02,
         help="tum: of image to pose, seconds (default: 0.02)",
     )
     frames.add_argument(
@@ -91,6 +91,8 @@ def run(args: argparse.Namespace) -> int:
     pairs = _pair(args, frames)
     posed = sum(bool(np.isfinite(frame.pose).all()) for frame in frames)
     print(f"{len(frames)} frames, {posed} with a pose; {len(pairs)} pairs", file=sys.stderr)
+    if not pairs:
+        raise ValueError(f"no pairs of frames to match ({_pairing(args)}) among {len(frames)} frames at {args.root}")
     names = sorted({frame.sequence for frame in frames}) if args.reader in ("kitti", "tum") else [args.root.name]
     about = {"dataset": f"{READERS[args.reader]} {', '.join(names)}{_resized(args)}", "pairs": _pairing(args)}
     skipped = collect_matches(pairs, args.out, options, about, args.jobs, args.dask)
@@ -108,6 +110,8 @@ def _check(args: argparse.Namespace) -> None:
     for name, readers in {
         "sequences": ("kitti", "tum"),
         "split": ("kitti", "tum", "cambridge"),
+        "camera": ("kitti",),
+        "max_difference": ("tum",),
         "model": ("colmap",),
         "min_points": ("colmap",),
     }.items():
@@ -126,9 +130,9 @@ def _read(args: argparse.Namespace) -> list[Frame]:
     if args.split and args.reader != "cambridge":
         sequences = split_sequences(args.reader, args.split, args.root)
     if args.reader == "kitti":
-        return read_kitti(args.root, sequences, args.camera)
+        return read_kitti(args.root, sequences, args.camera or "image_0")
     if args.reader == "tum":
-        return read_tum(args.root, sequences, args.max_difference)
+        return read_tum(args.root, sequences, 0.02 if args.max_difference is None else args.max_difference)
     if args.reader == "cambridge":
         return read_cambridge(args.root, args.split)
     if args.reader == "colmap":

@@ -292,10 +292,10 @@ def _append_all(h5py: Any, file: h5py.File, stores: Iterable[CorrespondenceStore
     for store in stores:
         if "offsets" not in file:
             file.attrs.update({key: getattr(store, key) for key in ("dataset", "pairs", "detector")})
-            file.create_dataset("offsets", (1,), np.int64, maxshape=(None,), chunks=(1024,))
-            file.create_dataset("names", (0, 2), h5py.string_dtype(), maxshape=(None, 2), chunks=(1024, 2))
+            file.create_dataset("offsets", (1,), np.int64, maxshape=(None,), chunks=(128,))
+            file.create_dataset("names", (0, 2), h5py.string_dtype(), maxshape=(None, 2), chunks=(64, 2))
             for name, (tail, dtype, axis) in _LAYOUT.items():
-                rows = 8192 if axis == "M" else 256
+                rows = 2048 if axis == "M" else 16  # small, since a part of a store is one too
                 file.create_dataset(name, (0, *tail), dtype, maxshape=(None, *tail), chunks=(rows, *tail))
         _append(file["offsets"], store.offsets[1:] + file["offsets"][-1])
         _append(file["names"], np.array(store.names, dtype=h5py.string_dtype()))

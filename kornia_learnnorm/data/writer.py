@@ -13,6 +13,8 @@ from kornia_learnnorm.files import replacing
 
 __all__ = ["StoreWriter"]
 
+OPTIONS = "options.json"  # in the folder of the parts
+
 
 class StoreWriter:
     """Collect the pairs of a store in any order.
@@ -28,33 +30,51 @@ class StoreWriter:
         path: the store to write.
         folder: where the parts wait.
         complete: the store is there already, made with the same options.
+        skipped: the pairs that a complete store leaves out, and why; empty while it is not complete.
 
     Raises:
         FileNotFoundError: if the folder of the store does not exist.
         PermissionError: if it cannot be written.
-        ValueError: if the store, or parts of it, are there but were made with other options or by other means.
+        ValueError: if the store, or parts of it, are there but were made with other options or by other means, or
+            cannot be read.
     """
 
     def __init__(self, path: str | Path, options: dict[str, Any]) -> None:
         self.path = Path(path)
         self.folder = self.path.with_name(self.path.name + ".parts")
         self.options: dict[str, Any] = json.loads(json.dumps(options))
+        self.skipped: dict[str, str] = {}
         self.complete = self.path.exists()
         if self.complete:
-            _refuse(self.path, read_store(self.path).provenance.get("options"), self.options)
-            return
-        about = self.folder / "options.json"
-        if about.is_file():
-            _refuse(self.folder, json.loads(about.read_text(encoding="utf-8")), self.options)
-            return
+            self._check_complete()
+        elif any(self._parts()):
+            _refuse(self.folder, _read_options(self.folder / OPTIONS), self.options)
+        else:
+            self._begin()
+
+    def _check_complete(self) -> None:
+        if not self.path.is_file():
+            raise ValueError(f"cannot write {self.path}: it is not a regular file")
+        provenance = read_store(self.path).provenance
+        _refuse(self.path, provenance.get("options"), self.options)
+        self.skipped = dict(provenance.get("skipped", {}))
+
+    def _begin(self) -> None:
         if not self.path.parent.is_dir():
             raise FileNotFoundError(f"cannot write {self.path}: the folder {self.path.parent} does not exist")
+        if self.folder.exists() and not self.folder.is_dir():
+            raise ValueError(f"cannot write {self.path}: its parts wait in {self.folder}, which is not a folder")
         self.folder.mkdir(exist_ok=True)
-        with replacing(about) as beside:
+        with replacing(self.folder / OPTIONS) as beside:
             beside.write_text(json.dumps(self.options, indent=1), encoding="utf-8")
 
     def done(self) -> set[int]:
-        """Return the places of the pairs that are there."""
+        """Return the places of the pairs that are there; parts that a power cut made unreadable are removed."""
+        for part in self._parts():
+            try:
+                read_store(part)
+            except ValueError:
+                part.unlink()
         return {int(part.stem) for part in self._parts()}
 
     def add(self, place: int, pair: CorrespondenceStore) -> None:
@@ -89,6 +109,13 @@ class StoreWriter:
 
     def _parts(self) -> Iterator[Path]:
         return iter(sorted(self.folder.glob("[0-9]*.h5")))
+
+
+def _read_options(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return None
 
 
 def _refuse(path: Path, had: Any, options: dict[str, Any]) -> None:

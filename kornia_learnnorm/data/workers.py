@@ -1,0 +1,100 @@
+"""Processes that work on lists of tasks: on this machine, or those of a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+__all__ = ["Workers", "open_workers"]
+
+
+class Workers:
+    """Processes that call a function on many arguments.
+
+    Args:
+        options: arguments of joblib's ``Parallel``.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        self.options = options
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        from joblib import effective_n_jobs
+
+        return int(effective_n_jobs(self.options["n_jobs"]))
+
+    @contextmanager
+    def results(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Iterator[Any]]:
+        """Give the results, in order and one at a time; leaving the context cancels what is not done.
+
+        Args:
+            function: of a module, so that a process can find it.
+            arguments: of one call each; they are taken as processes become free.
+
+        Yields:
+            an iterator over the results; a call's errors are raised there.
+
+        """
+        from joblib import Parallel, delayed
+
+        # A new Parallel each time: one whose process was killed gives late results of that call to the next.
+        parallel = Parallel(return_as="generator", batch_size=1, max_nbytes=None, **self.options)
+        results = parallel(delayed(function)(*some) for some in arguments)
+        try:
+            yield results
+        finally:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # that tasks were cancelled: it is meant so
+                results.close()
+
+
+@contextmanager
+def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
+    """Give processes here or, with ``dask``, those of a cluster.
+
+    Args:
+        jobs: processes on this machine; -1 for as many as it has cores.
+        dask: address of a Dask scheduler whose workers are taken instead.
+
+    Raises:
+        ValueError: if ``jobs`` is 0.
+        OSError: if the scheduler or its workers cannot be reached, or a task kills one worker of Dask after another.
+        ImportError: if joblib or, for ``dask``, Dask is not installed.
+
+    """
+    try:
+        import joblib
+    except ImportError as error:
+        raise ImportError("matching many pairs needs joblib: pip install 'kornia-learnnorm[images]'") from error
+    if jobs == 0:
+        raise ValueError("jobs must be a number of processes, or -1 for as many as there are cores, got 0")
+    if dask is None:
+        yield Workers(n_jobs=jobs, backend="loky", initializer=_end_with, initargs=(os.getpid(),))
+        return
+    try:
+        from distributed import Client, KilledWorker
+    except ImportError as error:
+        raise ImportError("a Dask scheduler needs Dask: pip install 'kornia-learnnorm[dask]'") from error
+    try:
+        with Client(dask) as client, joblib.parallel_config("dask", client=client):  # type: ignore[no-untyped-call]
+            yield Workers(n_jobs=-1)
+    except KilledWorker as error:
+        raise OSError(f"one worker after another of {dask} was killed: {error}") from error
+
+
+def _end_with(parent: int) -> None:
+    """End this process when ``parent`` was killed: it would wait for ever to write to a pipe that nobody reads."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

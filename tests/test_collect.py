@@ -1,0 +1,378 @@
+"""Matching many pairs: once a frame, on any number of processes, through kills and full disks."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("cv2", reason="OpenCV is not installed")
+pytest.importorskip("h5py", reason="h5py is not installed")
+pytest.importorskip("joblib", reason="joblib is not installed")
+
+from data.make_sequences import write_image
+
+from kornia_learnnorm.data import collect, feature_cache
+from kornia_learnnorm.data.collect import MatchOptions, collect_matches, match_pair
+from kornia_learnnorm.data.feature_cache import FeatureCache
+from kornia_learnnorm.data.features import Features
+from kornia_learnnorm.data.frames import FramePair, pair_frames
+from kornia_learnnorm.data.sequences import read_folder
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+
+OPTIONS = MatchOptions(num_features=200, max_matches=30)
+ARRAYS = ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t")
+COMMAND = [sys.executable, "-m", "lightning_modules.cli", "match", "folder"]
+
+
+def frames_of(root: Path, number: int = 6) -> Path:
+    for frame in range(number):
+        write_image(root / f"{frame:03}.png", 6 * frame)
+    return root
+
+
+def pairs_of(root: Path) -> list[FramePair]:
+    return list(pair_frames(read_folder(root)))
+
+
+def assert_same(path1: Path, path2: Path) -> None:
+    store1, store2 = read_store(path1), read_store(path2)
+    for name in ARRAYS:
+        assert np.array_equal(getattr(store1, name), getattr(store2, name), equal_nan=True), name
+    assert (store1.names, store1.provenance) == (store2.names, store2.provenance)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    return frames_of(tmp_path_factory.mktemp("images"), 24)
+
+
+@pytest.fixture(scope="module")
+def expected(images, tmp_path_factory):
+    path = tmp_path_factory.mktemp("expected") / "store.h5"
+    assert collect_matches(pairs_of(images), path, OPTIONS) == {}
+    return path
+
+
+class Detector:
+    """SIFT that counts its calls and what waits on disk at each."""
+
+    def __init__(self, folder: Path, fail_at: int = -1) -> None:
+        self.detect, self.calls, self.waiting = collect.DETECTORS["sift"], 0, 0
+        self.folder, self.fail_at = folder, fail_at
+
+    def __call__(self, image: np.ndarray, num_features: int) -> Features:
+        if self.calls == self.fail_at:
+            raise KeyboardInterrupt
+        self.calls += 1
+        self.waiting = max(self.waiting, len(list(self.folder.glob("*.npz"))))
+        return self.detect(image, num_features)
+
+
+class TestOnce:
+    def test_each_frame_is_detected_once_and_its_features_go(self, images, tmp_path, monkeypatch):
+        frames = read_folder(images)
+        pairs = [FramePair(a, b) for gap in (1, 2, 3) for a, b in zip(frames, frames[gap:], strict=False)]
+        pairs.sort(key=lambda pair: pair.frame1.name)
+        detector = Detector(tmp_path / "store.h5.parts" / "features")
+        monkeypatch.setitem(collect.DETECTORS, "sift", detector)
+        collect_matches(pairs, tmp_path / "store.h5", OPTIONS)
+        assert len(pairs) == 66
+        assert detector.calls == 24
+        # A window of 8 pairs and the frames that reach 3 further: bounded, whatever the number of pairs.
+        assert 2 <= detector.waiting <= 8
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["store.h5"]
+
+    def test_memory_does_not_grow(self, images, tmp_path, monkeypatch):
+        sizes = []
+        release = FeatureCache.release
+
+        def watched(cache: FeatureCache, pair: FramePair) -> None:
+            release(cache, pair)
+            sizes.append(len(cache.held))
+
+        monkeypatch.setattr(feature_cache.FeatureCache, "release", watched)
+        collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS)
+        assert max(sizes) <= collect.WINDOW
+        assert sizes[-1] == 0
+
+    def test_cache_gives_back_what_was_put(self, images, tmp_path):
+        (pair, *_) = pairs_of(images)
+        rows = np.arange(6, dtype=np.uint8).reshape(2, 3)
+        features = Features(np.ones((2, 2), np.float32), rows, (160, 120))
+        with FeatureCache(tmp_path / "cache", [pair]) as cache:
+            cache.put(pair.frame1, features)
+            cache.put(pair.frame2, "unreadable")
+            got, reason = cache.get(pair)
+            assert cache.missing([pair]) == []
+            cache.release(pair)
+            assert list(cache.folder.iterdir()) == []
+        assert reason == "unreadable"
+        assert np.array_equal(got.points, features.points)
+        assert np.array_equal(got.descriptors, rows)
+        assert (got.descriptors.dtype, got.size) == (np.uint8, (160, 120))
+        assert not cache.folder.exists()
+
+
+class TestProcesses:
+    def test_two_give_the_same_store_as_one(self, images, expected, tmp_path):
+        collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, jobs=2)
+        assert_same(expected, tmp_path / "store.h5")
+
+    def test_killed_worker_loses_nothing(self, images, expected, tmp_path, capfd, monkeypatch):
+        add, killed = collect.StoreWriter.add, []
+
+        def kill_first(writer, place, pair):
+            if not killed:
+                killed.append(loky_workers()[0])
+                os.kill(killed[0], signal.SIGKILL)
+            add(writer, place, pair)
+
+        monkeypatch.setattr(collect.StoreWriter, "add", kill_first)
+        collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, jobs=2)
+        assert "a process was killed; going on" in capfd.readouterr().err
+        assert_same(expected, tmp_path / "store.h5")
+
+    def test_workers_that_die_again_and_again(self, images, tmp_path, monkeypatch):
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+        def broken(*_):
+            raise TerminatedWorkerError("killed")
+            yield
+
+        monkeypatch.setattr(collect, "_match_some", broken)
+        with pytest.raises(OSError, match=r"were killed 4 times in a row: killed"):
+            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS)
+
+    def test_no_processes(self, images, tmp_path):
+        with pytest.raises(ValueError, match=r"jobs must be .* got 0"):
+            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, jobs=0)
+
+
+def loky_workers() -> list[int]:
+    """Return the ids of this process's loky workers."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            mine = f"PPid:\t{os.getpid()}\n" in (folder / "status").read_text()
+            if mine and b"LokyProcess" in (folder / "cmdline").read_bytes():
+                found.append(int(folder.name))
+        except OSError:  # it ended meanwhile
+            continue
+    return found
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+class TestSignals:
+    @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGINT])
+    def test_stopped_run_goes_on(self, images, expected, tmp_path, kind):
+        out, parts = tmp_path / "store.h5", tmp_path / "store.h5.parts"
+        args = [*COMMAND, images, "--out", out, "--jobs", "2", "--num-features", "200", "--max-matches", "30"]
+        with subprocess.Popen(args, stderr=subprocess.PIPE, text=True, start_new_session=True) as run:
+            until = time.time() + 60
+            while not any(parts.glob("0*.h5")) and time.time() < until:
+                time.sleep(0.005)
+            # Ctrl-C reaches the whole group, kill -9 one process.
+            os.killpg(run.pid, kind) if kind == signal.SIGINT else os.kill(run.pid, kind)
+            error = run.communicate(timeout=30)[1]
+        assert any(parts.glob("0*.h5"))
+        assert not out.exists()
+        if kind == signal.SIGINT:
+            assert run.returncode == 130
+            assert error.rstrip().endswith("interrupted")
+            assert "Traceback" not in error
+        again = subprocess.run(args, capture_output=True, text=True, timeout=60, check=True)
+        assert len(again.stderr.splitlines()) <= 4  # the bar is quiet where stderr is no terminal
+        store, whole = read_store(out), read_store(expected)
+        assert all(np.array_equal(getattr(store, name), getattr(whole, name), equal_nan=True) for name in ARRAYS)
+
+
+class TestDask:
+    @pytest.fixture
+    def cluster(self):
+        distributed = pytest.importorskip("distributed", reason="Dask is not installed")
+        with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+        ) as cluster:
+            yield cluster
+
+    def test_same_store_though_a_worker_is_killed(self, images, expected, tmp_path, cluster):
+        path, parts = tmp_path / "store.h5", tmp_path / "store.h5.parts"
+        victim, done = next(iter(cluster.workers.values())).pid, []
+
+        def kill() -> None:
+            until = time.time() + 60
+            while not any(parts.glob("0*.h5")) and time.time() < until:
+                time.sleep(0.005)
+            os.kill(victim, signal.SIGKILL)
+            done.append(len(list(parts.glob("0*.h5"))))
+
+        thread = threading.Thread(target=kill)
+        thread.start()
+        collect_matches(pairs_of(images), path, OPTIONS, dask=cluster.scheduler_address)
+        thread.join()
+        assert 0 < done[0] < 23  # in the middle
+        assert_same(expected, path)
+
+    def test_nobody_at_the_address(self, images, tmp_path):
+        dask = pytest.importorskip("dask", reason="Dask is not installed")
+        with dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}), pytest.raises(OSError, match="tcp"):
+            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask="tcp://127.0.0.1:1")
+
+
+class TestGoingOn:
+    def test_complete_store_is_left_alone_and_lists_what_it_lacks(self, tmp_path, capsys):
+        root = frames_of(tmp_path / "images", 4)
+        (root / "003.png").write_bytes(b"")
+        path = tmp_path / "store.h5"
+        skipped = collect_matches(pairs_of(root), path, OPTIONS)
+        before = path.stat().st_mtime_ns
+        assert collect_matches(pairs_of(root), path, OPTIONS) == skipped
+        assert path.stat().st_mtime_ns == before
+        assert "is there already" in capsys.readouterr().err
+
+    def test_other_options_or_cameras_are_refused(self, images, expected):
+        pairs = pairs_of(images)
+        with pytest.raises(ValueError, match=r"other options.* num_features was 200 and is 201"):
+            collect_matches(pairs, expected, replace(OPTIONS, num_features=201))
+        moved = [FramePair(replace(pair.frame1, camera=np.eye(3)), pair.frame2) for pair in pairs]
+        with pytest.raises(ValueError, match=r"other options.* frames was"):
+            collect_matches(moved, expected, OPTIONS)
+
+    def test_full_disk(self, images, expected, tmp_path, monkeypatch):
+        path = tmp_path / "store.h5"
+        add = collect.StoreWriter.add
+
+        def full(writer, place, pair):
+            if place == 3:
+                raise OSError(28, "No space left on device")
+            add(writer, place, pair)
+
+        monkeypatch.setattr(collect.StoreWriter, "add", full)
+        with pytest.raises(OSError, match="No space left"):
+            collect_matches(pairs_of(images), path, OPTIONS, jobs=2)
+        monkeypatch.undo()
+        assert not path.exists()
+        assert not (tmp_path / "store.h5.parts" / "features").exists()  # gives back what room it can
+        collect_matches(pairs_of(images), path, OPTIONS)
+        assert_same(expected, path)
+
+    def test_features_do_not_fit(self, images, expected, tmp_path, monkeypatch):
+        def full(*args, **arrays):
+            raise OSError("4096 requested and 1024 written")
+
+        path = tmp_path / "store.h5"
+        monkeypatch.setattr(feature_cache.np, "savez", full)
+        with pytest.raises(OSError, match=r"cannot write the features of 000\.png .*full"):
+            collect_matches(pairs_of(images), path, OPTIONS)
+        monkeypatch.undo()
+        collect_matches(pairs_of(images), path, OPTIONS)
+        assert_same(expected, path)
+
+    def test_interrupted(self, images, expected, tmp_path, monkeypatch):
+        path = tmp_path / "store.h5"
+        monkeypatch.setitem(collect.DETECTORS, "sift", Detector(tmp_path, fail_at=12))
+        with pytest.raises(KeyboardInterrupt):
+            collect_matches(pairs_of(images), path, OPTIONS)
+        monkeypatch.undo()
+        assert any((tmp_path / "store.h5.parts").glob("0*.h5"))
+        collect_matches(pairs_of(images), path, OPTIONS)
+        assert_same(expected, path)
+
+
+class TestBadInput:
+    def test_unreadable_and_blank_images_are_skipped_and_listed(self, tmp_path):
+        root = frames_of(tmp_path / "images", 9)
+        (root / "002.png").write_bytes(b"")
+        data = (root / "004.png").read_bytes()
+        (root / "004.png").write_bytes(data[: len(data) // 2])
+        blank = np.zeros((120, 160), np.uint8)
+        from PIL import Image
+
+        Image.fromarray(blank).save(root / "006.png")
+        skipped = collect_matches(pairs_of(root), tmp_path / "store.h5", OPTIONS)
+        assert list(skipped) == [f"{i:03}.png {i + 1:03}.png" for i in range(1, 7)]
+        for name, reason in zip(skipped, ["is empty", "is empty", *["truncated"] * 2, *["is blank"] * 2], strict=True):
+            assert reason in skipped[name]
+        store = read_store(tmp_path / "store.h5")
+        assert store.names == [("000.png", "001.png"), ("007.png", "008.png")]
+        assert store.provenance["skipped"] == skipped
+
+    def test_other_size_than_the_camera(self, images, tmp_path):
+        (pair, *_) = pairs_of(images)
+        wrong = FramePair(replace(pair.frame1, size=(100, 100)), pair.frame2)
+        with pytest.raises(ValueError, match=r"none of the 1 pairs .* 160 x 120 pixels, its camera 100 x 100"):
+            collect_matches([wrong], tmp_path / "store.h5", OPTIONS)
+
+    def test_nothing_matched_blocks_no_later_run(self, images, tmp_path):
+        self.test_other_size_than_the_camera(images, tmp_path)
+        collect_matches(pairs_of(images)[:1], tmp_path / "store.h5", replace(OPTIONS, seed=1))
+        assert len(read_store(tmp_path / "store.h5")) == 1
+
+    def test_no_pairs(self, tmp_path):
+        with pytest.raises(ValueError, match="no pairs of frames to match"):
+            collect_matches([], tmp_path / "store.h5")
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"detector": "orb"}, r"detector must be one of sift, .* got 'orb'"),
+            ({"matcher": "magic"}, r"matcher must be one of nearest, lightglue, got 'magic'"),
+            ({"matcher": "lightglue"}, r"lightglue takes features of the detector disk, got sift"),
+            ({"num_features": 1}, "at least 2 features"),
+            ({"max_matches": 7}, "8 matches or None"),
+            ({"seed": -1}, "a seed from 0"),
+        ],
+    )
+    def test_options(self, wrong, message):
+        with pytest.raises(ValueError, match=message):
+            MatchOptions(**wrong)
+
+
+def matched(pair: FramePair, seed: int, most: int | None) -> CorrespondenceStore:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 100, (60, 2)).astype(np.float32)
+    near, far = rng.normal(size=(2, 30, 8))
+    noisy = np.concatenate([near + rng.normal(size=near.shape) * 0.1, rng.normal(size=(30, 8))])
+    first = Features(points, np.concatenate([near, far]).astype(np.float32), (160, 120))
+    second = Features(points + 1, noisy.astype(np.float32), (160, 120))
+    return match_pair(pair, first, second, options=MatchOptions(max_matches=most, seed=seed))
+
+
+class TestMatchPair:
+    @given(seed=st.integers(0, 1000), most=st.integers(8, 40))
+    def test_cut_is_a_subset_with_at_most_so_many_of_each_class(self, images, seed, most):
+        (pair, *_) = pairs_of(images)
+        whole, cut = matched(pair, seed, None), matched(pair, seed, most)
+        rows, some = (
+            [tuple(row) for row in np.column_stack([store.points1, store.points2, store.ratio])]
+            for store in (whole, cut)
+        )
+        assert len(set(some)) == len(some)
+        assert set(some) <= set(rows)
+        passes = {True: (whole.ratio < 0.8).sum(), False: (whole.ratio >= 0.8).sum()}
+        assert (cut.ratio < 0.8).sum() == min(most, passes[True])
+        assert (cut.ratio >= 0.8).sum() == min(most, passes[False])
+
+    @given(order=st.permutations(range(4)))
+    def test_a_pair_is_the_same_in_whatever_order_pairs_are_matched(self, images, order):
+        pairs = pairs_of(images)[:4]
+        detect = collect.DETECTORS["sift"]
+        from kornia_learnnorm.data.images import read_frame
+
+        features = [detect(read_frame(pair.frame1), 50) for pair in pairs_of(images)[:5]]
+        sides = list(pairwise(features))
+        straight = [match_pair(pairs[i], *sides[i], i, OPTIONS) for i in range(4)]
+        shuffled = {i: match_pair(pairs[i], *sides[i], i, OPTIONS) for i in order}
+        assert all(np.array_equal(straight[i].points1, shuffled[i].points1) for i in range(4))

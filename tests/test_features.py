@@ -1,0 +1,141 @@
+"""Features of images: SIFT's against NumPy, the learned ones with stubs and random weights."""
+
+from __future__ import annotations
+
+import urllib.error
+
+import numpy as np
+import pytest
+import torch
+from kornia.feature import DISK, LightGlue
+
+from kornia_learnnorm.data import features as module
+from kornia_learnnorm.data import matching
+from kornia_learnnorm.data.features import (
+    Features,
+    detect_disk,
+    detect_keynet,
+    detect_rootsift,
+    detect_sift,
+    pretrained,
+)
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+
+
+@pytest.fixture(autouse=True)
+def _no_networks_kept():
+    caches = (module._disk, module._keynet, matching._lightglue)
+    for cache in caches:
+        cache.cache_clear()
+    yield
+    for cache in caches:
+        cache.cache_clear()
+
+
+def texture(width: int = 240, height: int = 180) -> np.ndarray:
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(height, width)), (0, 0), 2)
+    return cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def test_rootsift_is_the_root_of_sift_of_unit_sum():
+    sift, root = detect_sift(texture(), 100), detect_rootsift(texture(), 100)
+    rows = sift.descriptors.astype(np.float64)
+    assert np.allclose(root.descriptors, np.sqrt(rows / np.abs(rows).sum(1)[:, None]), atol=1e-6)
+    assert np.allclose(np.linalg.norm(root.descriptors, axis=1), 1, atol=1e-5)
+    assert root.descriptors.dtype == np.float32
+    assert np.array_equal(root.points, sift.points)
+
+
+@pytest.mark.parametrize("detect", [detect_sift, detect_rootsift])
+def test_blank_has_none(detect):
+    found = detect(np.zeros((60, 80), np.uint8))
+    assert (found.points.shape, found.descriptors.shape, found.size) == ((0, 2), (0, 128), (80, 60))
+
+
+def test_disk_of_random_weights(monkeypatch):
+    weights = {"extractor": DISK().state_dict()}
+    monkeypatch.setattr("kornia.feature.disk.disk.load_state_dict_from_url", lambda *_, **__: weights)
+    found = detect_disk(texture(width=200), 50)  # 180 and 200 are no multiples of 16
+    assert 0 < len(found.points) <= 50
+    assert found.descriptors.shape == (len(found.points), 128)
+    assert (found.points.dtype, found.descriptors.dtype, found.size) == (np.float32, np.float32, (200, 180))
+    assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-4)
+
+
+def test_disk_names_pixels_x_first(monkeypatch):
+    class Bright(torch.nn.Module):  # scores a pixel by how bright it is
+        def forward(self, images):
+            return torch.cat([torch.ones(1, 128, *images.shape[2:]), images[:, :1]], 1)
+
+    monkeypatch.setattr(DISK, "from_pretrained", lambda: DISK(unet=Bright()).eval())
+    image = np.zeros((90, 100), np.uint8)
+    image[40, 70], image[20, 30] = 255, 200
+    assert sorted(detect_disk(image, 10).points.tolist()) == [[30, 20], [70, 40]]
+
+
+def test_keynet_leaves_out_what_fills_up(monkeypatch):
+    """Kornia fills up with frames of zeros where it finds fewer features than it was asked for."""
+    frames = torch.zeros(1, 5, 2, 3)
+    frames[0, :2, :, 2] = torch.tensor([[30.0, 20.0], [70.0, 40.0]])
+    frames[0, :2, 0, 0] = frames[0, :2, 1, 1] = 11.0
+    output = frames, torch.zeros(1, 5), torch.rand(1, 5, 128)
+    monkeypatch.setattr(module, "_keynet", lambda number: lambda image: output)
+    found = detect_keynet(texture(), 5)
+    assert found.points.tolist() == [[30, 20], [70, 40]]
+    assert found.descriptors.shape == (2, 128)
+
+
+def test_keynet_of_random_weights(monkeypatch):
+    import kornia.feature.affine_shape as affine
+    import kornia.feature.hardnet as hardnet
+    import kornia.feature.keynet as keynet
+    import kornia.feature.orientation as orientation
+
+    networks = {
+        keynet: keynet.KeyNet(False), orientation: orientation.OriNet(False),
+        affine: affine.LAFAffNetShapeEstimator(False), hardnet: hardnet.HardNet(False),
+    }  # fmt: skip
+    for place, network in networks.items():
+        weights = {"state_dict": network.state_dict()}
+        monkeypatch.setattr(place, "load_state_dict_from_url", lambda *_, w=weights, **__: w)
+    found = detect_keynet(texture(), 40)
+    assert len(found.points) <= 40
+    assert found.descriptors.shape == (len(found.points), 128)
+    assert (found.points.dtype, found.descriptors.dtype) == (np.float32, np.float32)
+    assert found.points.any(1).all()
+
+
+def test_lightglue_of_random_weights(monkeypatch):
+    glue = LightGlue(None, input_dim=128).eval()
+    monkeypatch.setattr(matching, "_lightglue", lambda: glue)
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(2, 30, 128)).astype(np.float32)
+    sides = [Features(rng.uniform(0, 90, (30, 2)).astype(np.float32), row, (100, 90)) for row in rows]
+    matches = matching.match_lightglue(*sides)
+    assert matches.points1.shape == matches.points2.shape == (len(matches.ratio), 2)
+    assert all(part.dtype == torch.float32 for part in matches)
+    assert ((matches.ratio >= 0) & (matches.ratio <= 1)).all()
+
+
+@pytest.mark.parametrize(
+    "error", [urllib.error.URLError("no network"), RuntimeError("cut"), EOFError("Ran out of input")]
+)
+def test_weights_that_are_not_there(error):
+    def load():
+        raise error
+
+    with pytest.raises(OSError, match=r"the weights of DISK are not in .*checkpoints and could not be loaded: ") as got:
+        pretrained("DISK", load)
+    assert "\n" not in str(got.value)
+
+
+@pytest.mark.parametrize("detect", [detect_disk, detect_keynet])
+def test_without_network(monkeypatch, detect):
+    def none(*_, **__):
+        raise urllib.error.URLError("no network")
+
+    for place in ("disk.disk", "keynet", "affine_shape", "orientation", "hardnet"):
+        monkeypatch.setattr(f"kornia.feature.{place}.load_state_dict_from_url", none)
+    with pytest.raises(OSError, match=r"could not be loaded: <urlopen error no network>"):
+        detect(texture(), 10)

@@ -1,0 +1,178 @@
+"""Reading images, and frames as they are matched."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kornia_learnnorm.data.features import Features
+from kornia_learnnorm.data.frames import Frame, FramePair
+from kornia_learnnorm.data.images import read_frame, read_image
+from kornia_learnnorm.data.matching import match_nearest
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+
+CAMERA = np.array([[250.0, 0, 119.0], [0, 245.0, 92.0], [0, 0, 1]])
+DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # of the benchmark's first Kinect
+
+
+def texture(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
+    """Blurred noise at two scales, with the full range of grey values."""
+    rng = np.random.default_rng(seed)
+    image = sum(cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
+    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def blobs(centres: np.ndarray, width: int = 240, height: int = 180) -> np.ndarray:
+    """A smooth bright blob about each centre (x, y)."""
+    y, x = np.mgrid[:height, :width]
+    image = sum(np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 18.0) for cx, cy in centres)
+    return np.round(np.clip(image, 0, 1) * 250).astype(np.uint8)
+
+
+def centroids(image: np.ndarray, near: np.ndarray, reach: int = 14) -> np.ndarray:
+    """Centre of mass of the grey values about each of some pixels."""
+    found = []
+    for cx, cy in np.round(near).astype(int):
+        y, x = np.mgrid[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1]
+        mass = image[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1].astype(float)
+        found.append([(mass * x).sum() / mass.sum(), (mass * y).sum() / mass.sum()])
+    return np.array(found)
+
+
+def precise_sift(image: np.ndarray) -> Features:
+    """SIFT without the quarter of a pixel that OpenCV's default is off, which differs between sizes."""
+    keypoints, rows = cv2.SIFT_create(2000, enable_precise_upscale=True).detectAndCompute(image, None)
+    return Features(np.array([keypoint.pt for keypoint in keypoints], np.float32), rows, image.shape[::-1])
+
+
+def frame_of(path: Path, image: np.ndarray, **known) -> Frame:
+    cv2.imwrite(str(path), image)
+    return Frame(path, path.name, "", image.shape[::-1], **known)
+
+
+class TestReadImage:
+    def test_grey_values_survive(self, tmp_path):
+        image = texture()
+        path = tmp_path / "näme with spaces.png"
+        path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        assert np.array_equal(read_image(path), image)
+        assert np.array_equal(read_image(str(path)), image)
+
+    def test_colour_becomes_grey(self, tmp_path):
+        colour = np.zeros((4, 5, 3), np.uint8)
+        colour[..., 2] = 200  # red, the last channel in OpenCV's order
+        cv2.imwrite(str(tmp_path / "red.png"), colour)
+        image = read_image(tmp_path / "red.png")
+        assert image.shape == (4, 5)
+        assert abs(int(image[0, 0]) - 0.299 * 200) <= 1  # luma of ITU-R BT.601
+
+    def test_sixteen_bits_become_eight(self, tmp_path):
+        cv2.imwrite(str(tmp_path / "deep.png"), np.full((4, 5), 0x8000, np.uint16))
+        image = read_image(tmp_path / "deep.png")
+        assert image.dtype == np.uint8
+        assert abs(int(image[0, 0]) - 0x80) <= 1
+
+    def test_missing_file(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"nothing\.png does not exist"):
+            read_image(tmp_path / "nothing.png")
+
+    def test_folder(self, tmp_path):
+        with pytest.raises(ValueError, match="is a folder"):
+            read_image(tmp_path)
+
+    def test_empty_file(self, tmp_path):
+        (tmp_path / "empty.png").touch()
+        with pytest.raises(ValueError, match=r"empty\.png is empty"):
+            read_image(tmp_path / "empty.png")
+
+    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp"])
+    def test_truncated(self, tmp_path, suffix):
+        data = cv2.imencode(suffix, texture())[1].tobytes()
+        (tmp_path / f"half{suffix}").write_bytes(data[: len(data) // 2])
+        with pytest.raises(ValueError, match="truncated") as caught:
+            read_image(tmp_path / f"half{suffix}")
+        assert "\n" not in str(caught.value)
+
+    def test_jpeg_with_a_thumbnail_is_whole_and_noticed_when_cut(self, tmp_path):
+        thumbnail = cv2.imencode(".jpg", texture(width=32, height=24))[1].tobytes()
+        segment = b"\xff\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail  # a fill byte, APP1
+        data = cv2.imencode(".jpg", texture())[1].tobytes()
+        data = data[:2] + segment + data[2:]
+        (tmp_path / "whole.jpg").write_bytes(data)
+        assert read_image(tmp_path / "whole.jpg").shape == (180, 240)
+        (tmp_path / "cut.jpg").write_bytes(data[:-200])
+        with pytest.raises(ValueError, match="truncated"):
+            read_image(tmp_path / "cut.jpg")
+
+    def test_corrupt(self, tmp_path):
+        data = bytearray(cv2.imencode(".png", texture())[1].tobytes())
+        data[len(data) // 2 : len(data) // 2 + 50] = bytes(50)
+        (tmp_path / "corrupt.png").write_bytes(data)
+        with pytest.raises(ValueError, match="corrupt"):
+            read_image(tmp_path / "corrupt.png")
+
+    def test_text(self, tmp_path):
+        (tmp_path / "text.png").write_text("hello")
+        with pytest.raises(ValueError, match="not an image"):
+            read_image(tmp_path / "text.png")
+
+    def test_without_opencv(self, tmp_path, monkeypatch):
+        cv2.imwrite(str(tmp_path / "image.png"), texture())
+        monkeypatch.setitem(sys.modules, "cv2", None)
+        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[images\]'"):
+            read_image(tmp_path / "image.png")
+
+
+class TestReadFrame:
+    GRID = np.stack(np.meshgrid(np.arange(40.0, 210, 40), np.arange(40.0, 150, 33)), -1).reshape(-1, 2)
+
+    def test_as_it_is(self, tmp_path):
+        image = texture()
+        assert np.array_equal(read_frame(frame_of(tmp_path / "a.png", image)), image)
+
+    def test_undistortion_moves_points_as_opencv_says(self, tmp_path):
+        frame = frame_of(tmp_path / "a.png", blobs(self.GRID), camera=CAMERA, distortion=DISTORTION)
+        want = cv2.undistortPoints(self.GRID[:, None], CAMERA, np.array(DISTORTION), P=CAMERA)[:, 0]
+        assert np.abs(want - self.GRID).max() > 1  # there is something to undistort
+        assert np.abs(centroids(read_frame(frame), want) - want).max() < 0.1
+
+    @pytest.mark.parametrize("size", [(120, 90), (180, 135), (360, 270), (320, 180)])
+    def test_resizing_agrees_with_the_camera(self, tmp_path, size):
+        frame = replace(frame_of(tmp_path / "a.png", blobs(self.GRID), camera=CAMERA), resized=size)
+        image = read_frame(frame)
+        assert image.shape == size[::-1]
+        rays = np.linalg.solve(CAMERA, np.column_stack([self.GRID, np.ones(len(self.GRID))]).T)
+        want = (frame.K @ rays)[:2].T
+        reach = int(14 * max(size[0] / 240, size[1] / 180))
+        assert np.abs(centroids(image, want, reach) - want).max() < 0.05
+
+    def test_features_of_a_resized_pair_satisfy_its_fundamental_matrix(self, tmp_path):
+        whole, pose = texture(width=300), np.eye(4)
+        pose[0, 3] = 20 / CAMERA[0, 0]  # of a wall at depth 1: 20 pixels
+        frames = [
+            replace(
+                frame_of(tmp_path / name, whole[:, shift : shift + 240].copy(), camera=CAMERA, pose=place), resized=size
+            )
+            for name, shift, place, size in (("a.png", 0, np.eye(4), (480, 360)), ("b.png", 20, pose, (240, 180)))
+        ]
+        matches = match_nearest(*map(precise_sift, map(read_frame, frames)))
+        good = (matches.ratio < 0.6).numpy()
+        x1, x2 = (np.column_stack([points.numpy()[good], np.ones(good.sum())]) for points in matches[:2])
+        line = x1 @ FramePair(*frames).F.T
+        distance = np.abs((x2 * line).sum(1)) / np.linalg.norm(line[:, :2], axis=1)
+        assert good.sum() > 30
+        assert np.median(distance) < 0.05  # a convention that is off by half a pixel gives 0.25
+
+    def test_size_is_not_the_cameras(self, tmp_path):
+        frame = replace(frame_of(tmp_path / "a.png", texture()), size=(640, 480))
+        with pytest.raises(ValueError, match=r"a\.png has 240 x 180 pixels, its camera 640 x 480"):
+            read_frame(frame)
+
+    def test_distorted_by_an_unknown_camera(self, tmp_path):
+        with pytest.raises(ValueError, match="a distortion, but no camera matrix"):
+            read_frame(frame_of(tmp_path / "a.png", texture(), distortion=DISTORTION))

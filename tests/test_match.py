@@ -1,0 +1,147 @@
+"""The command that makes stores of correspondences from images."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2", reason="OpenCV is not installed")
+pytest.importorskip("h5py", reason="h5py is not installed")
+pytest.importorskip("joblib", reason="joblib is not installed")
+
+from data.make_sequences import LAYOUTS
+
+from kornia_learnnorm.data import collect, match
+from kornia_learnnorm.data.store import read_store
+from lightning_modules.cli import main
+
+
+def run(reader: str, root: Path, out: Path, *args: str) -> int:
+    return main(["match", reader, str(root), "--out", str(out), "--jobs", "1", "--num-features", "200", *args])
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory):
+    root = tmp_path_factory.mktemp("sequences")
+    for name, write in LAYOUTS.items():
+        write(root / name)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("reader", "args", "pairs", "known"),
+    [
+        ("kitti", ["--sequences", "06"], 3, 3),
+        ("kitti", ["--sequences", "11"], 3, 0),  # it has no poses
+        ("kitti", ["--split", "test", "--gap", "2", "--camera", "image_1"], 2, 2),
+        ("tum", ["--split", "val", "--max-difference", "0.005"], 3, 3),
+        ("tum", ["--split", "val", "--max-difference", "0.001"], 3, 0),  # no pose is so near
+        ("cambridge", ["--split", "train"], 3, 3),
+        ("folder", [], 3, 0),
+    ],
+)
+def test_readers(roots, tmp_path, capsys, reader, args, pairs, known):
+    assert run(reader, roots / reader, tmp_path / "s.h5", *args) == 0
+    assert f"{pairs} pairs, {known} with ground truth" in capsys.readouterr().out
+    assert len(read_store(tmp_path / "s.h5")) == pairs
+
+
+@pytest.mark.parametrize("args", [[], ["--pairs"], ["--min-points", "5"]])
+def test_colmap(roots, tmp_path, args):
+    root = roots / "colmap"
+    more = [*args, str(root / "pairs.txt")] if args == ["--pairs"] else args
+    assert run("colmap", root / "images", tmp_path / "s.h5", "--model", str(root / "model"), *more) == 0
+    assert np.isfinite(read_store(tmp_path / "s.h5").F).all()
+
+
+def test_resized_images_and_cameras_agree(roots, tmp_path):
+    args = ["--sequences", "06", "--resize", "320", "240"]
+    assert run("kitti", roots / "kitti", tmp_path / "s.h5", *args) == 0
+    store = read_store(tmp_path / "s.h5")
+    assert store.image_size[0].tolist() == [[320, 240]] * 2
+    assert "resized to 320x240" in store.dataset
+    assert store.K[0, 0, 0, 0] == 260  # twice the focal length
+
+
+def test_skipped_pairs_are_listed_up_to_a_number(roots, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(match, "LISTED", 1)
+    root = tmp_path / "kitti"
+    LAYOUTS["kitti"](root)
+    (root / "sequences/06/image_0/000001.png").write_bytes(b"")
+    assert run("kitti", root, tmp_path / "s.h5", "--sequences", "06") == 0
+    captured = capsys.readouterr()
+    assert captured.err.count("000001.png is empty (0 bytes)") == 1
+    assert "skipped 2 pairs in all; the store lists them" in captured.err
+    assert len(read_store(tmp_path / "s.h5").provenance["skipped"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("reader", "args", "message"),
+    [
+        ("folder", ["--sequences", "06"], "--sequences is for kitti and tum, got folder"),
+        ("tum", ["--camera", "image_1"], "--camera is for kitti, got tum"),
+        ("kitti", ["--max-difference", "1"], "--max-difference is for tum, got kitti"),
+        ("kitti", ["--sequences", "06", "--split", "test"], "exclude each other"),
+        ("kitti", ["--sequences", "99"], "no sequence '99'"),
+        ("kitti", ["--gap", "9"], "no pairs of frames to match (frames 9 apart) among 12 frames"),
+        ("kitti", ["--gap", "0"], "must be at least 1, got 0"),
+        ("kitti", ["--matcher", "lightglue"], "lightglue takes features of the detector disk, got sift"),
+        ("kitti", ["--max-matches", "3"], "8 matches or None"),
+        ("colmap", [], "colmap needs --model"),
+    ],
+)
+def test_errors_are_one_line(roots, tmp_path, capsys, reader, args, message):
+    assert run(reader, roots / reader, tmp_path / "s.h5", *args) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("learnnorm match: error: ")
+    assert message in error
+    assert not (tmp_path / "s.h5").exists()
+
+
+def test_pose_that_is_missing_or_short(tmp_path, capsys):
+    root = tmp_path / "kitti"
+    LAYOUTS["kitti"](root)
+    poses = root / "poses" / "06.txt"
+    lines = poses.read_text().splitlines()
+    poses.write_text("\n".join(lines[:-1]))
+    assert run("kitti", root, tmp_path / "s.h5", "--sequences", "06") == 2
+    assert "has no line 4, the pose of" in capsys.readouterr().err
+    poses.write_text("1 0 0")
+    assert run("kitti", root, tmp_path / "s.h5", "--sequences", "06") == 2
+    assert "line 1: the 12 numbers of a pose expected, got '1 0 0'" in capsys.readouterr().err
+
+
+def test_unknown_detector(roots, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run("kitti", roots / "kitti", tmp_path / "s.h5", "--detector", "orb")
+    assert "invalid choice: 'orb'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("reader", "args", "reference", "limit"),
+    [
+        ("kitti", ["--sequences", "06"], "kitti_06", 6),
+        ("tum", ["--max-difference", "0.1"], "tum_fr3_office", 6),
+    ],
+)
+def test_real_data_gives_the_stores_that_other_code_made(tmp_path, monkeypatch, reader, args, reference, limit):
+    data = os.environ.get("LEARNNORM_DATA")
+    if data is None:
+        pytest.skip("LEARNNORM_DATA does not name a folder of real data")
+    monkeypatch.setattr(match, "collect_matches", lambda pairs, *rest: collect.collect_matches(pairs[:limit], *rest))
+    out = tmp_path / "s.h5"
+    assert (
+        main(["match", reader, f"{data}/{reader}", "--out", str(out), "--jobs", "2", "--max-matches", "0", *args]) == 0
+    )
+    ours, theirs = read_store(out), read_store(f"{data}/correspondences/{reference}.h5@0:{limit}")
+    assert [tuple(Path(name).name for name in pair) for pair in ours.names] == theirs.names
+    for name in ("F", "K", "R", "t"):
+        assert np.allclose(getattr(ours, name), getattr(theirs, name), rtol=0, atol=1e-6)
+    for place in range(limit):
+        one, two = ours.select(place, place + 1), theirs.select(place, place + 1)
+        wanted = np.hstack([two.points1, two.points2])[two.ratio < 0.8]
+        distance = np.abs(wanted[:, None] - np.hstack([one.points1, one.points2])[None]).max(-1).min(1)
+        assert (distance < 0.01).mean() >= 0.95

@@ -1,0 +1,161 @@
+"""Writing a store pair by pair, in any order, with crashes between."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kornia_learnnorm.data import writer as module
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store, write_store
+from kornia_learnnorm.data.writer import StoreWriter
+
+pytest.importorskip("h5py", reason="h5py is not installed")
+
+OPTIONS = {"detector": "sift", "num_features": 200, "max_matches": None}
+
+
+def pair(number: int) -> CorrespondenceStore:
+    points = np.full((number + 1, 2), number, np.float32)
+    return CorrespondenceStore(
+        points, points + 1, np.full(number + 1, 0.5, np.float32), np.array([0, number + 1]),
+        np.full((1, 2, 2), 100, np.int32), [(f"{number}a", f"{number}b")], np.eye(3)[None],
+        np.stack([np.eye(3)] * 2)[None], np.eye(3)[None], np.ones((1, 3)), "test", "none", "none",
+    )  # fmt: skip
+
+
+@given(order=st.permutations(range(5)), stop=st.integers(0, 5))
+def test_order_and_stops_leave_no_trace(tmp_path_factory, order, stop):
+    path = tmp_path_factory.mktemp("store") / "store.h5"
+    for places in (order[:stop], order[stop:]):
+        writer = StoreWriter(path, OPTIONS)
+        assert writer.done().isdisjoint(places)
+        for place in places:
+            writer.add(place, pair(place))
+    writer.finish({"by": "a test"})
+    store = read_store(path)
+    assert store.names == [(f"{i}a", f"{i}b") for i in range(5)]
+    assert store.points1[:, 0].tolist() == [i for i in range(5) for _ in range(i + 1)]
+    assert store.provenance == {"by": "a test", "options": OPTIONS}
+    assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
+    assert StoreWriter(path, OPTIONS).complete
+
+
+class TestParts:
+    @pytest.mark.parametrize("size", [0, 100, 5000])
+    def test_broken_part_is_made_again(self, tmp_path, size):
+        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+        for place in range(3):
+            writer.add(place, pair(place))
+        part = writer.folder / "00000001.h5"
+        part.write_bytes(part.read_bytes()[:size])
+        assert StoreWriter(tmp_path / "store.h5", OPTIONS).done() == {0, 2}
+        assert not part.exists()
+
+    def test_of_other_options(self, tmp_path):
+        StoreWriter(tmp_path / "store.h5", OPTIONS).add(0, pair(0))
+        with pytest.raises(ValueError, match=r"store\.h5\.parts was made .* num_features was 200 and is 300"):
+            StoreWriter(tmp_path / "store.h5", {**OPTIONS, "num_features": 300})
+
+    def test_of_other_options_but_none_done(self, tmp_path):
+        StoreWriter(tmp_path / "store.h5", OPTIONS)
+        writer = StoreWriter(tmp_path / "store.h5", {**OPTIONS, "num_features": 300})
+        assert json.loads((writer.folder / "options.json").read_text())["num_features"] == 300
+
+    @pytest.mark.parametrize("text", [None, "", "[1]", '{"num_feat'])
+    def test_without_readable_options(self, tmp_path, text):
+        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+        writer.add(0, pair(0))
+        about = writer.folder / "options.json"
+        about.unlink() if text is None else about.write_text(text)
+        with pytest.raises(ValueError, match=r"store\.h5\.parts is there, but not made by this command"):
+            StoreWriter(tmp_path / "store.h5", OPTIONS)
+
+    def test_wrong_arguments(self, tmp_path):
+        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+        with pytest.raises(ValueError, match="got 1 pairs and place -1"):
+            writer.add(-1, pair(0))
+        with pytest.raises(ValueError, match="no pairs to write"):
+            writer.finish({})
+
+
+class TestStoreThatIsThere:
+    def test_truncated(self, tmp_path):
+        write_store(tmp_path / "store.h5", pair(0))
+        data = (tmp_path / "store.h5").read_bytes()
+        (tmp_path / "store.h5").write_bytes(data[: len(data) // 2])
+        with pytest.raises(ValueError, match=r"store\.h5 is not a readable HDF5 file"):
+            StoreWriter(tmp_path / "store.h5", OPTIONS)
+
+    def test_of_another_tool(self, tmp_path):
+        write_store(tmp_path / "store.h5", pair(0))
+        with pytest.raises(ValueError, match=r"store\.h5 is there, but not made by this command"):
+            StoreWriter(tmp_path / "store.h5", OPTIONS)
+
+    def test_folder(self, tmp_path):
+        with pytest.raises(ValueError, match="not a regular file"):
+            StoreWriter(tmp_path, OPTIONS)
+
+
+class TestNoRoom:
+    def test_missing_folder(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"the folder .*nothing does not exist"):
+            StoreWriter(tmp_path / "nothing" / "store.h5", OPTIONS)
+
+    def test_file_where_the_parts_belong(self, tmp_path):
+        (tmp_path / "store.h5.parts").touch()
+        with pytest.raises(ValueError, match=r"store\.h5\.parts, which is not a folder"):
+            StoreWriter(tmp_path / "store.h5", OPTIONS)
+
+    def test_no_permission(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(os, "access", lambda path, mode: False)
+        with pytest.raises(PermissionError, match="is not writable"):
+            StoreWriter(tmp_path / "store.h5", OPTIONS)
+
+    @pytest.mark.skipif(os.name != "posix", reason="limits are POSIX's")
+    @pytest.mark.parametrize("limit", [20_000, 700_000])  # a part, the store of three
+    def test_full_disk(self, tmp_path, limit):
+        code = f"""
+import resource, signal, sys
+sys.path[:0] = {[str(Path(__file__).parent)]!r}
+from test_writer import OPTIONS, StoreWriter, pair
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
+writer = StoreWriter({str(tmp_path / "store.h5")!r}, OPTIONS)
+try:
+    for place in range(3):
+        writer.add(place, pair(place + 20_000 * ({limit} > 100_000)))
+    writer.finish({{}})
+except OSError as error:
+    sys.exit("one line: " + str(error))
+"""
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+        assert "one line: " in done.stderr
+        assert not (tmp_path / "store.h5").exists()
+        assert not list(tmp_path.rglob(".*"))  # nothing half-written stays
+        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+        for place in set(range(3)) - writer.done():
+            writer.add(place, pair(place))
+        writer.finish({})
+        assert len(read_store(tmp_path / "store.h5")) == 3
+
+    def test_parts_stay_when_the_store_does_not_fit(self, tmp_path, monkeypatch):
+        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+        writer.add(0, pair(0))
+
+        def full(*_):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(module, "join_stores", full)
+        with pytest.raises(OSError, match="No space"):
+            writer.finish({})
+        monkeypatch.undo()
+        writer.finish({})
+        assert len(read_store(tmp_path / "store.h5")) == 1
