@@ -1,0 +1,288 @@
+"""Inlier share, F1 and epipolar error against loops over correspondences; the paired bootstrap against another one."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from two_view import scenes
+
+from kornia_learnnorm import bootstrap_interval
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.pair_metrics import epipolar_error, f1_score, inlier_share, paired_bootstrap
+
+INF, NAN = float("inf"), float("nan")
+ROWS = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]], dtype=torch.float64)  # y1 - y2
+METRICS = {
+    "share": lambda points1, points2, F, true, threshold, mask=None: inlier_share(points1, points2, F, threshold, mask),
+    "f1": f1_score,
+    "error": epipolar_error,
+}
+
+
+def distance(p1, p2, F):
+    """Eq. 7 of one correspondence: line by line, d1 + d2."""
+    a, b = np.array([*p1, 1.0]), np.array([*p2, 1.0])
+    line2, line1 = F @ a, F.T @ b
+    return abs(b @ line2) / np.hypot(line2[0], line2[1]) + abs(a @ line1) / np.hypot(line1[0], line1[1])
+
+
+def by_hand(points1, points2, F, true, threshold):
+    """All three of one pair, precision and recall apart."""
+    estimated = [distance(a, b, F) for a, b in zip(points1, points2, strict=True)]
+    actual = [distance(a, b, true) for a, b in zip(points1, points2, strict=True)]
+    chosen, right = ({i for i, d in enumerate(ds) if d < threshold} for ds in (estimated, actual))
+    hits, f1 = len(chosen & right), NAN
+    if right:
+        precision, recall = hits / max(len(chosen), 1), hits / len(right)
+        f1 = 2 * precision * recall / (precision + recall) if hits else 0.0
+    return {
+        "share": len(chosen) / len(estimated),
+        "f1": f1,
+        "error": np.mean([estimated[i] for i in sorted(right)]) if right else NAN,
+    }
+
+
+def pairs(seed=0, batch_size=6, num_points=40, jitter=1e-3):
+    """Noisy scenes with outliers, and matrices that are somewhat wrong, in the numbers that the points see."""
+    scene = scenes("handheld", batch_size, num_points, seed=seed, noise=0.5, outliers=0.3)
+    generator = torch.Generator().manual_seed(seed)
+    wrong = 1 + jitter * torch.randn(scene.F_mat.shape, generator=generator, dtype=torch.float64)
+    return scene.points1, scene.points2, scene.F_mat * wrong, scene.F_mat
+
+
+def real_pairs():
+    folder = os.environ.get("LEARNNORM_DATA")
+    if not folder:
+        pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
+    return read_store(f"{folder}/correspondences/kitti_06.h5@0:5")
+
+
+@pytest.mark.parametrize("name", METRICS)
+class TestAll:
+    @pytest.mark.parametrize("shape", [(1,), (3,), (2, 3)])
+    def test_smoke(self, name, shape, device, dtype):
+        points1, points2 = (torch.rand(*shape, 5, 2, device=device, dtype=dtype) for _ in range(2))
+        F, true = (torch.rand(*shape, 3, 3, device=device, dtype=dtype) for _ in range(2))
+        found = METRICS[name](points1, points2, F, true, 100.0)
+        assert found.shape == shape
+        assert found.dtype == dtype
+        assert found.device.type == device.type
+
+    @pytest.mark.parametrize("threshold", [0.1, 1.0, 5.0])
+    def test_by_hand(self, name, threshold):
+        batch = pairs()
+        found = METRICS[name](*batch, threshold)
+        expected = [by_hand(*(v.numpy() for v in pair), threshold)[name] for pair in zip(*batch, strict=True)]
+        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9)
+        assert len(set(expected)) > 1
+
+    def test_mask_leaves_out(self, name):
+        points1, points2, F, true = pairs()
+        mask = torch.rand(points1.shape[:2], generator=torch.Generator().manual_seed(0)) < 0.7
+        points1[~mask] = NAN  # what pads a batch does not matter
+        found = METRICS[name](points1, points2, F, true, 1.0, mask=mask)
+        for k, keep in enumerate(mask):
+            alone = METRICS[name](points1[k, keep], points2[k, keep], F[k], true[k], 1.0)
+            np.testing.assert_allclose(found[k].numpy(), alone.numpy(), rtol=1e-12)
+
+    @given(seed=st.integers(0, 2**31))
+    def test_order_does_not_matter(self, name, seed):
+        points1, points2, F, true = pairs(seed)
+        order = torch.randperm(points1.shape[1], generator=torch.Generator().manual_seed(seed))
+        expected = METRICS[name](points1, points2, F, true, 1.0)
+        found = METRICS[name](points1[:, order], points2[:, order], F, true, 1.0)
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=0, equal_nan=True)
+
+    @given(seed=st.integers(0, 2**31))
+    def test_swapping_the_views_does_not_matter(self, name, seed):
+        points1, points2, F, true = pairs(seed)
+        expected = METRICS[name](points1, points2, F, true, 1.0)
+        found = METRICS[name](points2, points1, F.mT, true.mT, 1.0)
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=0, equal_nan=True)
+
+    @given(seed=st.integers(0, 2**31), factor=st.floats(0.01, 100))
+    def test_pixels_and_threshold_scale_together(self, name, seed, factor):
+        points1, points2, F, true = pairs(seed)
+        shrink = torch.tensor([1 / factor, 1 / factor, 1.0], dtype=F.dtype).diag()
+        unit = factor if name == "error" else 1.0
+        expected = unit * METRICS[name](points1, points2, F, true, 1.0)
+        F, true = shrink @ F @ shrink, shrink @ true @ shrink
+        found = METRICS[name](factor * points1, factor * points2, F, true, factor)
+        torch.testing.assert_close(found, expected, rtol=1e-7, atol=0, equal_nan=True)
+
+    @given(seed=st.integers(0, 2**31), factor=st.sampled_from([-1.0, 1e-9, -3.0, 1e9]))
+    def test_scale_and_sign_of_the_matrices_do_not_matter(self, name, seed, factor):
+        points1, points2, F, true = pairs(seed)
+        expected = METRICS[name](points1, points2, F, true, 1.0)
+        for found in (
+            METRICS[name](points1, points2, factor * F, true, 1.0),
+            METRICS[name](points1, points2, F, factor * true, 1.0),
+        ):
+            torch.testing.assert_close(found, expected, rtol=1e-9, atol=0, equal_nan=True)
+
+    @pytest.mark.parametrize("value", [NAN, 0.0])
+    def test_failed_estimate(self, name, value):
+        points1, points2, F, true = pairs()
+        found = METRICS[name](points1, points2, torch.full_like(F, value), true, 1.0)
+        assert (found == {"share": 0.0, "f1": 0.0, "error": INF}[name]).all()
+
+    def test_no_correspondences(self, name):
+        points1, points2, F, true = pairs()
+        assert METRICS[name](points1[:, :0], points2[:, :0], F, true, 1.0).isnan().all()
+        nothing = torch.zeros(points1.shape[:2], dtype=torch.bool)
+        assert METRICS[name](points1, points2, F, true, 1.0, mask=nothing).isnan().all()
+
+    @pytest.mark.parametrize("threshold", [0.0, -1.0, NAN])
+    def test_threshold(self, name, threshold):
+        with pytest.raises(ValueError, match=f"threshold must be positive, got {threshold}"):
+            METRICS[name](*pairs(), threshold)
+
+    @pytest.mark.parametrize(
+        ("mask", "error", "message"),
+        [
+            (torch.ones(6, 40), TypeError, "mask must be a boolean tensor, got torch.float32"),
+            ([True], TypeError, "mask must be a boolean tensor, got <class 'list'>"),
+            (torch.ones(6, 39).bool(), ValueError, r"mask must have shape \[6, 40\], got \[6, 39\]"),
+        ],
+    )
+    def test_mask(self, name, mask, error, message):
+        with pytest.raises(error, match=message):
+            METRICS[name](*pairs(), 1.0, mask=mask)
+
+    @pytest.mark.parametrize(
+        ("change", "error"),
+        [
+            (lambda a, b, F, true: (a.int(), b, F, true), TypeError),
+            (lambda a, b, F, true: (a.float(), b, F, true), TypeError),
+            (lambda a, b, F, true: (a[:, :-1], b, F, true), ValueError),
+            (lambda a, b, F, true: (a[..., :1], b, F, true), ShapeError),
+            (lambda a, b, F, true: (a, b, F[:, :2], true[:, :2]), ShapeError),
+        ],
+    )
+    def test_exceptions(self, name, change, error):
+        with pytest.raises(error):
+            METRICS[name](*change(*pairs()), 1.0)
+
+
+class TestByRows:
+    """Epipolar lines are rows and the distance is twice the difference of y."""
+
+    def points(self, *differences):
+        points1 = torch.tensor([[[5.0, 7.0]] * len(differences)], dtype=torch.float64)
+        offset = torch.tensor([[[3.0, d / 2] for d in differences]], dtype=torch.float64)
+        return points1, points1 + offset
+
+    def test_at_the_threshold_is_outside(self):
+        assert inlier_share(*self.points(0.5, 1.0, 1.5, 3.0), ROWS, 1.0).item() == 0.25
+
+    def test_sets_that_do_not_meet(self):
+        """The estimate is one row off: it keeps the second, the truth the first."""
+        estimate = ROWS + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        points = self.points(0.0, 2.0)
+        assert f1_score(*points, estimate, ROWS, 1.0).item() == 0.0
+        assert f1_score(*points, ROWS, estimate, 1.0).item() == 0.0
+        assert f1_score(*points, ROWS, ROWS, 1.0).item() == 1.0
+        assert epipolar_error(*points, estimate, ROWS).item() == 2.0
+
+    def test_error_is_over_the_inliers_below_one_pixel(self):
+        points = self.points(0.0, 0.5, 0.75, 1.0, 40.0)
+        assert epipolar_error(*points, ROWS, ROWS).item() == pytest.approx(1.25 / 3)
+        assert epipolar_error(*points, ROWS, ROWS, threshold=1.5).item() == pytest.approx(2.25 / 4)
+
+    @pytest.mark.parametrize("true", [ROWS, torch.full_like(ROWS, NAN)], ids=["no inliers", "unknown"])
+    def test_pairs_to_drop(self, true):
+        points = self.points(3.0, 4.0)
+        assert f1_score(*points, ROWS, true, 1.0).isnan().all()
+        assert epipolar_error(*points, ROWS, true).isnan().all()
+        assert inlier_share(*points, ROWS, 1.0).item() == 0.0
+
+    def test_a_point_on_an_epipole_is_no_inlier(self):
+        """The epipoles of this matrix are the origins; 0 / 0 must not pass for a distance."""
+        F = torch.tensor([[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+        assert inlier_share(torch.zeros(1, 1, 2), torch.ones(1, 1, 2), F, 1e9).item() == 0.0
+
+
+class TestRealMatches:
+    def test_truth_against_itself_and_an_estimate(self):
+        store = real_pairs()
+        for i in range(len(store)):
+            rows = slice(store.offsets[i], store.offsets[i + 1])
+            points1, points2 = (torch.tensor(v[rows]).double() for v in (store.points1, store.points2))
+            true = torch.tensor(store.F[i])
+            estimate = true * (1 + 1e-3 * torch.randn(3, 3, generator=torch.Generator().manual_seed(i)).double())
+            assert f1_score(points1, points2, true, true, 1.0) == 1
+            for F in (true, estimate):
+                expected = by_hand(points1.numpy(), points2.numpy(), F.numpy(), true.numpy(), 1.0)
+                for name, metric in METRICS.items():
+                    assert metric(points1, points2, F, true, 1.0).item() == pytest.approx(expected[name], rel=1e-9)
+            assert 0.1 < inlier_share(points1, points2, true, 1.0) < 0.9
+            assert 0.1 < epipolar_error(points1, points2, true, true) < 0.6
+
+
+def uneven(effect=0.0, number=30, seed=1):
+    """Differences that agree within pairs of very different sizes."""
+    rng = np.random.default_rng(seed)
+    groups = np.repeat(np.arange(number), rng.geometric(0.1, number))
+    baseline = rng.normal(size=len(groups))
+    return baseline + effect + rng.normal(size=number)[groups], baseline, groups
+
+
+class TestPairedBootstrap:
+    def test_another_bootstrap(self):
+        values, baseline, groups = uneven(0.4)
+        parts = [(values - baseline)[groups == g] for g in range(30)]
+        rng = np.random.default_rng(0)
+        means = np.array([np.concatenate([parts[i] for i in rng.integers(30, size=30)]).mean() for _ in range(4000)])
+        found = paired_bootstrap(*map(torch.tensor, (values, baseline, groups)), draws=4000)
+        assert found.mean == pytest.approx((values - baseline).mean())
+        np.testing.assert_allclose(found[1:3], np.quantile(means, [0.025, 0.975]), atol=0.2 * means.std())
+        assert found.p_value == pytest.approx(2 * min((means <= 0).mean(), (means >= 0).mean()), abs=0.03)
+
+    def test_interval_is_that_of_the_differences(self):
+        values, baseline, groups = map(torch.tensor, uneven(0.2))
+        found = paired_bootstrap(values, baseline, groups, level=0.9, draws=500, seed=3)
+        assert found[1:3] == bootstrap_interval(values - baseline, groups, 0.9, 500, 3)
+
+    @given(st.floats(-1.5, 1.5), st.integers(0, 99))
+    def test_small_exactly_where_the_interval_leaves_zero_out(self, effect, seed):
+        values, baseline, groups = map(torch.tensor, uneven(effect, seed=seed))
+        found = paired_bootstrap(values, baseline, groups, draws=999)
+        outside = not found.low <= 0 <= found.high
+        assert outside == (found.p_value < 0.05) or abs(found.p_value - 0.05) < 0.005  # quantiles interpolate
+
+    def test_swapping_the_methods(self):
+        values, baseline, groups = map(torch.tensor, uneven(0.3))
+        found, swapped = paired_bootstrap(values, baseline, groups), paired_bootstrap(baseline, values, groups)
+        np.testing.assert_allclose(swapped, [-found.mean, -found.high, -found.low, found.p_value], rtol=1e-12)
+
+    def test_extremes(self):
+        values, groups = torch.rand(10), torch.arange(10)
+        assert paired_bootstrap(values, values, groups) == (0.0, 0.0, 0.0, 1.0)
+        assert paired_bootstrap(values + 1, values, groups, draws=99).p_value == 2 / 100
+        better = torch.tensor([True, True, False])
+        assert paired_bootstrap(better, better, groups[:3]).mean == 0  # shares of booleans
+
+    def test_p_values_are_uniform_where_there_is_no_effect(self):
+        found = [paired_bootstrap(*map(torch.tensor, uneven(seed=s)), draws=199).p_value for s in range(400)]
+        for level in (0.1, 0.5):
+            assert np.mean(np.array(found) < level) == pytest.approx(level, abs=0.07)
+
+    @pytest.mark.parametrize(
+        ("values", "baseline", "groups", "message"),
+        [
+            (torch.rand(3), torch.rand(4), torch.arange(3), r"two \(S,\) tensors, got \[3\] and \[4\]"),
+            (torch.rand(3, 1), torch.rand(3, 1), torch.arange(3), r"two \(S,\) tensors, got \[3, 1\]"),
+            (torch.rand(3), torch.rand(3), torch.arange(4), r"got \[3\] and \[4\]"),
+            (torch.rand(3), torch.rand(3), torch.zeros(3).long(), "at least two groups are needed, got 1"),
+            (torch.tensor([1.0, NAN, INF]), torch.rand(3), torch.arange(3), "got 2 NaN or infinite ones of 3"),
+        ],
+    )
+    def test_exceptions(self, values, baseline, groups, message):
+        with pytest.raises(ValueError, match=message):
+            paired_bootstrap(values, baseline, groups)
