@@ -1,0 +1,378 @@
+"""Levenberg-Marquardt against Gauss-Newton in NumPy on numerical derivatives, and the properties it must have."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from torch.autograd import gradcheck
+from two_view import (
+    SCENES,
+    correspondences,
+    epipolar_distances,
+    homogeneous,
+    in_hartley,
+    numpy_hartley,
+    scenes,
+    signless,
+    uniform,
+    unit,
+    up_to_sign,
+)
+
+from kornia_learnnorm import find_fundamental, sampson_distance, symmetric_epipolar_distance
+from kornia_learnnorm.objectives import Cauchy, GemanMcClure, Huber, sampson_factor, squared_loss, symmetric_factor
+from kornia_learnnorm.refine import refine_fundamental
+
+DISTANCES = {
+    "sampson": (sampson_factor, sampson_distance),
+    "symmetric": (symmetric_factor, symmetric_epipolar_distance),
+}
+LOSSES = [squared_loss, Huber(0.5), Cauchy(0.5), GemanMcClure(2.0)]
+
+
+def numpy_distances(F, points1, points2, kind: str) -> np.ndarray:
+    """Distances in pixels, without sign, (N,)."""
+    x1, x2 = homogeneous(points1), homogeneous(points2)
+    line1, line2 = x2 @ F, x1 @ F.T
+    norm1, norm2 = np.hypot(*line1[:, :2].T), np.hypot(*line2[:, :2].T)
+    algebraic = (x2 * line2).sum(-1)
+    return algebraic / np.hypot(norm1, norm2) if kind == "sampson" else algebraic * (1 / norm1 + 1 / norm2)
+
+
+def gauss_newton(F, points1, points2, kind: str = "sampson", iterations: int = 300) -> float:
+    """Least cost found from F: damped steps of F = [a b a*s + b*t] (epipole by two ratios) by central differences."""
+    T1, T2 = (numpy_hartley(p[None])[0] for p in (points1, points2))
+    F = unit(np.linalg.inv(T2).T @ F @ np.linalg.inv(T1))
+    # Turn the epipole of view 1 to the third axis, where the last column of F vanishes and the chart is centred.
+    V = np.linalg.svd(F)[2].T
+    G = F @ V
+
+    def distances(q):
+        columns = np.column_stack([q[:6].reshape(3, 2), q[:6].reshape(3, 2) @ q[6:]])
+        return numpy_distances(T2.T @ columns @ V.T @ T1, points1, points2, kind)
+
+    q = np.concatenate([G[:, :2].reshape(6), np.zeros(2)])
+    damping, cost = 1e-3, (distances(q) ** 2).sum()
+    for _ in range(iterations):
+        d, steps = distances(q), 1e-6 * np.eye(8)
+        J = np.stack([(distances(q + s) - distances(q - s)) / 2e-6 for s in steps], -1)
+        H = J.T @ J
+        new = q - np.linalg.solve(H + damping * np.diag(H.diagonal()) + 1e-12 * np.eye(8), J.T @ d)
+        new_cost = (distances(new) ** 2).sum()
+        q, cost, damping = (new, new_cost, damping / 5) if new_cost < cost else (q, cost, damping * 5)
+        damping = min(max(damping, 1e-12), 1e12)
+    return cost
+
+
+class TestRefineFundamental:
+    @pytest.mark.parametrize("batch_size", [0, 1, 5])
+    @pytest.mark.parametrize("num_points", [8, 20, 500])
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_smoke(self, batch_size, num_points, weighted, device, dtype):
+        points1, points2 = (uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1))
+        weights = uniform(batch_size, num_points, seed=2).to(device, dtype) if weighted else None
+        found = refine_fundamental(points1, points2, uniform(batch_size, 3, 3).to(device), weights, max_iterations=5)
+        assert found.F_mat.shape == (batch_size, 3, 3)
+        assert found.F_mat.dtype == found.cost.dtype == found.cost_before.dtype == dtype
+        assert all(value.shape == (batch_size,) for value in found[1:])
+        assert found.iterations.dtype == torch.int64
+        assert found.converged.dtype == torch.bool
+        assert found.F_mat.device.type == device.type
+        assert torch.isfinite(found.F_mat).all()
+
+    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
+    @pytest.mark.parametrize("kind", DISTANCES)
+    @pytest.mark.parametrize("num_points", [12, 40])
+    def test_agrees_with_numpy(self, name, kind, num_points):
+        points1, points2 = correspondences(name, 3, num_points, noise=0.5)
+        F0 = find_fundamental(points1, points2)
+        found = refine_fundamental(points1, points2, F0, factor=DISTANCES[kind][0], max_iterations=200)
+        arguments = zip(F0.numpy(), points1.numpy(), points2.numpy(), strict=True)
+        expected = [gauss_newton(*values, kind) for values in arguments]
+        assert found.converged.all()
+        assert found.cost.numpy() == pytest.approx(expected, rel=1e-6)
+
+    @pytest.mark.parametrize("kind", DISTANCES)
+    @pytest.mark.parametrize("loss", LOSSES)
+    def test_costs_are_those_of_the_matrices(self, kind, loss):
+        points1, points2 = correspondences("handheld", 10, 15)
+        weights, F0 = uniform(10, 15), find_fundamental(points1, points2)
+        factor, distance = DISTANCES[kind]
+        found = refine_fundamental(points1, points2, F0, weights, factor, loss)
+        for F_mat, cost in ((F0, found.cost_before), (found.F_mat, found.cost)):
+            expected = (weights * loss(distance(points1, points2, F_mat).square())[0]).sum(-1)
+            np.testing.assert_allclose(cost.numpy(), expected.numpy(), rtol=1e-8)
+
+    @pytest.mark.parametrize("kind", DISTANCES)
+    @pytest.mark.parametrize("loss", LOSSES)
+    def test_nothing_near_the_optimum_costs_less(self, kind, loss):
+        points1, points2 = correspondences("orbit", 10, 30, noise=0.5)
+        factor, _ = DISTANCES[kind]
+        found = refine_fundamental(points1, points2, find_fundamental(points1, points2), None, factor, loss, 300)
+        assert found.converged.all()
+        T1, T2 = (torch.from_numpy(numpy_hartley(points)) for points in (points1, points2))
+        F_hat = torch.from_numpy(in_hartley(found.F_mat, points1, points2))
+        for seed in range(20):
+            near = T2.mT @ (F_hat + 1e-3 * uniform(10, 3, 3, low=-1, seed=seed)) @ T1
+            cost = refine_fundamental(points1, points2, near, None, factor, loss, 0).cost
+            assert (cost > found.cost * (1 - 1e-9)).all()
+
+    @pytest.mark.parametrize("kind", DISTANCES)
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_the_truth_of_exact_points_is_left_alone(self, kind, num_points):
+        scene = scenes("orbit", 20, num_points, noise=0.0)
+        found = refine_fundamental(scene.points1, scene.points2, scene.F_mat, factor=DISTANCES[kind][0])
+        assert (found.cost < 1e-20).all()
+        assert up_to_sign(found.F_mat, scene.F_mat) < 1e-9
+        # From a start nearby, too, to zero residuals.
+        T1, T2 = (torch.from_numpy(numpy_hartley(points)) for points in scene[:2])
+        F_hat = torch.from_numpy(in_hartley(scene.F_mat, scene.points1, scene.points2))
+        F0 = T2.mT @ (F_hat + 1e-4 * uniform(20, 3, 3, low=-1)) @ T1
+        found = refine_fundamental(scene.points1, scene.points2, F0, factor=DISTANCES[kind][0], max_iterations=200)
+        assert found.converged.all()
+        assert (found.cost < 1e-16).all()
+
+    def test_is_nearer_to_the_truth_than_the_linear_solution(self):
+        scene = scenes("orbit", 100, 50, noise=0.5)
+        exact = scenes("orbit", 100, 50, noise=0.0)
+        assert torch.equal(scene.F_mat, exact.F_mat)
+        F0 = find_fundamental(scene.points1, scene.points2)
+        found = refine_fundamental(scene.points1, scene.points2, F0)
+        before, after = (epipolar_distances(exact.points1, exact.points2, F).mean() for F in (F0, found.F_mat))
+        assert after < 0.95 * before
+
+    @pytest.mark.parametrize("loss", LOSSES[1:])
+    def test_robust_losses_see_past_outliers(self, loss):
+        scene = scenes("orbit", 20, 60, noise=0.2, outliers=0.1)
+        F0 = find_fundamental(scene.points1, scene.points2, torch.where(scene.inliers, 1.0, 1e-9))
+        squares, robust = (refine_fundamental(scene.points1, scene.points2, F0, loss=x) for x in (squared_loss, loss))
+        errors = [
+            np.median(epipolar_distances(scene.points1, scene.points2, found.F_mat)[scene.inliers.numpy()])
+            for found in (squares, robust)
+        ]
+        assert errors[1] < 0.5 * errors[0]
+
+    @given(
+        st.integers(0, 2**31),
+        st.sampled_from([8, 9, 30]),
+        st.sampled_from(sorted(SCENES)),
+        st.sampled_from(sorted(DISTANCES)),
+        st.sampled_from(LOSSES),
+        st.integers(0, 12),
+    )
+    def test_cost_never_rises_and_rank_two_holds(self, seed, num_points, name, kind, loss, max_iterations):
+        points1, points2 = correspondences(name, 5, num_points, seed)
+        F0 = find_fundamental(points1, points2)
+        found = refine_fundamental(points1, points2, F0, None, DISTANCES[kind][0], loss, max_iterations)
+        assert (found.cost <= found.cost_before).all()
+        assert (found.iterations <= max_iterations).all()
+        assert np.linalg.norm(found.F_mat.numpy(), axis=(1, 2)) == pytest.approx(1, abs=1e-14)
+        for F in (found.F_mat.numpy(), in_hartley(found.F_mat, points1, points2)):
+            assert (np.linalg.svd(F)[1][:, 2] < 1e-12).all()
+
+    def test_costs_fall_with_the_number_of_iterations(self):
+        points1, points2 = correspondences("driving", 50, 8)
+        F0 = find_fundamental(points1, points2)
+        costs = [refine_fundamental(points1, points2, F0, max_iterations=k).cost for k in (0, 1, 3, 10, 30)]
+        for earlier, later in pairwise(costs):
+            assert (later <= earlier).all()
+
+    def test_optimum_is_kept(self):
+        points1, points2 = correspondences("orbit", 10, 20)
+        first = refine_fundamental(points1, points2, find_fundamental(points1, points2), max_iterations=200)
+        second = refine_fundamental(points1, points2, first.F_mat)
+        assert first.converged.all()
+        assert (second.iterations <= 2).all()
+        assert up_to_sign(first.F_mat, second.F_mat) < 1e-6
+
+    @pytest.mark.parametrize("kind", DISTANCES)
+    def test_swapped_views_give_the_transpose(self, kind):
+        points1, points2 = correspondences("orbit", 20, 12)
+        weights, F0, factor = uniform(20, 12), find_fundamental(points1, points2), DISTANCES[kind][0]
+        found = refine_fundamental(points1, points2, F0, weights, factor, max_iterations=5)
+        mirrored = refine_fundamental(points2, points1, F0.mT, weights, factor, max_iterations=5)
+        F_mat, transpose = (in_hartley(F, points1, points2) for F in (found.F_mat, mirrored.F_mat.mT))
+        assert up_to_sign(F_mat, transpose) < 1e-7
+
+    @given(st.integers(0, 2**31), st.sampled_from([9, 17]), st.sampled_from(["orbit", "handheld"]), st.randoms())
+    def test_order_does_not_matter(self, seed, num_points, name, random):
+        points1, points2 = correspondences(name, 4, num_points, seed)
+        F0, order = find_fundamental(points1, points2), random.sample(range(num_points), num_points)
+        F_mat, shuffled = (
+            refine_fundamental(points1[:, p], points2[:, p], F0, max_iterations=5).F_mat for p in (slice(None), order)
+        )
+        assert up_to_sign(in_hartley(F_mat, points1, points2), in_hartley(shuffled, points1, points2)) < 1e-6
+
+    @given(st.floats(-3, 3), st.sampled_from([-7.0, 1e-3, 1e6]), st.sampled_from([8, 15]))
+    def test_scales_of_pixels_and_of_the_matrix_do_not_matter(self, log_scale, factor, num_points):
+        points1, points2 = correspondences("orbit", 4, num_points)
+        F0, scale = find_fundamental(points1, points2), 10**log_scale
+        S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
+        start = factor * S.inverse() @ F0 @ S.inverse()
+        found = refine_fundamental(scale * points1, scale * points2, start, max_iterations=5)
+        expected = refine_fundamental(points1, points2, F0, max_iterations=5)
+        F_mat, wanted = (in_hartley(F, points1, points2) for F in (S @ found.F_mat @ S, expected.F_mat))
+        assert up_to_sign(F_mat, wanted) < 1e-7
+        np.testing.assert_allclose(found.cost.numpy(), scale**2 * expected.cost.numpy(), rtol=1e-5)
+
+    @pytest.mark.parametrize("loss", LOSSES)
+    def test_zero_weight_means_absent(self, loss):
+        points1, points2 = correspondences("orbit", 5, 20)
+        weights, F0 = uniform(5, 20, low=0.5), find_fundamental(points1, points2)
+        junk1, junk2 = (uniform(5, 4, 2, low=-5000, high=5000, seed=seed) for seed in (3, 4))
+        every = [torch.cat(pair, 1) for pair in ((points1, junk1), (points2, junk2), (weights, torch.zeros(5, 4)))]
+        found = refine_fundamental(*every[:2], F0, every[2], loss=loss, max_iterations=5)
+        expected = refine_fundamental(points1, points2, F0, weights, loss=loss, max_iterations=5)
+        F_mat, wanted = (in_hartley(result.F_mat, points1, points2) for result in (found, expected))
+        assert up_to_sign(F_mat, wanted) < 1e-8
+
+    def test_batch_is_many_single_calls(self):
+        points1, points2 = correspondences("driving", 6, 12)
+        F0 = find_fundamental(points1, points2)
+        together = refine_fundamental(points1, points2, F0, max_iterations=8)
+        alone = [refine_fundamental(*(v[k, None] for v in (points1, points2, F0)), max_iterations=8) for k in range(6)]
+        assert up_to_sign(together.F_mat, torch.cat([one.F_mat for one in alone])) < 1e-7
+        assert torch.equal(together.iterations, torch.cat([one.iterations for one in alone]))
+
+    @pytest.mark.parametrize("degenerate", ["coincident", "collinear", "planar", "absent", "same", "epipole"])
+    @pytest.mark.parametrize("kind", DISTANCES)
+    @pytest.mark.parametrize("loss", LOSSES)
+    def test_degenerate_points_are_finite_in_value_and_gradient(self, degenerate, kind, loss):
+        points1, points2 = correspondences("handheld", 5, 12)
+        weights = torch.ones(5, 12, dtype=torch.float64)
+        F0 = find_fundamental(points1, points2)
+        if degenerate == "coincident":
+            points1, points2 = points1[:, :1].repeat(1, 12, 1), points2[:, :1].repeat(1, 12, 1)
+        elif degenerate == "collinear":
+            points1 = torch.linspace(0, 500, 12, dtype=torch.float64)[None, :, None].repeat(5, 1, 2)
+        elif degenerate == "planar":
+            points2 = 0.9 * points1 + 20
+        elif degenerate == "absent":
+            weights = torch.zeros_like(weights)
+        elif degenerate == "same":
+            points2 = points1.clone()
+        else:
+            F0 = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=torch.float64).expand(5, 3, 3)
+            points1, points2 = points1.clone(), points2.clone()
+            points1[:, 0] = points2[:, 1] = points1[:, 2] = points2[:, 2] = 0.0
+        values = [value.clone().requires_grad_() for value in (points1, points2, weights)]
+        found = refine_fundamental(*values[:2], F0, values[2], DISTANCES[kind][0], loss)
+        assert torch.isfinite(found.F_mat).all()
+        assert (found.cost <= found.cost_before).all()
+        for gradient in torch.autograd.grad(signless(found.F_mat).sum(), values):
+            assert torch.isfinite(gradient).all()
+
+    def test_returns_the_start_where_no_step_is_possible(self):
+        points1, points2 = correspondences("handheld", 5, 12)
+        F0 = find_fundamental(points1, points2)
+
+        def broken(squares):
+            return squares, torch.full_like(squares, torch.nan)
+
+        found = refine_fundamental(points1, points2, F0, loss=broken)
+        assert up_to_sign(found.F_mat, F0) < 1e-12
+        assert torch.equal(found.cost, found.cost_before)
+        assert not found.converged.any()
+
+    def test_float32_is_float64_rounded(self):
+        points1, points2 = (points.float() for points in correspondences("orbit", 20, 20))
+        F0 = find_fundamental(points1, points2)
+        single = refine_fundamental(points1, points2, F0)
+        double = refine_fundamental(points1.double(), points2.double(), F0.double())
+        assert up_to_sign(single.F_mat, double.F_mat) < 1e-6
+
+
+class TestGradients:
+    @pytest.mark.parametrize("kind", DISTANCES)
+    @pytest.mark.parametrize("loss", [squared_loss, Cauchy(0.3)])
+    def test_at_the_optimum(self, kind, loss):
+        scene = scenes("orbit", 1, 14, noise=1.0)
+        points = [(points / 300 - 1).requires_grad_() for points in scene[:2]]
+        F0 = find_fundamental(*points).detach()
+        optimum = refine_fundamental(*points, F0, factor=DISTANCES[kind][0], loss=loss, max_iterations=500)
+        assert optimum.converged.all()
+        start = optimum.F_mat.detach()
+        weights = uniform(1, 14, low=0.9, high=1.1, seed=3).requires_grad_()
+
+        def refined(points1, points2, weights):
+            return signless(refine_fundamental(points1, points2, start, weights, DISTANCES[kind][0], loss, 500).F_mat)
+
+        # A central difference of the iteration stops within 1e-7 of the gradient's zero.
+        assert gradcheck(refined, [*points, weights], eps=1e-5, atol=1e-3, rtol=1e-3, fast_mode=True)
+
+    def test_start_has_none(self):
+        points1, points2 = correspondences("orbit", 2, 12)
+        F0 = find_fundamental(points1, points2).requires_grad_()
+        assert not refine_fundamental(points1, points2, F0).F_mat.requires_grad
+
+    def test_without_gradients_the_result_is_the_same(self):
+        points1, points2 = correspondences("orbit", 5, 12)
+        F0 = find_fundamental(points1, points2)
+        with torch.inference_mode():
+            plain = refine_fundamental(points1, points2, F0)
+        tracked = refine_fundamental(points1.requires_grad_(), points2, F0)
+        assert up_to_sign(plain.F_mat, tracked.F_mat.detach()) < 1e-12
+        assert not tracked.cost.requires_grad
+
+    def test_none_where_it_did_not_converge(self):
+        points1, points2 = (points.requires_grad_() for points in correspondences("driving", 5, 8))
+        found = refine_fundamental(points1, points2, find_fundamental(points1, points2).detach(), max_iterations=1)
+        (gradient,) = torch.autograd.grad(signless(found.F_mat).sum(), points1)
+        assert not found.converged.any()
+        assert (gradient == 0).all()
+
+
+class TestObjectives:
+    @pytest.mark.parametrize("factor", [sampson_factor, symmetric_factor])
+    def test_slopes_of_factors(self, factor):
+        normals = [uniform(5, low=0.5, seed=k).requires_grad_() for k in (0, 1)]
+        value, *slopes = factor(*normals)
+        for got, want in zip(slopes, torch.autograd.grad(value.sum(), normals), strict=True):
+            torch.testing.assert_close(got.detach(), want)
+
+    @pytest.mark.parametrize("loss", LOSSES)
+    def test_weights_of_losses(self, loss):
+        squares = uniform(50, high=20).requires_grad_()
+        value, weight = loss(squares)
+        torch.testing.assert_close(weight.detach(), torch.autograd.grad(value.sum(), squares)[0])
+        assert loss(torch.zeros(1))[0] == 0
+        assert loss(torch.zeros(1))[1] == 1
+
+    @pytest.mark.parametrize("kind", [Huber, Cauchy, GemanMcClure])
+    @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
+    def test_scale_must_be_positive(self, kind, scale):
+        with pytest.raises(ValueError, match=f"scale must be positive, got {scale}"):
+            kind(scale)
+
+
+class TestExceptions:
+    @pytest.mark.parametrize(
+        ("F_mat", "error", "message"),
+        [
+            (None, TypeError, "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
+            (torch.ones(3, 3), ShapeError, r"\[3, 3\]"),
+            (torch.ones(1, 3, 3), ValueError, "got 1 matrices and 2 sets"),
+            (torch.full((2, 3, 3), torch.inf), ValueError, "F_mat must be finite, got 18 NaN or infinite"),
+            (torch.zeros(2, 3, 3), ValueError, "F_mat must not be zero, got 2 zero matrices"),
+        ],
+    )
+    def test_matrix(self, F_mat, error, message):
+        with pytest.raises(error, match=message):
+            refine_fundamental(torch.rand(2, 8, 2), torch.rand(2, 8, 2), F_mat)
+
+    def test_points_weights_and_iterations(self):
+        eye, points = torch.eye(3).expand(2, 3, 3), torch.rand(2, 8, 2)
+        with pytest.raises(ValueError, match="at least 8 correspondences are needed, got 7"):
+            refine_fundamental(points[:, :7], points[:, :7], eye)
+        with pytest.raises(ValueError, match="points1 must be finite, got 32 NaN"):
+            refine_fundamental(points * torch.nan, points, eye)
+        with pytest.raises(ValueError, match="weights must not be negative"):
+            refine_fundamental(points, points, eye, -torch.ones(2, 8))
+        with pytest.raises(ValueError, match="max_iterations must be >= 0, got -1"):
+            refine_fundamental(points, points, eye, max_iterations=-1)
