@@ -38,9 +38,9 @@ class MatchOptions:
     """How images are matched.
 
     Attributes:
-        detector: a key of :data:`~kornia_learnnorm.data.features.DETECTORS`.
+        detector: a key of ``kornia_learnnorm.data.features.DETECTORS``.
         num_features: the strongest features of an image that are kept.
-        matcher: a key of :data:`~kornia_learnnorm.data.matching.MATCHERS`.
+        matcher: a key of ``kornia_learnnorm.data.matching.MATCHERS``.
         max_matches: how many matches of a pair pass Lowe's ratio test of 0.8, and how many that do not, are kept, drawn
             at random; None keeps all.
         seed: seed of that draw and of the order of a pair's matches.
