@@ -23,6 +23,7 @@ TOOLS = {
     "evaluate": ("kornia_learnnorm.evaluation.evaluate", "better rates and errors on stores of correspondences"),
     "diagnose": ("kornia_learnnorm.evaluation.diagnose", "condition number, rank-2 error and other diagnostics"),
     "compare": ("kornia_learnnorm.evaluation.compare", "trained weights side by side, with confidence intervals"),
+    "report": ("kornia_learnnorm.evaluation.report", "tables and figures of what evaluate --out wrote"),
     "match": ("kornia_learnnorm.data.match", "a store of correspondences from folders of images"),
     "convert": ("kornia_learnnorm.data.convert", "a store from or to the match files of others"),
     "synthesize": ("kornia_learnnorm.data.synthesize", "a synthetic store and a rendered image pair"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.evaluate import beside_closed_forms, evaluation_samples
 from kornia_learnnorm.evaluation.predict import Normalizer, Residuals, evaluate_normalizers
-from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.evaluation.tables import format_table, names_of
 from kornia_learnnorm.learned import LearnedNormalizer
 from kornia_learnnorm.metrics import better_rate, bootstrap_interval, comparable
 
@@ -105,18 +104,8 @@ def run(args: argparse.Namespace) -> int:
         ValueError: if a store or weights cannot be read, or two have the same name.
 
     """
-    stores = dict(zip(_names(args.stores), map(read_store, args.stores), strict=True))
-    learned = dict(zip(_names(args.weights), map(LearnedNormalizer.from_pretrained, args.weights), strict=True))
+    stores = dict(zip(names_of(args.stores), map(read_store, args.stores), strict=True))
+    learned = dict(zip(names_of(args.weights), map(LearnedNormalizer.from_pretrained, args.weights), strict=True))
     for title, (header, rows) in compare(stores, learned).items():
         print(f"\n{title}\n\n{format_table(header, rows)}", flush=True)
     return 0
-
-
-def _names(paths: Sequence[str]) -> list[str]:
-    """Short names of files, or of the runs that left them."""
-    files = [Path(path) for path in paths]
-    names = [f.resolve().parent.name if f.name == "weights.safetensors" else f.name for f in files]
-    names = [name.removesuffix(".safetensors").replace(".h5", "") for name in names]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: {', '.join(paths)}")
-    return names

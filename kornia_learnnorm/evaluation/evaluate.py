@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 
 from kornia_learnnorm.data.samples import RATIO, Samples, draw_samples, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.methods import DEFAULT_METHODS
 from kornia_learnnorm.evaluation.predict import Normalizer, evaluate_normalizers
-from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows
+from kornia_learnnorm.evaluation.record import record_run
+from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows, names_of
 from kornia_learnnorm.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers import Hartley, Identity, Whitening
 from kornia_learnnorm.reweighting import ReweightedWhitening
@@ -103,16 +106,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="leave out samples with an un-normalised residual from this many px on (default: %(default)s; inf: none)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
+    run = parser.add_argument_group("a run of predictions, for learnnorm report")
+    run.add_argument(
+        "--out", metavar="RUN", type=Path, help="folder to write predictions to, instead of printing tables"
+    )
+    run.add_argument(
+        "--methods",
+        metavar="NAME",
+        nargs="+",
+        help="normalisers or weights, with +LM or +optimal or without; module:Name for your own"
+        f" (default: {' '.join(DEFAULT_METHODS)})",
+    )
+    run.add_argument("--max-samples", metavar="N", type=int, help="at most so many samples of each store and protocol")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm evaluate``: print two tables per store, for filtered and unfiltered matches.
+    """Run ``learnnorm evaluate``: write predictions, or print two tables per store, for filtered and other matches.
 
     Raises:
         FileNotFoundError: if a store or weights are missing.
         ValueError: if a store or weights cannot be read.
 
     """
+    if args.out is not None:
+        stores_by_name = dict(zip(names_of(args.stores), args.stores, strict=True))
+        record_run(args.out, stores_by_name, args.methods or list(DEFAULT_METHODS), args.seed, args.max_samples)
+        print(f"wrote {args.out}; learnnorm report {args.out} makes tables and figures of it")
+        return 0
+    if args.methods or args.max_samples:
+        raise ValueError("--methods and --max-samples are for a run of predictions: give --out too")
     stores = {path: read_store(path) for path in args.stores}
     for name in args.weights:
         LearnedNormalizer.from_pretrained(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from kornia_learnnorm.evaluation.predict import Residuals
 from kornia_learnnorm.metrics import better_rate
 
-__all__ = ["format_table", "method_rows"]
+__all__ = ["format_table", "method_rows", "names_of"]
 
 HEADER = (
     "method",
@@ -70,3 +71,18 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
     rule = "|" + "|".join(":" + "-" * (w + 1) if i == 0 else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
     return "\n".join([line(header), rule, *map(line, rows)])
+
+
+def names_of(paths: Sequence[str]) -> list[str]:
+    """Return short names of files, or of the runs that left them, for tables.
+
+    Raises:
+        ValueError: if two have the same name.
+
+    """
+    files = [Path(path) for path in paths]
+    names = [f.resolve().parent.name if f.name == "weights.safetensors" else f.name for f in files]
+    names = [name.removesuffix(".safetensors").replace(".h5", "") for name in names]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: {', '.join(paths)}")
+    return names

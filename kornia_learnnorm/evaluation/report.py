@@ -1,0 +1,130 @@
+"""Tables and figures of a run: ``learnnorm report``. No model is run."""
+
+from __future__ import annotations
+
+import argparse
+import html
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from kornia_learnnorm.evaluation.report_figures import Picture, report_figures
+from kornia_learnnorm.evaluation.report_tables import Table, report_tables
+from kornia_learnnorm.evaluation.run import Run, read_run
+from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.files import replacing
+
+__all__ = ["add_arguments", "run", "write_report"]
+
+STYLE = """
+:root { color-scheme: light dark; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem;
+       color: light-dark(#1d2329, #dfe5ea); background: light-dark(#fff, #14181d); }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 13px; }
+th, td { padding: 0.25rem 0.6rem; text-align: right; border-bottom: 1px solid light-dark(#d8dee4, #333b44); }
+th:first-child, td:first-child { text-align: left; }
+.wide { overflow-x: auto; }
+svg { width: 100%; height: auto; font-family: system-ui, sans-serif; }
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``learnnorm report`` to a parser."""
+    parser.add_argument("folder", metavar="RUN", type=Path, help="what learnnorm evaluate --out wrote")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run ``learnnorm report``: write ``report.md``, ``report.html`` and the figures, and print the tables.
+
+    Raises:
+        FileNotFoundError: if the run is not there or not complete.
+        ValueError: if a file of it is damaged.
+        ImportError: if Matplotlib or rich is not installed.
+
+    """
+    tables = write_report(args.folder)
+    _print(tables)
+    print(f"wrote {args.folder / 'report.md'} and {args.folder / 'report.html'}")
+    return 0
+
+
+def write_report(folder: str | Path) -> list[Table]:
+    """Write ``report.md`` with its figures and a self-contained ``report.html`` into a run.
+
+    Args:
+        folder: what ``learnnorm evaluate --out`` wrote.
+
+    Returns:
+        the tables.
+
+    Raises:
+        FileNotFoundError: if the run is not there or not complete.
+        ValueError: if a file of it is damaged.
+        ImportError: if Matplotlib is not installed.
+
+    """
+    folder, found = Path(folder), read_run(folder)
+    tables, pictures = report_tables(found), report_figures(found)
+    for picture in pictures:
+        # A file of its own has no page to take its colour from: one that shows on white and on black.
+        _write(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", "#808890"))
+    _write(folder / "report.md", _markdown(found, tables, pictures))
+    _write(folder / "report.html", _html(found, tables, pictures))
+    return tables
+
+
+def _write(path: Path, text: str) -> None:
+    with replacing(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+def _about(run: Run) -> str:
+    stores = "; ".join(f"`{name}`: {text}" for name, text in run.about["stores"].items())
+    versions = ", ".join(f"{name} {version}" for name, version in run.about["versions"].items())
+    return f"Stores: {stores}. Methods: {', '.join(run.about['methods'])}. Seed {run.about['seed']}. {versions}."
+
+
+def _markdown(run: Run, tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
+    parts = ["# Evaluation", _about(run)]
+    parts += [f"## {t.title}\n\n{t.text}\n\n{format_table(t.header, t.rows)}" for t in tables]
+    parts += [f"## {p.title}\n\n{p.text}\n\n![{p.title}]({p.name}.svg)" for p in pictures]
+    return "\n\n".join(parts) + "\n"
+
+
+def _html(run: Run, tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
+    body = [f"<h1>Evaluation</h1><p>{_inline(_about(run))}</p>"]
+    for table in tables:
+        rows = "".join(_row("td", row) for row in table.rows)
+        grid = f"<table><thead>{_row('th', table.header)}</thead><tbody>{rows}</tbody></table>"
+        body.append(f'<h2>{_inline(table.title)}</h2><p>{_inline(table.text)}</p><div class="wide">{grid}</div>')
+    body += [f"<h2>{_inline(p.title)}</h2><p>{_inline(p.text)}</p><figure>{p.svg}</figure>" for p in pictures]
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>Evaluation</title>'
+    return (
+        f'<!doctype html><html lang="en"><head>{head}<style>{STYLE}</style></head><body>{"".join(body)}</body></html>\n'
+    )
+
+
+def _row(tag: str, cells: Sequence[str]) -> str:
+    return "<tr>" + "".join(f"<{tag}>{_inline(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+
+def _inline(text: str) -> str:
+    """Escape a text and set what stands in backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+
+
+def _print(tables: Sequence[Table]) -> None:
+    """Print the tables in the terminal."""
+    try:
+        from rich.console import Console
+        from rich.table import Table as RichTable
+    except ImportError as error:
+        raise ImportError("printing tables needs rich: pip install 'kornia-learnnorm[report]'") from error
+    console = Console()
+    for table in tables:
+        shown = RichTable(title=table.title, title_justify="left", caption=table.text, caption_justify="left")
+        for place, name in enumerate(table.header):
+            shown.add_column(name, justify="left" if place == 0 else "right")
+        for row in table.rows:
+            shown.add_row(*row)
+        console.print(shown)

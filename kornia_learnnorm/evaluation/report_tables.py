@@ -1,0 +1,232 @@
+"""The tables of a report, from the predictions of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.evaluation.run import Cell, Run
+from kornia_learnnorm.metrics import better_rate, bootstrap_interval, comparable
+from kornia_learnnorm.pair_metrics import paired_bootstrap
+from kornia_learnnorm.pose_accuracy import mean_average_accuracy, pose_auc
+
+__all__ = ["Table", "report_tables"]
+
+# Fan et al., Table 1, trained on KITTI: better than Hartley %, by what a store's name begins with.
+PRINTED = {"kitti": "86.68", "tum": "90.04"}
+BASELINE = "Hartley"
+FAILURES = 10
+
+
+class Table(NamedTuple):
+    """A table of a report.
+
+    Attributes:
+        title: heading.
+        text: what it shows and how to read it, Markdown.
+        header: names of the columns.
+        rows: cells as text.
+    """
+
+    title: str
+    text: str
+    header: list[str]
+    rows: list[list[str]]
+
+
+def report_tables(run: Run) -> list[Table]:
+    """Make all tables of a run.
+
+    Args:
+        run: predictions with ``Hartley`` among the methods.
+
+    Raises:
+        ValueError: if the baseline is missing.
+
+    """
+    if BASELINE not in run.about["methods"]:
+        raise ValueError(f"a report compares with {BASELINE}, the run has {', '.join(run.about['methods'])}")
+    tables = [_better_rates(run.cells, BASELINE)]
+    if "whitening" in run.about["methods"]:
+        tables.append(_better_rates(run.cells, "whitening"))
+    for cell in run.cells:
+        tables.append(_accuracy(cell))
+    for cell in run.cells:
+        tables.append(_tests(cell))
+    learned = next((name for name in ("crossview", "paper", "whitening") if name in run.about["methods"]), None)
+    if learned:
+        for cell in run.cells:
+            if cell.protocol == "filtered":
+                tables += [_by_motion(cell, run, learned), _failures(cell, run, learned)]
+    return tables
+
+
+def _better_rates(cells: list[Cell], baseline: str) -> Table:
+    header = ["method", *(f"{cell.title}: {len(cell.pair)} of {cell.drawn}" for cell in cells)]
+    rows = [
+        [name, *("-" if name == baseline else _rate(cell, name, baseline, "own") for cell in cells)]
+        for name in cells[0].predictions
+    ]
+    ties = sum(
+        better_rate(p["own"], cell.predictions[baseline]["own"]).ties for cell in cells for p in _others(cell, baseline)
+    )
+    lost = sum(
+        better_rate(p["own"], cell.predictions[baseline]["own"]).degenerate
+        for cell in cells
+        for p in _others(cell, baseline)
+    )
+    text = (
+        "Share of samples of eight correspondences with a smaller mean symmetric epipolar distance than under "
+        f"{baseline}, %, and 95 % bootstrap interval over image pairs. In the whole table {ties} ties count as not "
+        f"better and {lost} degenerate comparisons are left out. The header counts the samples below 60 px."
+    )
+    if baseline == BASELINE:
+        printed = [next((PRINTED[key] for key in PRINTED if cell.store.startswith(key)), "") for cell in cells]
+        printed = [value if cell.protocol == "filtered" else "" for value, cell in zip(printed, cells, strict=True)]
+        rows.append(["Fan et al., as printed (KITTI 06-10; TUM)", *printed])
+    return Table(f"Better than {baseline} (Table 1)", text, header, rows)
+
+
+def _others(cell: Cell, baseline: str) -> list[dict[str, Tensor]]:
+    return [prediction for name, prediction in cell.predictions.items() if name != baseline]
+
+
+def _rate(cell: Cell, name: str, baseline: str, quantity: str, rows: Tensor | None = None) -> str:
+    """A better rate with its interval."""
+    rows = torch.ones_like(cell.pair, dtype=torch.bool) if rows is None else rows
+    value, other = cell.predictions[name][quantity][rows], cell.predictions[baseline][quantity][rows]
+    valid = comparable(value, other)
+    if not bool(valid.any()):
+        return ""
+    rate, pair = f"{100 * better_rate(value, other).rate:.1f}", cell.pair[rows][valid]
+    if len(torch.unique(pair)) < 2:
+        return rate
+    low, high = bootstrap_interval((value < other)[valid].double(), pair)
+    return f"{rate} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def _accuracy(cell: Cell) -> Table:
+    header = [
+        "method",
+        "own px",
+        "held out px",
+        "truth px",
+        "truth: better than Hartley %",
+        "rotation deg",
+        "translation deg",
+    ]
+    header += ["AUC@5", "AUC@10", "AUC@20", "mAA(10)", "condition number", "rho", "distance 1", "distance 2"]
+    rows = []
+    for name, p in cell.predictions.items():
+        numbers = [_median(p[key]) for key in ("own", "heldout", "truth")]
+        error = torch.maximum(p["rotation_error"], p["translation_error"])
+        error = error.nan_to_num(float("inf"))[_posed(cell)]
+        pose = (
+            [f"{100 * value:.1f}" for value in (*pose_auc(error), mean_average_accuracy(error))]
+            if len(error)
+            else [""] * 4
+        )
+        angles = [_median(p[key], 2) for key in ("rotation_error", "translation_error")]
+        inside = [f"{p[key].nanmedian().item():.4g}" for key in ("condition_number", "rho", "distance1", "distance2")]
+        truth = "-" if name == BASELINE else _rate(cell, name, BASELINE, "truth")
+        rows.append([name, *numbers, truth, *angles, *pose, *inside])
+    text = (
+        "Medians over samples. `own` is fit: the mean symmetric epipolar distance of the sample's eight points. "
+        "`held out` (16 other matches of the pair) and `truth` (the pair's ground-truth inliers), medians of the same "
+        "distance, are accuracy, and so are the angles of the relative pose, their AUC at 5, 10 and 20 degrees and "
+        "mAA(10), %. A pose that cannot be found counts as failed. `+LM` is refined on the eight points: the limit."
+    )
+    return Table(f"Fit and accuracy: {cell.title}", text, header, rows)
+
+
+def _posed(cell: Cell) -> Tensor:
+    """Samples whose pair has a ground-truth pose: where any method has an error, (S,)."""
+    errors = torch.stack([p["translation_error"] for p in cell.predictions.values()])
+    return errors.isfinite().any(0)
+
+
+def _median(values: Tensor, digits: int = 3) -> str:
+    known = values[~values.isnan()]
+    return (
+        f"{known.quantile(0.5).item() if len(known) < 10**7 else known.median().item():.{digits}f}"
+        if len(known)
+        else ""
+    )
+
+
+def _tests(cell: Cell) -> Table:
+    quantities = {"own": "own", "heldout": "held out", "truth": "truth"}
+    header = ["method", *(f"{name}: change %, p" for name in quantities.values())]
+    rows = []
+    for name, prediction in cell.predictions.items():
+        if name != BASELINE:
+            tests = [_test(prediction[key], cell.predictions[BASELINE][key], cell.pair) for key in quantities]
+            rows.append([name, *tests])
+    text = (
+        f"Change of the geometric mean of each distance against {BASELINE}, with its 95 % interval and two-sided "
+        "p-value from a paired bootstrap over image pairs. Negative is better."
+    )
+    return Table(f"Paired tests: {cell.title}", text, header, rows)
+
+
+def _test(values: Tensor, baseline: Tensor, pair: Tensor) -> str:
+    logs = values.clamp(min=1e-6).log() - baseline.clamp(min=1e-6).log()
+    valid = logs.isfinite()
+    if len(torch.unique(pair[valid])) < 2:
+        return ""
+    found = paired_bootstrap(logs[valid], torch.zeros_like(logs[valid]), pair[valid])
+    change: Callable[[float], str] = lambda value: f"{100 * np.expm1(value):+.1f}"  # noqa: E731
+    return f"{change(found.mean)} [{change(found.low)}, {change(found.high)}], {found.p_value:.3f}"
+
+
+def _by_motion(cell: Cell, run: Run, learned: str) -> Table:
+    """Rates within the halves of the pairs on either side of the median of a figure of their motion."""
+    names = {"rotation": "rotation, degrees", "forward": "forward share of the translation"}
+    names |= {"parallax": "parallax, px", "inliers": "share of inliers among the matches"}
+    rows = []
+    for key, name in names.items():
+        values = torch.from_numpy(run.pairs[cell.store][key])
+        known = values[values.isfinite()]
+        if len(known) < 4:
+            continue
+        middle = known.quantile(0.5)
+        for text, chosen in ((f"up to {middle:.3g}", values <= middle), (f"above {middle:.3g}", values > middle)):
+            inside = chosen[cell.pair]
+            if bool(inside.any()):
+                rates = [_rate(cell, learned, BASELINE, quantity, inside) for quantity in ("own", "heldout", "truth")]
+                rows.append([name, text, str(int(chosen.sum())), str(int(inside.sum())), *rates])
+    header = ["motion", "half", "pairs", "samples", "own: better %", "held out: better %", "truth: better %"]
+    text = (
+        f"Where `{learned}` helps: its rate against {BASELINE} in the halves of the pairs below and above each median."
+    )
+    return Table(f"By motion: {cell.title}", text, header, rows)
+
+
+def _failures(cell: Cell, run: Run, learned: str) -> Table:
+    """The samples on which a method is worst against the baseline, by ground truth."""
+    mine, other = cell.predictions[learned], cell.predictions[BASELINE]
+    ratio = (mine["truth"] / other["truth"]).nan_to_num(-1.0)
+    worst = ratio.argsort(descending=True)[:FAILURES]
+    header = [
+        "pair",
+        "truth px",
+        f"{BASELINE}: truth px",
+        "own px",
+        f"{BASELINE}: own px",
+        "condition number",
+        "parallax px",
+    ]
+    rows = []
+    for row in worst[ratio[worst] > 0].tolist():
+        pair = int(cell.pair[row])
+        numbers = [mine["truth"][row], other["truth"][row], mine["own"][row], other["own"][row]]
+        cells = [f"{float(number):.2f}" for number in numbers]
+        parallax = float(run.pairs[cell.store]["parallax"][pair])
+        name = str(run.pairs[cell.store]["names"][pair])
+        rows.append([name, *cells, f"{float(mine['condition_number'][row]):.3g}", f"{parallax:.1f}"])
+    text = f"The samples on which the ground truth says that `{learned}` does worst against {BASELINE}."
+    return Table(f"Worst failures: {cell.title}", text, header, rows)

@@ -1,0 +1,251 @@
+"""Runs of predictions and the reports made of them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.samples import Samples
+from kornia_learnnorm.data.store import read_store, write_store
+from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.evaluation import record
+from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.motion import pair_motions
+from kornia_learnnorm.evaluation.report import write_report
+from kornia_learnnorm.evaluation.report_tables import report_tables
+from kornia_learnnorm.evaluation.run import read_run
+from kornia_learnnorm.learned import WEIGHTS
+from lightning_modules.cli import main
+
+pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
+METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "scenes.h5"
+    write_store(path, synthetic_store(pairs=3, points=330, seed=1))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(store, tmp_path_factory):
+    """A run, not to be changed."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record, "TRIALS", 20)
+        assert main(["evaluate", str(store), "--out", str(folder), "--methods", *METHODS]) == 0
+    return folder
+
+
+@pytest.fixture
+def copied(run, tmp_path):
+    return shutil.copytree(run, tmp_path / "run")
+
+
+class TestMethods:
+    def scene(self):
+        store = synthetic_store(pairs=1, points=40, seed=4, outliers=0.0)
+        return (torch.from_numpy(p).double().reshape(3, 40, 2)[:, :9] for p in (store.points1, store.points2))
+
+    def test_closed_forms_and_weights(self):
+        x1, x2 = self.scene()
+        for name, normalizer in {
+            "Hartley": kln.Hartley(),
+            "crossview": kln.LearnedNormalizer.from_pretrained(),
+        }.items():
+            expected = kln.find_fundamental(x1, x2, normalizer=normalizer)
+            assert torch.equal(find_method(name).estimate(x1, x2), expected)
+
+    def test_an_own_normaliser(self):
+        x1, x2 = self.scene()
+        for name in ("kornia_learnnorm.normalizers:Whitening", "kornia_learnnorm:Whitening"):
+            expected = kln.find_fundamental(x1, x2, normalizer=kln.Whitening())
+            assert torch.equal(find_method(name).estimate(x1, x2), expected)
+
+    def test_refined_is_the_better_fit(self):
+        x1, x2 = self.scene()
+        plain, refined = (
+            kln.sampson_distance(x1, x2, find_method(n).estimate(x1, x2)) for n in ("Hartley", "Hartley+LM")
+        )
+        assert (refined.square().sum(-1) <= plain.square().sum(-1)).all()
+
+    @pytest.mark.parametrize(
+        ("name", "error", "message"),
+        [
+            ("nothing", FileNotFoundError, "no weights 'nothing'"),
+            ("no.such.module:Thing", ValueError, "no normaliser at"),
+            ("kornia_learnnorm:Nothing", ValueError, "no normaliser at"),
+            ("kornia_learnnorm:__version__", ValueError, "cannot be called"),
+        ],
+    )
+    def test_unknown(self, name, error, message):
+        with pytest.raises(error, match=message):
+            find_method(name)
+
+    def test_names(self, tmp_path):
+        path = str(tmp_path / "mine" / "weights.safetensors")
+        assert short_names([path, path + "+LM", "paper"]) == {path: "mine", path + "+LM": "mine+LM", "paper": "paper"}
+        assert identify_method("paper").startswith("paper ")
+        assert identify_method("Hartley+LM") == "Hartley+LM"
+        with pytest.raises(ValueError, match="same name"):
+            short_names([path, path])
+
+
+def test_figures_agree_with_the_expectation_under_known_noise():
+    """Mean distance under the true F of points with noise s: s sqrt(2 / pi) sqrt(n1 + n2) (n1^-1/2 + n2^-1/2)."""
+    store = synthetic_store(pairs=40, points=64, seed=3, noise=0.5, outliers=0.0, scenes=["orbit"])
+    points1, points2 = (torch.from_numpy(p).reshape(40, 64, 2) for p in (store.points1, store.points2))
+    samples = Samples(points1, points2, points1[:, :1], points2[:, :1], torch.arange(40))
+    F_mat = torch.from_numpy(store.F)
+    found = record._predict(Method(kln.Hartley(), lambda x1, x2: F_mat), samples, store)
+    x1, x2 = (np.concatenate([p.double().numpy(), np.ones((40, 64, 1))], -1) for p in (points1, points2))
+    n2, n1 = (np.square(x @ f)[..., :2].sum(-1) for x, f in ((x1, store.F.swapaxes(1, 2)), (x2, store.F)))
+    expected = 0.5 * np.sqrt(2 / np.pi) * np.sqrt(n1 + n2) * (n1**-0.5 + n2**-0.5)
+    assert found["own"].mean() == pytest.approx(expected.mean(), rel=0.03)  # of 2,560 points
+    assert found["rotation_error"].max() < 1e-6
+    assert found["translation_error"].max() < 1e-4
+    assert found["distance1"] == pytest.approx(2**0.5)
+
+
+def test_predictions_are_those_of_the_functions(run, store):
+    read, found = read_store(store), read_run(run)
+    cell = found.cells[0]
+    samples, drawn = record._draw(read, 0.8, 0, None), cell.drawn
+    assert drawn == len(samples.pair)
+    raw = np.load(run / "scenes" / "filtered" / "crossview.npz")
+    x1, x2 = samples.points1.double(), samples.points2.double()
+    with torch.no_grad():
+        F_mat = find_method("crossview").estimate(x1[:2048], x2[:2048])
+    np.testing.assert_array_equal(raw["F_mat"][:2048], F_mat)
+    own = kln.symmetric_epipolar_distance(x1, x2, torch.from_numpy(raw["F_mat"])).mean(-1)
+    np.testing.assert_allclose(raw["own"], own, rtol=1e-12)
+
+
+def test_another_run_computes_nothing_and_adds_what_is_new(copied, store, monkeypatch):
+    files = {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")}
+    monkeypatch.setattr(record, "_predict", None)
+    assert main(["evaluate", str(store), "--out", str(copied), "--methods", *METHODS]) == 0
+    assert {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")} == files
+    monkeypatch.undo()
+    monkeypatch.setattr(record, "TRIALS", 20)
+    assert main(["evaluate", str(store), "--out", str(copied), "--methods", "reweighted"]) == 0
+    assert [*read_run(copied).about["methods"]] == [*METHODS, "reweighted"]
+    assert len([*copied.rglob("*.npz")]) == len(files) + 3
+
+
+def test_a_run_of_other_options_is_refused(copied, store, capsys):
+    command = ["evaluate", str(store), "--out", str(copied), "--methods", *METHODS]
+    assert main([*command, "--seed", "1"]) == 2
+    assert "is a run of other options" in capsys.readouterr().err
+    assert main([*command, "--max-samples", "9"]) == 2
+    about = json.loads((copied / "run.json").read_text())
+    about["methods"]["crossview"] = "crossview 0000"
+    (copied / "run.json").write_text(json.dumps(about))
+    assert main(command) == 2
+    assert "crossview 0000" in capsys.readouterr().err
+
+
+def test_names_do_not_change_numbers(store, tmp_path, monkeypatch):
+    """The same weights under exchanged names: the numbers go with the weights."""
+    monkeypatch.setattr(record, "TRIALS", 5)
+    numbers = []
+    for first, second in (("crossview", "paper"), ("paper", "crossview")):
+        folder = tmp_path / first
+        folder.mkdir()
+        shutil.copy(WEIGHTS / f"{first}.safetensors", folder / "one.safetensors")
+        shutil.copy(WEIGHTS / f"{second}.safetensors", folder / "two.safetensors")
+        methods = ["Hartley", str(folder / "one.safetensors"), str(folder / "two.safetensors")]
+        record.record_run(folder / "run", {"scenes": str(store)}, methods)
+        rows = report_tables(read_run(folder / "run"))[0].rows
+        numbers.append({row[0]: row[1:] for row in rows})
+    assert numbers[0]["one"] == numbers[1]["two"]
+    assert numbers[0]["two"] == numbers[1]["one"]
+    assert numbers[0]["one"] != numbers[0]["two"]
+
+
+class TestReport:
+    def test_files(self, copied, capsys):
+        assert main(["report", str(copied)]) == 0
+        assert "Better than Hartley" in capsys.readouterr().out
+        text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
+        for name in re.findall(r"\]\(([\w-]+\.svg)\)", text):
+            ElementTree.parse(copied / name)
+        assert page.count("<svg") == text.count(".svg)") == 6
+        assert not re.findall(r'(?:src|href)="(?!#)', page)  # nothing from elsewhere
+        identifiers = re.findall(r'\bid="([^"]+)"', page)
+        assert len(identifiers) == len(set(identifiers))
+        for reference in re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', page):
+            assert "".join(reference) in identifiers
+
+    def test_rates_are_those_of_the_samples(self, run):
+        found = read_run(run)
+        cell = found.cells[0]
+        own = {name: prediction["own"].numpy() for name, prediction in cell.predictions.items()}
+        table = report_tables(found)[0]
+        for row in table.rows:
+            if row[0] in own and row[0] != "Hartley":
+                assert row[1].startswith(f"{100 * np.mean(own[row[0]] < own['Hartley']):.1f} [")
+        assert table.header[1] == f"scenes, filtered: {len(cell.pair)} of {cell.drawn}"
+        raw = np.load(run / "scenes" / "filtered" / "samples.npz")["plain_residual"]
+        assert len(cell.pair) == (raw < 60).sum()
+
+    def test_accuracy_and_tests(self, run):
+        tables = {table.title: table for table in report_tables(read_run(run))}
+        rows = {row[0]: row for row in tables["Fit and accuracy: scenes, filtered"].rows}
+        assert float(rows["Hartley+LM"][1]) < float(rows["Hartley"][1]) < float(rows["none"][1])
+        tests = {row[0]: row for row in tables["Paired tests: scenes, filtered"].rows}
+        assert tests["none"][1].startswith("+")
+        assert tests["Hartley+LM"][1].startswith("-")
+        assert len(tables["By motion: scenes, filtered"].rows) == 8
+        assert 0 < len(tables["Worst failures: scenes, filtered"].rows) <= 10
+
+    def test_without_the_baseline(self, copied, store):
+        about = json.loads((copied / "run.json").read_text())
+        del about["methods"]["Hartley"]
+        (copied / "run.json").write_text(json.dumps(about))
+        with pytest.raises(ValueError, match="compares with Hartley"):
+            write_report(copied)
+
+    def test_not_a_run(self, tmp_path, capsys):
+        assert main(["report", str(tmp_path)]) == 2
+        assert "no run at" in capsys.readouterr().err
+
+    def test_incomplete_and_damaged(self, copied, capsys):
+        path = copied / "scenes" / "filtered" / "crossview.npz"
+        path.write_bytes(path.read_bytes()[:200])
+        assert main(["report", str(copied)]) == 2
+        assert "crossview.npz is damaged" in capsys.readouterr().err
+        path.unlink()
+        assert main(["report", str(copied)]) == 2
+        assert "the run is not complete" in capsys.readouterr().err
+
+
+def test_methods_need_a_run(store, capsys):
+    assert main(["evaluate", str(store), "--methods", "Hartley"]) == 2
+    assert "give --out too" in capsys.readouterr().err
+
+
+def test_a_few_samples(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(record, "TRIALS", 5)
+    record.record_run(tmp_path / "run", {"scenes": str(store)}, ["Hartley"], max_samples=50)
+    assert [cell.drawn for cell in read_run(tmp_path / "run").cells] == [50, 50]
+
+
+def test_motions_by_hand():
+    store = synthetic_store(pairs=2, points=100, seed=0, outliers=0.0)
+    found = pair_motions(store)
+    angle = np.degrees(np.arccos((np.trace(store.R, axis1=1, axis2=2) - 1) / 2))
+    np.testing.assert_allclose(found["rotation"], angle, atol=1e-4)
+    np.testing.assert_allclose(found["forward"], np.abs(store.t[:, 2]) / np.linalg.norm(store.t, axis=1))
+    assert (found["parallax"] > 0).all()
+    assert (found["inliers"] > 0.4).all()
+    store.F[0] = np.nan
+    assert np.isnan(pair_motions(store)["parallax"][0])
