@@ -21,8 +21,10 @@ STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem;
        color: light-dark(#1d2329, #dfe5ea); background: light-dark(#fff, #14181d); }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 13px; }
-th, td { padding: 0.25rem 0.6rem; text-align: right; border-bottom: 1px solid light-dark(#d8dee4, #333b44); }
+th, td { padding: 0.25rem 0.6rem; text-align: right; white-space: nowrap;
+         border-bottom: 1px solid light-dark(#d8dee4, #333b44); }
 th:first-child, td:first-child { text-align: left; }
+th { white-space: normal; vertical-align: bottom; }
 .wide { overflow-x: auto; }
 svg { width: 100%; height: auto; font-family: system-ui, sans-serif; }
 """

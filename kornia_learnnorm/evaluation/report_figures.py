@@ -55,16 +55,14 @@ def report_figures(run: Run) -> list[Picture]:
     """
     cell = next(cell for cell in run.cells if cell.protocol == "filtered")
     colors = dict(zip(run.about["methods"], COLORS * 10, strict=False))
-    pictures = [
+    return [
         _per_frame(cell, colors),
         _distribution(cell, colors),
         _distances(cell, colors),
+        *([_by_size(run, colors)] if run.sizes else []),
         _conditions(cell, colors),
         _rho(cell, colors),
     ]
-    if run.sizes:
-        pictures.append(_by_size(run, colors))
-    return pictures
 
 
 def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
