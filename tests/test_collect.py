@@ -140,9 +140,13 @@ class TestProcesses:
             add(writer, place, pair)
 
         monkeypatch.setattr(collect.StoreWriter, "add", kill_first)
-        collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, jobs=2)
-        assert "a process was killed; going on" in capfd.readouterr().err
-        assert_same(expected, tmp_path / "store.h5")
+        for attempt in range(5):  # on a busy machine the other worker can have done everything by then
+            killed.clear()
+            collect_matches(pairs_of(images), tmp_path / f"{attempt}.h5", OPTIONS, jobs=2)
+            assert_same(expected, tmp_path / f"{attempt}.h5")
+            if "a process was killed; going on" in capfd.readouterr().err:
+                return
+        pytest.fail("no run missed its worker")
 
     def test_workers_that_die_again_and_again(self, images, tmp_path, monkeypatch):
         from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -207,7 +211,7 @@ class TestDask:
     def cluster(self):
         distributed = pytest.importorskip("distributed", reason="Dask is not installed")
         with distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50
         ) as cluster:
             yield cluster
 
