@@ -159,9 +159,11 @@ class TestProcesses:
         with pytest.raises(OSError, match=r"were killed 4 times in a row: killed"):
             collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS)
 
-    def test_no_processes(self, images, tmp_path):
-        with pytest.raises(ValueError, match=r"jobs must be .* got 0"):
-            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, jobs=0)
+    @pytest.mark.parametrize("jobs", [0, -7])
+    def test_no_processes(self, images, tmp_path, jobs):
+        with pytest.raises(ValueError, match=f"jobs must be .* got {jobs}"):
+            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, jobs=jobs)
+        assert list(tmp_path.iterdir()) == []
 
 
 def loky_workers() -> list[int]:
@@ -245,6 +247,13 @@ class TestDask:
         dask = pytest.importorskip("dask", reason="Dask is not installed")
         with dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}), pytest.raises(OSError, match="tcp"):
             collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask="tcp://127.0.0.1:1")
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize("address", ["127.0.0.1:bad", "", "http://127.0.0.1:1"])
+    def test_no_address(self, images, tmp_path, address):
+        pytest.importorskip("dask", reason="Dask is not installed")
+        with pytest.raises(ValueError, match=f"address as tcp://host:8786, got '{address}'"):
+            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask=address)
 
 
 class TestGoingOn:
@@ -263,7 +272,9 @@ class TestGoingOn:
         with pytest.raises(ValueError, match=r"other options.* num_features was 200 and is 201"):
             collect_matches(pairs, expected, replace(OPTIONS, num_features=201))
         moved = [FramePair(replace(pair.frame1, camera=np.eye(3)), pair.frame2) for pair in pairs]
-        with pytest.raises(ValueError, match=r"other options.* frames was"):
+        with pytest.raises(
+            ValueError, match=r"other data.* the images, their cameras or poses, or the pairs have changed"
+        ):
             collect_matches(moved, expected, OPTIONS)
 
     def test_full_disk(self, images, expected, tmp_path, monkeypatch):
@@ -333,6 +344,7 @@ class TestBadInput:
 
     def test_nothing_matched_blocks_no_later_run(self, images, tmp_path):
         self.test_other_size_than_the_camera(images, tmp_path)
+        assert list(tmp_path.iterdir()) == []
         collect_matches(pairs_of(images)[:1], tmp_path / "store.h5", replace(OPTIONS, seed=1))
         assert len(read_store(tmp_path / "store.h5")) == 1
 
@@ -346,9 +358,9 @@ class TestBadInput:
             ({"detector": "orb"}, r"detector must be one of sift, .* got 'orb'"),
             ({"matcher": "magic"}, r"matcher must be one of nearest, lightglue, got 'magic'"),
             ({"matcher": "lightglue"}, r"lightglue takes features of the detector disk, got sift"),
-            ({"num_features": 1}, "at least 2 features"),
-            ({"max_matches": 7}, "8 matches or None"),
-            ({"seed": -1}, "a seed from 0"),
+            ({"num_features": 1}, "num_features must be at least 2, got 1"),
+            ({"max_matches": 7}, "max_matches must be at least 8, or None .* got 7"),
+            ({"seed": -1}, "seed must be 0 or more, got -1"),
         ],
     )
     def test_options(self, wrong, message):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,12 +30,15 @@ def test_there_and_back(path, tmp_path, capsys, kind):
     folder, back = tmp_path / "new" / "folder", tmp_path / "back.h5"
     assert convert(path, folder, "--to", kind) == 0
     line = capsys.readouterr().out
-    assert line.startswith(f"wrote {folder} from 3 pairs with 90 matches")
+    left = line.startswith(f"wrote {folder}: 3 pairs, 90 matches, 0 left out")
+    assert left or kind == "kitti-flow"
     assert line.count("\n") == 1
     assert ("; names with white space or empty, written with _: 2" in line) == (kind == "kitti-flow")
     assert convert(folder, back, "--from", kind) == 0
     got = read_store(back)
-    assert capsys.readouterr().out == f"wrote {back} from 3 pairs with {len(got.ratio)} matches\n"
+    known, ratios = 3 * (kind == "ngransac"), "; there are no ratios in" if kind == "kitti-flow" else "\n"
+    line = f"wrote {back}: 3 pairs, {known} with ground truth, {len(got.ratio)} matches{ratios}"
+    assert capsys.readouterr().out.startswith(line)
     assert len(got) == 3
     if kind != "kitti-flow":
         assert len(got.ratio) == 90
@@ -45,8 +49,37 @@ def test_there_and_back(path, tmp_path, capsys, kind):
 
 def test_some_pairs(path, tmp_path, capsys):
     convert(f"{path}@1:2", tmp_path / "folder", "--to", "ngransac")
-    assert "from 1 pairs with 30 matches" in capsys.readouterr().out
+    assert "1 pairs, 30 matches" in capsys.readouterr().out
     assert [file.name for file in (tmp_path / "folder").iterdir()] == ["pair_0_1.npy"]
+
+
+def test_matches_that_are_left_out_are_counted(path, tmp_path, capsys):
+    store = read_store(path)
+    store.points1[:2] = -1  # outside of the image
+    write_store(tmp_path / "cut.h5", store)
+    convert(tmp_path / "cut.h5", tmp_path / "folder", "--to", "kitti-flow")
+    line = capsys.readouterr().out
+    assert "; matches outside image 1: 2; " in line
+    convert(tmp_path / "folder", tmp_path / "back.h5", "--from", "kitti-flow")
+    got = len(read_store(tmp_path / "back.h5").ratio)
+    assert f": 3 pairs, {got} matches, {90 - got} left out; " in line
+
+
+def test_existing_store_is_not_replaced(path, tmp_path):
+    convert(path, tmp_path / "folder", "--to", "hloc")
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=r"cannot write .*store\.h5: it is there already"):
+        convert(tmp_path / "folder", path, "--from", "hloc")
+    assert path.read_bytes() == before
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
+def test_unwritable_target(path, tmp_path):
+    convert(path, tmp_path / "folder", "--to", "ngransac")
+    with pytest.raises(OSError, match=r"^cannot write /proc/out\.h5: "):
+        convert(tmp_path / "folder", "/proc/out.h5", "--from", "ngransac")
+    with pytest.raises(OSError, match=r"^cannot export to /proc/out: "):
+        convert(path, "/proc/out", "--to", "ngransac")
 
 
 @pytest.mark.parametrize(

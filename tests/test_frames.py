@@ -169,12 +169,22 @@ class TestListedPairs:
         [
             ("x/0.png x/1.png\nx/0.png\n", r"pairs\.txt, line 2: two names expected, got 'x/0\.png'"),
             ("x/0.png x/1.png x/2.png", r"line 1: two names expected"),
+            ("x/0.png x/0.png", r"line 1: two images expected, got 'x/0\.png' with itself"),
+            (
+                "x/0.png x/1.png\nx/1.png x/0.png\n\nx/0.png  x/1.png",
+                r"line 4: 'x/0\.png  x/1\.png' is in line 1 already",
+            ),
             ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
         ],
     )
     def test_malformed(self, tmp_path, text, message):
         (tmp_path / "pairs.txt").write_text(text)
         with pytest.raises(ValueError, match=message):
+            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
+
+    def test_binary(self, tmp_path):
+        (tmp_path / "pairs.txt").write_bytes(b"\x89HDF")
+        with pytest.raises(ValueError, match=r"pairs\.txt is not a text file in UTF-8"):
             list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
 
     def test_missing(self, tmp_path):

@@ -18,6 +18,8 @@ from kornia_learnnorm.data import collect, match
 from kornia_learnnorm.data.store import read_store
 from lightning_modules.cli import main
 
+FR3 = "rgbd_dataset_freiburg3_long_office_household"
+
 
 def run(reader: str, root: Path, out: Path, *args: str) -> int:
     return main(["match", reader, str(root), "--out", str(out), "--jobs", "1", "--num-features", "200", *args])
@@ -89,7 +91,7 @@ def test_skipped_pairs_are_listed_up_to_a_number(roots, tmp_path, capsys, monkey
         ("kitti", ["--gap", "9"], "no pairs of frames to match (frames 9 apart) among 12 frames"),
         ("kitti", ["--gap", "0"], "must be at least 1, got 0"),
         ("kitti", ["--matcher", "lightglue"], "lightglue takes features of the detector disk, got sift"),
-        ("kitti", ["--max-matches", "3"], "8 matches or None"),
+        ("kitti", ["--max-matches", "3"], "max_matches must be at least 8, or None (a command's 0) for all, got 3"),
         ("colmap", [], "colmap needs --model"),
     ],
 )
@@ -112,6 +114,58 @@ def test_pose_that_is_missing_or_short(tmp_path, capsys):
     poses.write_text("1 0 0")
     assert run("kitti", root, tmp_path / "s.h5", "--sequences", "06") == 2
     assert "line 1: the 12 numbers of a pose expected, got '1 0 0'" in capsys.readouterr().err
+
+
+def test_rerun_says_that_the_store_is_there(roots, tmp_path, capsys):
+    args = ("kitti", roots / "kitti", tmp_path / "s.h5", "--sequences", "06")
+    assert run(*args) == 0
+    assert capsys.readouterr().out.startswith(f"wrote {tmp_path / 's.h5'}: 3 pairs, ")
+    assert run(*args) == 0
+    captured = capsys.readouterr()
+    assert captured.out.startswith(f"{tmp_path / 's.h5'}: 3 pairs, ")
+    assert "is there already" in captured.err
+
+
+def test_other_pairs_than_the_store_has(roots, tmp_path, capsys):
+    args = ("kitti", roots / "kitti", tmp_path / "s.h5", "--sequences", "06")
+    assert run(*args) == 0
+    assert run(*args, "--gap", "2") == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.endswith("elsewhere: pairs was 'consecutive frames' and is 'frames 2 apart'")
+
+
+@pytest.mark.parametrize(
+    ("reader", "args", "lost", "expected"),
+    [
+        ("kitti", ["--sequences", "06"], "poses/06.txt", "no pose known for sequence 06: no file {}/poses/06.txt"),
+        ("tum", [], f"{FR3}/groundtruth.txt", f"no pose known for sequence {FR3}: no file {{}}/{FR3}/groundtruth.txt"),
+        ("tum", [], FR3, "no camera known for sequence household: its name has no fr1, fr2 or fr3"),
+        ("cambridge", [], "reconstruction.nvm", "no camera known: no file {}/reconstruction.nvm"),
+    ],
+)
+def test_missing_ground_truth_is_named(tmp_path, capsys, reader, args, lost, expected):
+    root = tmp_path / "root"
+    LAYOUTS[reader](root)
+    (root / lost).rename(root / "household")
+    assert run(reader, root, tmp_path / "s.h5", *args) == 0
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if line.startswith("no ")]
+    assert lines == [expected.format(root)]
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--jobs", "-7"], "jobs must be a number of processes"),
+        (["--seed", "-1"], "seed must be 0 or more, got -1"),
+        (["--num-features", "1"], "num_features must be at least 2, got 1"),
+        (["--out", "none/s.h5"], "cannot write none/s.h5: the folder none does not exist"),
+    ],
+)
+def test_options_are_checked_before_images_are_read(roots, tmp_path, capsys, monkeypatch, args, message):
+    monkeypatch.setattr(match, "_read", None)
+    assert run("kitti", roots / "kitti", tmp_path / "s.h5", *args) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_unknown_detector(roots, tmp_path, capsys):

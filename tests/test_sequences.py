@@ -273,6 +273,13 @@ class TestTum:
         assert np.isnan(frame.K).all()
         assert frame.distortion == ()
 
+    @pytest.mark.parametrize(
+        ("name", "known"), [("fr1_wall", True), ("tum-fr1", True), ("fr10", False), ("afr1", False)]
+    )
+    def test_camera_is_told_by_the_name(self, tum, name, known):
+        (tum / FR1).rename(tum / name)
+        assert np.isfinite(read_tum(tum, [name])[0].K).all() == known
+
     def test_a_sequence_alone(self, written, monkeypatch):
         frames = read_tum(written / "tum" / FR3)
         assert frames[0].name == f"rgb/{TUM_START:.6f}.png"

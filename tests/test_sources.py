@@ -33,7 +33,7 @@ def test_store_source(store, tmp_path, monkeypatch):
     assert samples.pair.max() == 17  # pairs of the second store count on
     assert torch.equal(samples.points1, source.draw(3, 0).points1)
     assert not torch.equal(samples.points1, source.draw(4, 0).points1)
-    with pytest.raises(ValueError, match="environment variable UNSET_DATA"):
+    with pytest.raises(ValueError, match=r"environment variable UNSET_DATA.* is not set; data\.train, "):
         StoreSamples(["$UNSET_DATA/a.h5"])
     with pytest.raises(FileNotFoundError):
         StoreSamples(["$SOME_DATA/c.h5"])

@@ -64,6 +64,22 @@ class TestParts:
         with pytest.raises(ValueError, match=r"store\.h5\.parts was made .* num_features was 200 and is 300"):
             StoreWriter(tmp_path / "store.h5", {**OPTIONS, "num_features": 300})
 
+    def test_of_other_images(self, tmp_path):
+        StoreWriter(tmp_path / "store.h5", {**OPTIONS, "frames": "48af"}).add(0, pair(0))
+        with pytest.raises(ValueError, match=r"other data, remove .* the images, .* have changed since$"):
+            StoreWriter(tmp_path / "store.h5", {**OPTIONS, "frames": "3500"})
+        with pytest.raises(ValueError, match=r": num_features was 200 and is 300$"):  # without the digests
+            StoreWriter(tmp_path / "store.h5", {**OPTIONS, "frames": "3500", "num_features": 300})
+
+    def test_folder_goes_if_nothing_is_in_it(self, tmp_path):
+        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+        (writer.folder / "notes.txt").touch()
+        writer.close()
+        assert [path.name for path in writer.folder.iterdir()] == ["notes.txt"]
+        (writer.folder / "notes.txt").unlink()
+        writer.close()
+        assert list(tmp_path.iterdir()) == []
+
     def test_of_other_options_but_none_done(self, tmp_path):
         StoreWriter(tmp_path / "store.h5", OPTIONS)
         writer = StoreWriter(tmp_path / "store.h5", {**OPTIONS, "num_features": 300})
@@ -116,8 +132,14 @@ class TestNoRoom:
 
     def test_no_permission(self, tmp_path, monkeypatch):
         monkeypatch.setattr(os, "access", lambda path, mode: False)
-        with pytest.raises(PermissionError, match="is not writable"):
+        with pytest.raises(PermissionError, match=r"cannot write .*store\.h5: .* is not writable"):
             StoreWriter(tmp_path / "store.h5", OPTIONS)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
+    def test_folder_that_takes_no_files(self):
+        with pytest.raises(OSError, match=r"^cannot write /proc/out\.h5: "):
+            StoreWriter("/proc/out.h5", OPTIONS)
 
     @pytest.mark.skipif(os.name != "posix", reason="limits are POSIX's")
     @pytest.mark.parametrize("limit", [20_000, 700_000])  # a part, the store of three

@@ -59,9 +59,12 @@ class MatchOptions:
         for kind, given, known in (("detector", self.detector, DETECTORS), ("matcher", self.matcher, MATCHERS)):
             if given not in known:
                 raise ValueError(f"{kind} must be one of {', '.join(known)}, got {given!r}")
-        if self.num_features < 2 or self.seed < 0 or (self.max_matches is not None and self.max_matches < 8):
-            got = f"{self.num_features}, {self.max_matches} and {self.seed}"
-            raise ValueError(f"at least 2 features, 8 matches or None, and a seed from 0 are expected, got {got}")
+        if self.num_features < 2:
+            raise ValueError(f"num_features must be at least 2, got {self.num_features}")
+        if self.max_matches is not None and self.max_matches < 8:
+            raise ValueError(f"max_matches must be at least 8, or None (a command's 0) for all, got {self.max_matches}")
+        if self.seed < 0:
+            raise ValueError(f"seed must be 0 or more, got {self.seed}")
         if self.matcher == "lightglue" and self.detector != "disk":
             raise ValueError(f"the matcher lightglue takes features of the detector disk, got {self.detector}")
 
@@ -148,13 +151,15 @@ def collect_matches(
         raise ValueError("no pairs of frames to match")
     writer = StoreWriter(path, {**about, **asdict(options), "frames": _digest(pairs)})
     if writer.complete:
-        print(f"{path} is there already, made with these options", file=sys.stderr)
+        print(f"{path} is there already, made with these options; remove it to match anew", file=sys.stderr)
         return writer.skipped
-    with open_workers(jobs, dask) as workers:
-        skipped = _match_all(pairs, writer, options, about, workers)
-    if not writer.done():
-        raise ValueError(f"none of the {len(pairs)} pairs could be matched; the first: {next(iter(skipped.values()))}")
-    writer.finish({"versions": _versions(), "skipped": skipped})
+    with closing(writer):
+        with open_workers(jobs, dask) as workers:
+            skipped = _match_all(pairs, writer, options, about, workers)
+        if not writer.done():
+            first = next(iter(skipped.values()))
+            raise ValueError(f"none of the {len(pairs)} pairs could be matched; the first: {first}")
+        writer.finish({"versions": _versions(), "skipped": skipped})
     return skipped
 
 

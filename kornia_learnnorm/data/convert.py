@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from kornia_learnnorm.data.hloc import export_hloc, import_hloc
 from kornia_learnnorm.data.interchange import new_folder
 from kornia_learnnorm.data.kitti_flow import export_kitti_flow, import_kitti_flow
@@ -55,17 +57,27 @@ def run(args: argparse.Namespace) -> int:
 
     Raises:
         FileNotFoundError: if the source is missing.
-        ValueError: if it is not what it should be, or the target cannot hold it.
+        ValueError: if it is not what it should be, or the target is there already or cannot hold it.
         OSError: if the target cannot be written.
 
     """
-    notes: dict[str, int] = {}
-    if args.source_format:
-        store = IMPORTS[args.source_format](Path(args.source))
-        write_store(args.target, store)
-    else:
-        store = read_store(args.source)
-        notes = EXPORTS[args.target_format](store, args.target)
-    left = "".join(f"; {what}: {count}" for what, count in notes.items())
-    print(f"wrote {args.target} from {len(store)} pairs with {len(store.ratio)} matches{left}")
+    print(f"wrote {args.target}: {_import(args) if args.source_format else _export(args)}")
     return 0
+
+
+def _import(args: argparse.Namespace) -> str:
+    if args.target.exists():
+        raise ValueError(f"cannot write {args.target}: it is there already, remove it or write elsewhere")
+    store = IMPORTS[args.source_format](Path(args.source))
+    write_store(args.target, store)
+    known = int(np.isfinite(store.F).all((1, 2)).sum())
+    ratios = "" if store.ratio.any() else f"; there are no ratios in {args.source}: all are 0 and pass every ratio test"
+    return f"{len(store)} pairs, {known} with ground truth, {len(store.ratio)} matches{ratios}"
+
+
+def _export(args: argparse.Namespace) -> str:
+    store = read_store(args.source)
+    notes = EXPORTS[args.target_format](store, args.target)
+    left = sum(count for what, count in notes.items() if what.startswith("matches"))
+    why = "".join(f"; {what}: {count}" for what, count in notes.items())
+    return f"{len(store)} pairs, {len(store.ratio) - left} matches, {left} left out{why}"

@@ -130,19 +130,29 @@ def listed_pairs(frames: Sequence[Frame], path: str | Path) -> Iterator[FramePai
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if a line is not two names, or names no frame.
+        ValueError: if the file is not text, or a line is not two names, names no frame, one frame twice, or the pair of
+            an earlier line; the other way round is another pair.
 
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no list of pairs at {path}")
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not a text file in UTF-8: {error}") from error
     named = {frame.name: frame for frame in frames}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        names = line.split()
+    first: dict[tuple[str, ...], int] = {}
+    for number, line in enumerate(lines, 1):
+        names = tuple(line.split())
         if not names:
             continue
         if len(names) != 2:
             raise ValueError(f"{path}, line {number}: two names expected, got {line.strip()!r}")
+        if names[0] == names[1]:
+            raise ValueError(f"{path}, line {number}: two images expected, got {names[0]!r} with itself")
+        if first.setdefault(names, number) != number:
+            raise ValueError(f"{path}, line {number}: {line.strip()!r} is in line {first[names]} already")
         for name in names:
             if name not in named:
                 some = next(iter(named), "none")

@@ -26,7 +26,7 @@ order of the pairs             kept                      by number of the images
 
 The formats are in :mod:`~kornia_learnnorm.data.kitti_flow`, :mod:`~kornia_learnnorm.data.ngransac` and
 :mod:`~kornia_learnnorm.data.hloc`. A ratio of 0 passes every ratio test. An export returns what it left out or
-changed, and how often.
+changed, and how often; what begins with "matches" is left out.
 """
 
 from __future__ import annotations
@@ -170,6 +170,7 @@ def new_folder(folder: str | Path, pattern: str) -> Path:
 
     Raises:
         ValueError: if it is a file, or already holds such files.
+        OSError: if it cannot be made.
 
     """
     folder = Path(folder)
@@ -178,5 +179,8 @@ def new_folder(folder: str | Path, pattern: str) -> Path:
     old = next(folder.glob(pattern), None)
     if old is not None:
         raise ValueError(f"cannot export to {folder}: it already holds {old.name}; expected a folder without {pattern}")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise type(error)(f"cannot export to {folder}: {error.strerror}") from error
     return folder

@@ -14,9 +14,12 @@ from kornia_learnnorm.data.collect import MatchOptions, collect_matches
 from kornia_learnnorm.data.colmap import covisible_pairs, read_colmap
 from kornia_learnnorm.data.features import DETECTORS
 from kornia_learnnorm.data.frames import Frame, FramePair, listed_pairs, pair_frames, resize_frames
+from kornia_learnnorm.data.ground_truth import missing_ground_truth
 from kornia_learnnorm.data.matching import MATCHERS
 from kornia_learnnorm.data.sequences import read_folder, read_kitti, read_tum, split_sequences
 from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.workers import check_jobs
+from kornia_learnnorm.data.writer import check_target
 
 __all__ = ["add_arguments", "run"]
 
@@ -91,10 +94,13 @@ def run(args: argparse.Namespace) -> int:
     pairs = _pair(args, frames)
     posed = sum(bool(np.isfinite(frame.pose).all()) for frame in frames)
     print(f"{len(frames)} frames, {posed} with a pose; {len(pairs)} pairs", file=sys.stderr)
+    for missing in missing_ground_truth(args.reader, args.root, frames):
+        print(missing, file=sys.stderr)
     if not pairs:
         raise ValueError(f"no pairs of frames to match ({_pairing(args)}) among {len(frames)} frames at {args.root}")
     names = sorted({frame.sequence for frame in frames}) if args.reader in ("kitti", "tum") else [args.root.name]
     about = {"dataset": f"{READERS[args.reader]} {', '.join(names)}{_resized(args)}", "pairs": _pairing(args)}
+    wrote = "" if args.out.exists() else "wrote "
     skipped = collect_matches(pairs, args.out, options, about, args.jobs, args.dask)
     for pair, reason in list(skipped.items())[:LISTED]:
         print(f"skipped {pair}: {reason}", file=sys.stderr)
@@ -102,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"skipped {len(skipped)} pairs in all; the store lists them", file=sys.stderr)
     store = read_store(args.out)
     known = int(np.isfinite(store.F).all((1, 2)).sum())
-    print(f"wrote {args.out}: {len(store)} pairs, {known} with ground truth, {store.offsets[-1]} matches")
+    print(f"{wrote}{args.out}: {len(store)} pairs, {known} with ground truth, {store.offsets[-1]} matches")
     return 0
 
 
@@ -121,6 +127,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError("--sequences and --split exclude each other")
     if args.reader == "colmap" and args.model is None:
         raise ValueError("colmap needs --model, the folder of cameras, images and points")
+    check_target(args.out)
+    check_jobs(args.jobs)
     if not args.root.is_dir():
         raise FileNotFoundError(f"no folder at {args.root}")
 

@@ -7,6 +7,7 @@ not stop a reader: its frame has size (0, 0).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -43,9 +44,9 @@ _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", 
 # fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3 of the three Kinects; https://cvg.cit.tum.de/data/datasets/rgbd-dataset,
 # file formats, calibration of the colour camera. The images of the third are already undistorted.
 _KINECTS: dict[str, tuple[tuple[float, float, float, float], tuple[float, ...]]] = {
-    "freiburg1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "freiburg2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "freiburg3": ((535.4, 539.2, 320.1, 247.6), ()),
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
 }
 
 
@@ -162,8 +163,8 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
         max_difference: a frame has the pose that is nearest in time, the earlier of two; NaN beyond this, seconds.
 
     Returns:
-        the frames by time; cameras are NaN where a folder's name has none of ``freiburg1`` to ``freiburg3``, poses
-        where it has no ``groundtruth.txt``, as the benchmark's own test sequences.
+        the frames by time; cameras are NaN where a folder's name has none of ``freiburg1`` to ``freiburg3``, or ``fr1``
+        to ``fr3``, poses where it has no ``groundtruth.txt``, as the benchmark's own test sequences.
 
     Raises:
         FileNotFoundError: if there is no sequence, or an image that ``rgb.txt`` lists is missing.
@@ -176,8 +177,7 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
         raise ValueError(f"max_difference must be zero or more seconds, got {max_difference}")
     frames = []
     for name, folder in _chosen(_marked_folders(root, "rgb.txt"), sequences, root).items():
-        kinect = next((kinect for key, kinect in _KINECTS.items() if key in name), None)
-        K, distortion = (camera_matrix(*kinect[0]), kinect[1]) if kinect else (np.full((3, 3), np.nan), ())
+        K, distortion = _tum_camera(name)
         times, poses = _tum_trajectory(folder / "groundtruth.txt")
         for time, listed in _tum_images(folder):
             # Stamps have microseconds; at 1e9 s float64 resolves a quarter of one, which must not decide on ties.
@@ -187,6 +187,15 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
             image, short = folder / listed, str(PurePosixPath(folder.relative_to(root), listed))
             frames.append(Frame(image, short, name, image_size(image), K, pose, distortion))
     return frames
+
+
+def _tum_camera(name: str) -> tuple[Array, tuple[float, ...]]:
+    """Return the camera matrix (3, 3) and the distortion of a sequence; NaN and none where its name does not tell."""
+    kinect = re.search(r"(?<![a-z])fr(?:eiburg)?([1-3])(?!\d)", name)
+    if kinect is None:
+        return np.full((3, 3), np.nan), ()
+    focal, distortion = _KINECTS[kinect[1]]
+    return camera_matrix(*focal), distortion
 
 
 def _tum_images(folder: Path) -> list[tuple[float, str]]:

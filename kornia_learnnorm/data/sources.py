@@ -211,5 +211,6 @@ class SyntheticSamples:
 def _expand(path: str) -> str:
     for name in re.findall(r"\$\{?(\w+)", path):
         if not os.environ.get(name):
-            raise ValueError(f"the environment variable {name}, named in {path!r}, is not set")
+            keys = "data.train, data.val and data.test of a configuration name stores, in init_args.paths"
+            raise ValueError(f"the environment variable {name}, named in {path!r}, is not set; {keys}")
     return os.path.expandvars(path)

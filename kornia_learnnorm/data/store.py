@@ -7,6 +7,7 @@ configuration takes a store, ``file.h5@3:10`` means its pairs 3 to 9.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -284,8 +285,9 @@ def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provena
                 if "offsets" not in file:
                     raise ValueError(f"no pairs to write to {path}")
                 file.attrs.update({"format": FORMAT, "version": VERSION, "provenance": json.dumps(provenance)})
-        except RuntimeError as error:  # h5py's word for a disk that fills while a file is closed
-            raise OSError(f"{path} could not be written: {error}") from error
+        except (OSError, RuntimeError) as error:  # RuntimeError: a disk that fills while a file is closed
+            number = getattr(error, "errno", None)
+            raise OSError(f"cannot write {path}: {os.strerror(number) if number else error}") from error
 
 
 def _append_all(h5py: Any, file: h5py.File, stores: Iterable[CorrespondenceStore]) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["Workers", "open_workers"]
+__all__ = ["Workers", "check_jobs", "open_workers"]
 
 
 class Workers:
@@ -55,6 +55,17 @@ class Workers:
                 results.close()
 
 
+def check_jobs(jobs: int) -> None:
+    """Refuse a number of processes that is none.
+
+    Raises:
+        ValueError: unless ``jobs`` is positive, or -1.
+
+    """
+    if jobs < 1 and jobs != -1:
+        raise ValueError(f"jobs must be a number of processes, or -1 for as many as there are cores, got {jobs}")
+
+
 @contextmanager
 def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
     """Give processes here or, with ``dask``, those of a cluster.
@@ -64,7 +75,7 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
         dask: address of a Dask scheduler whose workers are taken instead.
 
     Raises:
-        ValueError: if ``jobs`` is 0.
+        ValueError: if ``jobs`` is neither positive nor -1, or ``dask`` is no address.
         OSError: if the scheduler or its workers cannot be reached, or a task kills one worker of Dask after another.
         ImportError: if joblib or, for ``dask``, Dask is not installed.
 
@@ -73,8 +84,7 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
         import joblib
     except ImportError as error:
         raise ImportError("matching many pairs needs joblib: pip install 'kornia-learnnorm[images]'") from error
-    if jobs == 0:
-        raise ValueError("jobs must be a number of processes, or -1 for as many as there are cores, got 0")
+    check_jobs(jobs)
     if dask is None:
         yield Workers(n_jobs=jobs, backend="loky", initializer=_end_with, initargs=(os.getpid(),))
         return
@@ -83,7 +93,11 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
     except ImportError as error:
         raise ImportError("a Dask scheduler needs Dask: pip install 'kornia-learnnorm[dask]'") from error
     try:
-        with Client(dask) as client, joblib.parallel_config("dask", client=client):  # type: ignore[no-untyped-call]
+        client = Client(dask)  # type: ignore[no-untyped-call]
+    except ValueError as error:
+        raise ValueError(f"a Dask scheduler has an address as tcp://host:8786, got {dask!r}: {error}") from error
+    try:
+        with client, joblib.parallel_config("dask", client=client):
             yield Workers(n_jobs=-1)
     except KilledWorker as error:
         raise OSError(f"one worker after another of {dask} was killed: {error}") from error

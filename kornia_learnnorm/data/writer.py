@@ -5,15 +5,37 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from kornia_learnnorm.data.store import CorrespondenceStore, join_stores, read_store, write_store
 from kornia_learnnorm.files import replacing
 
-__all__ = ["StoreWriter"]
+__all__ = ["StoreWriter", "check_target"]
 
 OPTIONS = "options.json"  # in the folder of the parts
+DIGEST = "frames"  # the option that no reader can make sense of
+
+
+def check_target(path: str | Path) -> None:
+    """Refuse a path where no store can be written, without touching anything.
+
+    Args:
+        path: the store to write.
+
+    Raises:
+        FileNotFoundError: if its folder does not exist.
+        ValueError: if something else is there than a file, or where its parts have to wait, than a folder.
+
+    """
+    path, folder = Path(path), _folder(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"cannot write {path}: it is not a regular file")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"cannot write {path}: its parts wait in {folder}, which is not a folder")
 
 
 class StoreWriter:
@@ -25,6 +47,7 @@ class StoreWriter:
     Args:
         path: the store to write, an HDF5 file.
         options: what the store depends on, of JSON's types; a part that other options made must not mix with these.
+            ``frames`` is a digest: a message does not quote it.
 
     Attributes:
         path: the store to write.
@@ -34,16 +57,17 @@ class StoreWriter:
 
     Raises:
         FileNotFoundError: if the folder of the store does not exist.
-        PermissionError: if it cannot be written.
+        OSError: if it cannot be written.
         ValueError: if the store, or parts of it, are there but were made with other options or by other means, or
             cannot be read.
     """
 
     def __init__(self, path: str | Path, options: dict[str, Any]) -> None:
         self.path = Path(path)
-        self.folder = self.path.with_name(self.path.name + ".parts")
+        self.folder = _folder(self.path)
         self.options: dict[str, Any] = json.loads(json.dumps(options))
         self.skipped: dict[str, str] = {}
+        check_target(self.path)
         self.complete = self.path.exists()
         if self.complete:
             self._check_complete()
@@ -53,20 +77,18 @@ class StoreWriter:
             self._begin()
 
     def _check_complete(self) -> None:
-        if not self.path.is_file():
-            raise ValueError(f"cannot write {self.path}: it is not a regular file")
         provenance = read_store(self.path).provenance
         _refuse(self.path, provenance.get("options"), self.options)
         self.skipped = dict(provenance.get("skipped", {}))
 
     def _begin(self) -> None:
-        if not self.path.parent.is_dir():
-            raise FileNotFoundError(f"cannot write {self.path}: the folder {self.path.parent} does not exist")
-        if self.folder.exists() and not self.folder.is_dir():
-            raise ValueError(f"cannot write {self.path}: its parts wait in {self.folder}, which is not a folder")
-        self.folder.mkdir(exist_ok=True)
-        with replacing(self.folder / OPTIONS) as beside:
-            beside.write_text(json.dumps(self.options, indent=1), encoding="utf-8")
+        try:
+            self.folder.mkdir(exist_ok=True)
+            with replacing(self.folder / OPTIONS) as beside:
+                beside.write_text(json.dumps(self.options, indent=1), encoding="utf-8")
+        except OSError as error:
+            self.close()
+            raise type(error)(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def done(self) -> set[int]:
         """Return the places of the pairs that are there; parts that a power cut made unreadable are removed."""
@@ -107,8 +129,19 @@ class StoreWriter:
         join_stores(self.path, map(read_store, self._parts()), {**provenance, "options": self.options})
         shutil.rmtree(self.folder)
 
+    def close(self) -> None:
+        """Remove the folder of the parts if there is none in it, so that a run that failed early leaves nothing."""
+        if not any(self._parts()):
+            with suppress(OSError):  # it is gone, or holds what others put there
+                (self.folder / OPTIONS).unlink(missing_ok=True)
+                self.folder.rmdir()
+
     def _parts(self) -> Iterator[Path]:
         return iter(sorted(self.folder.glob("[0-9]*.h5")))
+
+
+def _folder(path: Path) -> Path:
+    return path.with_name(path.name + ".parts")
 
 
 def _read_options(path: Path) -> Any:
@@ -122,6 +155,9 @@ def _refuse(path: Path, had: Any, options: dict[str, Any]) -> None:
     if not isinstance(had, dict):
         raise ValueError(f"{path} is there, but not made by this command: remove it or write elsewhere")
     other = [key for key in {**had, **options} if had.get(key) != options.get(key)]
-    if other:
-        differ = ", ".join(f"{key} was {had.get(key)!r} and is {options.get(key)!r}" for key in other)
+    differ = ", ".join(f"{key} was {had.get(key)!r} and is {options.get(key)!r}" for key in other if key != DIGEST)
+    if differ:
         raise ValueError(f"{path} was made with other options, remove it or write elsewhere: {differ}")
+    if other:
+        changed = "the images, their cameras or poses, or the pairs have changed since"
+        raise ValueError(f"{path} was made from other data, remove it or write elsewhere: {changed}")
