@@ -10,14 +10,9 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
+from kornia_learnnorm.linear import design_matrix, null_vector, rank2_projection
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
-from kornia_learnnorm.solver import (
-    Normalizer,
-    design_matrix,
-    normalizing_transforms,
-    null_vector,
-    rank2_projection,
-)
+from kornia_learnnorm.solver import Normalizer, normalizing_transforms
 from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["Diagnostics", "condition_number", "diagnose", "normalized_distance", "singularity_ratio"]

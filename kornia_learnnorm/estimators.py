@@ -2,12 +2,12 @@ r"""Estimators: modules from correspondences to a fundamental matrix."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Literal
 
 from torch import Tensor, nn
 
 from kornia_learnnorm.normalizers import Hartley
-from kornia_learnnorm.solver import find_fundamental
+from kornia_learnnorm.solver import Normalizer, find_fundamental
 
 __all__ = ["EightPoint"]
 
@@ -17,6 +17,8 @@ class EightPoint(nn.Module):
 
     Args:
         normalizer: a module or callable ``(points1, points2, weights) -> (T1, T2)``; Hartley's when not given.
+        rank2: how the singularity constraint is enforced: ``None`` projects in normalised coordinates, ``"optimal"``
+            corrects in pixels with the covariance of :math:`F`.
 
     Example:
         >>> import torch
@@ -26,11 +28,10 @@ class EightPoint(nn.Module):
 
     """
 
-    def __init__(
-        self, normalizer: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]] | None = None
-    ) -> None:
+    def __init__(self, normalizer: Normalizer | None = None, rank2: Literal["optimal"] | None = None) -> None:
         super().__init__()
         self.normalizer = Hartley() if normalizer is None else normalizer
+        self.rank2 = rank2
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:
         r"""Return fundamental matrices :math:`(B, 3, 3)`; see :func:`kornia_learnnorm.find_fundamental`.
@@ -41,4 +42,4 @@ class EightPoint(nn.Module):
             weights: optional non-negative weights with shape :math:`(B, N)`.
 
         """
-        return find_fundamental(points1, points2, weights, self.normalizer)
+        return find_fundamental(points1, points2, weights, self.normalizer, self.rank2)

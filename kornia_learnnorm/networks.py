@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.correspondences import weighted_mean
-from kornia_learnnorm.solver import design_matrix, null_vector, smallest_right_singular_vector
+from kornia_learnnorm.linear import design_matrix, null_vector, smallest_right_singular_vector
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 

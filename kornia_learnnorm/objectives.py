@@ -14,7 +14,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Cauchy", "Factor", "GemanMcClure", "Huber", "Loss", "sampson_factor", "squared_loss", "symmetric_factor"]
+__all__ = [
+    "Cauchy",
+    "GemanMcClure",
+    "Huber",
+    "Truncated",
+    "sampson_factor",
+    "squared_loss",
+    "symmetric_factor",
+]
 
 Factor = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -145,3 +153,26 @@ class GemanMcClure(_RobustLoss):
         """Return the losses and their derivatives by the squared distances."""
         weight = 1 / (1 + squares / self.scale**2)
         return squares * weight, weight.square()
+
+
+class Truncated(_RobustLoss):
+    r"""The truncated squares of MSAC: squared distances :math:`s` up to :math:`c^2`, and :math:`c^2` beyond.
+
+    Args:
+        scale: :math:`c` in pixels.
+
+    Raises:
+        ValueError: if the scale is not positive.
+
+    Reference:
+        P. Torr, A. Zisserman, MLESAC: a new robust estimator with application to estimating image geometry, CVIU 2000.
+
+    Example:
+        >>> Truncated(2.0)(torch.tensor([1.0, 9.0]))
+        (tensor([1., 4.]), tensor([1., 0.]))
+
+    """
+
+    def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the losses and their derivatives by the squared distances."""
+        return squares.clamp(max=self.scale**2), (squares <= self.scale**2).to(squares)

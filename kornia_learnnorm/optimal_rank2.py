@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
+from kornia_learnnorm.linear import design_matrix, rank2_projection
 from kornia_learnnorm.normalizers import Hartley
 from kornia_learnnorm.reweighting import adjugate, line_norms
-from kornia_learnnorm.solver import design_matrix, rank2_projection
 from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["check_fundamental", "optimal_rank2"]

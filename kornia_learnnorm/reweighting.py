@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.correspondences import solve_dtype, weighted_mean
+from kornia_learnnorm.linear import design_matrix, null_vector, smallest_right_singular_vector
 from kornia_learnnorm.normalizers import Hartley, Whitening
-from kornia_learnnorm.solver import design_matrix, null_vector, smallest_right_singular_vector
 from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["ReweightedWhitening", "adjugate", "line_norms"]

@@ -1,31 +1,25 @@
-r"""The linear solver for the fundamental matrix: design matrix, null vector, rank-2 projection.
+r"""The linear solver for the fundamental matrix.
 
-A pair of point sets goes from pixels to a fundamental matrix in :func:`find_fundamental`, top to bottom. Every step is
-batched, runs in float64 where the device has it, and has derivatives that stay finite on degenerate input.
+A pair of point sets goes from pixels to a fundamental matrix in :func:`find_fundamental`, top to bottom, by the steps
+in :mod:`~kornia_learnnorm.linear`, in float64 where the device has it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
+from kornia_learnnorm.linear import design_matrix, null_vector, rank2_projection
 from kornia_learnnorm.normalizers import Hartley
+from kornia_learnnorm.optimal_rank2 import optimal_rank2
 from kornia_learnnorm.transforms import transform_fundamental
 
-__all__ = [
-    "design_matrix",
-    "find_fundamental",
-    "normalizing_transforms",
-    "null_vector",
-    "rank2_projection",
-    "smallest_right_singular_vector",
-]
+__all__ = ["find_fundamental", "normalizing_transforms"]
 
 Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
@@ -35,13 +29,16 @@ def find_fundamental(
     points2: Tensor,
     weights: Tensor | None = None,
     normalizer: Normalizer | None = None,
+    rank2: Literal["optimal"] | None = None,
 ) -> Tensor:
     r"""Compute the fundamental matrix from eight or more correspondences by the normalised eight-point algorithm.
 
     The points are mapped to normalised coordinates :math:`\hat x_i = T_i x_i`, the direct linear transformation (DLT)
     finds :math:`\hat F` with :math:`\hat x_2^\top \hat F \hat x_1 = 0`, the rank-2 constraint is enforced **there**,
     and :math:`F = T_2^\top \hat F T_1`. With eight points the DLT is exact, and the normalisation acts only through the
-    metric in which :math:`F` is projected.
+    metric in which :math:`F` is projected. With ``rank2="optimal"``, :math:`T_2^\top \hat F T_1` is corrected in pixels
+    by :func:`~kornia_learnnorm.optimal_rank2.optimal_rank2` instead; the result of eight points then depends on no
+    normalisation.
 
     Args:
         points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64.
@@ -49,6 +46,8 @@ def find_fundamental(
         weights: optional non-negative weights :math:`(B, N)` of the squared algebraic residuals; zero means absent.
         normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views;
             :class:`~kornia_learnnorm.Hartley` when not given.
+        rank2: how the singularity constraint is enforced: ``None`` projects in Frobenius norm in normalised
+            coordinates, ``"optimal"`` corrects with the covariance of :math:`F`.
 
     Returns:
         fundamental matrices with shape :math:`(B, 3, 3)` in the dtype of the points, of rank 2 and unit Frobenius norm,
@@ -60,7 +59,8 @@ def find_fundamental(
         TypeError: if the points are not floating-point tensors of one dtype, or the normaliser cannot be called.
         ShapeError: if the shapes do not agree with the above.
         ValueError: if there are fewer than eight correspondences, the views do not pair up, a value is not finite, a
-            weight is negative, or the normaliser does not return two finite transforms :math:`(B, 3, 3)`.
+            weight is negative, the normaliser does not return two finite transforms :math:`(B, 3, 3)`, or ``rank2``
+            is neither ``None`` nor ``"optimal"``.
 
     Reference:
         R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; B. Fan, Y. Dai, Y. Seo, M. He, A revisit of the
@@ -74,14 +74,17 @@ def find_fundamental(
 
     """
     check_correspondences(points1, points2, weights)
+    if rank2 not in (None, "optimal"):
+        raise ValueError(f"rank2 must be None or 'optimal', got {rank2!r}")
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     w = None if weights is None else weights.to(dtype)
     T1, T2 = (T.to(dtype) for T in normalizing_transforms(normalizer or Hartley(), x1, x2, w))
-    x1 = convert_points_to_homogeneous(x1) @ T1.mT
-    x2 = convert_points_to_homogeneous(x2) @ T2.mT
-    f = null_vector(design_matrix(x1, x2), w)
-    F = transform_fundamental(rank2_projection(torch.unflatten(f, -1, (3, 3))), T1, T2)
+    A = design_matrix(convert_points_to_homogeneous(x1) @ T1.mT, convert_points_to_homogeneous(x2) @ T2.mT)
+    F = torch.unflatten(null_vector(A, w), -1, (3, 3))
+    if rank2 == "optimal":
+        return optimal_rank2(transform_fundamental(F, T1, T2), x1, x2, w).to(points1.dtype)
+    F = transform_fundamental(rank2_projection(F), T1, T2)
     F_mat: Tensor = F / torch.linalg.matrix_norm(F, keepdim=True)
     return F_mat.to(points1.dtype)
 
@@ -105,123 +108,3 @@ def normalizing_transforms(normalizer: Normalizer, x1: Tensor, x2: Tensor, w: Te
     if not torch.compiler.is_compiling() and not bool(torch.isfinite(T1).all() & torch.isfinite(T2).all()):
         raise ValueError(f"the transforms of {type(normalizer).__name__} are not finite")
     return T1, T2
-
-
-def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
-    r"""Stack the epipolar constraints into the DLT's design matrix.
-
-    Row :math:`i` is :math:`x_{2,i} \otimes x_{1,i}`, so that row times the row-major :math:`\mathrm{vec}(F)` is
-    :math:`x_{2,i}^\top F x_{1,i}` (Fan et al., Eq. 3).
-
-    Args:
-        x1: homogeneous points of the first view with shape :math:`(*, N, 3)`.
-        x2: homogeneous points of the second view with shape :math:`(*, N, 3)`.
-
-    Returns:
-        the design matrix with shape :math:`(*, N, 9)`.
-
-    Example:
-        >>> design_matrix(torch.tensor([[[1.0, 2.0, 1.0]]]), torch.tensor([[[3.0, 4.0, 1.0]]]))
-        tensor([[[3., 6., 3., 4., 8., 4., 1., 2., 1.]]])
-
-    """
-    KORNIA_CHECK_SHAPE(x1, ["*", "N", "3"])
-    KORNIA_CHECK_SHAPE(x2, ["*", "N", "3"])
-    return (x2[..., :, None] * x1[..., None, :]).flatten(-2)
-
-
-def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return the unit vector :math:`h` that minimises :math:`\sum_i w_i (A_i h)^2`.
-
-    Eight rows have an exact null vector, whatever the positive weights: it comes from a QR factorisation of
-    :math:`A^\top`, and from the linear system :math:`[A; h_0^\top]\, h = e_9`, in which :math:`h_0` is that vector held
-    fixed, it gets its derivatives. More rows go to :func:`smallest_right_singular_vector`.
-
-    Args:
-        A: design matrix with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
-        weights: optional non-negative weights with shape :math:`(*, N)`.
-
-    Returns:
-        unit vectors with shape :math:`(*, 9)`, sign arbitrary; without gradient where the rows are linearly dependent.
-
-    """
-    if A.shape[-2] > 8:
-        return smallest_right_singular_vector(A, weights)
-    if weights is not None:
-        A = A * (weights > 0).to(A)[..., None]
-    with torch.no_grad():
-        Q, R = torch.linalg.qr(A.mT, mode="complete")
-        h0 = Q[..., -1]
-        pivots = R.diagonal(dim1=-2, dim2=-1).abs()
-        scale = pivots.amax(-1)
-        determined = pivots.amin(-1) > 64 * torch.finfo(A.dtype).eps * scale
-        scale = torch.where(determined, scale, 1.0)
-    bordered = torch.cat([A / scale[..., None, None], h0[..., None, :]], -2)
-    # The substitute enters before the solve and its result is dropped after it: no derivative ever meets a singular
-    # matrix.
-    eye = torch.eye(9, dtype=A.dtype, device=A.device)
-    bordered = torch.where(determined[..., None, None], bordered, eye)
-    h = torch.linalg.solve_ex(bordered, eye[:, 8].expand(*A.shape[:-2], 9).unsqueeze(-1))[0].squeeze(-1)
-    h = torch.where(determined[..., None], h, h0)
-    return normalize(h, dim=-1)
-
-
-def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return the unit vector :math:`v` that minimises :math:`\sum_i w_i (A_i v)^2`, twice differentiable.
-
-    The value comes from a singular value decomposition held fixed, :math:`\sqrt{w} A = U \Sigma V^\top`; the
-    derivatives from two steps of the perturbation series of the last eigenvector of the Gram matrix, written in the
-    basis :math:`V`, where it is diagonal. So the condition number is never squared, other singular values may
-    coincide, the weights may be zero, and a last singular value that is not simple sends a zero gradient instead of an
-    infinite one.
-
-    Args:
-        A: matrices with shape :math:`(*, M, n)`, :math:`M \ge n`.
-        weights: optional non-negative weights with shape :math:`(*, M)`.
-
-    Returns:
-        unit vectors with shape :math:`(*, n)`, sign arbitrary.
-
-    Example:
-        >>> smallest_right_singular_vector(torch.diag(torch.tensor([3.0, 0.5, 2.0]))).abs()
-        tensor([0., 1., 0.])
-
-    """
-    with torch.no_grad():
-        weighted = A if weights is None else A * weights.sqrt()[..., None]
-        _, s, Vh = torch.linalg.svd(weighted, full_matrices=False)
-        gap = s[..., :-1].square() - s[..., -1:].square()
-        simple = gap > 64 * torch.finfo(A.dtype).eps * s[..., :-1] * s[..., :1]
-        inverse_gap = torch.where(simple, gap, torch.inf).reciprocal()
-    C = A @ Vh.mT
-    G = C.mT @ (C if weights is None else C * weights[..., None])
-    G11, g = G[..., :-1, :-1], G[..., :-1, -1]
-    x = -inverse_gap * g
-    eigenvalue = G[..., -1:, -1] + (g * x).sum(-1, keepdim=True)
-    x = x - inverse_gap * ((G11 @ x[..., None]).squeeze(-1) - eigenvalue * x + g)
-    v = (Vh.mT @ torch.cat([x, torch.ones_like(x[..., :1])], -1)[..., None]).squeeze(-1)
-    return normalize(v, dim=-1)
-
-
-def rank2_projection(F_mat: Tensor) -> Tensor:
-    r"""Project matrices on the nearest rank-2 matrices in Frobenius norm.
-
-    :math:`F - F v v^\top`, with :math:`v` the right singular vector of the smallest singular value (the singularity
-    constraint, Fan et al., section 3, step 2b).
-
-    Args:
-        F_mat: matrices with shape :math:`(*, 3, 3)`.
-
-    Returns:
-        matrices of rank 2 with shape :math:`(*, 3, 3)`.
-
-    Example:
-        >>> rank2_projection(torch.diag(torch.tensor([3.0, 2.0, 1.0])))
-        tensor([[3., 0., 0.],
-                [0., 2., 0.],
-                [0., 0., 0.]])
-
-    """
-    KORNIA_CHECK_SHAPE(F_mat, ["*", "3", "3"])
-    v = smallest_right_singular_vector(F_mat)[..., None]
-    return F_mat - (F_mat @ v) @ v.mT

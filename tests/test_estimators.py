@@ -44,6 +44,12 @@ class TestEightPoint:
         assert torch.equal(EightPoint(normalizer)(*points), find_fundamental(*points, normalizer=normalizer))
         assert torch.equal(EightPoint(normalizer)(*points, weights), find_fundamental(*points, weights, normalizer))
 
+    def test_rank2_is_that_of_the_function(self):
+        points, weights = correspondences("driving", 5, 12), uniform(5, 12)
+        expected = find_fundamental(*points, weights, Whitening(), "optimal")
+        assert torch.equal(EightPoint(Whitening(), "optimal")(*points, weights), expected)
+        assert not torch.equal(expected, find_fundamental(*points, weights, Whitening()))
+
     def test_default_is_hartley(self):
         points = correspondences()
         assert isinstance(EightPoint().normalizer, Hartley)

@@ -26,7 +26,7 @@ from two_view import (
     up_to_sign,
 )
 
-from kornia_learnnorm import Hartley, find_fundamental
+from kornia_learnnorm import Hartley, Whitening, find_fundamental
 from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.optimal_rank2 import optimal_rank2
@@ -196,6 +196,30 @@ class TestOptimalRank2:
         weights = uniform(2, num_points, low=0.5, seed=3).requires_grad_()
         F0 = linear(points[0].detach(), points[1].detach()).requires_grad_()
         assert gradcheck(lambda *values: signless(optimal_rank2(*values)), [F0, *points, weights])
+
+    @pytest.mark.parametrize("num_points", [8, 15])
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_in_the_solver(self, num_points, weighted, dtype):
+        points1, points2 = correspondences("handheld", 10, num_points, noise=0.3)
+        weights = uniform(10, num_points, low=0.5) if weighted else None
+        expected = optimal_rank2(linear(points1, points2, weights), points1, points2, weights)
+        F_mat = find_fundamental(points1, points2, weights, rank2="optimal")
+        assert up_to_sign(in_hartley(F_mat, points1, points2), in_hartley(expected, points1, points2)) < 1e-6
+        single = find_fundamental(points1.to(dtype), points2.to(dtype), weights, rank2="optimal")
+        rounded = [points.to(dtype).double() for points in (points1, points2)]
+        assert single.dtype == dtype
+        assert up_to_sign(single, find_fundamental(*rounded, weights, rank2="optimal")) < 1e-6
+
+    def test_in_the_solver_the_normalisation_of_eight_points_does_not_matter(self):
+        points = correspondences("driving", 20, 8, noise=0.5)
+        results = [find_fundamental(*points, normalizer=n, rank2="optimal") for n in (Hartley(), Whitening())]
+        assert up_to_sign(*(in_hartley(F, *points) for F in results)) < 1e-6
+
+    @pytest.mark.parametrize("num_points", [8, 11])
+    def test_gradients_through_the_solver(self, num_points):
+        points = [uniform(2, num_points, 2, low=-1, seed=seed).requires_grad_() for seed in (1, 2)]
+        weights = uniform(2, num_points, low=0.5, seed=3).requires_grad_()
+        assert gradcheck(lambda *values: signless(find_fundamental(*values, rank2="optimal")), [*points, weights])
 
     def test_real_eights(self):
         pytest.importorskip("h5py")

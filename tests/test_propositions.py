@@ -57,7 +57,7 @@ from kornia_learnnorm import (
     paper_transform,
 )
 from kornia_learnnorm.diagnostics import condition_number
-from kornia_learnnorm.solver import null_vector
+from kornia_learnnorm.linear import null_vector
 from kornia_learnnorm.transforms import affine_transform
 
 GRID = [(i, j) for i in range(3) for j in range(3)]

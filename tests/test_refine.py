@@ -26,14 +26,22 @@ from two_view import (
 )
 
 from kornia_learnnorm import find_fundamental, sampson_distance, symmetric_epipolar_distance
-from kornia_learnnorm.objectives import Cauchy, GemanMcClure, Huber, sampson_factor, squared_loss, symmetric_factor
+from kornia_learnnorm.objectives import (
+    Cauchy,
+    GemanMcClure,
+    Huber,
+    Truncated,
+    sampson_factor,
+    squared_loss,
+    symmetric_factor,
+)
 from kornia_learnnorm.refine import refine_fundamental
 
 DISTANCES = {
     "sampson": (sampson_factor, sampson_distance),
     "symmetric": (symmetric_factor, symmetric_epipolar_distance),
 }
-LOSSES = [squared_loss, Huber(0.5), Cauchy(0.5), GemanMcClure(2.0)]
+LOSSES = [squared_loss, Huber(0.5), Cauchy(0.5), GemanMcClure(2.0), Truncated(3.0)]
 
 
 def numpy_distances(F, points1, points2, kind: str) -> np.ndarray:
@@ -240,6 +248,44 @@ class TestRefineFundamental:
         assert up_to_sign(together.F_mat, torch.cat([one.F_mat for one in alone])) < 1e-7
         assert torch.equal(together.iterations, torch.cat([one.iterations for one in alone]))
 
+    @pytest.mark.parametrize("num_points", [20, 3000])  # as one part and as several
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_matrices_may_share_points(self, num_points, weighted):
+        points = correspondences("handheld", 1, num_points, noise=0.5)
+        weights = uniform(1, num_points, low=0.1) if weighted else None
+        F0 = find_fundamental(*(p[:, : 8 * (num_points // 8)].unflatten(1, (-1, 8))[0] for p in points))[:12]
+        many = [
+            None if value is None else value.repeat(len(F0), 1, 1).view(len(F0), *value.shape[1:])
+            for value in (*points, weights)
+        ]
+        shared = refine_fundamental(*points, F0, weights, loss=Cauchy(1.0), max_iterations=8)
+        copied = refine_fundamental(*many[:2], F0, many[2], loss=Cauchy(1.0), max_iterations=8)
+        assert up_to_sign(in_hartley(shared.F_mat, *many[:2]), in_hartley(copied.F_mat, *many[:2])) < 1e-7
+        np.testing.assert_allclose(shared.cost_before.numpy(), copied.cost_before.numpy())
+        assert torch.equal(shared.iterations, copied.iterations)
+
+    def test_shared_points_take_the_gradients_of_all(self):
+        points = correspondences("orbit", 1, 14, noise=1.0)
+        F0 = find_fundamental(*points).repeat(3, 1, 1)
+        gradients = []
+        for count in (1, 3):
+            values = [value.repeat(count, 1, 1).requires_grad_() for value in points]
+            found = refine_fundamental(*values, F0, max_iterations=200)
+            assert found.converged.all()
+            gradients.append([g.sum(0) for g in torch.autograd.grad(signless(found.F_mat).sum(), values)])
+        for one, many in zip(*gradients, strict=True):
+            torch.testing.assert_close(one, many, rtol=1e-4, atol=1e-8)
+
+    @pytest.mark.parametrize("loss", LOSSES)
+    def test_tolerance_trades_steps_for_cost(self, loss):
+        points1, points2 = correspondences("driving", 20, 100, noise=0.5)
+        F0 = find_fundamental(points1, points2)
+        loose, tight = (refine_fundamental(points1, points2, F0, loss=loss, tolerance=t) for t in (1e-3, 1e-7))
+        assert loose.converged.all()
+        assert (loose.iterations <= tight.iterations).all()
+        assert loose.iterations.sum() < 0.5 * tight.iterations.sum()
+        assert (loose.cost <= tight.cost * 1.002).double().mean() > 0.9
+
     @pytest.mark.parametrize("degenerate", ["coincident", "collinear", "planar", "absent", "same", "epipole"])
     @pytest.mark.parametrize("kind", DISTANCES)
     @pytest.mark.parametrize("loss", LOSSES)
@@ -344,7 +390,7 @@ class TestObjectives:
         assert loss(torch.zeros(1))[0] == 0
         assert loss(torch.zeros(1))[1] == 1
 
-    @pytest.mark.parametrize("kind", [Huber, Cauchy, GemanMcClure])
+    @pytest.mark.parametrize("kind", [Huber, Cauchy, GemanMcClure, Truncated])
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
     def test_scale_must_be_positive(self, kind, scale):
         with pytest.raises(ValueError, match=f"scale must be positive, got {scale}"):
@@ -374,5 +420,10 @@ class TestExceptions:
             refine_fundamental(points * torch.nan, points, eye)
         with pytest.raises(ValueError, match="weights must not be negative"):
             refine_fundamental(points, points, eye, -torch.ones(2, 8))
-        with pytest.raises(ValueError, match="max_iterations must be >= 0, got -1"):
-            refine_fundamental(points, points, eye, max_iterations=-1)
+        for options, message in (
+            ({"max_iterations": -1}, "must be >= 0, got -1 and 1e-07"),
+            ({"tolerance": -0.5}, "must be >= 0, got 50 and -0.5"),
+            ({"tolerance": float("nan")}, "must be >= 0, got 50 and nan"),
+        ):
+            with pytest.raises(ValueError, match=f"max_iterations and tolerance {message}"):
+                refine_fundamental(points, points, eye, **options)

@@ -35,7 +35,7 @@ from kornia_learnnorm import (
     null_vector,
     rank2_projection,
 )
-from kornia_learnnorm.solver import smallest_right_singular_vector
+from kornia_learnnorm.linear import smallest_right_singular_vector
 
 # Each normaliser with its independent computation.
 REFERENCES = {
@@ -319,6 +319,11 @@ class TestExceptions:
     def test_weights(self, weights, error, message):
         with pytest.raises(error, match=message):
             find_fundamental(torch.rand(2, 8, 2), torch.rand(2, 8, 2), weights)
+
+    @pytest.mark.parametrize("rank2", ["projection", True, rank2_projection])
+    def test_rank2(self, rank2):
+        with pytest.raises(ValueError, match="rank2 must be None or 'optimal', got "):
+            find_fundamental(torch.rand(2, 8, 2), torch.rand(2, 8, 2), rank2=rank2)
 
     def test_parts(self):
         for call in (

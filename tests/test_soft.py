@@ -1,0 +1,309 @@
+"""The soft RANSAC against NumPy, and its gradients against enumeration and finite differences."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from torch import nn
+from torch.autograd import gradcheck
+from two_view import (
+    correspondences,
+    eight_point,
+    homogeneous,
+    numpy_hartley,
+    numpy_whitening,
+    shaken,
+    uniform,
+    up_to_sign,
+)
+
+from kornia_learnnorm import Hartley, Whitening, symmetric_epipolar_distance
+from kornia_learnnorm.soft import expected_loss, sample_minimal_sets
+
+
+def target(F):
+    """A loss of matrices that knows no sign, (*, K)."""
+    return (F[..., 0, :].square() * F.new_tensor([1.0, 2.0, 3.0])).sum(-1)
+
+
+def drawn(points, count: int = 6, seed: int = 0):
+    logits = uniform(*points.shape[:2], low=-1, seed=seed)
+    return sample_minimal_sets(logits, count, torch.Generator().manual_seed(seed))
+
+
+def unit_square(num_points: int):
+    return [uniform(2, num_points, 2, low=-1, seed=seed) for seed in (1, 2)]
+
+
+def log_probability(p, order) -> float:
+    """Of indices drawn one after the other without replacement."""
+    left, total = 1.0, 0.0
+    for i in order:
+        total += np.log(p[i] / left)
+        left -= p[i]
+    return total
+
+
+class TestSampleMinimalSets:
+    @pytest.mark.parametrize("batch_size", [0, 1, 3])
+    @pytest.mark.parametrize("num_points", [8, 40])
+    def test_smoke(self, batch_size, num_points, device, dtype):
+        logits = uniform(batch_size, num_points).to(device, dtype)
+        samples, log_probs = sample_minimal_sets(logits, 5)
+        assert samples.shape == (batch_size, 5, 8)
+        assert log_probs.shape == (batch_size, 5)
+        assert log_probs.dtype == dtype
+        assert samples.device.type == log_probs.device.type == device.type
+        assert all(len(set(row.tolist())) == 8 for row in samples.flatten(0, 1))
+
+    def test_probabilities_agree_with_numpy(self):
+        logits = uniform(3, 12, low=-2, high=2)
+        samples, log_probs = sample_minimal_sets(logits, 10, torch.Generator().manual_seed(0))
+        p = np.exp(logits.numpy()) / np.exp(logits.numpy()).sum(-1, keepdims=True)
+        expected = [[log_probability(p[b], order) for order in samples[b].tolist()] for b in range(3)]
+        np.testing.assert_allclose(log_probs.numpy(), expected)
+
+    def test_frequencies_are_the_probabilities(self, generator):
+        logits = torch.tensor([[2.0, 0, 0, 0, 0, 0, 0, 0, -1, 1]]).double()
+        samples, _ = sample_minimal_sets(logits, 40_000, generator)
+        p = logits.softmax(-1)[0].numpy()
+        first = np.bincount(samples[0, :, 0].numpy(), minlength=10) / 40_000
+        np.testing.assert_allclose(first, p, atol=0.01)
+        pairs = np.zeros((10, 10))
+        np.add.at(pairs, tuple(samples[0, :, :2].T.numpy()), 1 / 40_000)
+        np.testing.assert_allclose(pairs, p[:, None] * p / (1 - p[:, None]) * (1 - np.eye(10)), atol=0.01)
+
+    def test_repeats_with_the_generator_and_ignores_a_constant(self):
+        logits = uniform(2, 20)
+        first, again, moved = (
+            sample_minimal_sets(values, 7, torch.Generator().manual_seed(3)) for values in (logits, logits, logits + 50)
+        )
+        assert torch.equal(first[0], again[0])
+        assert torch.equal(first[0], moved[0])
+        torch.testing.assert_close(first[1], moved[1])
+
+    def test_gradients(self):
+        def log_probs(logits):
+            return sample_minimal_sets(logits, 4, torch.Generator().manual_seed(0))[1]
+
+        assert gradcheck(log_probs, [uniform(2, 10, low=-1).requires_grad_()])
+
+    def test_gradients_of_certain_draws_are_finite(self):
+        logits = torch.full((1, 20), -60.0)
+        logits[:, :8] = 60.0
+        logits.requires_grad_()
+        samples, log_probs = sample_minimal_sets(logits, 4)
+        assert (samples < 8).all()
+        (gradient,) = torch.autograd.grad(log_probs.sum(), logits)
+        assert torch.isfinite(gradient).all()
+
+    @pytest.mark.parametrize(
+        ("logits", "count", "error", "message"),
+        [
+            (None, 1, TypeError, "logits must be a floating-point tensor, got <class 'NoneType'>"),
+            (torch.ones(1, 9, dtype=torch.int64), 1, TypeError, "got torch.int64"),
+            (torch.ones(9), 1, ShapeError, r"\[9\]"),
+            (torch.ones(1, 7), 1, ValueError, "at least 8 correspondences are needed, got 7"),
+            (torch.full((1, 9), -torch.inf), 1, ValueError, "logits must be finite, got 9"),
+            (torch.ones(1, 9), 0, ValueError, "count must be >= 1, got 0"),
+        ],
+    )
+    def test_exceptions(self, logits, count, error, message):
+        with pytest.raises(error, match=message):
+            sample_minimal_sets(logits, count)
+
+
+class TestExpectedLoss:
+    @pytest.mark.parametrize("batch_size", [0, 1, 3])
+    @pytest.mark.parametrize("num_points", [8, 40])
+    @pytest.mark.parametrize("guided", [False, True])
+    def test_smoke(self, batch_size, num_points, guided, device, dtype):
+        points = [uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
+        samples, log_probs = sample_minimal_sets(torch.zeros(batch_size, num_points, device=device, dtype=dtype), 5)
+        choice = expected_loss(*points, samples, target, log_probs if guided else None)
+        assert choice.loss.shape == (batch_size,)
+        assert choice.F_mat.shape == (batch_size, 5, 3, 3)
+        assert choice.probability.shape == (batch_size, 5)
+        assert choice.loss.dtype == choice.F_mat.dtype == choice.probability.dtype == dtype
+        assert choice.loss.device.type == device.type
+
+    @pytest.mark.parametrize(("normalizer", "transform"), [(None, numpy_hartley), (Whitening(), numpy_whitening)])
+    def test_agrees_with_numpy(self, normalizer, transform):
+        points1, points2 = correspondences("handheld", 3, 30)
+        samples, log_probs = drawn(points1)
+        choice = expected_loss(points1, points2, samples, target, log_probs, normalizer, 2.0, 3.0, 0.5)
+        for b in range(3):
+            chosen = [points[b][samples[b]] for points in (points1, points2)]
+            F = eight_point(*chosen, *(transform(points) for points in chosen))
+            x1, x2 = homogeneous(points1[b].numpy()), homogeneous(points2[b].numpy())
+            line1, line2 = x2 @ F, x1 @ F.swapaxes(-1, -2)
+            size = np.sqrt((line1[..., :2] ** 2).sum(-1) + (line2[..., :2] ** 2).sum(-1))
+            distance = np.abs((x2 * line2).sum(-1)) / size
+            scores = 0.5 * (1 / (1 + np.exp(-3.0 * (1 - distance / 2.0)))).sum(-1)
+            p = np.exp(scores - scores.max()) / np.exp(scores - scores.max()).sum()
+            losses = (F[:, 0] ** 2 * [1, 2, 3]).sum(-1)
+            assert up_to_sign(choice.F_mat[b], F) < 1e-9
+            np.testing.assert_allclose(choice.probability[b].numpy(), p, rtol=1e-6)
+            assert choice.loss[b].item() == pytest.approx(p @ losses, rel=1e-6)
+
+    @given(st.integers(0, 2**31), st.randoms())
+    def test_order_does_not_matter(self, seed, random):
+        points1, points2 = correspondences("handheld", 2, 15, seed)
+        samples, _ = drawn(points1, seed=seed)
+        order = torch.tensor(random.sample(range(15), 15))
+        hypotheses, within = (torch.tensor(random.sample(range(n), n)) for n in (6, 8))
+        choice = expected_loss(points1, points2, samples, target)
+        moved = order.argsort()[samples][:, hypotheses][..., within]
+        shuffled = expected_loss(points1[:, order], points2[:, order], moved, target)
+        torch.testing.assert_close(choice.loss, shuffled.loss, rtol=1e-5, atol=1e-12)
+        torch.testing.assert_close(choice.probability[:, hypotheses], shuffled.probability, rtol=1e-4, atol=1e-9)
+
+    def test_sharp_scores_choose_the_best_and_flat_ones_average(self):
+        points = correspondences("orbit", 3, 40, noise=0.2, outliers=0.2)
+        samples, _ = drawn(points[0], 20)
+        flat, sharp = (expected_loss(*points, samples, target, scale=scale) for scale in (0.0, 1e4))
+        torch.testing.assert_close(flat.loss, target(flat.F_mat).mean(-1))
+        best = sharp.probability.argmax(-1, keepdim=True)
+        torch.testing.assert_close(sharp.loss, target(sharp.F_mat).gather(-1, best)[:, 0])
+
+    def test_gradients_of_the_points(self):
+        points = [p.requires_grad_() for p in unit_square(12)]
+        samples, log_probs = drawn(points[0])
+
+        def loss(points1, points2):
+            return expected_loss(points1, points2, samples, target, log_probs, threshold=0.1).loss
+
+        assert gradcheck(loss, points)
+
+    def test_gradients_of_the_normaliser(self):
+        points = unit_square(12)
+        samples, _ = drawn(points[0])
+
+        def loss(shear):
+            def normalizer(points1, points2, weights):
+                T1, T2 = Hartley()(points1, points2, weights)
+                S = torch.eye(3, dtype=torch.float64) + torch.diag_embed(shear, 1)
+                return S @ T1, S.mT @ T2
+
+            return expected_loss(*points, samples, target, None, normalizer, threshold=0.1).loss
+
+        assert gradcheck(loss, [torch.tensor([0.3, -0.2], dtype=torch.float64, requires_grad=True)])
+
+    def test_both_score_and_loss_teach_a_network(self):
+        points = [p.float() for p in correspondences("handheld", 2, 20)]
+        samples, _ = drawn(points[0])
+        normalizer = shaken()
+        weights = list(normalizer.parameters())
+        whole = expected_loss(*points, samples, target, normalizer=normalizer)
+        by_loss = (whole.probability.detach() * target(whole.F_mat)).sum()
+        by_score = (whole.probability * target(whole.F_mat).detach()).sum()
+        parts = [torch.autograd.grad(v, weights, retain_graph=True) for v in (whole.loss.sum(), by_loss, by_score)]
+        for total, first, second in zip(*parts, strict=True):
+            assert first.count_nonzero() > 0
+            assert second.count_nonzero() > 0
+            torch.testing.assert_close(total, first + second, rtol=1e-3, atol=1e-5 * total.abs().max().item())
+
+    def test_gradients_of_the_sampling_are_unbiased(self, generator):
+        """Nine points have nine sets of eight: the exact expectation over two hypotheses is a sum of 81 terms."""
+        points = [p[:1] for p in unit_square(9)]
+        logits = uniform(1, 9, low=-1, seed=5).requires_grad_()
+        sets = torch.tensor([[i for i in range(9) if i != left_out] for left_out in range(9)])
+        pairs = torch.cartesian_prod(torch.arange(9), torch.arange(9))
+        values = expected_loss(*(p.expand(81, -1, -1) for p in points), sets[pairs], target, scale=1.0, threshold=0.1)
+        p = logits[0].softmax(-1)
+        # A set is drawn where its missing point would come last.
+        last = _probabilities_to_be_last(p)
+        exact = (last[pairs[:, 0]] * last[pairs[:, 1]] * values.loss).sum()
+        (wanted,) = torch.autograd.grad(exact, logits)
+
+        many = logits.detach().expand(40_000, -1).clone().requires_grad_()
+        samples, log_probs = sample_minimal_sets(many, 2, generator)
+        points = [p.expand(40_000, -1, -1) for p in points]
+        found = expected_loss(*points, samples, target, log_probs, scale=1.0, threshold=0.1)
+        (gradients,) = torch.autograd.grad(found.loss.sum(), many)
+        error = gradients.std(0) / 200
+        assert found.loss.mean().item() == pytest.approx(exact.item(), abs=4 * found.loss.std().item() / 200)
+        assert ((gradients.mean(0) - wanted[0]).abs() < 4.5 * error).all()
+        assert (wanted[0].abs() > 6 * error).any()
+
+    def test_learns_where_to_sample(self, generator):
+        scene = correspondences("orbit", 1, 40, noise=0.1)
+        points = [p.clone() for p in scene]
+        points[1][:, 20:] = uniform(1, 20, 2, high=400)
+        logits = nn.Parameter(torch.zeros(1, 40, dtype=torch.float64))
+        optimizer = torch.optim.Adam([logits], 0.1)
+
+        def loss(F):
+            held_out = [p[:, None].expand(-1, F.shape[1], -1, -1) for p in scene]
+            return symmetric_epipolar_distance(*held_out, F).clamp(max=10).mean(-1)
+
+        for _ in range(40):
+            samples, log_probs = sample_minimal_sets(logits, 64, generator)
+            optimizer.zero_grad()
+            expected_loss(*points, samples, loss, log_probs).loss.sum().backward()
+            optimizer.step()
+        assert logits[0, :20].mean() > logits[0, 20:].mean() + 1
+
+
+def _probabilities_to_be_last(p):
+    """Probability of each of nine to be drawn last without replacement: by inclusion and exclusion."""
+    result = []
+    for last in range(9):
+        others = [i for i in range(9) if i != last]
+        total = 0.0
+        for mask in range(256):
+            chosen = [o for bit, o in enumerate(others) if mask >> bit & 1]
+            total = total + (-1) ** len(chosen) * p[last] / (p[last] + sum(p[i] for i in chosen))
+        result.append(total)
+    return torch.stack(result)
+
+
+def test_probabilities_to_be_last():
+    p = np.array([0.5, 0.2, 0.2, 0.1])
+    for last in range(4):
+        orders = [order for order in permutations(range(4)) if order[-1] == last]
+        direct = sum(np.exp(log_probability(p, order[:-1])) for order in orders)
+        others = [i for i in range(4) if i != last]
+        total = 0.0
+        for mask in range(8):
+            chosen = [o for bit, o in enumerate(others) if mask >> bit & 1]
+            total += (-1) ** len(chosen) * p[last] / (p[last] + p[chosen].sum())
+        assert total == pytest.approx(direct)
+
+
+class TestExceptions:
+    points = torch.rand(2, 9, 2)
+    samples = torch.arange(8).expand(2, 3, 8)
+
+    @pytest.mark.parametrize(
+        ("samples", "error", "message"),
+        [
+            (None, TypeError, "samples must be an int64 tensor, got <class 'NoneType'>"),
+            (torch.zeros(2, 3, 8), TypeError, "got torch.float32"),
+            (torch.zeros(2, 3, 7, dtype=torch.int64), ShapeError, r"\[2, 3, 7\]"),
+            (torch.zeros(1, 3, 8, dtype=torch.int64), ValueError, "samples of 2 sets of points are needed, got 1"),
+        ],
+    )
+    def test_samples(self, samples, error, message):
+        with pytest.raises(error, match=message):
+            expected_loss(self.points, self.points, samples, target)
+
+    def test_others(self):
+        args = self.points, self.points, self.samples
+        with pytest.raises(ValueError, match="at least 8 correspondences are needed, got 7"):
+            expected_loss(self.points[:, :7], self.points[:, :7], self.samples, target)
+        with pytest.raises(ValueError, match=r"log_probs must have shape \[2, 3\] with two samples or more, got \[2\]"):
+            expected_loss(*args, target, torch.zeros(2))
+        with pytest.raises(ValueError, match=r"with two samples or more, got \[2, 1\]"):
+            expected_loss(*args[:2], self.samples[:, :1], target, torch.zeros(2, 1))
+        with pytest.raises(ValueError, match=r"one value per matrix, \[2, 3\], got \[2\]"):
+            expected_loss(*args, lambda F: F[:, 0, 0, 0])
+        for name in ("threshold", "slope"):
+            with pytest.raises(ValueError, match=r"threshold and slope must be positive, got .*0\.0"):
+                expected_loss(*args, target, **{name: 0.0})
