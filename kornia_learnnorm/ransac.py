@@ -1,0 +1,228 @@
+r"""RANSAC whose minimal samples and refits run through a normaliser."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from torch import Tensor, nn
+
+from kornia_learnnorm.correspondences import solve_dtype
+from kornia_learnnorm.normalizers import Hartley
+from kornia_learnnorm.objectives import Cauchy, Factor, Loss, Truncated, sampson_factor
+from kornia_learnnorm.refine import refine_fundamental
+from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
+from kornia_learnnorm.scoring import Hypotheses, PairScorer, epipolar_distance
+from kornia_learnnorm.solver import Normalizer, find_fundamental
+
+__all__ = ["RANSAC"]
+
+BATCHES = (64, 1024)  # hypotheses in the first batch, and in the largest
+POOL = 8  # hypotheses that are refined in the end
+OPTIMIZED = 4  # hypotheses of a batch that are optimised
+SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on
+STEPS = 10  # of Levenberg-Marquardt, at most
+TOLERANCE = 1e-3
+
+
+class RANSAC(nn.Module):
+    r"""Robust estimation of a fundamental matrix from correspondences with outliers.
+
+    Minimal samples of eight run through :func:`~kornia_learnnorm.find_fundamental` with any normaliser, a thousand at
+    once, and MSAC scores them all. The best of each batch is refitted to its inliers by the same function, and with the
+    next best refined by Levenberg-Marquardt (local optimisation); the inliers of the best matrix so far say how many
+    samples are still needed. In the end the eight best are refined on the truncated squared distance, and the best of
+    these on the Cauchy loss of its inliers.
+
+    Called and answering like ``kornia.geometry.RANSAC(model_type="fundamental_8pt")``. What differs: ``max_iter``
+    counts samples, the matrix has unit Frobenius norm, and weights steer the sampling.
+
+    Args:
+        normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, in whose coordinates matrices
+            are projected to rank 2. When not given, it is :class:`~kornia_learnnorm.Hartley`'s and ``rank2`` is
+            ``"optimal"``, which takes fewer samples than any normalisation.
+        inl_th: largest distance of an inlier, pixels.
+        max_iter: largest number of minimal samples.
+        max_seconds: time after which no further samples are drawn; with it the result depends on the machine.
+        confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
+            best matrix so far has found all inliers; 1 draws all ``max_iter`` samples.
+        factor: the distance, :func:`~kornia_learnnorm.objectives.sampson_factor` or
+            :func:`~kornia_learnnorm.objectives.symmetric_factor` (Fan et al., Eq. 7).
+        rank2: how the singularity constraint is enforced, see :func:`~kornia_learnnorm.find_fundamental`.
+        refine: whether to optimise; otherwise the result is the minimal sample of highest score.
+        sampler: what weights do: :class:`~kornia_learnnorm.sampling.ProsacSampler` or
+            :class:`~kornia_learnnorm.sampling.WeightedSampler`.
+        seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
+
+    Raises:
+        ValueError: if a number is out of its range.
+
+    Reference:
+        P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM
+        2003; O. Chum, J. Matas, Matching with PROSAC, CVPR 2005.
+
+    Example:
+        >>> import kornia_learnnorm as kln
+        >>> _ = torch.manual_seed(0)
+        >>> F_true = kln.find_fundamental(torch.rand(1, 8, 2) * 600, torch.rand(1, 8, 2) * 600)[0].double()
+        >>> points1, points2 = torch.rand(2, 400, 2, dtype=torch.float64) * 600
+        >>> a, b, c = (F_true @ torch.cat([points1, torch.ones(400, 1)], -1).mT).unbind(0)
+        >>> points2[:300, 1] = -(a * points2[:, 0] + c)[:300] / b[:300]  # on their epipolar lines
+        >>> F_mat, inliers = RANSAC(seed=0)(points1, points2)
+        >>> bool(inliers[:300].all()), (F_mat - F_true).norm() < 1e-6 or (F_mat + F_true).norm() < 1e-6
+        (True, tensor(True))
+
+    """
+
+    def __init__(
+        self,
+        normalizer: Normalizer | None = None,
+        inl_th: float = 1.0,
+        max_iter: int = 20_000,
+        max_seconds: float | None = None,
+        confidence: float = 0.999,
+        factor: Factor = sampson_factor,
+        rank2: Literal["optimal"] | None = None,
+        refine: bool = True,
+        sampler: Callable[[Tensor], Sampler] = ProsacSampler,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__()
+        if not (math.isfinite(inl_th) and inl_th > 0):
+            raise ValueError(f"inl_th must be a positive number of pixels, got {inl_th}")
+        if max_iter < 1:
+            raise ValueError(f"max_iter must be >= 1, got {max_iter}")
+        if max_seconds is not None and not max_seconds > 0:
+            raise ValueError(f"max_seconds must be positive or None, got {max_seconds}")
+        if not 0 < confidence <= 1:
+            raise ValueError(f"confidence must lie in (0, 1], got {confidence}")
+        self.normalizer = Hartley() if normalizer is None else normalizer
+        self.rank2: Literal["optimal"] | None = "optimal" if normalizer is None else rank2
+        self.inl_th, self.max_iter, self.max_seconds, self.confidence = inl_th, max_iter, max_seconds, confidence
+        self.factor, self.refine, self.sampler, self.seed = factor, refine, sampler, seed
+
+    @torch.no_grad()
+    def forward(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        r"""Estimate the fundamental matrix of one image pair.
+
+        Args:
+            kp1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, float32 or float64. Rows that are
+                not finite are no inliers.
+            kp2: pixels in the second image with shape :math:`(N, 2)`.
+            weights: optional non-negative scores :math:`(N,)`, higher is better, such as one minus Lowe's ratio. They
+                steer sampling only; zero is never sampled.
+
+        Returns:
+            the matrix :math:`(3, 3)` of unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, and the inliers :math:`(N,)`,
+            boolean. Zeros and no inliers where no matrix has more than eight of them.
+
+        Raises:
+            TypeError: if the points are not floating-point tensors of one dtype, or the weights not floating-point.
+            ShapeError: if a shape is wrong.
+            ValueError: if there are fewer than eight rows, the views do not pair up, or a weight is negative or not
+                finite.
+
+        """
+        _check(kp1, kp2, weights)
+        failure = kp1.new_zeros(3, 3), torch.zeros(len(kp1), dtype=torch.bool, device=kp1.device)
+        finite = (kp1.isfinite() & kp2.isfinite()).all(-1)
+        x1, x2 = (kp[finite].to(solve_dtype(kp.device)) for kp in (kp1, kp2))
+        w = torch.ones_like(x1[:, 0]) if weights is None else weights[finite].to(x1)
+        if int((w > 0).sum()) < SAMPLE_SIZE:
+            return failure
+        generator = torch.Generator(kp1.device)
+        generator.manual_seed(int(torch.randint(2**62, ())) if self.seed is None else self.seed)
+        sampler = UniformSampler(len(w), w.device) if weights is None else self.sampler(w)
+        scored = torch.arange(len(x1), device=x1.device)
+        if len(x1) > SCORED:
+            scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:SCORED]
+        scorer = PairScorer(x1[scored], x2[scored], self.inl_th, self.factor)
+        pool = self._search(scorer, scored, x1, x2, sampler, generator)
+        if len(pool.F_mat) == 0:
+            return failure
+        F = self._polish(scorer, pool, x1, x2) if self.refine else pool.F_mat[:1]
+        F_mat = F[0].to(kp1.dtype)
+        inliers = finite.clone()
+        inliers[finite] = self._inliers(x1, x2, F_mat[None].to(x1))[0]
+        return (F_mat, inliers) if int(inliers.sum()) > SAMPLE_SIZE else failure
+
+    def _search(
+        self, scorer: PairScorer, scored: Tensor, x1: Tensor, x2: Tensor, sampler: Sampler, generator: torch.Generator
+    ) -> Hypotheses:
+        """Return the best hypotheses that enough minimal samples of pixels (N, 2) give, best first."""
+        pool = Hypotheses(x1.new_zeros(0, 3, 3), x1.new_zeros(0), x1.new_zeros(0))
+        (batch, largest), drawn, needed, record = BATCHES, 0, self.max_iter, 0.0
+        start = time.perf_counter()
+        while drawn < needed and (self.max_seconds is None or time.perf_counter() - start < self.max_seconds):
+            rows = sampler.draw(min(batch, needed - drawn), generator)
+            drawn, batch = drawn + len(rows), min(2 * batch, largest)
+            rows = rows[scorer.determined(x1[rows], x2[rows])]
+            if len(rows) == 0:
+                continue
+            found = scorer.best(find_fundamental(x1[rows], x2[rows], None, self.normalizer, self.rank2), POOL)
+            if self.refine and len(found.F_mat):
+                found = found.join(self._optimize(scorer, found.F_mat[:OPTIMIZED]), POOL)
+            pool = pool.join(found, POOL)
+            if len(pool.F_mat) and float(pool.score[0]) > record:
+                record = float(pool.score[0])
+                inliers = self._inliers(scorer.points1, scorer.points2, pool.F_mat[:1])[0]
+                needed = min(self.max_iter, self._samples_needed(sampler.hit_rate(inliers, scored)))
+        return pool
+
+    def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
+        """Refit the first matrix to its inliers, refine all, and rate what comes out."""
+        points1, points2 = scorer.points1[None], scorer.points2[None]
+        inliers = self._inliers(scorer.points1, scorer.points2, F_mat[:1]).to(points1)
+        refit = find_fundamental(points1, points2, inliers, self.normalizer, self.rank2)
+        # Samples with noise or an outlier see too few of their inliers within the threshold itself.
+        loss = Truncated(2 * self.inl_th)
+        start = torch.cat([refit, F_mat])
+        refined = refine_fundamental(points1, points2, start, None, self.factor, loss, 5, TOLERANCE)
+        return scorer.best(torch.cat([refined.F_mat, refit]), POOL)
+
+    def _polish(self, scorer: PairScorer, pool: Hypotheses, x1: Tensor, x2: Tensor) -> Tensor:
+        """Return the refined matrix (1, 3, 3): of the pool on the scorer's points, then of the best one on all."""
+        points1, points2 = scorer.points1[None], scorer.points2[None]
+        loss: Loss = Truncated(self.inl_th)
+        refined = refine_fundamental(points1, points2, pool.F_mat, None, self.factor, loss, STEPS, TOLERANCE)
+        F_mat = pool.join(scorer.best(refined.F_mat, 1), 1).F_mat
+        inliers = self._inliers(x1, x2, F_mat).to(x1)
+        loss = Cauchy(self.inl_th / 3)  # the threshold is taken as three standard deviations of the noise
+        return refine_fundamental(x1[None], x2[None], F_mat, inliers, self.factor, loss, STEPS, TOLERANCE).F_mat
+
+    def _inliers(self, x1: Tensor, x2: Tensor, F_mat: Tensor) -> Tensor:
+        """Tell the inliers (1, N) of a matrix (1, 3, 3) among pixels (N, 2)."""
+        return epipolar_distance(x1[None], x2[None], F_mat, self.factor) <= self.inl_th
+
+    def _samples_needed(self, hit_rate: float) -> int:
+        """Return how many samples hold one without outliers with the confidence."""
+        if self.confidence == 1 or hit_rate == 0:
+            return self.max_iter
+        if hit_rate == 1:
+            return 0
+        return math.ceil(min(self.max_iter, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
+
+
+def _check(kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> None:
+    for name, points in (("kp1", kp1), ("kp2", kp2)):
+        if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"{name} must be a float32 or float64 tensor, got {getattr(points, 'dtype', type(points))}")
+        KORNIA_CHECK_SHAPE(points, ["N", "2"])
+    if kp1.dtype != kp2.dtype:
+        raise TypeError(f"kp1 and kp2 must have one dtype, got {kp1.dtype} and {kp2.dtype}")
+    if kp1.shape != kp2.shape:
+        raise ValueError(f"kp1 and kp2 must pair up, got shapes {[*kp1.shape]} and {[*kp2.shape]}")
+    if len(kp1) < SAMPLE_SIZE:
+        raise ValueError(f"at least {SAMPLE_SIZE} correspondences are needed, got {len(kp1)}")
+    if weights is None:
+        return
+    if not isinstance(weights, Tensor) or not weights.is_floating_point():
+        raise TypeError(f"weights must be a floating-point tensor, got {getattr(weights, 'dtype', type(weights))}")
+    if weights.shape != kp1.shape[:1]:
+        raise ValueError(f"weights must have shape {[*kp1.shape[:1]]}, got {[*weights.shape]}")
+    if not bool(weights.isfinite().all()) or bool((weights < 0).any()):
+        raise ValueError("weights must be finite and not negative")

@@ -1,0 +1,158 @@
+r"""Minimal samples of eight correspondences: uniform, by rank (PROSAC), and in proportion to weights."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+__all__ = ["ProsacSampler", "Sampler", "UniformSampler", "WeightedSampler", "draw_distinct"]
+
+SAMPLE_SIZE = 8
+BLOCK = 1 << 22  # random numbers in memory at once
+
+
+class Sampler(Protocol):
+    """What RANSAC asks of a way to sample."""
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return the indices of the next ``count`` minimal samples, (count, 8) int64."""
+
+    def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
+        """Return the probability that a sample holds no outlier.
+
+        Args:
+            inliers: which correspondences are inliers of the best matrix so far, (M,) boolean.
+            rows: which correspondences these are, (M,) int64.
+
+        """
+
+
+def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tensor:
+    r"""Draw sets of distinct indices, each set uniformly from its own range.
+
+    Floyd's algorithm, a column at a time: the :math:`k`-th draws from the first :math:`n - s + k + 1` indices and,
+    where it meets one that is there, takes the last of these instead.
+
+    Args:
+        totals: numbers :math:`n \ge s` of indices to draw from, (K,) int64.
+        size: indices in a set, :math:`s`.
+        generator: source of randomness, on the device of ``totals``.
+
+    Returns:
+        indices with shape :math:`(K, s)`.
+
+    Reference:
+        J. Bentley, R. Floyd, Programming pearls: a sample of brilliance, CACM 1987.
+
+    Example:
+        >>> draw_distinct(torch.tensor([3]), 3, torch.Generator().manual_seed(0)).sort(-1).values
+        tensor([[0, 1, 2]])
+
+    """
+    drawn = torch.empty(len(totals), size, dtype=torch.int64, device=totals.device)
+    uniform = torch.rand(len(totals), size, generator=generator, device=totals.device)
+    for k in range(size):
+        last = totals - size + k
+        index = (uniform[:, k] * (last + 1)).long().clamp(max=last)
+        met = (drawn[:, :k] == index[:, None]).any(-1)
+        drawn[:, k] = torch.where(met, last, index)
+    return drawn
+
+
+class UniformSampler:
+    """All correspondences alike.
+
+    Args:
+        total: number of correspondences, at least eight.
+        device: where indices are drawn.
+
+    """
+
+    def __init__(self, total: int, device: torch.device) -> None:
+        self.total = torch.tensor(total, device=device)
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return the indices of the next samples."""
+        return draw_distinct(self.total.expand(count), SAMPLE_SIZE, generator)
+
+    def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
+        """Return the share of inliers to the power of eight."""
+        return float(inliers.double().mean() ** SAMPLE_SIZE)
+
+
+class ProsacSampler:
+    r"""The correspondences of largest weight first, and from ever more.
+
+    The :math:`t`-th sample holds the :math:`n(t)`-th best correspondence and seven of the better ones, where
+    :math:`n(t)` grows as if 200,000 uniform samples were ordered by their worst member. Only the order of the weights
+    counts; those of zero are never drawn.
+
+    Args:
+        weights: scores, higher is better, (N,), at least eight of them positive.
+
+    Reference:
+        O. Chum, J. Matas, Matching with PROSAC, CVPR 2005, section 2.
+
+    """
+
+    GROWTH = 200_000
+    LEAST = 0.25  # share of the best that may stop the sampling: a cluster of few must not
+
+    def __init__(self, weights: Tensor) -> None:
+        self.weights = weights
+        order = weights.argsort(descending=True, stable=True)
+        self.order = order[weights[order] > 0]
+        total = len(self.order)
+        sizes = torch.arange(SAMPLE_SIZE, total + 1, dtype=torch.float64)
+        taken = torch.arange(SAMPLE_SIZE, dtype=torch.float64)
+        expected = self.GROWTH * ((sizes[:, None] - taken) / (total - taken)).prod(-1)
+        until = torch.cat([expected.new_ones(1), 1 + expected.diff().ceil().cumsum(-1)])
+        self.until, self.drawn = until.long().to(weights.device), 0  # samples among the best 8, 9, ...
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return the indices of the next samples; how many there were before counts."""
+        total, device = len(self.order), self.order.device
+        t = torch.arange(self.drawn + 1, self.drawn + count + 1, device=device)
+        self.drawn += count
+        grown = torch.searchsorted(self.until, t)
+        last = (grown + SAMPLE_SIZE - 1).clamp(max=total - 1)
+        ranked = torch.cat([draw_distinct(last, SAMPLE_SIZE - 1, generator), last[:, None]], -1)
+        uniform = draw_distinct(torch.full_like(last, total), SAMPLE_SIZE, generator)
+        return self.order[torch.where(grown[:, None] < len(self.until), ranked, uniform)]
+
+    def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
+        """Return the largest share of inliers among the best correspondences to the power of eight."""
+        ranked = inliers[self.weights[rows].argsort(descending=True, stable=True)].double()
+        shares = ranked.cumsum(-1) / torch.arange(1, len(ranked) + 1, device=ranked.device)
+        return float(shares[int(self.LEAST * len(shares)) :].max() ** SAMPLE_SIZE)
+
+
+class WeightedSampler:
+    """Correspondences in proportion to weights, without replacement; those of zero are never drawn.
+
+    Args:
+        weights: non-negative weights, (N,), at least eight of them positive.
+
+    Reference:
+        P. Efraimidis, P. Spirakis, Weighted random sampling with a reservoir, Information Processing Letters 2006.
+
+    """
+
+    def __init__(self, weights: Tensor) -> None:
+        self.weights = weights.float() / weights.max().float()
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return the indices of the next samples."""
+        blocks = torch.split(torch.arange(count), max(1, BLOCK // len(self.weights)))
+        return torch.cat([self._draw_block(len(block), generator) for block in blocks])
+
+    def _draw_block(self, count: int, generator: torch.Generator) -> Tensor:
+        uniform = torch.rand(count, len(self.weights), generator=generator, device=self.weights.device)
+        return (uniform.log() / self.weights).topk(SAMPLE_SIZE).indices
+
+    def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
+        """Return the share of the weights that inliers have to the power of eight."""
+        weights = self.weights[rows].double()
+        return float(((weights * inliers).sum() / weights.sum()) ** SAMPLE_SIZE)

@@ -1,0 +1,301 @@
+"""RANSAC against ground truth and Kornia's, and on the input that makes robust estimators hang."""
+
+from __future__ import annotations
+
+import copy
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from kornia.geometry import ransac as kornia_ransac
+from two_view import epipolar_distances, scenes, shaken, uniform, up_to_sign
+
+import kornia_learnnorm as kln
+from kornia_learnnorm import RANSAC
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.objectives import symmetric_factor
+from kornia_learnnorm.pair_metrics import f1_score
+from kornia_learnnorm.sampling import WeightedSampler
+
+NORMALIZERS = [None, kln.Whitening(), kln.ReweightedWhitening()]
+
+
+def pair(name: str = "handheld", num_points: int = 400, noise: float = 0.3, outliers: float = 0.4, seed: int = 0):
+    """Correspondences (N, 2) of one pair, its matrix, and which are no outliers."""
+    scene = scenes(name, 1, num_points, seed, noise=noise, outliers=outliers)
+    return scene.points1[0], scene.points2[0], scene.F_mat[0], scene.inliers[0]
+
+
+def failed(result) -> bool:
+    F_mat, inliers = result
+    return not bool(F_mat.any()) and not bool(inliers.any())
+
+
+class TestSmoke:
+    def test_shapes(self, device, dtype):
+        points1, points2, _, _ = pair(num_points=100)
+        F_mat, inliers = RANSAC(seed=0)(points1.to(device, dtype), points2.to(device, dtype))
+        assert (F_mat.shape, F_mat.dtype, F_mat.device.type) == ((3, 3), dtype, device.type)
+        assert (inliers.shape, inliers.dtype, inliers.device.type) == ((100,), torch.bool, device.type)
+        assert F_mat.norm().item() == pytest.approx(1)
+        assert torch.linalg.svdvals(F_mat.double())[2] < 1e-7
+
+    @pytest.mark.parametrize("normalizer", NORMALIZERS)
+    @pytest.mark.parametrize("rank2", [None, "optimal"])
+    def test_any_normalizer(self, normalizer, rank2):
+        points1, points2, F_true, _ = pair()
+        F_mat, _ = RANSAC(normalizer, rank2=rank2, seed=0)(points1, points2)
+        inlying = epipolar_distances(points1, points2, F_true.numpy()) < 1
+        assert np.median(epipolar_distances(points1, points2, F_mat.numpy())[inlying]) < 1
+
+    def test_learned(self):
+        points1, points2, _, true = pair(num_points=100)
+        _, inliers = RANSAC(shaken(), max_iter=200, seed=0)(points1, points2)
+        assert inliers[true].float().mean() > 0.7
+
+    def test_module(self):
+        ransac = RANSAC(shaken())
+        assert set(ransac.state_dict()) == {f"normalizer.{name}" for name in ransac.normalizer.state_dict()}
+        assert isinstance(copy.deepcopy(ransac).eval(), RANSAC)
+
+
+class TestExceptions:
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"inl_th": 0.0}, "inl_th .* got 0.0"),
+            ({"inl_th": float("nan")}, "inl_th"),
+            ({"max_iter": 0}, "max_iter must be >= 1, got 0"),
+            ({"max_seconds": 0.0}, "max_seconds"),
+            ({"confidence": 1.5}, r"confidence must lie in \(0, 1\], got 1.5"),
+            ({"confidence": 0.0}, "confidence"),
+        ],
+    )
+    def test_options(self, wrong, message):
+        with pytest.raises(ValueError, match=message):
+            RANSAC(**wrong)
+
+    def test_points(self):
+        points = uniform(20, 2)
+        with pytest.raises(TypeError, match=r"kp1 must be a float32 or float64 tensor, got torch.int64"):
+            RANSAC()(points.long(), points)
+        with pytest.raises(TypeError, match="one dtype"):
+            RANSAC()(points, points.float())
+        with pytest.raises(ShapeError):
+            RANSAC()(points[None], points[None])
+        with pytest.raises(ValueError, match=r"pair up, got shapes \[20, 2\] and \[19, 2\]"):
+            RANSAC()(points, points[1:])
+
+    @pytest.mark.parametrize("number", [0, 1, 7])
+    def test_too_few(self, number):
+        with pytest.raises(ValueError, match=f"at least 8 correspondences are needed, got {number}"):
+            RANSAC()(uniform(number, 2), uniform(number, 2))
+
+    def test_weights(self):
+        points = uniform(20, 2)
+        with pytest.raises(TypeError, match=r"weights must be a floating-point tensor, got torch.bool"):
+            RANSAC()(points, points, torch.ones(20, dtype=torch.bool))
+        with pytest.raises(ValueError, match=r"weights must have shape \[20\], got \[19\]"):
+            RANSAC()(points, points, torch.ones(19))
+        for bad in (-1.0, float("nan"), float("inf")):
+            with pytest.raises(ValueError, match="finite and not negative"):
+                RANSAC()(points, points, torch.full((20,), bad))
+
+
+class TestAccuracy:
+    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
+    @pytest.mark.parametrize("factor_th", [None, 2.0])
+    def test_finds_the_inliers(self, name, factor_th):
+        points1, points2, _, true = pair(name)
+        options = {} if factor_th is None else {"factor": symmetric_factor, "inl_th": factor_th}
+        _, inliers = RANSAC(seed=0, **options)(points1, points2)
+        assert inliers[true].float().mean() > 0.9
+        assert inliers[~true].float().mean() < 0.15  # outliers can lie on their lines
+
+    def test_exact_points(self):
+        points1, points2, F_true, _ = pair(noise=0.0, outliers=0.0)
+        F_mat, inliers = RANSAC(seed=0)(points1, points2)
+        assert up_to_sign(F_mat[None], F_true[None]) < 1e-8
+        assert inliers.all()
+
+    def test_refining_helps(self):
+        points1, points2, _, true = pair(noise=1.0)
+        truth = [points1[true], points2[true]]
+        errors = [
+            epipolar_distances(*truth, RANSAC(seed=0, inl_th=3.0, refine=refine)(points1, points2)[0]).mean()
+            for refine in (True, False)
+        ]
+        assert errors[0] < errors[1]
+
+    @pytest.mark.skipif("LEARNNORM_DATA" not in os.environ, reason="LEARNNORM_DATA is not set")
+    @pytest.mark.parametrize("name", ["kitti_06", "tum_fr3_office"])
+    def test_level_with_kornia(self, name):
+        store = read_store(Path(os.environ["LEARNNORM_DATA"]) / "correspondences" / f"{name}.h5")
+        ours, theirs = [], []
+        for i in range(2, 17, 2):
+            rows = slice(store.offsets[i], store.offsets[i + 1])
+            points = [torch.from_numpy(p[rows][store.ratio[rows] < 0.8]) for p in (store.points1, store.points2)]
+            F_true = torch.from_numpy(store.F[i])
+            for found, ransac in ((ours, RANSAC(seed=0)), (theirs, kornia_ransac.RANSAC("fundamental", 1.0, seed=0))):
+                F_mat = ransac(*points)[0].double()
+                x1, x2 = (x.double() for x in points)
+                found.append(f1_score(x1, x2, F_mat, F_true, 1.0).item())
+        assert np.nanmean(ours) > np.nanmean(theirs) - 0.01
+
+
+class TestSeeds:
+    def test_seeded_calls_repeat_exactly(self):
+        points1, points2, _, _ = pair()
+        ransac = RANSAC(seed=3)
+        first, second = ransac(points1, points2), ransac(points1, points2)
+        assert torch.equal(first[0], second[0])
+        assert torch.equal(first[1], second[1])
+
+    def test_seeded_calls_leave_the_global_generator(self):
+        points1, points2, _, _ = pair(num_points=50)
+        state = torch.get_rng_state()
+        RANSAC(seed=3)(points1, points2)
+        assert torch.equal(state, torch.get_rng_state())
+
+    def test_unseeded_calls_follow_the_global_generator(self):
+        points1, points2, _, _ = pair(noise=1.0, outliers=0.6)
+        ransac, found = RANSAC(refine=False, max_iter=20), []
+        for seed in (0, 0, 1):
+            torch.manual_seed(seed)
+            found.append(ransac(points1, points2)[0])
+        assert torch.equal(found[0], found[1])
+        assert not torch.equal(found[0], found[2])
+
+
+class TestBudget:
+    def count(self, monkeypatch, points, weights=None, **options) -> int:
+        drawn = []
+        solve = kln.ransac.find_fundamental
+
+        def counted(x1, *args):
+            drawn.append(len(x1) if x1.shape[1] == 8 else 0)
+            return solve(x1, *args)
+
+        monkeypatch.setattr(kln.ransac, "find_fundamental", counted)
+        RANSAC(seed=0, **options)(*points, weights)
+        return sum(drawn)
+
+    def test_stops_early(self, monkeypatch):
+        assert self.count(monkeypatch, pair(outliers=0.05)[:2]) <= 64
+
+    def test_confidence_of_one_draws_all(self, monkeypatch):
+        assert self.count(monkeypatch, pair(outliers=0.05)[:2], confidence=1.0, max_iter=3000) == 3000
+
+    def test_time(self):
+        points1, points2, _, _ = pair(num_points=1000, outliers=0.95)
+        start = time.perf_counter()
+        RANSAC(max_iter=10**9, max_seconds=0.2, seed=0)(points1, points2)
+        assert time.perf_counter() - start < 10
+
+    def test_good_weights_spare_samples(self, monkeypatch):
+        points1, points2, _, true = pair(outliers=0.7)
+        good = true + 0.5 * uniform(400)
+        plain = self.count(monkeypatch, (points1, points2))
+        assert self.count(monkeypatch, (points1, points2), good) < plain
+        monkeypatch.undo()
+        assert self.count(monkeypatch, (points1, points2), 0.01 + good, sampler=WeightedSampler) < plain
+
+
+class TestHardInput:
+    def test_eight(self):
+        points1, points2, _, _ = pair(num_points=8, outliers=0.0)
+        assert failed(RANSAC(seed=0)(points1, points2))
+
+    def test_many(self):
+        points1, points2, _, true = pair(num_points=100_000, outliers=0.3)
+        F_mat, inliers = RANSAC(seed=0)(points1.float(), points2.float())
+        assert inliers[true].float().mean() > 0.9
+        assert np.median(epipolar_distances(points1[true], points2[true], F_mat.double())) < 0.6
+
+    def test_all_outliers(self):
+        F_mat, inliers = RANSAC(seed=0, max_iter=2000)(uniform(300, 2, high=500), uniform(300, 2, high=500, seed=1))
+        assert F_mat.isfinite().all()
+        assert inliers.float().mean() < 0.3
+
+    @pytest.mark.parametrize("value", [0.0, 5.0, 1e6])
+    def test_all_identical(self, value):
+        points = torch.full((50, 2), value)
+        assert failed(RANSAC(seed=0, max_iter=2000)(points, points))
+
+    def test_no_motion(self):
+        points = uniform(200, 2, high=500)
+        F_mat, _ = RANSAC(seed=0, max_iter=2000)(points, points)
+        assert F_mat.isfinite().all()
+
+    def test_on_a_line(self):
+        along = torch.linspace(0, 300, 60, dtype=torch.float64)
+        points = torch.stack([along, 2 * along], -1)
+        assert failed(RANSAC(seed=0, max_iter=2000)(points, points + 3))
+
+    @pytest.mark.parametrize("planes", [1, 2])
+    def test_planes(self, planes):
+        """Two planes determine the matrix, one does not."""
+        scene = scenes("handheld", 1, 400, noise=0.0, outliers=0.0)
+        points1 = scene.points1[0]
+        K1, K2, R, t = scene.K1[0], scene.K2[0], scene.R[0], scene.t[0]
+        x2 = []
+        for k, points in enumerate(points1.chunk(planes)):
+            normal = torch.tensor([[0.1, 0.9, 0.3], [0.2, -0.1, 1.0]], dtype=torch.float64)[k] / (5 + 10 * k)
+            H = K2 @ (R + torch.outer(t, normal)) @ torch.linalg.inv(K1)
+            x = torch.cat([points, torch.ones(len(points), 1)], -1) @ H.mT
+            x2.append(x[:, :2] / x[:, 2:])
+        F_mat, inliers = RANSAC(seed=0)(points1, torch.cat(x2))
+        assert F_mat.isfinite().all()
+        if planes == 2:
+            assert inliers.all()
+
+    def test_rows_that_are_not_finite_are_as_if_absent(self):
+        points1, points2, _, _ = pair(num_points=200)
+        F_mat, inliers = RANSAC(seed=0)(points1, points2)
+        with_bad1 = torch.cat([points1, torch.full((3, 2), torch.nan), points1[:2]])
+        with_bad2 = torch.cat([points2, points2[:3], torch.full((2, 2), -torch.inf)])
+        again, more = RANSAC(seed=0)(with_bad1, with_bad2)
+        assert torch.equal(F_mat, again)
+        assert torch.equal(more, torch.cat([inliers, torch.zeros(5, dtype=torch.bool)]))
+
+    def test_too_few_finite_rows(self):
+        points = uniform(20, 2)
+        points[:13] = torch.nan
+        assert failed(RANSAC()(points, uniform(20, 2, seed=1)))
+
+    def test_too_few_weights(self):
+        weights = torch.zeros(20)
+        weights[:7] = 1
+        assert failed(RANSAC()(uniform(20, 2), uniform(20, 2, seed=1), weights))
+
+
+class TestInvariances:
+    @given(seed=st.integers(0, 20))
+    def test_swapping_the_views_transposes(self, seed):
+        points1, points2, _, _ = pair("driving", 100, seed=seed)
+        F_mat, inliers = RANSAC(seed=0)(points1, points2)
+        swapped, same = RANSAC(seed=0)(points2, points1)
+        assert (inliers == same).float().mean() > 0.98
+        errors = [epipolar_distances(points1[inliers], points2[inliers], F).mean() for F in (F_mat, swapped.mT)]
+        assert errors[0] == pytest.approx(errors[1], rel=0.05, abs=1e-3)
+
+    @given(scale=st.floats(0.1, 10), x=st.floats(-1e4, 1e4), y=st.floats(-1e4, 1e4))
+    def test_similarities_of_the_pixels(self, scale, x, y):
+        points1, points2, _, _ = pair("orbit", 100)
+        _, inliers = RANSAC(seed=0)(points1, points2)
+        moved = [scale * points + torch.tensor([x, y], dtype=torch.float64) for points in (points1, points2)]
+        _, same = RANSAC(inl_th=scale, seed=0)(*moved)
+        assert (inliers == same).float().mean() > 0.98
+
+    @given(order=st.permutations(range(100)))
+    def test_the_order_of_the_rows_does_not_count(self, order):
+        points1, points2, _, _ = pair("handheld", 100)
+        _, inliers = RANSAC(seed=0)(points1, points2)
+        _, same = RANSAC(seed=0)(points1[order], points2[order])
+        assert (inliers[order] == same).float().mean() > 0.95

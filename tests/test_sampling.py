@@ -1,0 +1,123 @@
+"""Minimal samples against counts, a sequential PROSAC and NumPy's draws without replacement."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import ceil, comb
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kornia_learnnorm.sampling import ProsacSampler, UniformSampler, WeightedSampler, draw_distinct
+
+GROWTH = ProsacSampler.GROWTH
+
+CPU = torch.device("cpu")
+
+
+class TestDrawDistinct:
+    @given(totals=st.lists(st.integers(8, 40), min_size=1, max_size=50), seed=st.integers(0, 2**32))
+    def test_distinct_and_in_range(self, totals, seed):
+        drawn = draw_distinct(torch.tensor(totals), 8, torch.Generator().manual_seed(seed))
+        assert drawn.shape == (len(totals), 8)
+        for row, total in zip(drawn.tolist(), totals, strict=True):
+            assert len(set(row)) == 8
+            assert 0 <= min(row) <= max(row) < total
+
+    def test_every_set_is_as_likely(self, generator):
+        drawn = draw_distinct(torch.full((20_000,), 6), 3, generator).sort(-1).values
+        counts = [int((drawn == torch.tensor(kind)).all(-1).sum()) for kind in combinations(range(6), 3)]
+        expected = 20_000 / comb(6, 3)
+        assert sum(counts) == 20_000
+        assert max(abs(count - expected) for count in counts) < 5 * expected**0.5
+
+    def test_all_of_few(self, generator):
+        drawn = UniformSampler(8, CPU).draw(10, generator)
+        assert (drawn.sort(-1).values == torch.arange(8)).all()
+
+
+def sequential_prosac(total: int, samples: int) -> list[tuple[int, bool]]:
+    """Size of the set of each sample, and whether its last member must be in, as in the paper's algorithm 1."""
+    n, average = 8, GROWTH * np.prod([(8 - i) / (total - i) for i in range(8)])
+    until, sizes = 1, []
+    for t in range(1, samples + 1):
+        while t > until and n < total:
+            following = average * (n + 1) / (n + 1 - 8)
+            until += ceil(following - average)
+            average, n = following, n + 1
+        sizes.append((n, t <= until))
+    return sizes
+
+
+class TestProsac:
+    @pytest.mark.parametrize("total", [8, 9, 30, 2000])
+    def test_grows_as_in_the_paper(self, total, generator):
+        weights = torch.rand(total, generator=generator)
+        draw = ProsacSampler(weights).draw
+        rows = torch.cat([draw(100, generator), draw(400, generator)])
+        rank = weights.argsort(descending=True).argsort()[rows]
+        for ranks, (size, last_in) in zip(rank.tolist(), sequential_prosac(total, 500), strict=True):
+            assert len(set(ranks)) == 8
+            assert max(ranks) == size - 1 if last_in else max(ranks) < size
+
+    def test_is_uniform_in_the_end(self, generator):
+        draw = ProsacSampler(torch.arange(1.0, 21.0)).draw
+        draw(GROWTH + 100, generator)
+        counts = torch.bincount(draw(20_000, generator).flatten(), minlength=20)
+        assert (counts - 8000).abs().max() < 5 * 8000**0.5
+
+    @given(scale=st.floats(1e-3, 100))
+    def test_only_the_order_of_the_weights_counts(self, scale):
+        weights = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        rows = [ProsacSampler(w).draw(64, torch.Generator().manual_seed(0)) for w in (weights, (scale * weights).exp())]
+        assert torch.equal(*rows)
+
+
+class TestWeighted:
+    def test_inclusion_as_numpy_draws(self, generator):
+        weights = torch.tensor([1.0, 2, 4, 8, 16, 1, 1, 1, 1, 1, 1, 1])
+        drawn = torch.bincount(WeightedSampler(weights).draw(20_000, generator).flatten(), minlength=12) / 20_000
+        rng, p = np.random.default_rng(0), (weights / weights.sum()).double().numpy()
+        reference = sum(np.bincount(rng.choice(12, 8, False, p), minlength=12) for _ in range(20_000)) / 20_000
+        assert np.abs(drawn.numpy() - reference).max() < 0.02
+
+    def test_in_blocks(self, monkeypatch, generator):
+        monkeypatch.setattr("kornia_learnnorm.sampling.BLOCK", 100)
+        rows = WeightedSampler(torch.ones(30)).draw(50, generator)
+        assert rows.shape == (50, 8)
+        assert all(len(set(row)) == 8 for row in rows.tolist())
+
+
+@pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
+def test_zero_is_never_drawn(sampler, generator):
+    weights = torch.zeros(100)
+    weights[10:20] = torch.linspace(0.1, 1, 10)
+    rows = sampler(weights).draw(2000, generator)
+    assert set(rows.flatten().tolist()) <= set(range(10, 20))
+    assert all(len(set(row)) == 8 for row in rows.tolist())
+
+
+class TestHitRate:
+    ROWS = torch.arange(100)
+
+    def test_uniform(self):
+        assert UniformSampler(100, CPU).hit_rate(self.ROWS < 50, self.ROWS) == 0.5**8
+
+    @pytest.mark.parametrize(("best", "share"), [(100, 1), (50, 1), (26, 1), (10, 10 / 26)])
+    def test_prosac_looks_at_the_best_but_not_at_few(self, best, share):
+        sampler = ProsacSampler(torch.linspace(1, 0.1, 100))
+        assert sampler.hit_rate(best > self.ROWS, self.ROWS) == pytest.approx(share**8)
+
+    def test_weighted(self):
+        weights = torch.where(self.ROWS < 10, 9.0, 1.0)
+        assert WeightedSampler(weights).hit_rate(self.ROWS < 10, self.ROWS) == pytest.approx(0.5**8)
+
+    @pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
+    def test_weights_of_the_rows_that_were_scored(self, sampler):
+        weights, some = torch.rand(100), torch.randperm(100)
+        inliers = weights > 0.5
+        drawn = sampler(weights)
+        assert drawn.hit_rate(inliers[some], some) == pytest.approx(drawn.hit_rate(inliers, self.ROWS))
