@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.metrics import bootstrap_interval
+from kornia_learnnorm.metrics import bootstrap_means, percentile_interval
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
 
 __all__ = ["PairedDifference", "epipolar_error", "f1_score", "inlier_share", "paired_bootstrap"]
@@ -220,17 +220,7 @@ def paired_bootstrap(
     bad = int((~difference.isfinite()).sum())
     if bad:
         raise ValueError(f"differences must be finite, got {bad} NaN or infinite ones of {len(difference)}")
-    low, high = bootstrap_interval(difference, groups, level, draws, seed)
-    means = _bootstrap_means(difference, groups, draws, seed)
+    means = bootstrap_means(difference, groups, draws, seed)
+    low, high = percentile_interval(means, level)
     fewest = min(int((means <= 0).sum()), int((means >= 0).sum()))
     return PairedDifference(difference.mean().item(), low, high, min(1.0, 2 * (1 + fewest) / (1 + draws)))
-
-
-def _bootstrap_means(values: Tensor, groups: Tensor, draws: int, seed: int) -> Tensor:
-    """Means of the same draws as :func:`~kornia_learnnorm.bootstrap_interval` takes."""
-    _, group = torch.unique(groups, return_inverse=True)
-    counts = torch.bincount(group).double()
-    sums = torch.zeros_like(counts).index_add_(0, group, values)
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.randint(len(counts), (draws, len(counts)), generator=generator).to(counts.device)
-    return sums[drawn].sum(1) / counts[drawn].sum(1)

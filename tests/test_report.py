@@ -12,13 +12,14 @@ import pytest
 import torch
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.samples import Samples
+from kornia_learnnorm.data.samples import plain_residual
 from kornia_learnnorm.data.store import read_store, write_store
 from kornia_learnnorm.data.synthesize import synthetic_store
-from kornia_learnnorm.evaluation import record
-from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation import evaluate, example, record
+from kornia_learnnorm.evaluation.methods import find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.motion import pair_motions
 from kornia_learnnorm.evaluation.report import write_report
+from kornia_learnnorm.evaluation.report_pair import draw_example
 from kornia_learnnorm.evaluation.report_tables import report_tables
 from kornia_learnnorm.evaluation.run import read_run
 from kornia_learnnorm.learned import WEIGHTS
@@ -40,7 +41,7 @@ def run(store, tmp_path_factory):
     """A run, not to be changed."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record, "TRIALS", 20)
+        patch.setattr(example, "TRIALS", 20)
         assert main(["evaluate", str(store), "--out", str(folder), "--methods", *METHODS]) == 0
     return folder
 
@@ -99,28 +100,13 @@ class TestMethods:
             short_names([path, path])
 
 
-def test_figures_agree_with_the_expectation_under_known_noise():
-    """Mean distance under the true F of points with noise s: s sqrt(2 / pi) sqrt(n1 + n2) (n1^-1/2 + n2^-1/2)."""
-    store = synthetic_store(pairs=40, points=64, seed=3, noise=0.5, outliers=0.0, scenes=["orbit"])
-    points1, points2 = (torch.from_numpy(p).reshape(40, 64, 2) for p in (store.points1, store.points2))
-    samples = Samples(points1, points2, points1[:, :1], points2[:, :1], torch.arange(40))
-    F_mat = torch.from_numpy(store.F)
-    found = record._predict(Method(kln.Hartley(), lambda x1, x2: F_mat), samples, store)
-    x1, x2 = (np.concatenate([p.double().numpy(), np.ones((40, 64, 1))], -1) for p in (points1, points2))
-    n2, n1 = (np.square(x @ f)[..., :2].sum(-1) for x, f in ((x1, store.F.swapaxes(1, 2)), (x2, store.F)))
-    expected = 0.5 * np.sqrt(2 / np.pi) * np.sqrt(n1 + n2) * (n1**-0.5 + n2**-0.5)
-    assert found["own"].mean() == pytest.approx(expected.mean(), rel=0.03)  # of 2,560 points
-    assert found["rotation_error"].max() < 1e-6
-    assert found["translation_error"].max() < 1e-4
-    assert found["distance1"] == pytest.approx(2**0.5)
-
-
 def test_predictions_are_those_of_the_functions(run, store):
     read, found = read_store(store), read_run(run)
     cell = found.cells[0]
     samples, drawn = record._draw(read, 0.8, 0, None), cell.drawn
     assert drawn == len(samples.pair)
     raw = np.load(run / "scenes" / "filtered" / "crossview.npz")
+    samples = samples.select(plain_residual(samples.points1, samples.points2) < 60)
     x1, x2 = samples.points1.double(), samples.points2.double()
     with torch.no_grad():
         F_mat = find_method("crossview").estimate(x1[:2048], x2[:2048])
@@ -131,11 +117,11 @@ def test_predictions_are_those_of_the_functions(run, store):
 
 def test_another_run_computes_nothing_and_adds_what_is_new(copied, store, monkeypatch):
     files = {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")}
-    monkeypatch.setattr(record, "_predict", None)
+    monkeypatch.setattr(record, "_predict", pytest.fail)
     assert main(["evaluate", str(store), "--out", str(copied), "--methods", *METHODS]) == 0
     assert {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")} == files
     monkeypatch.undo()
-    monkeypatch.setattr(record, "TRIALS", 20)
+    monkeypatch.setattr(example, "TRIALS", 20)
     assert main(["evaluate", str(store), "--out", str(copied), "--methods", "reweighted"]) == 0
     assert [*read_run(copied).about["methods"]] == [*METHODS, "reweighted"]
     assert len([*copied.rglob("*.npz")]) == len(files) + 3
@@ -153,9 +139,33 @@ def test_a_run_of_other_options_is_refused(copied, store, capsys):
     assert "crossview 0000" in capsys.readouterr().err
 
 
+def test_a_run_of_an_older_format_is_refused(copied, store, capsys):
+    about = json.loads((copied / "run.json").read_text())
+    for key in ("format", "trained_on"):
+        del about[key]
+    (copied / "run.json").write_text(json.dumps(about))
+    assert main(["evaluate", str(store), "--out", str(copied), "--methods", *METHODS]) == 2
+    assert "format None, now 2" in capsys.readouterr().err
+    assert main(["report", str(copied)]) == 2
+    assert "another version of the package made it" in capsys.readouterr().err
+
+
+def test_a_store_that_joins_later_changes_no_figure(copied, store, tmp_path, monkeypatch):
+    """Errors by the number of correspondences stay those of the pair that the run began with."""
+    monkeypatch.setattr(example, "TRIALS", 20)
+    write_store(tmp_path / "other.h5", synthetic_store(pairs=2, points=330, seed=2))
+    before = read_run(copied)
+    (copied / "sizes" / "Hartley.npz").unlink()
+    assert main(["evaluate", str(tmp_path / "other.h5"), "--out", str(copied), "--methods", *METHODS]) == 0
+    after = read_run(copied)
+    assert [*after.about["stores"]] == ["scenes", "other"]
+    assert str(after.example["store"]) == "scenes"
+    np.testing.assert_array_equal(after.sizes["Hartley"]["own"], before.sizes["Hartley"]["own"])
+
+
 def test_names_do_not_change_numbers(store, tmp_path, monkeypatch):
     """The same weights under exchanged names: the numbers go with the weights."""
-    monkeypatch.setattr(record, "TRIALS", 5)
+    monkeypatch.setattr(example, "TRIALS", 5)
     numbers = []
     for first, second in (("crossview", "paper"), ("paper", "crossview")):
         folder = tmp_path / first
@@ -171,6 +181,19 @@ def test_names_do_not_change_numbers(store, tmp_path, monkeypatch):
     assert numbers[0]["one"] != numbers[0]["two"]
 
 
+def test_order_does_not_change_numbers(run, store, tmp_path, monkeypatch):
+    monkeypatch.setattr(example, "TRIALS", 20)
+    assert main(["evaluate", str(store), "--out", str(tmp_path / "run"), "--methods", *METHODS[::-1]]) == 0
+    first, second = read_run(run), read_run(tmp_path / "run")
+    assert [*first.about["methods"]] == [*second.about["methods"]][::-1] == METHODS
+    for one, other in zip(report_tables(first), report_tables(second), strict=True):
+        assert (one.title, one.text, one.header) == (other.title, other.text, other.header)
+        assert sorted(one.rows) == sorted(other.rows)
+    for name in METHODS:
+        for key, values in first.sizes[name].items():
+            np.testing.assert_array_equal(values, second.sizes[name][key])
+
+
 class TestReport:
     def test_files(self, copied, capsys):
         assert main(["report", str(copied)]) == 0
@@ -178,7 +201,7 @@ class TestReport:
         text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
         for name in re.findall(r"\]\(([\w-]+\.svg)\)", text):
             ElementTree.parse(copied / name)
-        assert page.count("<svg") == text.count(".svg)") == 6
+        assert page.count("<svg") == text.count(".svg)") == 7
         assert not re.findall(r'(?:src|href)="(?!#)', page)  # nothing from elsewhere
         identifiers = re.findall(r'\bid="([^"]+)"', page)
         assert len(identifiers) == len(set(identifiers))
@@ -192,8 +215,9 @@ class TestReport:
         table = report_tables(found)[0]
         for row in table.rows:
             if row[0] in own and row[0] != "Hartley":
-                assert row[1].startswith(f"{100 * np.mean(own[row[0]] < own['Hartley']):.1f} [")
-        assert table.header[1] == f"scenes, filtered: {len(cell.pair)} of {cell.drawn}"
+                assert row[2].startswith(f"{100 * np.mean(own[row[0]] < own['Hartley']):.1f} [")
+        assert table.header[2] == f"scenes: {len(cell.pair)} of {cell.drawn}"
+        assert {row[0]: row[1] for row in table.rows}["crossview"] == "kitti_00, kitti_01, kitti_03"
         raw = np.load(run / "scenes" / "filtered" / "samples.npz")["plain_residual"]
         assert len(cell.pair) == (raw < 60).sum()
 
@@ -233,10 +257,22 @@ def test_methods_need_a_run(store, capsys):
     assert "give --out too" in capsys.readouterr().err
 
 
-def test_a_few_samples(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(record, "TRIALS", 5)
-    record.record_run(tmp_path / "run", {"scenes": str(store)}, ["Hartley"], max_samples=50)
-    assert [cell.drawn for cell in read_run(tmp_path / "run").cells] == [50, 50]
+@pytest.mark.parametrize(("options", "most"), [(["--max-samples", "50"], 50), ([], 60), (["--max-samples", "0"], None)])
+def test_a_few_samples(store, tmp_path, monkeypatch, options, most):
+    monkeypatch.setattr(example, "TRIALS", 5)
+    monkeypatch.setattr(evaluate, "MAX_SAMPLES", 60)
+    folder = tmp_path / "run"
+    assert main(["evaluate", str(store), "--out", str(folder), "--methods", "Hartley", *options]) == 0
+    assert json.loads((folder / "run.json").read_text())["max_samples"] == most
+    everything = [len(record._draw(read_store(store), ratio, 0, None).pair) for ratio in (0.8, None)]
+    assert [cell.drawn for cell in read_run(folder).cells] == ([most, most] if most else everything)
+
+
+def test_without_a_sample_of_the_pair_there_is_no_figure_of_it(copied):
+    found = read_run(copied)
+    assert [picture.name for picture in draw_example(found, dict.fromkeys(METHODS, "red"))] == ["figure-10"]
+    found.example["pair"] = np.array(99)
+    assert draw_example(found, {}) == []
 
 
 def test_motions_by_hand():

@@ -21,6 +21,8 @@ from kornia_learnnorm.search import SearchedNormalizer
 
 __all__ = ["add_arguments", "beside_closed_forms", "evaluate_store", "evaluation_samples", "run"]
 
+MAX_SAMPLES = 16000
+
 
 def evaluate_store(
     store: CorrespondenceStore, weights: list[str], max_ratio: float | None, max_residual: float = 60.0, seed: int = 0
@@ -117,7 +119,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="normalisers or weights, with +LM or +optimal or without; module:Name for your own"
         f" (default: {' '.join(DEFAULT_METHODS)})",
     )
-    run.add_argument("--max-samples", metavar="N", type=int, help="at most so many samples of each store and protocol")
+    run.add_argument(
+        "--max-samples",
+        metavar="N",
+        type=int,
+        help=f"at most so many samples of each store and protocol, at random (default: {MAX_SAMPLES}; 0: all)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -130,10 +137,11 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.out is not None:
         stores_by_name = dict(zip(names_of(args.stores), args.stores, strict=True))
-        record_run(args.out, stores_by_name, args.methods or list(DEFAULT_METHODS), args.seed, args.max_samples)
+        most = MAX_SAMPLES if args.max_samples is None else args.max_samples
+        record_run(args.out, stores_by_name, args.methods or list(DEFAULT_METHODS), args.seed, most or None)
         print(f"wrote {args.out}; learnnorm report {args.out} makes tables and figures of it")
         return 0
-    if args.methods or args.max_samples:
+    if args.methods or args.max_samples is not None:
         raise ValueError("--methods and --max-samples are for a run of predictions: give --out too")
     stores = {path: read_store(path) for path in args.stores}
     for name in args.weights:

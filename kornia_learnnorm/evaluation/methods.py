@@ -6,22 +6,19 @@ import importlib
 from collections.abc import Callable, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.learned import WEIGHTS, LearnedNormalizer
 from kornia_learnnorm.normalizers import Hartley, Identity, Whitening
-from kornia_learnnorm.optimal_rank2 import optimal_rank2
 from kornia_learnnorm.refine import refine_fundamental
 from kornia_learnnorm.reweighting import ReweightedWhitening
 from kornia_learnnorm.search import SearchedNormalizer
-from kornia_learnnorm.solver import design_matrix, find_fundamental, null_vector
-from kornia_learnnorm.transforms import transform_fundamental
+from kornia_learnnorm.solver import find_fundamental
 
-__all__ = ["DEFAULT_METHODS", "Method", "find_method", "identify_method", "short_names"]
+__all__ = ["DEFAULT_METHODS", "Method", "base_name", "find_method", "identify_method", "short_names"]
 
 CLOSED_FORMS: dict[str, Callable[[], Normalizer]] = {
     "none": Identity,
@@ -38,6 +35,7 @@ DEFAULT_METHODS = (
     "reweighted",
     "paper",
     "crossview",
+    "crossview-synthetic",
     "searched",
     "Hartley+optimal",
     "Hartley+LM",
@@ -50,11 +48,15 @@ class Method(NamedTuple):
 
     Attributes:
         normalizer: maps ``(points1, points2, weights)`` to two transforms.
-        estimate: maps points in pixels, (B, N, 2) float64 each, to fundamental matrices (B, 3, 3).
+        solve: maps points in pixels, (B, N, 2) float64 each, and a normaliser to fundamental matrices (B, 3, 3).
     """
 
     normalizer: Normalizer
-    estimate: Callable[[Tensor, Tensor], Tensor]
+    solve: Callable[[Tensor, Tensor, Normalizer], Tensor]
+
+    def estimate(self, points1: Tensor, points2: Tensor) -> Tensor:
+        """Return the fundamental matrices (B, 3, 3) of points in pixels, (B, N, 2) float64 each."""
+        return self.solve(points1, points2, self.normalizer)
 
 
 def find_method(name: str) -> Method:
@@ -71,13 +73,23 @@ def find_method(name: str) -> Method:
         FileNotFoundError: if there are no such weights.
 
     """
-    base = name.removesuffix(REFINED).removesuffix(OPTIMAL)
-    normalizer = _find_normalizer(base)
+    normalizer = _find_normalizer(base_name(name))
     if name.endswith(OPTIMAL):
-        return Method(normalizer, lambda x1, x2: optimal_rank2(_linear(x1, x2, normalizer), x1, x2))
+        return Method(normalizer, lambda x1, x2, n: _solve(x1, x2, n, "optimal"))
     if name.endswith(REFINED):
-        return Method(normalizer, lambda x1, x2: refine_fundamental(x1, x2, _solve(x1, x2, normalizer)).F_mat)
-    return Method(normalizer, lambda x1, x2: _solve(x1, x2, normalizer))
+        return Method(normalizer, lambda x1, x2, n: refine_fundamental(x1, x2, _solve(x1, x2, n)).F_mat)
+    return Method(normalizer, _solve)
+
+
+def base_name(name: str) -> str:
+    """Return a method's name without what follows the normalisation.
+
+    Example:
+        >>> base_name("Hartley+LM")
+        'Hartley'
+
+    """
+    return name.removesuffix(REFINED).removesuffix(OPTIMAL)
 
 
 def _find_normalizer(name: str) -> Normalizer:
@@ -96,21 +108,13 @@ def _find_normalizer(name: str) -> Normalizer:
     return made
 
 
-def _solve(x1: Tensor, x2: Tensor, normalizer: Normalizer) -> Tensor:
-    return find_fundamental(x1, x2, normalizer=normalizer)
-
-
-def _linear(x1: Tensor, x2: Tensor, normalizer: Normalizer) -> Tensor:
-    """Solution of the direct linear transformation before the rank-2 constraint, in pixels (B, 3, 3)."""
-    T1, T2 = normalizer(x1, x2, None)
-    one = torch.ones_like(x1[..., :1])
-    A = design_matrix(torch.cat([x1, one], -1) @ T1.mT, torch.cat([x2, one], -1) @ T2.mT)
-    return transform_fundamental(torch.unflatten(null_vector(A), -1, (3, 3)), T1, T2)
+def _solve(x1: Tensor, x2: Tensor, normalizer: Normalizer, rank2: Literal["optimal"] | None = None) -> Tensor:
+    return find_fundamental(x1, x2, normalizer=normalizer, rank2=rank2)
 
 
 def identify_method(name: str) -> str:
     """Return what a method's predictions depend on: its name, of weights with the digest of their file."""
-    base = name.removesuffix(REFINED).removesuffix(OPTIMAL)
+    base = base_name(name)
     if base in CLOSED_FORMS or ":" in base:
         return name
     path = Path(base) if Path(base).is_file() else WEIGHTS / f"{base}.safetensors"
@@ -126,7 +130,7 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     """
     short = {}
     for name in names:
-        base = name.removesuffix(REFINED).removesuffix(OPTIMAL)
+        base = base_name(name)
         path = Path(base)
         if path.suffix == ".safetensors":
             stem = path.resolve().parent.name if path.name == "weights.safetensors" else path.stem

@@ -8,8 +8,13 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from kornia_learnnorm.evaluation.report_figures import Picture, report_figures
-from kornia_learnnorm.evaluation.report_tables import Table, report_tables
+from kornia_learnnorm.evaluation.report_figures import report_figures
+from kornia_learnnorm.evaluation.report_hypotheses import hypothesis_figures, hypothesis_tables
+from kornia_learnnorm.evaluation.report_rates import Table
+from kornia_learnnorm.evaluation.report_robust import about_robust, robust_tables
+from kornia_learnnorm.evaluation.report_style import Picture
+from kornia_learnnorm.evaluation.report_tables import report_tables
+from kornia_learnnorm.evaluation.robust_run import read_robust
 from kornia_learnnorm.evaluation.run import Run, read_run
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import replacing
@@ -32,7 +37,7 @@ svg { width: 100%; height: auto; font-family: system-ui, sans-serif; }
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm report`` to a parser."""
-    parser.add_argument("folder", metavar="RUN", type=Path, help="what learnnorm evaluate --out wrote")
+    parser.add_argument("folder", metavar="RUN", type=Path, help="what learnnorm evaluate or robust --out wrote")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,7 +59,7 @@ def write_report(folder: str | Path) -> list[Table]:
     """Write ``report.md`` with its figures and a self-contained ``report.html`` into a run.
 
     Args:
-        folder: what ``learnnorm evaluate --out`` wrote.
+        folder: what ``learnnorm evaluate --out`` or ``learnnorm robust --out`` wrote, or both.
 
     Returns:
         the tables.
@@ -65,13 +70,24 @@ def write_report(folder: str | Path) -> list[Table]:
         ImportError: if Matplotlib is not installed.
 
     """
-    folder, found = Path(folder), read_run(folder)
-    tables, pictures = report_tables(found), report_figures(found)
+    folder, about = Path(folder), []
+    tables: list[Table] = []
+    pictures: list[Picture] = []
+    robust = read_robust(folder)
+    if robust is None or (folder / "run.json").is_file():
+        found = read_run(folder)
+        about.append(_about(found))
+        tables += report_tables(found)
+        pictures += report_figures(found)
+    if robust is not None:
+        about.append(about_robust(robust))
+        tables += [*robust_tables(robust), *hypothesis_tables(robust)]
+        pictures += hypothesis_figures(robust)
     for picture in pictures:
         # A file of its own has no page to take its colour from: one that shows on white and on black.
         _write(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", "#808890"))
-    _write(folder / "report.md", _markdown(found, tables, pictures))
-    _write(folder / "report.html", _html(found, tables, pictures))
+    _write(folder / "report.md", _markdown(about, tables, pictures))
+    _write(folder / "report.html", _html(about, tables, pictures))
     return tables
 
 
@@ -83,18 +99,23 @@ def _write(path: Path, text: str) -> None:
 def _about(run: Run) -> str:
     stores = "; ".join(f"`{name}`: {text}" for name, text in run.about["stores"].items())
     versions = ", ".join(f"{name} {version}" for name, version in run.about["versions"].items())
-    return f"Stores: {stores}. Methods: {', '.join(run.about['methods'])}. Seed {run.about['seed']}. {versions}."
+    most = run.about["max_samples"]
+    samples = "All samples" if most is None else f"At most {most} random samples"
+    return (
+        f"Stores: {stores}. Methods: {', '.join(run.about['methods'])}. {samples} of each store, with and without the "
+        f"ratio test, seed {run.about['seed']}. {versions}."
+    )
 
 
-def _markdown(run: Run, tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
-    parts = ["# Evaluation", _about(run)]
+def _markdown(about: Sequence[str], tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
+    parts = ["# Evaluation", *about]
     parts += [f"## {t.title}\n\n{t.text}\n\n{format_table(t.header, t.rows)}" for t in tables]
     parts += [f"## {p.title}\n\n{p.text}\n\n![{p.title}]({p.name}.svg)" for p in pictures]
     return "\n\n".join(parts) + "\n"
 
 
-def _html(run: Run, tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
-    body = [f"<h1>Evaluation</h1><p>{_inline(_about(run))}</p>"]
+def _html(about: Sequence[str], tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
+    body = ["<h1>Evaluation</h1>", *(f"<p>{_inline(text)}</p>" for text in about)]
     for table in tables:
         rows = "".join(_row("td", row) for row in table.rows)
         grid = f"<table><thead>{_row('th', table.header)}</thead><tbody>{rows}</tbody></table>"

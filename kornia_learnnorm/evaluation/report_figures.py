@@ -1,46 +1,17 @@
-"""The figures of a report, from the predictions of a run, drawn with Matplotlib (extra ``report``).
-
-Lines and letters have the colour of the text around them, so that the pictures fit light and dark pages.
-"""
+"""The figures of a report, from the predictions of a run."""
 
 from __future__ import annotations
 
-import io
-import re
-from typing import TYPE_CHECKING, Any, NamedTuple
-
 import numpy as np
 
-from kornia_learnnorm.evaluation.figures import import_matplotlib
+from kornia_learnnorm.evaluation.report_pair import draw_example
+from kornia_learnnorm.evaluation.report_style import COLORS, INK, Picture, make_figure, make_picture
 from kornia_learnnorm.evaluation.run import Cell, Run
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+__all__ = ["report_figures"]
 
-__all__ = ["Picture", "report_figures"]
-
-INK = "#010203"  # replaced by the page's colour
-# Legible on white and on black; after P. Tol's and Okabe and Ito's palettes for colour blindness.
-COLORS = ("#8b8b8b", "#e69f00", "#2b9fd9", "#18a57a", "#d55e00", "#cc79a7", "#7a6ff0", "#b8a400", "#c2443f", "#5f8f2f")
 FRAMES = 20
 CONSECUTIVE = 100
-
-
-class Picture(NamedTuple):
-    """A figure of a report.
-
-    Attributes:
-        name: file name without suffix.
-        title: heading.
-        text: what it shows.
-        svg: the picture.
-    """
-
-    name: str
-    title: str
-    text: str
-    svg: str
 
 
 def report_figures(run: Run) -> list[Picture]:
@@ -59,6 +30,7 @@ def report_figures(run: Run) -> list[Picture]:
         _per_frame(cell, colors),
         _distribution(cell, colors),
         _distances(cell, colors),
+        *draw_example(run, colors),
         *([_by_size(run, colors)] if run.sizes else []),
         _conditions(cell, colors),
         _rho(cell, colors),
@@ -67,7 +39,7 @@ def report_figures(run: Run) -> list[Picture]:
 
 def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
     chosen = _present(cell, "Hartley", "paper", "crossview", "Hartley+LM", "crossview+LM")
-    figure, (axes,) = _figure(1)
+    figure, (axes,) = make_figure(1, 1)
     pair = cell.pair.numpy()
     frames = np.unique(pair)[:FRAMES]
     for name in chosen:
@@ -81,38 +53,38 @@ def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
         f"Mean symmetric epipolar distance of the samples of each of the first {len(frames)} image pairs of "
         f"{cell.store}, with and without non-linear refinement."
     )
-    return _picture(figure, "figure-4a", "Error by frame (Figure 4a)", text)
+    return make_picture(figure, "figure-4a", "Error by frame (Figure 4a)", text)
 
 
 def _distribution(cell: Cell, colors: dict[str, str]) -> Picture:
-    figure, (axes,) = _figure(1)
+    figure, (axes,) = make_figure(1, 1)
     for name in _present(cell, "none", "Hartley", "whitening", "paper", "crossview", "searched", "Hartley+optimal"):
         own = np.sort(cell.predictions[name]["own"].numpy())
-        axes.plot(own, np.arange(1, len(own) + 1) / len(own), color=colors[name], label=name)
+        axes.plot(own, np.arange(1, len(own) + 1) / len(own), _line(name), color=colors[name], label=name)
     axes.set(xlabel="symmetric epipolar distance of a sample, px", ylabel="share of samples below", xscale="log")
     axes.set(xlim=(0.01, 60), ylim=(0, 1))
     text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}."
-    return _picture(figure, "figure-4b", "Distribution of errors (Figure 4b)", text)
+    return make_picture(figure, "figure-4b", "Distribution of errors (Figure 4b)", text)
 
 
 def _distances(cell: Cell, colors: dict[str, str]) -> Picture:
-    figure, views = _figure(2)
+    figure, views = make_figure(1, 2)
     bins = np.geomspace(0.7, 30, 60).tolist()
     for view, axes in enumerate(views, 1):
         for name in _present(cell, "paper", "crossview", "searched"):
             values = cell.predictions[name][f"distance{view}"].numpy()
             axes.hist(values, bins, histtype="step", color=colors[name], label=name, linewidth=1.5)
         axes.axvline(2**0.5, color=colors.get("Hartley", INK), label="Hartley")
-        axes.set(xscale="log", xlabel=f"mean distance from the origin, view {view}")
+        axes.set(xscale="log", xlabel=f"mean distance from the origin, view {view} (no unit)")
         axes.set_xticks([1, 2, 5, 10, 20], ["1", "2", "5", "10", "20"])
         axes.minorticks_off()
     views[0].set_ylabel("samples")
     text = f"Mean distances of the normalised points from the origin, {cell.title}. Hartley's is the square root of 2."
-    return _picture(figure, "figure-5", "Normalised distances (Figure 5)", text)
+    return make_picture(figure, "figure-5", "Normalised distances (Figure 5)", text)
 
 
 def _by_size(run: Run, colors: dict[str, str]) -> Picture:
-    figure, panels = _figure(2)
+    figure, panels = make_figure(1, 2)
     titles = {"own": "the sample's points", "truth": "ground-truth inliers"}
     for axes, (key, title) in zip(panels, titles.items(), strict=True):
         for name, sizes in run.sizes.items():
@@ -123,11 +95,11 @@ def _by_size(run: Run, colors: dict[str, str]) -> Picture:
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
         axes.minorticks_off()
     text = "Median of 1,000 random samples of a random image pair of the first store, by the number of correspondences."
-    return _picture(figure, "figure-11", "Number of correspondences (Figure 11)", text)
+    return make_picture(figure, "figure-11", "Number of correspondences (Figure 11)", text)
 
 
 def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
-    figure, (axes,) = _figure(1)
+    figure, (axes,) = make_figure(1, 1)
     names = _present(cell, "none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched")[::-1]
     for place, name in enumerate(names):
         low, middle, high = np.nanquantile(cell.predictions[name]["condition_number"].numpy(), [0.25, 0.5, 0.75])
@@ -135,62 +107,32 @@ def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
         axes.plot(middle, place, "o", color=colors[name], markersize=8)
         axes.annotate(f"{middle:.3g}", (middle, place), (0, 8), textcoords="offset points", ha="center", color=INK)
     axes.set_yticks(range(len(names)), names)
-    axes.set(xscale="log", xlabel="condition number of the design matrix: median and quartiles")
+    axes.set(xscale="log", xlabel="condition number of the design matrix (no unit): median and quartiles")
     axes.set_ylim(-0.6, len(names) - 0.2)
     text = f"Condition number of the design matrix by normalisation, {cell.title}."
-    return _picture(figure, "figure-12", "Condition numbers (Figure 12)", text, legend=False)
+    return make_picture(figure, "figure-12", "Condition numbers (Figure 12)", text, legend=False)
 
 
 def _rho(cell: Cell, colors: dict[str, str]) -> Picture:
-    figure, (axes,) = _figure(1)
+    figure, (axes,) = make_figure(1, 1)
     for name in _present(cell, "Hartley", "whitening", "paper", "crossview"):
         rho = cell.predictions[name]["rho"].numpy()
         means = [np.mean(rho[i : i + CONSECUTIVE]) for i in range(0, len(rho) - CONSECUTIVE + 1, CONSECUTIVE)]
-        axes.plot(np.arange(len(means)) * CONSECUTIVE, means, color=colors[name], label=name)
-    axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {CONSECUTIVE} samples")
+        axes.plot(np.arange(len(means)) * CONSECUTIVE, means, _line(name), color=colors[name], label=name)
+    axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {CONSECUTIVE} samples (no unit)")
     text = (
         f"Singularity ratio before the projection to rank 2, means of {CONSECUTIVE} successive samples, {cell.title}."
     )
-    return _picture(figure, "figure-13", "Singularity ratio (Figure 13)", text)
+    return make_picture(figure, "figure-13", "Singularity ratio (Figure 13)", text)
+
+
+def _line(name: str) -> str:
+    """Dashes for what was learned, which often lies on a closed form."""
+    return "--" if name in ("paper", "crossview") else "-"
 
 
 def _present(cell: Cell, *names: str) -> list[str]:
     """Methods of the run among ``names``; all that have none of these names, such as one's own weights, come too."""
-    known = {"none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched"}
+    known = {"none", "Hartley", "whitening", "reweighted", "paper", "crossview", "crossview-synthetic", "searched"}
     own = [name for name in cell.predictions if name.split("+")[0] not in known and "+" not in name]
     return [name for name in names if name in cell.predictions] + own
-
-
-def _figure(panels: int) -> tuple[Figure, list[Axes]]:
-    matplotlib = import_matplotlib()
-    style: dict[str, Any] = {
-        "svg.fonttype": "none",
-        "font.size": 10,
-        "font.family": "sans-serif",
-        "svg.hashsalt": "report",
-    }
-    matplotlib.rcParams.update(style)
-    figure = matplotlib.figure.Figure(figsize=(8.0, 3.8), layout="constrained", facecolor="none")
-    axes = [figure.add_subplot(1, panels, panel + 1, facecolor="none") for panel in range(panels)]
-    for one in axes:
-        one.grid(color=INK, alpha=0.15, linewidth=0.6)
-        one.tick_params(colors=INK)
-        one.xaxis.label.set_color(INK)
-        one.yaxis.label.set_color(INK)
-        one.spines[["top", "right"]].set_visible(False)
-        one.spines[["left", "bottom"]].set_color(INK)
-    return figure, axes
-
-
-def _picture(figure: Figure, name: str, title: str, text: str, legend: bool = True) -> Picture:
-    if legend:
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=5, frameon=False, labelcolor=INK)
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    svg = buffer.getvalue()
-    svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
-    # Several pictures share a page: their identifiers must differ.
-    svg = re.sub(r'id="([^"]+)"', rf'id="{name}-\1"', svg)
-    svg = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)
-    return Picture(name, title, text, svg)

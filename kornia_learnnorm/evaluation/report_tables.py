@@ -3,39 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.evaluation.consensus import THRESHOLDS
+from kornia_learnnorm.evaluation.report_rates import BASELINE, Table, mean_text, rate_tables, rate_text
 from kornia_learnnorm.evaluation.run import Cell, Run
-from kornia_learnnorm.metrics import better_rate, bootstrap_interval, comparable
 from kornia_learnnorm.pair_metrics import paired_bootstrap
 from kornia_learnnorm.pose_accuracy import mean_average_accuracy, pose_auc
 
-__all__ = ["Table", "report_tables"]
+__all__ = ["report_tables"]
 
-# Fan et al., Table 1, trained on KITTI: better than Hartley %, by what a store's name begins with.
-PRINTED = {"kitti": "86.68", "tum": "90.04"}
-BASELINE = "Hartley"
 FAILURES = 10
-
-
-class Table(NamedTuple):
-    """A table of a report.
-
-    Attributes:
-        title: heading.
-        text: what it shows and how to read it, Markdown.
-        header: names of the columns.
-        rows: cells as text.
-    """
-
-    title: str
-    text: str
-    header: list[str]
-    rows: list[list[str]]
 
 
 def report_tables(run: Run) -> list[Table]:
@@ -50,63 +31,15 @@ def report_tables(run: Run) -> list[Table]:
     """
     if BASELINE not in run.about["methods"]:
         raise ValueError(f"a report compares with {BASELINE}, the run has {', '.join(run.about['methods'])}")
-    tables = [_better_rates(run.cells, BASELINE)]
-    if "whitening" in run.about["methods"]:
-        tables.append(_better_rates(run.cells, "whitening"))
+    tables = rate_tables(run)
     for cell in run.cells:
-        tables.append(_accuracy(cell))
-    for cell in run.cells:
-        tables.append(_tests(cell))
+        tables += [_accuracy(cell), _consensus(cell), _tests(cell)]
     learned = next((name for name in ("crossview", "paper", "whitening") if name in run.about["methods"]), None)
     if learned:
         for cell in run.cells:
             if cell.protocol == "filtered":
                 tables += [_by_motion(cell, run, learned), _failures(cell, run, learned)]
     return tables
-
-
-def _better_rates(cells: list[Cell], baseline: str) -> Table:
-    header = ["method", *(f"{cell.title}: {len(cell.pair)} of {cell.drawn}" for cell in cells)]
-    rows = [
-        [name, *("-" if name == baseline else _rate(cell, name, baseline, "own") for cell in cells)]
-        for name in cells[0].predictions
-    ]
-    ties = sum(
-        better_rate(p["own"], cell.predictions[baseline]["own"]).ties for cell in cells for p in _others(cell, baseline)
-    )
-    lost = sum(
-        better_rate(p["own"], cell.predictions[baseline]["own"]).degenerate
-        for cell in cells
-        for p in _others(cell, baseline)
-    )
-    text = (
-        "Share of samples of eight correspondences with a smaller mean symmetric epipolar distance than under "
-        f"{baseline}, %, and 95 % bootstrap interval over image pairs. In the whole table {ties} ties count as not "
-        f"better and {lost} degenerate comparisons are left out. The header counts the samples below 60 px."
-    )
-    if baseline == BASELINE:
-        printed = [next((PRINTED[key] for key in PRINTED if cell.store.startswith(key)), "") for cell in cells]
-        printed = [value if cell.protocol == "filtered" else "" for value, cell in zip(printed, cells, strict=True)]
-        rows.append(["Fan et al., as printed (KITTI 06-10; TUM)", *printed])
-    return Table(f"Better than {baseline} (Table 1)", text, header, rows)
-
-
-def _others(cell: Cell, baseline: str) -> list[dict[str, Tensor]]:
-    return [prediction for name, prediction in cell.predictions.items() if name != baseline]
-
-
-def _rate(cell: Cell, name: str, baseline: str, quantity: str, rows: Tensor | None = None) -> str:
-    """A better rate with its interval."""
-    rows = torch.ones_like(cell.pair, dtype=torch.bool) if rows is None else rows
-    value, other = cell.predictions[name][quantity][rows], cell.predictions[baseline][quantity][rows]
-    valid = comparable(value, other)
-    if not bool(valid.any()):
-        return ""
-    rate, pair = f"{100 * better_rate(value, other).rate:.1f}", cell.pair[rows][valid]
-    if len(torch.unique(pair)) < 2:
-        return rate
-    low, high = bootstrap_interval((value < other)[valid].double(), pair)
-    return f"{rate} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def _accuracy(cell: Cell) -> Table:
@@ -132,7 +65,7 @@ def _accuracy(cell: Cell) -> Table:
         )
         angles = [_median(p[key], 2) for key in ("rotation_error", "translation_error")]
         inside = [f"{p[key].nanmedian().item():.4g}" for key in ("condition_number", "rho", "distance1", "distance2")]
-        truth = "-" if name == BASELINE else _rate(cell, name, BASELINE, "truth")
+        truth = "-" if name == BASELINE else rate_text(cell, name, BASELINE, "truth")
         rows.append([name, *numbers, truth, *angles, *pose, *inside])
     text = (
         "Medians over samples. `own` is fit: the mean symmetric epipolar distance of the sample's eight points. "
@@ -141,6 +74,30 @@ def _accuracy(cell: Cell) -> Table:
         "mAA(10), %. A pose that cannot be found counts as failed. `+LM` is refined on the eight points: the limit."
     )
     return Table(f"Fit and accuracy: {cell.title}", text, header, rows)
+
+
+def _consensus(cell: Cell) -> Table:
+    """Share of inliers and F1 of the matrices of samples."""
+    header = ["method", *(f"{name} @{threshold:g} px" for threshold in THRESHOLDS for name in ("inliers %", "F1 %"))]
+    known = next(iter(cell.predictions.values()))["f1"].isfinite()
+    rows = []
+    for name, prediction in cell.predictions.items():
+        cells = [
+            mean_text(prediction[key][keep, place], cell.pair[keep])
+            for place, keep in enumerate(known.T)
+            for key in ("inliers", "f1")
+        ]
+        rows.append([name, *cells])
+    kind = "that pass the ratio test" if cell.protocol == "filtered" else "with or without the ratio test"
+    dropped = " and ".join(f"{int((~keep).sum())} at {t:g} px" for t, keep in zip(THRESHOLDS, known.T, strict=True))
+    text = (
+        f"Of one sample's matrix over all matches of its pair {kind}: mean over samples, 95 % bootstrap interval over "
+        "image pairs. `inliers`: share of the matches with a symmetric epipolar distance below the threshold. `F1`: "
+        "harmonic mean of precision and recall of these against the ground truth's inliers at the same threshold. "
+        f"Samples of pairs without any of those are left out: {dropped}. There is no RANSAC here and no refinement on "
+        "inliers: these are not the figures of Fan et al., Tables 2 and 3."
+    )
+    return Table(f"Inliers and F1: {cell.title}", text, header, rows)
 
 
 def _posed(cell: Cell) -> Tensor:
@@ -197,7 +154,9 @@ def _by_motion(cell: Cell, run: Run, learned: str) -> Table:
         for text, chosen in ((f"up to {middle:.3g}", values <= middle), (f"above {middle:.3g}", values > middle)):
             inside = chosen[cell.pair]
             if bool(inside.any()):
-                rates = [_rate(cell, learned, BASELINE, quantity, inside) for quantity in ("own", "heldout", "truth")]
+                rates = [
+                    rate_text(cell, learned, BASELINE, quantity, inside) for quantity in ("own", "heldout", "truth")
+                ]
                 rows.append([name, text, str(int(chosen.sum())), str(int(inside.sum())), *rates])
     header = ["motion", "half", "pairs", "samples", "own: better %", "held out: better %", "truth: better %"]
     text = (

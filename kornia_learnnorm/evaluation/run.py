@@ -13,8 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["Cell", "Run", "read_run"]
+__all__ = ["Cell", "Run", "file_name", "read_arrays", "read_run", "within_limit"]
 
+FORMAT = 2  # of what a run keeps; others are refused
 MAX_RESIDUAL = 60.0  # pixels: samples whose un-normalised residual is not below are left out, as in Fan et al.
 
 
@@ -51,12 +52,14 @@ class Run:
         cells: stores and protocols.
         pairs: figures of each store's pairs, (P,) each.
         sizes: errors by the number of correspondences, by method.
+        example: the image pair that these errors are of, from :func:`~kornia_learnnorm.evaluation.example.random_pair`.
     """
 
     about: dict[str, Any]
     cells: list[Cell]
     pairs: dict[str, dict[str, NDArray[Any]]]
     sizes: dict[str, dict[str, NDArray[Any]]]
+    example: dict[str, NDArray[Any]]
 
 
 def read_run(folder: str | Path) -> Run:
@@ -67,36 +70,61 @@ def read_run(folder: str | Path) -> Run:
 
     Raises:
         FileNotFoundError: if it is no run, or not a complete one.
-        ValueError: if a file is damaged.
+        ValueError: if another version of the package made it, or a file is damaged.
 
     """
     folder = Path(folder)
     if not (folder / "run.json").is_file():
         raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
     about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    if about.get("format") != FORMAT:
+        raise ValueError(
+            f"{folder} is a run of format {about.get('format')}, expected {FORMAT}: another version of the package made"
+            " it, learnnorm evaluate STORE --out ELSEWHERE makes it anew"
+        )
     cells = [
         _read_cell(folder / store / protocol, store, protocol, about["methods"])
         for store in about["stores"]
         for protocol in ("filtered", "unfiltered")
     ]
-    pairs = {store: _read(folder / store / "pairs.npz") for store in about["stores"]}
+    pairs = {store: read_arrays(folder / store / "pairs.npz") for store in about["stores"]}
     sizes = {name: folder / "sizes" / f"{file_name(name)}.npz" for name in about["methods"]}
-    return Run(about, cells, pairs, {name: _read(path) for name, path in sizes.items() if path.is_file()})
+    by_size = {name: read_arrays(path) for name, path in sizes.items() if path.is_file()}
+    return Run(about, cells, pairs, by_size, read_arrays(folder / "example.npz"))
 
 
 def _read_cell(folder: Path, store: str, protocol: str, methods: list[str]) -> Cell:
-    samples = _read(folder / "samples.npz")
-    kept = torch.from_numpy(samples["plain_residual"] < MAX_RESIDUAL)
-    if not bool(kept.any()):
-        raise ValueError(f"{folder}: none of {len(kept)} samples has an un-normalised residual below {MAX_RESIDUAL} px")
+    kept = within_limit(folder)
+    pair = torch.from_numpy(read_arrays(folder / "samples.npz")["pair"])[kept]
     predictions = {
-        name: {key: torch.from_numpy(value)[kept] for key, value in _read(folder / f"{file_name(name)}.npz").items()}
+        name: {key: torch.from_numpy(value) for key, value in read_arrays(folder / f"{file_name(name)}.npz").items()}
         for name in methods
     }
-    return Cell(store, protocol, torch.from_numpy(samples["pair"])[kept], len(kept), predictions)
+    return Cell(store, protocol, pair, len(kept), predictions)
 
 
-def _read(path: Path) -> dict[str, NDArray[Any]]:
+def within_limit(folder: Path) -> Tensor:
+    """Return which of a store's and protocol's samples, (S,), the un-normalised residual keeps.
+
+    Raises:
+        FileNotFoundError: if there are no samples.
+        ValueError: if none is kept or the file is damaged.
+
+    """
+    kept = torch.from_numpy(read_arrays(folder / "samples.npz")["plain_residual"] < MAX_RESIDUAL)
+    if not bool(kept.any()):
+        raise ValueError(f"{folder}: none of {len(kept)} samples has an un-normalised residual below {MAX_RESIDUAL} px")
+    return kept
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return what a file of a run holds.
+
+    Raises:
+        FileNotFoundError: if it is not there.
+        ValueError: if it is damaged.
+
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is not there: the run is not complete, learnnorm evaluate goes on with it")
     try:

@@ -1,0 +1,58 @@
+"""How many of a pair's correspondences agree with the matrix of each of its samples."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.residuals import symmetric_epipolar_distance
+
+__all__ = ["THRESHOLDS", "consensus"]
+
+THRESHOLDS = (0.1, 1.0)  # pixels
+
+
+def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
+    """Measure share of inliers and F1 of many matrices, each over all correspondences of its image pair.
+
+    What :func:`~kornia_learnnorm.pair_metrics.inlier_share` and :func:`~kornia_learnnorm.pair_metrics.f1_score` say of
+    one matrix, with the distances computed once for both and for all of :data:`THRESHOLDS`.
+
+    Args:
+        F_mat: estimated matrices with shape (S, 3, 3), float64.
+        pair: image pair of each with shape (S,), int64.
+        store: the correspondences and the true matrices.
+        max_ratio: only correspondences with Lowe's ratio below this count; None for all.
+
+    Returns:
+        ``inliers`` and ``f1`` with shape (S, thresholds); F1 is NaN where the ground truth has no inliers.
+
+    """
+    inliers = F_mat.new_full((len(F_mat), len(THRESHOLDS)), torch.nan)
+    f1 = inliers.clone()
+    for index in torch.unique(pair).tolist():
+        rows = torch.nonzero(pair == index).flatten()
+        points1, points2 = _matches(store, index, max_ratio)
+        true = _within(points1[None], points2[None], torch.from_numpy(store.F[index : index + 1]))
+        number = len(rows), -1, -1
+        found = _within(points1.expand(*number), points2.expand(*number), F_mat[rows])
+        both, either = (found & true).sum(-1), found.sum(-1) + true.sum(-1)
+        inliers[rows] = found.double().mean(-1)
+        f1[rows] = torch.where(true.any(-1), (2 * both).double() / either, torch.nan)
+    return {"inliers": inliers, "f1": f1}
+
+
+def _matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
+    rows = slice(int(store.offsets[pair]), int(store.offsets[pair + 1]))
+    points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
+    if max_ratio is None:
+        return points1, points2
+    passes = torch.from_numpy(store.ratio[rows]) < max_ratio
+    return points1[passes], points2[passes]
+
+
+def _within(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+    """Which points lie within each threshold, (S, thresholds, N); none do under a matrix of NaN."""
+    distance = symmetric_epipolar_distance(points1, points2, F_mat).nan_to_num(nan=torch.inf)
+    return distance[:, None] < distance.new_tensor(THRESHOLDS)[:, None]

@@ -1,0 +1,118 @@
+"""The figure of an image pair: its inliers and outliers, and epipolar lines of one of its samples."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kornia_learnnorm.evaluation.figures import INLIER, OUTLIER, clip_lines, import_matplotlib
+from kornia_learnnorm.evaluation.report_style import INK, Picture, make_figure, make_picture
+from kornia_learnnorm.evaluation.run import Run
+from kornia_learnnorm.residuals import symmetric_epipolar_distance
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["draw_example"]
+
+THRESHOLD = 1.0  # pixels, of an inlier
+LINES = 5
+METHODS = ("Hartley", "crossview")
+TRUTH = "ground truth"
+
+
+def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
+    """Draw the image pair that a run keeps, without the images, which no store has.
+
+    Args:
+        run: predictions.
+        colors: colours by method.
+
+    Returns:
+        the picture; nothing where the run has no sample of the pair.
+
+    Raises:
+        ImportError: if Matplotlib is not installed.
+
+    """
+    pair = run.example
+    cell = next(cell for cell in run.cells if (cell.store, cell.protocol) == (str(pair["store"]), "filtered"))
+    methods = [name for name in METHODS if name in cell.predictions]
+    rows = torch.nonzero(cell.pair == int(pair["pair"])).flatten()
+    if len(rows) == 0:
+        return []
+    errors = {name: cell.predictions[name]["truth"] for name in methods}
+    middle = rows[errors[methods[0]][rows].argsort()[(len(rows) - 1) // 2]]
+    wide = float((pair["size"][:, 0] / pair["size"][:, 1]).min()) > 1.8
+    figure, (first, second) = make_figure(2, 1, 6.2) if wide else make_figure(1, 2)
+    near = _inliers(pair)
+    _draw_matches(first, pair, near)
+    matrices = {name: cell.predictions[name]["F_mat"][middle].numpy() for name in methods} | {TRUTH: pair["F"]}
+    _draw_lines(second, pair, near, matrices, {TRUTH: INK, **colors})
+    medians = ", ".join(f"{errors[name][middle].item():.2f} px under {name}" for name in methods)
+    text = (
+        f"{' and '.join(pair['names'])} of {cell.store}, a random pair. View 1: the {len(near)} matches that pass the "
+        f"ratio test; {int(near.sum())} are inliers, within {THRESHOLD:g} px of the ground truth (symmetric epipolar "
+        f"distance). View 2: some of these, and their epipolar lines under the ground truth and under matrices of one "
+        f"sample of eight, that of the pair's median error for {methods[0]}: median distance of ground-truth inliers "
+        f"{medians}."
+    )
+    return [make_picture(figure, "figure-10", "Inliers, outliers and epipolar lines (Figure 10)", text)]
+
+
+def _inliers(pair: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    points1, points2, F_mat = (torch.from_numpy(pair[key]) for key in ("points1", "points2", "F"))
+    near: NDArray[np.bool_] = (symmetric_epipolar_distance(points1, points2, F_mat) < THRESHOLD).numpy()
+    return near
+
+
+def _draw_matches(axes: Axes, pair: dict[str, NDArray[Any]], near: NDArray[np.bool_]) -> None:
+    """Draw inliers with their motion and outliers in the first view."""
+    start, end = pair["points1"], pair["points2"]
+    lines = import_matplotlib().collections.LineCollection(
+        np.stack([start, end], 1)[near], colors=INLIER, linewidths=0.7, alpha=0.8
+    )
+    axes.add_collection(lines)
+    axes.plot(*start[near].T, "o", color=INLIER, markersize=2, label="inliers and their motion")
+    axes.plot(*start[~near].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8, label="outliers")
+    _frame(axes, pair["size"][0], "view 1")
+
+
+def _draw_lines(
+    axes: Axes,
+    pair: dict[str, NDArray[Any]],
+    near: NDArray[np.bool_],
+    matrices: dict[str, NDArray[Any]],
+    colors: dict[str, str],
+) -> None:
+    """Draw the epipolar lines of some inliers, and the inliers, in the second view."""
+    chosen = np.flatnonzero(near)[_spread(pair["points2"][near])]
+    points = np.pad(pair["points1"][chosen], ((0, 0), (0, 1)), constant_values=1.0)
+    for order, (name, F_mat) in enumerate(matrices.items()):
+        segments, meets = clip_lines(points @ F_mat.T, *pair["size"][1].tolist())
+        # Thinner and thinner, so that lines which coincide show each other.
+        line, width = "--" if name == TRUTH else "-", 3.2 / (1 + order)
+        for place, segment in enumerate(segments[meets]):
+            axes.plot(*segment.T, line, color=colors[name], linewidth=width, label=name if place == 0 else None)
+    axes.plot(*pair["points2"][chosen].T, "o", color=INLIER, markersize=5, markeredgecolor=INK)
+    _frame(axes, pair["size"][1], "view 2")
+
+
+def _spread(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Choose points far from each other: from the first one on, each the farthest from those before."""
+    chosen = [0]
+    distance = np.full(len(points), np.inf)
+    while len(chosen) < min(LINES, len(points)):
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        chosen.append(int(distance.argmax()))
+    return np.array(chosen)
+
+
+def _frame(axes: Axes, size: NDArray[np.int32], name: str) -> None:
+    """Give axes the extent of an image, y down."""
+    width, height = size.tolist()
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel=f"x in {name}, px")
+    axes.set_ylabel("y, px")

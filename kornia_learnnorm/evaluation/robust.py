@@ -1,0 +1,229 @@
+"""Robust estimators, and the hypotheses of minimal solvers, on stores: ``learnnorm robust STORE ... --out RUN``.
+
+What is there already is not computed again, and a run of other options is refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.consensus import THRESHOLDS
+from kornia_learnnorm.evaluation.hypotheses import hypothesis_quality, samples_of
+from kornia_learnnorm.evaluation.record import PROTOCOLS
+from kornia_learnnorm.evaluation.robust_estimators import (
+    DEFAULT_ESTIMATORS,
+    DEFAULT_SOLVERS,
+    Estimator,
+    Solver,
+    estimator_names,
+    find_estimator,
+    find_solver,
+    identify_estimator,
+    is_slow,
+    run_estimator,
+)
+from kornia_learnnorm.evaluation.robust_matches import Matches, draw_matches, even_pairs, measure
+from kornia_learnnorm.evaluation.robust_peers import PEERS
+from kornia_learnnorm.evaluation.robust_run import begin_run, estimate_path, hypotheses_path
+from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.files import replacing
+
+__all__ = ["add_arguments", "record_robust", "run"]
+
+PAIRS = 48
+HYPOTHESES = 12  # image pairs
+SEEDS, SLOW_SEEDS = 5, 1
+
+Draw = Callable[..., Matches]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``learnnorm robust`` to a parser."""
+    parser.add_argument(
+        "stores", metavar="STORE", nargs="+", help="stores of correspondences (.h5); FILE.h5@3:10 for some pairs"
+    )
+    parser.add_argument("--out", metavar="RUN", type=Path, required=True, help="folder to write to")
+    parser.add_argument(
+        "--estimators",
+        metavar="NAME",
+        nargs="*",
+        default=list(DEFAULT_ESTIMATORS),
+        help="robust estimators; count:METHOD, time:METHOD and RANSAC:METHOD for your own (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--solvers",
+        metavar="NAME",
+        nargs="*",
+        default=list(DEFAULT_SOLVERS),
+        help="minimal solvers whose hypotheses are measured (default: %(default)s)",
+    )
+    counts = {
+        "--pairs": (PAIRS, "evenly spaced image pairs of each store; 0: all"),
+        "--hypotheses": (HYPOTHESES, "evenly spaced image pairs of each store for the minimal solvers; 0: all"),
+        "--seeds": (SEEDS, "runs on each pair"),
+        "--slow-seeds": (SLOW_SEEDS, "runs of those that can take a second: all but opencv-*, count:* and time:*"),
+        "--seed": (0, "the first seed"),
+    }
+    for name, (default, text) in counts.items():
+        parser.add_argument(name, metavar="N", type=int, default=default, help=f"{text} (default: %(default)s)")
+    parser.add_argument(
+        "--redo", metavar="NAME", nargs="+", default=[], help="estimators or solvers to run again, after a change"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run ``learnnorm robust``.
+
+    Raises:
+        FileNotFoundError: if a store or weights are missing.
+        ValueError: if an option, a store or weights are wrong, or the folder holds a run of other options.
+
+    """
+    stores = dict(zip(names_of(args.stores), args.stores, strict=True))
+    options = {name: getattr(args, name) for name in ("pairs", "hypotheses", "seeds", "slow_seeds", "seed")}
+    record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo)
+    print(f"wrote {args.out}; learnnorm report {args.out} makes tables and figures of it")
+    return 0
+
+
+def record_robust(
+    folder: str | Path,
+    stores: Mapping[str, str],
+    estimators: Sequence[str] = DEFAULT_ESTIMATORS,
+    solvers: Sequence[str] = (),
+    options: Mapping[str, int] | None = None,
+    redo: Sequence[str] = (),
+) -> None:
+    """Compute what is not there yet of a run, with a progress bar.
+
+    An estimator whose package is not installed is left out, and the run says so.
+
+    Args:
+        folder: the run, made if missing.
+        stores: paths of the stores by the names that tables give them.
+        estimators: names for :func:`~kornia_learnnorm.evaluation.robust_estimators.find_estimator`.
+        solvers: names for :func:`~kornia_learnnorm.evaluation.robust_estimators.find_solver`.
+        options: of ``pairs``, ``hypotheses``, ``seeds``, ``slow_seeds`` and ``seed`` those that differ from the
+            command's.
+        redo: estimators or solvers whose figures are computed again.
+
+    Raises:
+        ValueError: if the folder holds a run of other options, or an option, a store or an estimator is wrong.
+        OSError: if a file is missing or cannot be written.
+
+    """
+    folder, options = Path(folder), _checked(options or {})
+    if unknown := {*redo} - {*estimators, *solvers}:
+        raise ValueError(f"--redo {' '.join(sorted(unknown))}: not among the estimators and solvers of this command")
+    names, solver_names = estimator_names(estimators), estimator_names(solvers)
+    found = {name: _find(name) for name in estimators}
+    read = {name: read_store(path) for name, path in stores.items()}
+    about: dict[str, Any] = {
+        "stores": {name: f"{s.dataset}, {len(s)} pairs, {s.offsets[-1]} matches" for name, s in read.items()},
+        "estimators": {names[name]: found[name] and identify_estimator(name) for name in estimators},
+        "solvers": {solver_names[name]: identify_estimator(name) for name in solvers},
+        **options,
+        "threads": torch.get_num_threads(),
+        "versions": {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")},
+    }
+    begin_run(folder, about, [(names | solver_names)[name] for name in redo])
+    present = {names[name]: estimator for name, estimator in found.items() if estimator is not None}
+    _record(folder, read, present, {solver_names[name]: find_solver(name) for name in solvers}, options)
+
+
+def _checked(options: Mapping[str, int]) -> dict[str, int]:
+    """Return all options, with the command's defaults."""
+    result = {"pairs": PAIRS, "hypotheses": HYPOTHESES, "seeds": SEEDS, "slow_seeds": SLOW_SEEDS, "seed": 0, **options}
+    for name, least in {"pairs": 0, "hypotheses": 0, "seeds": 1, "slow_seeds": 1, "seed": 0}.items():
+        if result[name] < least:
+            raise ValueError(f"{name.replace('_', '-')} must be {least} or more, got {result[name]}")
+    return result
+
+
+def _find(name: str) -> Estimator | None:
+    """Return an estimator; nothing for one of a package that is not installed."""
+    try:
+        return find_estimator(name)
+    except ImportError:
+        if name in PEERS:
+            return None
+        raise
+
+
+def _record(
+    folder: Path,
+    stores: Mapping[str, CorrespondenceStore],
+    estimators: Mapping[str, Estimator],
+    solvers: Mapping[str, Solver],
+    options: Mapping[str, int],
+) -> None:
+    """Compute what is not there yet; a step of the bar is a run on an image pair, or a solver on one."""
+    seeds = {name: min(options["seeds"], options["slow_seeds"] if is_slow(name) else 10**9) for name in estimators}
+    chosen = {name: even_pairs(len(store), options["pairs"] or None) for name, store in stores.items()}
+    few = {name: even_pairs(len(store), options["hypotheses"] or None) for name, store in stores.items()}
+    steps = sum(len(chosen[name]) * sum(seeds.values()) + len(few[name]) * len(solvers) for name in stores)
+    with tqdm(total=steps * len(PROTOCOLS), unit="run", disable=None) as bar:
+        for (name, store), protocol in product(stores.items(), PROTOCOLS):
+            draw = partial(draw_matches, store, protocol=protocol, seed=options["seed"])
+            for label, estimator in estimators.items():
+                bar.set_postfix_str(f"{name}, {protocol}, {label}")
+                paths = {t: estimate_path(folder, name, protocol, t, label) for t in THRESHOLDS}
+                todo = {t: path for t, path in paths.items() if not path.is_file()}
+                _record_estimates(todo, estimator, draw, chosen[name], range(seeds[label]), bar)
+            for label, solver in solvers.items():
+                bar.set_postfix_str(f"{name}, {protocol}, hypotheses of {label}")
+                path = hypotheses_path(folder, name, protocol, label)
+                _record_hypotheses(path, solver, samples_of(label), draw, few[name], options["seed"], bar)
+
+
+def _record_estimates(
+    paths: Mapping[float, Path], estimator: Estimator, draw: Draw, pairs: Sequence[int], seeds: range, bar: tqdm
+) -> None:
+    """Run an estimator on every pair with every seed, and write its figures of each threshold."""
+    shape = len(pairs), len(seeds)
+    figures: dict[float, dict[str, NDArray[Any]]] = {threshold: {} for threshold in paths}
+    for (i, pair), seed in product(enumerate(pairs), seeds if paths else ()):
+        matches = draw(pair=pair, order=seed)
+        for threshold, estimate in zip(paths, run_estimator(estimator, matches, seed, [*paths]), strict=True):
+            row = {"seconds": estimate.seconds, "samples": estimate.samples}
+            for key, value in (row | measure(matches, estimate.F_mat, threshold)).items():
+                figures[threshold].setdefault(key, np.full(shape, np.nan))[i, seed] = value
+            figures[threshold].setdefault("F_mat", np.full((*shape, 3, 3), np.nan))[i, seed] = estimate.F_mat.numpy()
+        bar.update()
+    bar.update(0 if paths else len(pairs) * len(seeds))
+    for threshold, path in paths.items():
+        _write(path, {"pair": np.array(pairs), **figures[threshold]})
+
+
+def _record_hypotheses(
+    path: Path, solver: Solver, number: int, draw: Draw, pairs: Sequence[int], seed: int, bar: tqdm
+) -> None:
+    """Measure a minimal solver's hypotheses of every pair."""
+    if path.is_file():
+        bar.update(len(pairs))
+        return
+    errors, scores = [], []
+    for pair in pairs:
+        error, score = hypothesis_quality(solver, draw(pair=pair), number, seed)
+        errors.append(error.float().numpy())
+        scores.append(score.float().numpy())
+        bar.update()
+    _write(path, {"pair": np.array(pairs), "error": np.stack(errors), "score": np.stack(scores)})
+
+
+def _write(path: Path, arrays: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as beside:
+        np.savez_compressed(beside, **arrays)

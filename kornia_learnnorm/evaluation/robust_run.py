@@ -1,0 +1,164 @@
+"""A run of robust estimation on disk: what it is of, its files, and reading it.
+
+``robust.json`` says what it is of. Figures of an estimator are in ``robust/STORE/PROTOCOL/THRESHOLD/ESTIMATOR.npz``,
+those of a minimal solver in ``hypotheses/STORE/PROTOCOL/SOLVER.npz``. The folder may also hold a run of ``learnnorm
+evaluate``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.evaluation.consensus import THRESHOLDS
+from kornia_learnnorm.evaluation.run import file_name, read_arrays
+from kornia_learnnorm.files import replacing
+
+__all__ = ["RobustCell", "RobustRun", "begin_run", "estimate_path", "hypotheses_path", "read_robust"]
+
+FORMAT = 1
+JOINED = ("stores", "estimators", "solvers")
+Figures = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class RobustCell:
+    """The figures of one store and protocol.
+
+    Attributes:
+        store: name of the store.
+        protocol: ``filtered`` or ``unfiltered``.
+        estimates: figures (pairs, seeds) by estimator, then by threshold.
+        hypotheses: ``error`` and ``score`` of minimal samples, (pairs, samples), by solver.
+    """
+
+    store: str
+    protocol: str
+    estimates: dict[str, dict[float, Figures]]
+    hypotheses: dict[str, Figures]
+
+    @property
+    def title(self) -> str:
+        """Store and protocol."""
+        return f"{self.store}, {self.protocol}"
+
+
+@dataclass(frozen=True)
+class RobustRun:
+    """Everything that a report shows of robust estimation.
+
+    Attributes:
+        about: what the run is of, from ``robust.json``.
+        cells: stores and protocols.
+    """
+
+    about: dict[str, Any]
+    cells: list[RobustCell]
+
+
+def estimate_path(folder: Path, store: str, protocol: str, threshold: float, name: str) -> Path:
+    """Return the file of an estimator's figures."""
+    return folder / "robust" / store / protocol / f"{threshold:g}px" / f"{file_name(name)}.npz"
+
+
+def hypotheses_path(folder: Path, store: str, protocol: str, name: str) -> Path:
+    """Return the file of a minimal solver's figures."""
+    return folder / "hypotheses" / store / protocol / f"{file_name(name)}.npz"
+
+
+def begin_run(folder: Path, about: dict[str, Any], redo: Sequence[str] = ()) -> None:
+    """Write what the run is of, or refuse a folder of another run; stores, estimators and solvers may join one.
+
+    Args:
+        folder: the run, made if missing.
+        about: options, and by the names of :data:`JOINED` what each store, estimator and solver is; an estimator that
+            is ``None`` is not installed.
+        redo: estimators and solvers whose files are removed.
+
+    Raises:
+        ValueError: if the folder holds a run of other options.
+
+    """
+    path, about = folder / "robust.json", {"format": FORMAT, **about}
+    if path.is_file():
+        had = json.loads(path.read_text(encoding="utf-8"))
+        differ = [
+            f"{key} {had.get(key)!r}, now {now!r}"
+            for key, now in about.items()
+            if key not in JOINED and had.get(key) != now
+        ]
+        for key in JOINED:
+            about[key], changed = _join(had.get(key, {}), about[key], redo)
+            differ += changed
+        if differ:
+            raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in redo:
+        for old in [
+            *folder.glob(f"robust/*/*/*/{file_name(name)}.npz"),
+            *folder.glob(f"hypotheses/*/*/{file_name(name)}.npz"),
+        ]:
+            old.unlink()
+    with replacing(path) as beside:
+        beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
+
+
+def _join(
+    old: dict[str, str | None], new: dict[str, str | None], redo: Sequence[str]
+) -> tuple[dict[str, str | None], list[str]]:
+    """Return what was there and what is new, and what has changed; what is not installed now stays as it was."""
+    new = {name: value for name, value in new.items() if value is not None or name not in old}
+    changed = [
+        f"{name} {old[name]!r}, now {value!r}"
+        for name, value in new.items()
+        if name not in redo and old.get(name) not in (None, value)
+    ]
+    return {**old, **new}, changed
+
+
+def read_robust(folder: str | Path) -> RobustRun | None:
+    """Read a run of robust estimation.
+
+    Args:
+        folder: what ``learnnorm robust --out`` wrote.
+
+    Returns:
+        the run; nothing where the folder has none.
+
+    Raises:
+        FileNotFoundError: if it is not complete.
+        ValueError: if another version of the package made it, or a file is damaged.
+
+    """
+    folder = Path(folder)
+    if not (folder / "robust.json").is_file():
+        return None
+    about = json.loads((folder / "robust.json").read_text(encoding="utf-8"))
+    if about.get("format") != FORMAT:
+        raise ValueError(f"{folder}: robust.json is of format {about.get('format')}, expected {FORMAT}")
+    cells = [
+        _read_cell(folder, about, store, protocol)
+        for store in about["stores"]
+        for protocol in ("filtered", "unfiltered")
+    ]
+    return RobustRun(about, cells)
+
+
+def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str) -> RobustCell:
+    estimates = {
+        name: {t: _figures(estimate_path(folder, store, protocol, t, name)) for t in THRESHOLDS}
+        for name, identity in about["estimators"].items()
+        if identity is not None
+    }
+    hypotheses = {name: _figures(hypotheses_path(folder, store, protocol, name)) for name in about["solvers"]}
+    return RobustCell(store, protocol, estimates, hypotheses)
+
+
+def _figures(path: Path) -> Figures:
+    return {key: torch.from_numpy(value).double() for key, value in read_arrays(path).items()}
