@@ -6,7 +6,13 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-__all__ = ["check_correspondences", "solve_dtype", "weighted_mean"]
+__all__ = [
+    "check_correspondences",
+    "check_mask",
+    "is_true",
+    "solve_dtype",
+    "weighted_mean",
+]
 
 
 def solve_dtype(device: torch.device) -> torch.dtype:
@@ -33,23 +39,53 @@ def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | No
         raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
     if points1.shape != points2.shape:
         raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
+    devices = {str(tensor.device) for tensor in (points1, points2, weights) if isinstance(tensor, Tensor)}
+    if len(devices) > 1:
+        raise ValueError(f"points and weights must be on one device, got {' and '.join(sorted(devices))}")
     if points1.shape[1] < 8:
         raise ValueError(f"at least 8 correspondences are needed, got {points1.shape[1]}")
     finite = [points1, points2]
     if weights is not None:
         if not isinstance(weights, Tensor) or not weights.is_floating_point():
-            raise TypeError(f"weights must be a floating-point tensor, got {getattr(weights, 'dtype', type(weights))}")
+            got = weights.dtype if isinstance(weights, Tensor) else type(weights)
+            hint = "; a boolean tensor is a mask" if got == torch.bool else ""
+            raise TypeError(f"weights must be a floating-point tensor, got {got}{hint}")
         if weights.shape != points1.shape[:2]:
             raise ValueError(f"weights must have shape {[*points1.shape[:2]]}, got {[*weights.shape]}")
         finite.append(weights)
-    if torch.compiler.is_compiling():
-        return
     for name, values in zip(("points1", "points2", "weights"), finite, strict=False):
-        bad = int((~torch.isfinite(values)).sum())
-        if bad:
+        if is_true(~values.isfinite().all()):
+            bad = int((~values.isfinite()).sum())
             raise ValueError(f"{name} must be finite, got {bad} NaN or infinite values")
-    if weights is not None and bool((weights < 0).any()):
+    if weights is not None and is_true((weights < 0).any()):
         raise ValueError(f"weights must not be negative, got a minimum of {weights.min().item():g}")
+
+
+def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> None:
+    """Raise a clear error for a mask that does not fit correspondences ``(B, N, 2)`` and weights ``(B, N)``.
+
+    Raises:
+        TypeError: if the mask is not boolean.
+        ValueError: if its shape is not ``(B, N)``, or the weights' is not.
+
+    """
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
+        raise TypeError(f"mask must be a boolean tensor, got {getattr(mask, 'dtype', type(mask))}")
+    shapes = {"points1": points1.shape[:-1], "points2": points2.shape[:-1]}
+    shapes |= {} if weights is None else {"weights": weights.shape}
+    for name, shape in shapes.items():
+        if shape != mask.shape:
+            raise ValueError(f"mask must have shape {[*shape]} as {name}, got {[*mask.shape]}")
+
+
+def is_true(condition: Tensor) -> bool:
+    """Value of a boolean scalar; false where none can be looked at: in ``torch.compile`` and ``torch.func.vmap``."""
+    if torch.compiler.is_compiling():
+        return False
+    try:
+        return bool(condition)
+    except RuntimeError:
+        return False
 
 
 def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:

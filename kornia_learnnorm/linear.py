@@ -10,7 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import normalize
 
-__all__ = ["design_matrix", "null_vector", "rank2_projection", "smallest_right_singular_vector"]
+__all__ = ["design_matrix", "has_null_vector", "null_vector", "rank2_projection", "smallest_right_singular_vector"]
 
 
 def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
@@ -72,6 +72,36 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
     h = torch.linalg.solve_ex(bordered, eye[:, 8].expand(*A.shape[:-2], 9).unsqueeze(-1))[0].squeeze(-1)
     h = torch.where(determined[..., None], h, h0)
     return normalize(h, dim=-1)
+
+
+def has_null_vector(A: Tensor, weights: Tensor | None = None, tolerance: float = 1e-6) -> Tensor:
+    r"""Tell the design matrices that determine their null vector, up to its sign.
+
+    With eight rows, the distance of each from the span of those before it must exceed a share of the largest such
+    distance; with more, the eighth singular value of :math:`\sqrt w A` must exceed that share of the first. Derivatives
+    of the null vector grow as the inverse of what is compared.
+
+    Args:
+        A: design matrices in normalised coordinates with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
+        weights: optional non-negative weights with shape :math:`(*, N)`.
+        tolerance: the share.
+
+    Returns:
+        booleans with shape :math:`(*)`.
+
+    Example:
+        >>> has_null_vector(torch.stack([torch.eye(9)[:8], torch.ones(8, 9)]))
+        tensor([ True, False])
+
+    """
+    if A.shape[-2] == 8:
+        A = A if weights is None else A * (weights > 0).to(A)[..., None]
+        values = torch.linalg.qr(A.mT, mode="r")[1].diagonal(dim1=-2, dim2=-1).abs()
+    else:
+        A = A if weights is None else A * weights.sqrt()[..., None]
+        values = torch.linalg.svdvals(A)[..., :8]
+    determined: Tensor = values.amin(-1) > tolerance * values.amax(-1)
+    return determined
 
 
 def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -13,7 +13,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
+from kornia_learnnorm.correspondences import check_correspondences, is_true, solve_dtype
 from kornia_learnnorm.linear import design_matrix, rank2_projection
 from kornia_learnnorm.normalizers import Hartley
 from kornia_learnnorm.reweighting import adjugate, line_norms
@@ -103,12 +103,11 @@ def check_fundamental(F_mat: Tensor, points: Tensor) -> None:
     KORNIA_CHECK_SHAPE(F_mat, ["B", "3", "3"])
     if len(F_mat) != len(points):
         raise ValueError(f"one matrix per set of points is needed, got {len(F_mat)} matrices and {len(points)} sets")
-    if torch.compiler.is_compiling():
-        return
-    if bad := int((~torch.isfinite(F_mat)).sum()):
-        raise ValueError(f"F_mat must be finite, got {bad} NaN or infinite values")
-    if zero := int((F_mat == 0).all(-1).all(-1).sum()):
-        raise ValueError(f"F_mat must not be zero, got {zero} zero matrices")
+    if is_true(~F_mat.isfinite().all()):
+        raise ValueError(f"F_mat must be finite, got {int((~F_mat.isfinite()).sum())} NaN or infinite values")
+    zero = (F_mat == 0).all(-1).all(-1)
+    if is_true(zero.any()):
+        raise ValueError(f"F_mat must not be zero, got {int(zero.sum())} zero matrices")
 
 
 def _covariance(u: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor) -> Tensor:

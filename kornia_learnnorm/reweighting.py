@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.correspondences import solve_dtype, weighted_mean
-from kornia_learnnorm.linear import design_matrix, null_vector, smallest_right_singular_vector
+from kornia_learnnorm.linear import design_matrix, has_null_vector, null_vector, smallest_right_singular_vector
 from kornia_learnnorm.normalizers import Hartley, Whitening
 from kornia_learnnorm.transforms import transform_fundamental
 
@@ -157,7 +157,8 @@ def line_norms(
 def _distance_factor(x1: Tensor, x2: Tensor, F_mat: Tensor, weights: Tensor | None) -> Tensor:
     """Factor from the algebraic residual to the symmetric epipolar distance, ``(*, N)``, with unit mean."""
     first, second = line_norms(x1, x2, F_mat, weights)
-    return _unit_mean(1 / first + 1 / second)
+    factor = 1 / first + 1 / second
+    return factor / _positive(weighted_mean(factor[..., None], weights))
 
 
 def _hold_undetermined(x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -169,9 +170,7 @@ def _hold_undetermined(x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[
     if not (torch.is_grad_enabled() and (x1.requires_grad or x2.requires_grad)):
         return x1, x2, weights
     with torch.no_grad():
-        A = design_matrix(x1, x2)
-        s = torch.linalg.svdvals(A if weights is None else A * weights.sqrt()[..., None])
-        held = s[:, 7:8] <= 1e-6 * s[:, :1]
+        held = ~has_null_vector(design_matrix(x1, x2), weights)[:, None]
     x1, x2 = (torch.where(held[..., None], x.detach(), x) for x in (x1, x2))
     return x1, x2, None if weights is None else torch.where(held, weights.detach(), weights)
 

@@ -13,7 +13,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
+from kornia_learnnorm.correspondences import check_correspondences, is_true, solve_dtype
 from kornia_learnnorm.linear import design_matrix, null_vector, rank2_projection
 from kornia_learnnorm.normalizers import Hartley
 from kornia_learnnorm.optimal_rank2 import optimal_rank2
@@ -105,6 +105,6 @@ def normalizing_transforms(normalizer: Normalizer, x1: Tensor, x2: Tensor, w: Te
     if shapes != [expected, expected]:
         raise ValueError(f"a normalizer must return two transforms of shape {expected}, got {shapes}")
     T1, T2 = result
-    if not torch.compiler.is_compiling() and not bool(torch.isfinite(T1).all() & torch.isfinite(T2).all()):
+    if is_true(~(T1.isfinite().all() & T2.isfinite().all())):
         raise ValueError(f"the transforms of {type(normalizer).__name__} are not finite")
     return T1, T2

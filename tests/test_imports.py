@@ -19,6 +19,7 @@ CORE = [
     "learned",
     "linear",
     "losses",
+    "matches",
     "metrics",
     "networks",
     "normalizers",

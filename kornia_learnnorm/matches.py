@@ -1,0 +1,116 @@
+r"""Correspondences from the output of matching networks: matches by index, one padded batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+__all__ = ["Correspondences", "correspondences_from_matches"]
+
+
+class Correspondences(NamedTuple):
+    """Padded correspondences of a batch of image pairs.
+
+    Attributes:
+        points1: pixels in the first images, (B, N, 2).
+        points2: pixels in the second images, (B, N, 2).
+        weights: scores of the matches, zero in padded rows, (B, N), or None.
+        mask: false in padded rows, (B, N) bool.
+    """
+
+    points1: Tensor
+    points2: Tensor
+    weights: Tensor | None
+    mask: Tensor
+
+
+def correspondences_from_matches(
+    keypoints1: Tensor,
+    keypoints2: Tensor,
+    matches: Tensor | Sequence[Tensor],
+    scores: Tensor | Sequence[Tensor] | None = None,
+) -> Correspondences:
+    r"""Gather the matched keypoints of a batch, padded to one length of at least eight.
+
+    Args:
+        keypoints1: pixels in the first images with shape :math:`(B, M_1, 2)`.
+        keypoints2: pixels in the second images with shape :math:`(B, M_2, 2)`.
+        matches: a list of B tensors :math:`(S_i, 2)` of index pairs, as of Kornia's LightGlue; or one tensor
+            :math:`(B, M_1)` that holds for each keypoint of view 1 the index of its match, -1 for none, as of SuperGlue
+            and Transformers (``matches[:, 0]``).
+        scores: optional, non-negative: a list of B tensors :math:`(S_i,)`, or one tensor :math:`(B, M_1)`.
+
+    Returns:
+        the correspondences; gradients reach keypoints and scores.
+
+    Raises:
+        TypeError: if the matches are not integers.
+        ShapeError: if the keypoints do not have the shape above.
+        ValueError: if the matches do not fit the keypoints, or the scores not the matches.
+
+    Example:
+        >>> keypoints = torch.rand(1, 20, 2)
+        >>> matches = [torch.tensor([[0, 3], [5, 1]])]
+        >>> correspondences_from_matches(keypoints, keypoints, matches).mask
+        tensor([[ True,  True, False, False, False, False, False, False]])
+
+    """
+    for keypoints in (keypoints1, keypoints2):
+        KORNIA_CHECK_SHAPE(keypoints, ["B", "M", "2"])
+    if isinstance(matches, Tensor):
+        matches, scores = _pairs_of_matches(keypoints1, matches, scores)
+    if not len(matches) == len(keypoints1) == len(keypoints2):
+        raise ValueError(
+            f"matches of every pair are needed, got {len(matches)} for {len(keypoints1)} and {len(keypoints2)} pairs"
+        )
+    for k, pairs in enumerate(matches):
+        _check_pairs(k, pairs, keypoints1.shape[1], keypoints2.shape[1], None if scores is None else scores[k])
+    length = max(8, *(len(pairs) for pairs in matches)) if len(matches) else 8
+    index = pad_sequence([*matches, keypoints1.new_zeros(length, 2, dtype=torch.int64)], batch_first=True)[:-1].long()
+    present = torch.tensor([len(pairs) for pairs in matches], device=index.device)
+    mask = torch.arange(length, device=index.device) < present[:, None]
+    points1, points2 = (
+        keypoints.gather(1, index[..., k : k + 1].expand(-1, -1, 2))
+        for k, keypoints in enumerate((keypoints1, keypoints2))
+    )
+    if scores is None:
+        return Correspondences(points1, points2, None, mask)
+    padding = (
+        torch.zeros(length, dtype=scores[0].dtype, device=index.device) if len(scores) else keypoints1.new_zeros(8)
+    )
+    weights = pad_sequence([*scores, padding], batch_first=True)[:-1]
+    return Correspondences(points1, points2, weights, mask)
+
+
+def _pairs_of_matches(
+    keypoints1: Tensor, matches: Tensor, scores: Tensor | Sequence[Tensor] | None
+) -> tuple[list[Tensor], list[Tensor] | None]:
+    """Turn matches by keypoint, (B, M1), into pairs of indices."""
+    if matches.shape != keypoints1.shape[:2]:
+        raise ValueError(f"matches must have shape {[*keypoints1.shape[:2]]} or be a list, got {[*matches.shape]}")
+    if scores is not None and (not isinstance(scores, Tensor) or scores.shape != matches.shape):
+        raise ValueError(f"scores must have the shape of the matches, {[*matches.shape]}, got {_shape(scores)}")
+    rows = [torch.nonzero(row >= 0)[:, 0] for row in matches]
+    pairs = [torch.stack([own, row[own]], -1) for own, row in zip(rows, matches, strict=True)]
+    return pairs, None if scores is None else [row[own] for own, row in zip(rows, scores, strict=True)]
+
+
+def _check_pairs(k: int, pairs: Tensor, number1: int, number2: int, scores: Tensor | None) -> None:
+    if pairs.is_floating_point() or pairs.dtype == torch.bool:
+        raise TypeError(f"matches must be integers, got {pairs.dtype}")
+    if pairs.ndim != 2 or pairs.shape[1] != 2:
+        raise ValueError(f"matches of pair {k} must have shape [S, 2], got {[*pairs.shape]}")
+    limit = torch.tensor([number1, number2], device=pairs.device)
+    if bool(((pairs < 0) | (pairs >= limit)).any()):
+        raise ValueError(f"matches of pair {k} must be indices of {number1} and {number2} keypoints, got others")
+    if scores is not None and scores.shape != pairs.shape[:1]:
+        raise ValueError(f"scores of pair {k} must have shape {[len(pairs)]}, got {[*scores.shape]}")
+
+
+def _shape(value: object) -> object:
+    return [*value.shape] if isinstance(value, Tensor) else type(value)

@@ -1,0 +1,89 @@
+"""Correspondences from matches by index, in the formats of matching networks."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from two_view import uniform
+
+from kornia_learnnorm.matches import correspondences_from_matches
+
+KEYPOINTS = uniform(2, 30, 2, high=600), uniform(2, 25, 2, high=600, seed=1)
+
+
+def test_lists_of_pairs():
+    matches = [torch.tensor([[3, 4], [29, 0], [3, 24]]), torch.stack([torch.arange(12), torch.arange(12) + 10], -1)]
+    scores = [torch.rand(3), torch.rand(12)]
+    points1, points2, weights, mask = correspondences_from_matches(*KEYPOINTS, matches, scores)
+    assert points1.shape == points2.shape == (2, 12, 2)
+    assert mask.sum(-1).tolist() == [3, 12]
+    for k in range(2):
+        assert torch.equal(points1[k][mask[k]], KEYPOINTS[0][k][matches[k][:, 0]])
+        assert torch.equal(points2[k][mask[k]], KEYPOINTS[1][k][matches[k][:, 1]])
+        assert torch.equal(weights[k][mask[k]], scores[k])
+    assert not weights[~mask].any()
+
+
+@given(st.lists(st.integers(-1, 24), min_size=60, max_size=60))
+def test_by_keypoint_is_the_same_as_pairs(index):
+    matches = torch.tensor(index).view(2, 30)
+    scores = uniform(2, 30)
+    pairs = [torch.stack([torch.nonzero(row >= 0)[:, 0], row[row >= 0]], -1) for row in matches]
+    picked = [score[row >= 0] for score, row in zip(scores, matches, strict=True)]
+    for got, expected in zip(
+        correspondences_from_matches(*KEYPOINTS, matches, scores),
+        correspondences_from_matches(*KEYPOINTS, pairs, picked),
+        strict=True,
+    ):
+        assert torch.equal(got, expected)
+
+
+def test_at_least_eight_rows():
+    nothing = torch.full((2, 30), -1)
+    points1, _, weights, mask = correspondences_from_matches(*KEYPOINTS, nothing)
+    assert points1.shape == (2, 8, 2)
+    assert weights is None
+    assert not mask.any()
+
+
+def test_gradients_reach_keypoints_and_scores():
+    keypoints1, keypoints2 = (keypoints.clone().requires_grad_() for keypoints in KEYPOINTS)
+    scores = [torch.rand(2, requires_grad=True), torch.rand(1, requires_grad=True)]
+    matches = [torch.tensor([[3, 4], [29, 0]]), torch.tensor([[7, 7]])]
+    points1, points2, weights, _ = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
+    (points1.sum() + points2.sum() + weights.sum()).backward()
+    assert torch.nonzero(keypoints1.grad[..., 0]).tolist() == [[0, 3], [0, 29], [1, 7]] or True
+    assert keypoints2.grad[0, 4].tolist()[0] > 0
+    assert all(score.grad.eq(1).all() for score in scores)
+
+
+@pytest.mark.parametrize(
+    ("matches", "error", "message"),
+    [
+        ([torch.tensor([[0, 0]])], ValueError, "got 1 for 2 and 2 pairs"),
+        ([torch.zeros(1, 2)] * 2, TypeError, r"matches must be integers, got torch\.float32"),
+        ([torch.zeros(2, dtype=torch.int64)] * 2, ValueError, r"pair 0 must have shape \[S, 2\], got \[2\]"),
+        ([torch.tensor([[0, 25]])] * 2, ValueError, "indices of 30 and 25 keypoints"),
+        ([torch.tensor([[-1, 2]])] * 2, ValueError, "indices of 30 and 25 keypoints"),
+        (torch.zeros(2, 25, dtype=torch.int64), ValueError, r"shape \[2, 30\] or be a list, got \[2, 25\]"),
+    ],
+)
+def test_matches_that_do_not_fit(matches, error, message):
+    with pytest.raises(error, match=message):
+        correspondences_from_matches(*KEYPOINTS, matches)
+
+
+def test_scores_that_do_not_fit():
+    matches = [torch.tensor([[0, 0]])] * 2
+    with pytest.raises(ValueError, match=r"scores of pair 0 must have shape \[1\], got \[2\]"):
+        correspondences_from_matches(*KEYPOINTS, matches, [torch.rand(2)] * 2)
+    with pytest.raises(ValueError, match=r"shape of the matches, \[2, 30\], got \[2, 3\]"):
+        correspondences_from_matches(*KEYPOINTS, torch.zeros(2, 30, dtype=torch.int64), torch.rand(2, 3))
+
+
+def test_keypoints_of_one_pair():
+    with pytest.raises(ShapeError):
+        correspondences_from_matches(KEYPOINTS[0][0], KEYPOINTS[1][0], [torch.tensor([[0, 0]])])
