@@ -21,8 +21,8 @@ from kornia_learnnorm.solver import Normalizer, find_fundamental
 
 __all__ = ["RANSAC"]
 
-BATCHES = (64, 1024)  # hypotheses in the first batch, and in the largest
-POOL = 8  # hypotheses that are refined in the end
+BATCHES = (128, 1024)  # hypotheses in the first batch, and in the largest
+POOL = 4  # hypotheses that are refined in the end
 OPTIMIZED = 4  # hypotheses of a batch that are optimised
 SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on
 STEPS = 10  # of Levenberg-Marquardt, at most
@@ -35,7 +35,7 @@ class RANSAC(nn.Module):
     Minimal samples of eight run through :func:`~kornia_learnnorm.find_fundamental` with any normaliser, a thousand at
     once, and MSAC scores them all. The best of each batch is refitted to its inliers by the same function, and with the
     next best refined by Levenberg-Marquardt (local optimisation); the inliers of the best matrix so far say how many
-    samples are still needed. In the end the eight best are refined on the truncated squared distance, and the best of
+    samples are still needed. In the end the four best are refined on the truncated squared distance, and the best of
     these on the Cauchy loss of its inliers.
 
     Called and answering like ``kornia.geometry.RANSAC(model_type="fundamental_8pt")``. What differs: ``max_iter``
@@ -155,22 +155,20 @@ class RANSAC(nn.Module):
     ) -> Hypotheses:
         """Return the best hypotheses that enough minimal samples of pixels (N, 2) give, best first."""
         pool = Hypotheses(x1.new_zeros(0, 3, 3), x1.new_zeros(0), x1.new_zeros(0))
-        (batch, largest), drawn, needed, record = BATCHES, 0, self.max_iter, 0.0
-        start = time.perf_counter()
+        (batch, largest), drawn, needed, start = BATCHES, 0, self.max_iter, time.perf_counter()
         while drawn < needed and (self.max_seconds is None or time.perf_counter() - start < self.max_seconds):
             rows = sampler.draw(min(batch, needed - drawn), generator)
-            drawn, batch = drawn + len(rows), min(2 * batch, largest)
+            drawn, batch = drawn + len(rows), min(4 * batch, largest)
             rows = rows[scorer.determined(x1[rows], x2[rows])]
             if len(rows) == 0:
                 continue
             found = scorer.best(find_fundamental(x1[rows], x2[rows], None, self.normalizer, self.rank2), POOL)
-            if self.refine and len(found.F_mat):
-                found = found.join(self._optimize(scorer, found.F_mat[:OPTIMIZED]), POOL)
             pool = pool.join(found, POOL)
-            if len(pool.F_mat) and float(pool.score[0]) > record:
-                record = float(pool.score[0])
-                inliers = self._inliers(scorer.points1, scorer.points2, pool.F_mat[:1])[0]
-                needed = min(self.max_iter, self._samples_needed(sampler.hit_rate(inliers, scored)))
+            needed = self._samples_needed(pool, scorer, scored, sampler)
+            # A pool that ends the search is refined anyway.
+            if self.refine and drawn < needed and len(found.F_mat):
+                pool = pool.join(self._optimize(scorer, found.F_mat[:OPTIMIZED]), POOL)
+                needed = self._samples_needed(pool, scorer, scored, sampler)
         return pool
 
     def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
@@ -198,12 +196,14 @@ class RANSAC(nn.Module):
         """Tell the inliers (1, N) of a matrix (1, 3, 3) among pixels (N, 2)."""
         return epipolar_distance(x1[None], x2[None], F_mat, self.factor) <= self.inl_th
 
-    def _samples_needed(self, hit_rate: float) -> int:
-        """Return how many samples hold one without outliers with the confidence."""
-        if self.confidence == 1 or hit_rate == 0:
+    def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, scored: Tensor, sampler: Sampler) -> int:
+        """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
+        if len(pool.F_mat) == 0 or self.confidence == 1:
             return self.max_iter
-        if hit_rate == 1:
-            return 0
+        inliers = self._inliers(scorer.points1, scorer.points2, pool.F_mat[:1])[0]
+        hit_rate = min(sampler.hit_rate(inliers, scored), 1 - 1e-9)
+        if hit_rate == 0:
+            return self.max_iter
         return math.ceil(min(self.max_iter, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
 
 

@@ -187,7 +187,7 @@ class TestBudget:
         return sum(drawn)
 
     def test_stops_early(self, monkeypatch):
-        assert self.count(monkeypatch, pair(outliers=0.05)[:2]) <= 64
+        assert self.count(monkeypatch, pair(outliers=0.05)[:2]) <= 128
 
     def test_confidence_of_one_draws_all(self, monkeypatch):
         assert self.count(monkeypatch, pair(outliers=0.05)[:2], confidence=1.0, max_iter=3000) == 3000
@@ -295,7 +295,7 @@ class TestInvariances:
 
     @given(order=st.permutations(range(100)))
     def test_the_order_of_the_rows_does_not_count(self, order):
-        points1, points2, _, _ = pair("handheld", 100)
+        points1, points2, _, _ = pair("handheld", 100, noise=0.1)
         _, inliers = RANSAC(seed=0)(points1, points2)
         _, same = RANSAC(seed=0)(points1[order], points2[order])
         assert (inliers[order] == same).float().mean() > 0.95
