@@ -18,7 +18,7 @@ from kornia_learnnorm.correspondences import (
 from kornia_learnnorm.linear import design_matrix, has_null_vector
 from kornia_learnnorm.matches import correspondences_from_matches
 from kornia_learnnorm.normalizers import Hartley
-from kornia_learnnorm.solver import find_fundamental
+from kornia_learnnorm.solver import check_rank2, find_fundamental
 from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["EightPoint", "TwoViewEstimate"]
@@ -54,6 +54,7 @@ class EightPoint(nn.Module):
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
 
     Raises:
+        ValueError: if ``rank2`` is neither ``None`` nor ``"optimal"``.
         TypeError: if it is compiled by ``torch.jit``; ``torch.compile`` and ``torch.export`` take it.
 
     Example:
@@ -72,6 +73,7 @@ class EightPoint(nn.Module):
         rank2: Literal["optimal"] | None = None,
     ) -> None:
         super().__init__()
+        check_rank2(rank2)
         self.normalizer = Hartley() if normalizer is None else normalizer
         self.rank2: Literal["optimal"] | None = rank2
 

@@ -17,7 +17,7 @@ from kornia_learnnorm.objectives import Cauchy, Factor, Loss, Truncated, sampson
 from kornia_learnnorm.refine import refine_fundamental
 from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.scoring import Hypotheses, PairScorer, epipolar_distance
-from kornia_learnnorm.solver import Normalizer, find_fundamental
+from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
 
 __all__ = ["RANSAC"]
 
@@ -59,7 +59,8 @@ class RANSAC(nn.Module):
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
 
     Raises:
-        ValueError: if a number is out of its range.
+        TypeError: if ``factor`` or ``sampler`` cannot be called.
+        ValueError: if a number is out of its range or ``rank2`` is neither of its values.
 
     Reference:
         P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM
@@ -94,12 +95,16 @@ class RANSAC(nn.Module):
         super().__init__()
         if not (math.isfinite(inl_th) and inl_th > 0):
             raise ValueError(f"inl_th must be a positive number of pixels, got {inl_th}")
-        if max_iter < 1:
-            raise ValueError(f"max_iter must be >= 1, got {max_iter}")
+        if not isinstance(max_iter, int) or max_iter < 1:
+            raise ValueError(f"max_iter must be a whole number of samples, at least 1, got {max_iter}")
         if max_seconds is not None and not max_seconds > 0:
             raise ValueError(f"max_seconds must be positive or None, got {max_seconds}")
         if not 0 < confidence <= 1:
             raise ValueError(f"confidence must lie in (0, 1], got {confidence}")
+        check_rank2(rank2)
+        for name, value in (("factor", factor), ("sampler", sampler)):
+            if not callable(value):
+                raise TypeError(f"{name} must be a function or a class, got {value!r}")
         self.normalizer = Hartley() if normalizer is None else normalizer
         self.rank2: Literal["optimal"] | None = "optimal" if normalizer is None else rank2
         self.inl_th, self.max_iter, self.max_seconds, self.confidence = inl_th, max_iter, max_seconds, confidence
@@ -118,7 +123,8 @@ class RANSAC(nn.Module):
 
         Returns:
             the matrix :math:`(3, 3)` of unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, and the inliers :math:`(N,)`,
-            boolean. Zeros and no inliers where no matrix has more than eight of them.
+            boolean. Zeros and no inliers where no matrix has more than eight of them. Where no sample determines a
+            matrix, as of a plane without noise or a camera that does not move, it is one of those that fit.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or the weights not floating-point.
@@ -159,9 +165,8 @@ class RANSAC(nn.Module):
         while drawn < needed and (self.max_seconds is None or time.perf_counter() - start < self.max_seconds):
             rows = sampler.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, largest)
-            rows = rows[scorer.determined(x1[rows], x2[rows])]
-            if len(rows) == 0:
-                continue
+            determined = scorer.determined(x1[rows], x2[rows])
+            rows = rows[determined] if bool(determined.any()) else rows
             found = scorer.best(find_fundamental(x1[rows], x2[rows], None, self.normalizer, self.rank2), POOL)
             pool = pool.join(found, POOL)
             needed = self._samples_needed(pool, scorer, scored, sampler)
@@ -210,7 +215,8 @@ class RANSAC(nn.Module):
 def _check(kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> None:
     for name, points in (("kp1", kp1), ("kp2", kp2)):
         if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"{name} must be a float32 or float64 tensor, got {getattr(points, 'dtype', type(points))}")
+            got = points.dtype if isinstance(points, Tensor) else type(points)
+            raise TypeError(f"{name} must be a float32 or float64 tensor, got {got}")
         KORNIA_CHECK_SHAPE(points, ["N", "2"])
     if kp1.dtype != kp2.dtype:
         raise TypeError(f"kp1 and kp2 must have one dtype, got {kp1.dtype} and {kp2.dtype}")
@@ -221,8 +227,10 @@ def _check(kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> None:
     if weights is None:
         return
     if not isinstance(weights, Tensor) or not weights.is_floating_point():
-        raise TypeError(f"weights must be a floating-point tensor, got {getattr(weights, 'dtype', type(weights))}")
+        got = weights.dtype if isinstance(weights, Tensor) else type(weights)
+        raise TypeError(f"weights must be a floating-point tensor, got {got}")
     if weights.shape != kp1.shape[:1]:
         raise ValueError(f"weights must have shape {[*kp1.shape[:1]]}, got {[*weights.shape]}")
-    if not bool(weights.isfinite().all()) or bool((weights < 0).any()):
-        raise ValueError("weights must be finite and not negative")
+    known = weights[(kp1.isfinite() & kp2.isfinite()).all(-1)]
+    if not bool(known.isfinite().all()) or bool((known < 0).any()):
+        raise ValueError("weights must be finite and not negative where the points are finite")

@@ -107,6 +107,8 @@ def refine_fundamental(
     """
     check_correspondences(points1, points2, weights)
     check_fundamental(F_mat, F_mat if len(points1) == 1 else points1)
+    if isinstance(loss, type):
+        raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
     if max_iterations < 0 or not tolerance >= 0:
         raise ValueError(f"max_iterations and tolerance must be >= 0, got {max_iterations} and {tolerance}")
     dtype = solve_dtype(points1.device)

@@ -19,7 +19,7 @@ from kornia_learnnorm.normalizers import Hartley
 from kornia_learnnorm.optimal_rank2 import optimal_rank2
 from kornia_learnnorm.transforms import transform_fundamental
 
-__all__ = ["find_fundamental", "normalizing_transforms"]
+__all__ = ["check_rank2", "find_fundamental", "normalizing_transforms"]
 
 Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
@@ -74,8 +74,7 @@ def find_fundamental(
 
     """
     check_correspondences(points1, points2, weights)
-    if rank2 not in (None, "optimal"):
-        raise ValueError(f"rank2 must be None or 'optimal', got {rank2!r}")
+    check_rank2(rank2)
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     w = None if weights is None else weights.to(dtype)
@@ -87,6 +86,17 @@ def find_fundamental(
     F = transform_fundamental(rank2_projection(F), T1, T2)
     F_mat: Tensor = F / torch.linalg.matrix_norm(F, keepdim=True)
     return F_mat.to(points1.dtype)
+
+
+def check_rank2(rank2: str | None) -> None:
+    """Raise a clear error for anything but a way to enforce the singularity constraint.
+
+    Raises:
+        ValueError: if ``rank2`` is neither ``None`` nor ``"optimal"``.
+
+    """
+    if rank2 not in (None, "optimal"):
+        raise ValueError(f"rank2 must be None or 'optimal', got {rank2!r}")
 
 
 def normalizing_transforms(normalizer: Normalizer, x1: Tensor, x2: Tensor, w: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -71,7 +71,9 @@ class TestExceptions:
         [
             ({"inl_th": 0.0}, "inl_th .* got 0.0"),
             ({"inl_th": float("nan")}, "inl_th"),
-            ({"max_iter": 0}, "max_iter must be >= 1, got 0"),
+            ({"max_iter": 0}, "max_iter must be .* at least 1, got 0"),
+            ({"max_iter": 1.5}, "whole number of samples"),
+            ({"rank2": "foo"}, "rank2 must be None or 'optimal', got 'foo'"),
             ({"max_seconds": 0.0}, "max_seconds"),
             ({"confidence": 1.5}, r"confidence must lie in \(0, 1\], got 1.5"),
             ({"confidence": 0.0}, "confidence"),
@@ -80,6 +82,12 @@ class TestExceptions:
     def test_options(self, wrong, message):
         with pytest.raises(ValueError, match=message):
             RANSAC(**wrong)
+
+    def test_names_for_functions(self):
+        with pytest.raises(TypeError, match="sampler must be a function or a class, got 'prosac'"):
+            RANSAC(sampler="prosac")
+        with pytest.raises(TypeError, match="factor must be a function"):
+            RANSAC(factor="sampson")
 
     def test_points(self):
         points = uniform(20, 2)
@@ -226,17 +234,25 @@ class TestHardInput:
     @pytest.mark.parametrize("value", [0.0, 5.0, 1e6])
     def test_all_identical(self, value):
         points = torch.full((50, 2), value)
-        assert failed(RANSAC(seed=0, max_iter=2000)(points, points))
-
-    def test_no_motion(self):
-        points = uniform(200, 2, high=500)
-        F_mat, _ = RANSAC(seed=0, max_iter=2000)(points, points)
+        F_mat, inliers = RANSAC(seed=0, max_iter=2000)(points, points)
         assert F_mat.isfinite().all()
+        assert inliers.all() or failed((F_mat, inliers))
+
+    @pytest.mark.parametrize("number", [9, 200])
+    def test_nothing_moves(self, number, dtype):
+        """One of the matrices that fit, as a camera that stands still must not look like lost tracking."""
+        points = uniform(number, 2, high=500).to(dtype)
+        for moved in (points, 0.9 * points + 20):
+            F_mat, inliers = RANSAC(seed=0, max_iter=2000)(points, moved)
+            assert F_mat.isfinite().all()
+            assert inliers.all()
 
     def test_on_a_line(self):
         along = torch.linspace(0, 300, 60, dtype=torch.float64)
         points = torch.stack([along, 2 * along], -1)
-        assert failed(RANSAC(seed=0, max_iter=2000)(points, points + 3))
+        F_mat, inliers = RANSAC(seed=0, max_iter=2000)(points, points + 3)
+        assert F_mat.isfinite().all()
+        assert inliers.all() or failed((F_mat, inliers))
 
     @pytest.mark.parametrize("planes", [1, 2])
     def test_planes(self, planes):
@@ -252,8 +268,7 @@ class TestHardInput:
             x2.append(x[:, :2] / x[:, 2:])
         F_mat, inliers = RANSAC(seed=0)(points1, torch.cat(x2))
         assert F_mat.isfinite().all()
-        if planes == 2:
-            assert inliers.all()
+        assert inliers.all()
 
     def test_rows_that_are_not_finite_are_as_if_absent(self):
         points1, points2, _, _ = pair(num_points=200)
