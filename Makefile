@@ -2,6 +2,7 @@
 # make test   set up, run all tests
 # make lint   set up, run the linters and the type checker
 # make docs   set up, build the documentation in docs/_build/html
+# make audit  report known vulnerabilities of the locked packages; never fails
 # make ablations DATA=<folder>, make table1 DATA=<folder>   train what is not trained yet, print the tables; -j 2 for two at once
 PYTHON ?= python3
 VENV := .venv
@@ -13,7 +14,9 @@ KITTI = "$(DATA)"/kitti/sequences/06/image_0
 
 STORES = "$(DATA)"/correspondences
 
-.PHONY: demo test lint docs wheel clean ablations table1
+AUDIT := .venv-audit
+
+.PHONY: demo test lint docs audit wheel clean ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -47,6 +50,18 @@ lint: $(VENV)/.ready
 
 docs: $(VENV)/.ready
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+# The auditor has an environment of its own, and asks a database of vulnerabilities about each line of the lock.
+audit:
+	@test -x $(AUDIT)/bin/pip-audit || { $(PYTHON) -m venv $(AUDIT) && \
+		$(AUDIT)/bin/python -m pip install --quiet pip-audit; } > /dev/null 2>&1; \
+	found=$$(timeout 120 $(AUDIT)/bin/pip-audit --requirement requirements.lock --no-deps --disable-pip \
+		--vulnerability-service osv --progress-spinner off 2>&1); \
+	case "$$?, $$found" in \
+		0,*) echo "audit: no known vulnerabilities";; \
+		*Found*known*) echo "audit: $$found";; \
+		*) echo "audit: not done (offline?): $$(echo "$$found" | tail -n 1)";; \
+	esac
 
 # A run that was cut goes on from its checkpoint.
 FIT = LEARNNORM_DATA="$(DATA)" $(BIN)/learnnorm fit
@@ -88,4 +103,4 @@ wheel: $(VENV)/.ready
 	$(BIN)/python -m build --no-isolation --wheel
 
 clean:
-	rm -rf $(VENV) dist build docs/_build runs
+	rm -rf $(VENV) $(AUDIT) dist build docs/_build runs

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
@@ -23,6 +24,7 @@ __all__ = ["LearnedNormalizer"]
 
 WEIGHTS = Path(__file__).parent / "weights"
 FORMAT = "kornia_learnnorm.normalizer.v1"
+LARGEST = 4096  # of the numbers that a file gives for widths, depths and iterations
 
 
 class LearnedNormalizer(nn.Module):
@@ -139,17 +141,19 @@ class LearnedNormalizer(nn.Module):
         try:
             with safe_open(path, "pt") as file:
                 metadata = file.metadata() or {}
-                state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+                state = {key: file.get_tensor(key).clone() for key in file.keys()}  # noqa: SIM118 (not a dict)
         except SafetensorError as error:
             raise ValueError(f"{path} is not a safetensors file: {error}") from error
         if metadata.get("format") != FORMAT:
             raise ValueError(f"{path} is not a normaliser: expected format {FORMAT!r}, got {metadata.get('format')!r}")
-        normalizer = cls(**_build(path, metadata.get("architecture", "")))
-        normalizer.to(next(iter(state.values())).dtype if state else None)
+        with torch.device("meta"):  # weights take no memory before their shapes are known to be those in the file
+            normalizer = cls(**_build(path, metadata.get("architecture", "")))
         try:
-            normalizer.load_state_dict(state, strict=True)
+            normalizer.load_state_dict(state, strict=True, assign=True)
         except RuntimeError as error:
-            raise ValueError(f"{path}: the tensors do not fit the architecture: {error}") from error
+            text = " ".join(str(error).split())
+            raise ValueError(f"{path}: the tensors do not fit the architecture: {text}") from error
+        normalizer.to(next(iter(state.values())).dtype if state else None)
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
         if broken:
             raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
@@ -191,10 +195,13 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
     try:
         parts = json.loads(architecture)
         base, network = dict(parts["base"]), dict(parts["network"])
+        large = [value for value in (*base.values(), *network.values()) if isinstance(value, int) and value > LARGEST]
+        if large:
+            raise ValueError(f"numbers can be at most {LARGEST}, got {large[0]}")
         return {
             "base": find(base.pop("name"), normalizers, reweighting)(**base),
             "network": find(network.pop("name"), networks, paper_network)(**network),
             "transform": find(parts["transform"], transforms),
         }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(f"{path} describes no normaliser of this version: {error}") from error

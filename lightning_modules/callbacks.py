@@ -10,7 +10,7 @@ import torch
 from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, distributed
 
 from kornia_learnnorm.files import replacing
 from lightning_modules.task import NormalizerTask
@@ -81,11 +81,25 @@ class WritePredictions(Callback):
         self._batches.append({key: value.cpu() for key, value in outputs.items()})
 
     def on_predict_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Concatenate the batches and write them beside the target, then rename."""
+        """Concatenate the batches of all processes and write them beside the target, then rename."""
+        batches = _gathered(self._batches) if trainer.world_size > 1 else self._batches
+        self._batches = []
+        if not trainer.is_global_zero:
+            return
         path = Path(trainer.default_root_dir) / self.filename
         path.parent.mkdir(parents=True, exist_ok=True)
-        fields = {key: torch.cat([batch[key] for batch in self._batches]) for key in self._batches[0]}
-        self._batches.clear()
+        fields = {key: torch.cat([batch[key] for batch in batches]) for key in batches[0]}
         with replacing(path) as beside:
             save_file(fields, beside)
         print(f"wrote {path}")
+
+
+def _gathered(batches: list[dict[str, Tensor]]) -> list[dict[str, Tensor]]:
+    """Return the batches of all processes, samples in order: of each batch, process r has every n-th from r on."""
+    shares: list[Any] = [None] * distributed.get_world_size()
+    distributed.all_gather_object(shares, batches)
+    whole = []
+    for parts in zip(*shares, strict=True):
+        order = torch.cat([torch.arange(len(part["pair"])) * len(parts) + r for r, part in enumerate(parts)]).argsort()
+        whole.append({key: torch.cat([part[key] for part in parts])[order] for key in parts[0]})
+    return whole

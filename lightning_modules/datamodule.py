@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -37,8 +36,9 @@ class SampleLoader:
 
     A block is cut into batches of nearly equal size, so none of its samples is lost or comes twice. The number of
     batches is the same in every epoch: how many samples the filter keeps is told from the first block of the first
-    epoch, and batches are as much smaller or larger than ``batch_size`` as other blocks differ from it. Of several
-    processes each takes its share of every batch.
+    epoch, and batches are as much smaller or larger than ``batch_size`` as other blocks differ from it; an epoch ends
+    early where a block has fewer samples than batches. Of several processes each takes its share of every batch, which
+    can be empty.
 
     Args:
         source: where the samples come from.
@@ -119,10 +119,11 @@ class SampleLoader:
         order = torch.arange(len(units))
         if self.shuffle:
             order = torch.randperm(len(units), generator=block_generator(self._seed(epoch), block, 1))
-        number = min(number, len(units) // self.world_size)
-        for first, stop in pairwise(len(units) * i // number for i in range(number + 1)):
+        number = min(number, len(units))
+        for i in range(number):
+            first, stop = len(units) * i // number, len(units) * (i + 1) // number
             chosen = order[first + self.rank : stop : self.world_size]
-            yield samples.select(torch.cat([units[i] for i in chosen]) if self.by_pair else chosen)
+            yield samples.select(torch.cat([order[:0], *(units[i] for i in chosen)]) if self.by_pair else chosen)
 
     def _units(self, samples: Samples) -> Sequence[Any]:
         """Rows of ``samples`` that stay together: those of a pair, or each alone."""

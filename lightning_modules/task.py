@@ -8,14 +8,16 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.utilities import rank_zero_warn
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 
+from kornia_learnnorm.correspondences import solve_dtype
 from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.learned import LearnedNormalizer
 from kornia_learnnorm.losses import EpipolarLoss
-from kornia_learnnorm.metrics import better_rate
+from kornia_learnnorm.metrics import comparable
 from kornia_learnnorm.normalizers import Hartley, Whitening
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
 from kornia_learnnorm.solver import find_fundamental
@@ -32,6 +34,11 @@ class NormalizerTask(pl.LightningModule):
 
     Validation and test log the mean log residual and the better rates against Hartley and whitening on the samples'
     own points; prediction returns the transforms, the fundamental matrix and the residual of each sample.
+
+    Of several processes, all samples count the same, however they are distributed. In training, validation and test,
+    samples with a NaN or infinite coordinate are left out and counted: ``train/left_out``. A step without any other
+    sample, or with a gradient that is not finite, leaves the weights and the optimiser as they are, with a warning, and
+    is counted: ``train/skipped``.
 
     Args:
         normalizer: the normaliser to train.
@@ -60,6 +67,8 @@ class NormalizerTask(pl.LightningModule):
         self.sample_gradient = sample_gradient
         self.hartley, self.whitening = Hartley(), Whitening()
         self._residuals: dict[str, list[Tensor]] = {}
+        self._left_out = 0  # since the last validation or test
+        self._samples = 0  # of all processes since the last step
 
     def configure_optimizers(self) -> Any:
         """Build the optimiser and its schedule."""
@@ -75,27 +84,58 @@ class NormalizerTask(pl.LightningModule):
         return find_fundamental(points1, points2, weights, self.normalizer)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
-        """Log and return the loss of a batch of samples."""
-        loss = self.compute_loss(batch)
-        self.log("train/loss", loss, prog_bar=True)
-        return loss
+        """Log the loss of the batch of all processes and return the part of it that this one's samples make."""
+        batch, left_out = _finite(batch)
+        samples = len(batch.pair)
+        # Without samples, all weights still take part: the other processes wait for their gradients.
+        loss = self.compute_loss(batch) if samples else 0 * torch.stack([p.sum() for p in self.parameters()]).sum()
+        total, all_left_out, all_samples = self._sum(samples * loss.detach(), left_out, samples)
+        of_all = int(all_samples)
+        self._samples += of_all
+        self.log("train/loss", total / max(of_all, 1), prog_bar=True)
+        self.log("train/left_out", all_left_out)
+        return loss * (samples * self.trainer.world_size / max(of_all, 1))  # gradients are averaged over processes
+
+    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
+        """Skip a step that has no samples, or whose gradient is not finite: the same one in all processes."""
+        finite = all(bool(p.grad.isfinite().all()) for p in self.parameters() if p.grad is not None)
+        skipped = self._samples == 0 or not finite
+        if skipped:
+            rank_zero_warn(f"a step was skipped: {'non-finite gradient' if self._samples else 'no samples'}")
+            for p in self.parameters():
+                p.grad = None  # an optimiser leaves these alone
+        self.log("train/skipped", float(skipped))
+        self._samples = 0
+
+    def _sum(self, *numbers: Tensor | float) -> list[Tensor]:
+        """Sum numbers over all processes."""
+        dtype = solve_dtype(self.device)
+        own = torch.stack([torch.as_tensor(number, dtype=dtype, device=self.device) for number in numbers])
+        return list(self.trainer.strategy.reduce(own, reduce_op="sum"))
 
     def compute_loss(self, batch: Samples) -> Tensor:
         """Return the loss of a batch of samples, each sample's gradient limited where it enters the network."""
         x1, x2 = batch.points1.double(), batch.points2.double()
-        with self._limited_gradients():
+        arrived: list[Tensor] = []
+        with self._limited_gradients(arrived):
             F_mat = self(x1, x2)
         loss: Tensor = self.loss(x1, x2, F_mat, batch.heldout1.double(), batch.heldout2.double())
+        if loss.requires_grad:
+            loss.register_hook(arrived.append)  # type: ignore[no-untyped-call]
         return loss
 
     @contextmanager
-    def _limited_gradients(self) -> Iterator[None]:
-        """Attach the limit to the network's outputs while the block runs."""
+    def _limited_gradients(self, arrived: list[Tensor]) -> Iterator[None]:
+        """Attach the limit to the network's outputs while the block runs.
+
+        Processes, accumulated batches and the scaler of half precision multiply the loss after it is computed. What
+        they make of its gradient arrives in a list, and the limit is multiplied alike.
+        """
 
         def limit(gradient: Tensor) -> Tensor:
-            most = self.sample_gradient / len(gradient)  # type: ignore[operator]
+            most = self.sample_gradient * arrived[-1] / len(gradient)  # type: ignore[operator]
             norm: Tensor = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
-            return gradient * (most / norm.clamp(min=most))
+            return gradient * torch.where(norm > most, most / norm, 1.0)
 
         def attach(module: nn.Module, args: Any, params: tuple[Tensor, Tensor]) -> None:
             for p in params:
@@ -133,6 +173,8 @@ class NormalizerTask(pl.LightningModule):
         self._log_residuals("test")
 
     def _collect(self, batch: Samples) -> None:
+        batch, left_out = _finite(batch)
+        self._left_out += left_out
         x1, x2 = batch.points1.double(), batch.points2.double()
         methods = {"learned": self.normalizer, "hartley": self.hartley, "whitening": self.whitening}
         for name, normalizer in methods.items():
@@ -141,11 +183,23 @@ class NormalizerTask(pl.LightningModule):
             self._residuals.setdefault(name, []).append(residual)
 
     def _log_residuals(self, stage: str) -> None:
-        if not self._residuals:
-            return
-        residuals = {name: torch.cat(parts) for name, parts in self._residuals.items()}
-        self._residuals.clear()
-        learned = residuals.pop("learned")
-        self.log(f"{stage}/log_sed", (learned + self.loss.floor).log().mean(), prog_bar=True, sync_dist=True)
-        for name, baseline in residuals.items():
-            self.log(f"{stage}/better_than_{name}", better_rate(learned, baseline).rate, prog_bar=True, sync_dist=True)
+        """Log figures of the samples of all processes; NaN where there are none."""
+        none = torch.zeros(0, dtype=solve_dtype(self.device), device=self.device)
+        learned, hartley, whitening = (
+            torch.cat([none, *self._residuals.pop(name, [])]) for name in ("learned", "hartley", "whitening")
+        )
+        total, samples, left_out = self._sum((learned + self.loss.floor).log().sum(), len(learned), self._left_out)
+        self._left_out = 0
+        self.log(f"{stage}/log_sed", total / samples, prog_bar=True, sync_dist=True)
+        for name, baseline in (("hartley", hartley), ("whitening", whitening)):
+            compared = comparable(learned, baseline)
+            better, number = self._sum((learned < baseline)[compared].sum(), compared.sum())
+            self.log(f"{stage}/better_than_{name}", better / number, prog_bar=True, sync_dist=True)
+        self.log(f"{stage}/left_out", left_out, sync_dist=True)
+
+
+def _finite(batch: Samples) -> tuple[Samples, int]:
+    """Return the samples whose coordinates are all finite, and how many others there are."""
+    finite = torch.stack([points.isfinite().flatten(1).all(1) for points in batch[:4]]).all(0)
+    left_out = len(finite) - int(finite.sum())
+    return (batch.select(finite) if left_out else batch), left_out

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import pickle
-import sys
 import warnings
-from itertools import pairwise
+import zipfile
 from pathlib import Path
 
 import torch
 from pytorch_lightning.cli import LightningCLI
+from torch import Tensor
 
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import NormalizerTask
@@ -19,6 +18,9 @@ __all__ = ["TrainingCLI", "run"]
 
 class TrainingCLI(LightningCLI):
     """LightningCLI that refuses a missing or foreign checkpoint before anything runs."""
+
+    def _parse_ckpt_path(self) -> None:
+        """Take no configuration from a checkpoint: it could name any class to be made."""
 
     def before_fit(self) -> None:
         """Check the checkpoint to resume from, where one is given."""
@@ -37,6 +39,7 @@ class TrainingCLI(LightningCLI):
         self._check_checkpoint(required=True)
 
     def _check_checkpoint(self, required: bool) -> None:
+        self.config_init[self.subcommand]["weights_only"] = True  # nothing that a checkpoint names is run
         path = self.config[self.subcommand].get("ckpt_path")
         if path is None:
             if required:
@@ -44,16 +47,28 @@ class TrainingCLI(LightningCLI):
             return
         if not Path(path).is_file():
             raise FileNotFoundError(f"no checkpoint at {path}")
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-        except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError) as error:
-            raise ValueError(f"{path} is not a checkpoint of a training run") from error
+        state = _state_dict(path)
         expected = {key: value.shape for key, value in self.model.state_dict().items()}
         if {key: value.shape for key, value in state.items()} != expected:
             raise ValueError(
                 f"{path} holds another network than the one configured: repeat the options of its run, or use the"
                 " config.yaml that the run left in lightning_logs"
             )
+
+
+def _state_dict(path: str) -> dict[str, Tensor]:
+    """Return the tensors of a checkpoint, which must not unfold to more than the file's own size."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > Path(path).stat().st_size:
+            raise ValueError(f"it would unfold to {size} bytes")
+        state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+        if not all(isinstance(value, Tensor) for value in state.values()):
+            raise TypeError("it holds something else than tensors")
+    except Exception as error:  # a broken or forged file can raise anything
+        raise ValueError(f"{path} is not a checkpoint of a training run, or not a whole one") from error
+    return dict(state)
 
 
 def run(args: list[str] | None) -> None:
@@ -68,20 +83,11 @@ def run(args: list[str] | None) -> None:
 
     """
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")  # Lightning's own call of torch
-    try:
-        TrainingCLI(
-            NormalizerTask,
-            CorrespondenceDataModule,
-            args=args,
-            auto_configure_optimizers=False,
-            parser_kwargs={"prog": "learnnorm"},
-            save_config_kwargs={"overwrite": True},
-        )
-    # The parser has a look at the checkpoint too, before the hooks run.
-    except (pickle.UnpicklingError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "PytorchStreamReader" not in str(error):
-            raise
-        words = [part for word in (sys.argv if args is None else args) for part in word.split("=", 1)]
-        given = [second for first, second in pairwise(words) if first == "--ckpt_path"]
-        path = given[-1] if given else "the file given by --ckpt_path"
-        raise ValueError(f"{path} is not a checkpoint of a training run, or not a whole one") from error
+    TrainingCLI(
+        NormalizerTask,
+        CorrespondenceDataModule,
+        args=args,
+        auto_configure_optimizers=False,
+        parser_kwargs={"prog": "learnnorm"},
+        save_config_kwargs={"overwrite": True},
+    )

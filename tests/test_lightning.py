@@ -41,6 +41,14 @@ def make_trainer(folder, callbacks=(), **arguments):
     return pl.Trainer(default_root_dir=folder, callbacks=list(callbacks), max_epochs=-1, **quiet, **arguments)
 
 
+class Losses(pl.Callback):
+    def __init__(self):
+        self.seen = []
+
+    def on_train_batch_end(self, trainer, *_):
+        self.seen.append(trainer.callback_metrics["train/loss"].item())
+
+
 class Interrupt(pl.Callback):
     def __init__(self, step):
         self.step = step
@@ -58,22 +66,73 @@ def test_training_lowers_the_loss(tmp_path):
     assert task.compute_loss(batch).item() < before - 0.02
 
 
+class Blocks(SyntheticSamples):
+    """Three blocks of 96 samples, so that workers have something to draw."""
+
+    def blocks(self, seed):
+        return [Block(96, 96)] * 3
+
+    def draw(self, seed, block):
+        return super().draw(3 * seed + block, 0)
+
+
 @pytest.mark.parametrize(
-    ("interrupted_at", "source", "arguments"), [(5, None, {}), (17, None, {}), (5, Pairs(), {"batch_pairs": 3})]
+    ("interrupted_at", "source", "arguments"),
+    [
+        (5, None, {}),
+        (17, None, {}),
+        (5, Pairs(), {"batch_pairs": 3}),
+        (5, Blocks(number=96, num_heldout=4, max_residual=None), {"workers": 1}),
+    ],
 )
 def test_resumes_to_the_same_curve(tmp_path, interrupted_at, source, arguments):
     """An epoch has about nine batches: the run is cut in the middle of the first and of the second."""
-    whole = make_task()
+    whole, losses = make_task(), [Losses(), Losses()]
     data = make_data(source, **arguments)
-    make_trainer(tmp_path / "whole", max_steps=20, enable_checkpointing=False).fit(whole, data)
+    make_trainer(tmp_path / "whole", losses[:1], max_steps=20, enable_checkpointing=False).fit(whole, data)
     first, second = make_task(), make_task()
     callbacks = [Checkpoints(every_n_train_steps=2), Interrupt(interrupted_at)]
     with pytest.raises(InterruptedError):
         make_trainer(tmp_path / "cut", callbacks, max_steps=20).fit(first, make_data(source, **arguments))
-    trainer = make_trainer(tmp_path / "cut", [Checkpoints(every_n_train_steps=2)], max_steps=20)
+    trainer = make_trainer(tmp_path / "cut", [losses[1], Checkpoints(every_n_train_steps=2)], max_steps=20)
     trainer.fit(second, make_data(source, **arguments), ckpt_path=tmp_path / "cut/checkpoints/last.ckpt")
     for (name, expected), got in zip(whole.state_dict().items(), second.state_dict().values(), strict=True):
         assert torch.equal(got, expected), name
+    assert losses[1].seen == losses[0].seen[interrupted_at // 2 * 2 :]
+
+
+@pytest.mark.parametrize("log", [True, False])
+def test_accumulated_batches_make_the_step_of_a_larger_one(tmp_path, log):
+    """Up to rounding, where the batches have the same number of samples; the limit of gradients is at work."""
+    source, states = SyntheticSamples(number=256, num_heldout=4, max_residual=None), []
+    for size, parts in ((64, 1), (16, 4)):
+        task = make_task(loss=kln.EpipolarLoss(log=log, heldout_weight=0.5), sample_gradient=0.1).double()
+        data = CorrespondenceDataModule(source, source, batch_size=size)
+        trainer = make_trainer(tmp_path, max_steps=6, enable_checkpointing=False, accumulate_grad_batches=parts)
+        trainer.fit(task, data)
+        assert trainer.global_step == 6
+        states.append(task.state_dict())
+    for name, expected in states[0].items():
+        torch.testing.assert_close(states[1][name], expected, rtol=0, atol=1e-9)
+
+
+def test_mixed_precision(tmp_path):
+    """In bfloat16 the network, not the solver: the loss falls as in float32, and matrices are float64."""
+    task, data = make_task(optimizer=lambda params: torch.optim.AdamW(params, lr=2e-2)), make_data()
+    batch = SyntheticSamples(number=1000).draw(99, 0)
+    before, seen = task.compute_loss(batch).item(), []
+    task.normalizer.network.set_network.head.register_forward_hook(lambda m, a, out: seen.append(out.dtype))
+    task.normalizer.register_forward_hook(lambda m, a, out: seen.append(out[0].dtype))
+    trainer = make_trainer(tmp_path, max_steps=150, enable_checkpointing=False, precision="bf16-mixed")
+    trainer.fit(task, data)
+    assert set(seen[::2]) == {torch.bfloat16}
+    assert set(seen[1::2]) == {torch.float64}
+    assert all(p.dtype == torch.float32 and p.isfinite().all() for p in task.parameters())
+    assert task.compute_loss(batch).item() < before - 0.02
+    with torch.autocast("cpu", torch.bfloat16):
+        x1, x2 = batch.points1.double(), batch.points2.double()
+        mixed = kln.find_fundamental(x1, x2, normalizer=kln.Hartley())
+    assert torch.equal(mixed, kln.find_fundamental(x1, x2, normalizer=kln.Hartley()))
 
 
 def test_export_and_predictions(tmp_path):
@@ -280,6 +339,14 @@ def test_workers_change_nothing():
     again_plain = SampleLoader(source, 3000, 0, shuffle=True)
     again_plain.load_state_dict({"epoch": 1, "batch": 3})
     assert same(list(again), list(again_plain))
+
+
+def test_no_sample_is_lost_to_more_processes_than_samples():
+    source = SyntheticSamples(number=1, max_residual=None)
+    loaders = [SampleLoader(source, 4, 0, shuffle=False, rank=rank, world_size=3) for rank in range(3)]
+    assert [[len(batch.pair) for batch in loader] for loader in loaders] == [[1], [0], [0]]
+    pairs = [SampleLoader(Pairs(), 3, 0, True, by_pair=True, rank=rank, world_size=3) for rank in range(3)]
+    assert [len(list(loader)) for loader in pairs] == [4, 4, 4]
 
 
 def test_a_smaller_batch_than_processes():

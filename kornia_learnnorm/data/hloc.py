@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.interchange import Pair, assemble, best_of_each, natural, split_pairs
-from kornia_learnnorm.data.store import CorrespondenceStore, _h5py
+from kornia_learnnorm.data.store import CorrespondenceStore, _h5py, check_declared
 from kornia_learnnorm.files import replacing
 
 __all__ = ["export_hloc", "import_hloc"]
@@ -196,7 +196,10 @@ def _read_features(path: Path) -> dict[str, _Image]:
 
 def _dataset(group: Any, key: str) -> NDArray[Any] | None:
     data = group.get(key)
-    return np.asarray(data[()]) if hasattr(data, "dtype") else None
+    if not hasattr(data, "dtype"):
+        return None
+    check_declared(Path(group.file.filename), [data])
+    return np.asarray(data[()])
 
 
 def _names(key: str, dashed: Mapping[str, list[str]]) -> tuple[str, str]:

@@ -38,15 +38,16 @@ def read_image(path: str | Path) -> npt.NDArray[np.uint8]:
     """Read an image file as grey values; colours and deeper pixels are converted.
 
     Args:
-        path: a file in any format that OpenCV decodes.
+        path: a file in any format that OpenCV decodes and Pillow knows, which tells the size before it is decoded.
 
     Returns:
         grey values with shape :math:`(H, W)`, uint8.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is a folder, not an image, or a truncated or corrupt image.
-        ImportError: if OpenCV is not installed.
+        ValueError: if it is a folder, not an image, a truncated or corrupt image, or one of more pixels than Pillow
+            opens, twice ``PIL.Image.MAX_IMAGE_PIXELS``: a small file can declare any number of them.
+        ImportError: if OpenCV or Pillow is not installed.
 
     """
     path = Path(path)
@@ -57,10 +58,23 @@ def read_image(path: str | Path) -> npt.NDArray[np.uint8]:
     data = path.read_bytes()
     if not data:
         raise ValueError(f"image {path} is empty (0 bytes)")
-    image = _decode(data) if _jpeg_ends(data) else None
+    image = _decode(data) if _size_is_allowed(path) and _jpeg_ends(data) else None
     if image is None:
         raise ValueError(f"image {path} cannot be decoded: {len(data)} bytes, not an image or truncated or corrupt")
     return image
+
+
+def _size_is_allowed(path: Path) -> bool:
+    """Tell whether Pillow knows an image's size, and raise if it is too large."""
+    Image = _pillow()
+    try:
+        return _header_size(path)[0] > 0
+    except Image.DecompressionBombError as error:
+        most = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+        message = f"image {path} declares more than {most} pixels, the limit, 2 * PIL.Image.MAX_IMAGE_PIXELS"
+        raise ValueError(message) from error
+    except Exception:  # a broken header can end in nearly any error of Pillow's parsers
+        return False
 
 
 def _decode(data: bytes) -> npt.NDArray[np.uint8] | None:
@@ -136,21 +150,30 @@ def image_size(path: str | Path) -> Size:
         ImportError: if Pillow is not installed; the message names the extra that brings it.
 
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        message = "reading sequences of images needs Pillow: pip install 'kornia-learnnorm[images]'"
-        raise ImportError(message) from error
+    _pillow()
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no image at {path}")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large images and odd metadata: nothing is decoded here
-            with Image.open(path) as image:
-                width, height = image.size
-                # getexif() without the test would decode a whole PNG; of a TIFF, Pillow has turned the size already
-                turned = "exif" in image.info and image.getexif().get(_ORIENTATION) in _QUARTER_TURNS
+        return _header_size(path)
     except Exception:  # a broken header can end in nearly any error of Pillow's parsers
         return 0, 0
+
+
+def _header_size(path: Path) -> Size:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of large images and odd metadata: nothing is decoded here
+        with _pillow().open(path) as image:
+            width, height = image.size
+            # getexif() without the test would decode a whole PNG; of a TIFF, Pillow has turned the size already
+            turned = "exif" in image.info and image.getexif().get(_ORIENTATION) in _QUARTER_TURNS
     return (height, width) if turned else (width, height)
+
+
+def _pillow() -> ModuleType:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        message = "reading images needs Pillow: pip install 'kornia-learnnorm[images]'"
+        raise ImportError(message) from error
+    return Image

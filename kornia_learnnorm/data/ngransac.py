@@ -110,7 +110,8 @@ def _load(path: Path) -> list[NDArray[np.float64]]:
         array = _Unpickler(stream).load()
         if not isinstance(array, _Array) or not isinstance(array.data, list) or len(array.data) != len(_PARTS):
             raise ValueError(f"expected an array of {len(_PARTS)} objects")
-        return [_numbers(item) for item in array.data]
+        left = [path.stat().st_size]
+        return [_numbers(item, left) for item in array.data]
     except Exception as error:  # a broken pickle can raise anything
         raise ValueError(f"{path} is not a match file, or is truncated: {error}") from error
 
@@ -148,9 +149,13 @@ class _Unpickler(pickle.Unpickler):
         raise ValueError(f"its pickle asks for {module}.{name}, only arrays of numbers are read")
 
 
-def _numbers(item: Any) -> NDArray[np.float64]:
+def _numbers(item: Any, left: list[int]) -> NDArray[np.float64]:
+    """Turn nested lists of arrays and numbers into an array, of no more bytes than are left: lists can share parts."""
+    left[0] -= len(item.data) if isinstance(item, _Array) else 1
+    if left[0] < 0:
+        raise ValueError("its lists hold more than the file has bytes")
     if isinstance(item, (tuple, list)):
-        return np.array([_numbers(part) for part in item], np.float64)
+        return np.array([_numbers(part, left) for part in item], np.float64)
     if not isinstance(item, _Array):
         return np.array(float(item))
     if not re.fullmatch("[fiu][1248]", item.dtype.code) or item.dtype.order not in tuple("<>="):

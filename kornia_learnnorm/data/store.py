@@ -7,6 +7,7 @@ configuration takes a store, ``file.h5@3:10`` means its pairs 3 to 9.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,9 +25,12 @@ from kornia_learnnorm.files import replacing
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["CorrespondenceStore", "StoreReader", "join_stores", "read_store", "write_store"]
+__all__ = ["CorrespondenceStore", "StoreReader", "check_declared", "join_stores", "read_store", "write_store"]
 
 FORMAT, VERSION = "correspondences", 1
+# Compression, and rows that were never written, let a small file declare large arrays. One is read if it takes at most
+# this many times its size in memory, and this many bytes beyond.
+UNFOLD, BEYOND = 20, 2**28
 # name: shape behind the first axis, dtype, "M" correspondences or "P" pairs
 _LAYOUT: dict[str, tuple[tuple[int, ...], str, str]] = {
     "points1": ((2,), "float32", "M"),
@@ -121,8 +125,8 @@ def read_store(path: str | Path) -> CorrespondenceStore:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is not a store of this version, is truncated, its arrays do not fit together, or it
-            lacks the pairs.
+        ValueError: if the file is not a store of this version, is truncated, its arrays do not fit together, would take
+            more than 20 times its size and 256 MiB in memory, or it lacks the pairs.
 
     """
     reader = StoreReader(path)
@@ -188,7 +192,7 @@ class StoreReader:
                 name: np.concatenate([np.zeros((0, *tail), dtype), *(file[name][part] for part in rows[axis])])
                 for name, (tail, dtype, axis) in _LAYOUT.items()
             }
-            names = [(str(a), str(b)) for part in rows["P"] for a, b in file["names"].asstr()[part]]
+            names = self._names(file["names"].asstr(), rows["P"])
             about: dict[str, Any] = {key: str(file.attrs.get(key, "")) for key in ("dataset", "pairs", "detector")}
             provenance = json.loads(file.attrs.get("provenance", "{}"))
         for name in ("points1", "points2", "ratio"):
@@ -197,6 +201,19 @@ class StoreReader:
         counts = np.diff(self.offsets)[list(pairs)]
         offsets = np.concatenate([[0], counts.cumsum()]).astype(np.int64)
         return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about, provenance=provenance)
+
+    def _names(self, dataset: Any, parts: list[slice]) -> list[tuple[str, str]]:
+        """Read names a few at a time: all of them can be one long text that the file holds once."""
+        names: list[tuple[str, str]] = []
+        most, size = _most_bytes(self.path), 0
+        for part in parts:
+            for first in range(part.start, part.stop, 16):
+                found = [(str(a), str(b)) for a, b in dataset[first : min(first + 16, part.stop)]]
+                size += sum(len(a) + len(b) for a, b in found)
+                if size > most:
+                    raise ValueError(f"{self.path}: its names take more than {_limit(most)}")
+                names += found
+        return names
 
     def passing(self, max_ratio: float | None) -> NDArray[np.int64]:
         """Count the correspondences of each pair with a ratio below ``max_ratio``, or all; (P,)."""
@@ -235,9 +252,11 @@ def _check(path: Path, file: h5py.File) -> NDArray[np.int64]:
     if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
         got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')}"
         raise ValueError(f"{path} is not a store: expected format={FORMAT!r}, version={VERSION}, got {got}")
-    missing = [name for name in (*_LAYOUT, "offsets", "names") if not hasattr(file.get(name), "shape")]
+    names = (*_LAYOUT, "offsets", "names")
+    missing = [name for name in names if not _holds(file, name)]
     if missing:
         raise ValueError(f"{path} lacks the datasets {', '.join(missing)}")
+    check_declared(path, [file[name] for name in names])
     offsets = np.asarray(file["offsets"][:], np.int64)
     if offsets.ndim != 1 or len(offsets) < 2 or offsets[0] != 0 or (np.diff(offsets) < 0).any():
         raise ValueError(f"{path}: offsets must rise from 0 over at least one pair, got {offsets[:4]}...")
@@ -247,7 +266,38 @@ def _check(path: Path, file: h5py.File) -> NDArray[np.int64]:
             raise ValueError(f"{path}: {name} must have shape {(rows[axis], *tail)}, got {file[name].shape}")
         if file[name].dtype.kind != np.dtype(dtype).kind:
             raise ValueError(f"{path}: {name} must be {dtype}, got {file[name].dtype}")
+    if _h5py().check_string_dtype(file["names"].dtype) is None:
+        raise ValueError(f"{path}: names must be texts, got {file['names'].dtype.metadata}")
     return offsets
+
+
+def _holds(file: h5py.File, name: str) -> bool:
+    """Tell whether the file itself holds a dataset; what leads to another file could lead to any on this disk."""
+    if not isinstance(file.get(name, getlink=True), _h5py().HardLink) or not hasattr(file[name], "shape"):
+        return False
+    return not (file[name].external or file[name].is_virtual)
+
+
+def check_declared(path: Path, datasets: Sequence[h5py.Dataset]) -> None:
+    """Raise a clear error for datasets of a file that declare more than the file could reasonably hold.
+
+    Raises:
+        ValueError: if their size in memory is over the limit, or their data are in other files.
+
+    """
+    if any(data.external or data.is_virtual or Path(data.file.filename) != path for data in datasets):
+        raise ValueError(f"{path} refers to data in other files, which are not read")
+    size, most = sum(math.prod(data.shape or ()) * data.dtype.itemsize for data in datasets), _most_bytes(path)
+    if size > most:
+        raise ValueError(f"{path} declares arrays of {size} bytes, more than {_limit(most)}")
+
+
+def _most_bytes(path: Path) -> int:
+    return UNFOLD * path.stat().st_size + BEYOND
+
+
+def _limit(most: int) -> str:
+    return f"the limit of {most} bytes, {UNFOLD} times the size of the file and {BEYOND}"
 
 
 def write_store(path: str | Path, store: CorrespondenceStore) -> None:

@@ -1,0 +1,106 @@
+"""Training on two processes gives what one gives; what is wrong with the samples of one stops none of them."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from train_processes import run
+
+CASES = ["plain", "pairs", "filtered", "spoiled", "infinite", "resumed"]
+SCRIPT = Path(__file__).parent / "train_processes.py"
+
+
+def start(folder, processes, *cases):
+    """Run cases on processes of their own, and return how these ended."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    command = [sys.executable, str(SCRIPT), str(processes), str(folder), *cases]
+    address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
+    started = [
+        subprocess.Popen(command, env=os.environ | address | {"LOCAL_RANK": str(rank)}, stderr=subprocess.PIPE)
+        for rank in range(processes)
+    ]
+    try:
+        errors = [process.communicate(timeout=220)[1] for process in started]
+    finally:
+        for process in started:
+            process.kill()
+    return [(process.returncode, error.decode()) for process, error in zip(started, errors, strict=True)]
+
+
+def figures(folder, rank=0):
+    return json.loads((folder / f"figures-{rank}.json").read_text())
+
+
+def same(folder, other, rank=0):
+    """The weights and figures of two runs are the same up to rounding."""
+    for name, expected in load_file(other / "weights-0.safetensors").items():
+        torch.testing.assert_close(load_file(folder / f"weights-{rank}.safetensors")[name], expected, rtol=0, atol=1e-9)
+    expected, got = figures(other), figures(folder, rank)
+    assert len(got) == len(expected) == 8
+    for name in got.keys() - {"samples"}:
+        assert got[name] == pytest.approx(expected[name], rel=1e-6, nan_ok=True), name
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("alone")
+    for case in ("plain", "pairs", "filtered"):
+        run(case, 1, folder)
+    with pytest.warns(UserWarning, match="a step was skipped: no samples"):
+        run("spoiled", 1, folder)
+    with pytest.warns(UserWarning, match="a step was skipped: non-finite gradient"):
+        run("infinite", 1, folder)
+    return folder
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the test starts its processes as on Unix")
+def test_two_processes_give_what_one_gives(alone, tmp_path):
+    """All cases in one test, since two processes take long to start."""
+    ended = start(tmp_path, 2, *CASES)
+    assert [code for code, _ in ended] == [0, 0], ended
+    for case in CASES[:-1]:
+        samples = [figures(tmp_path / case, rank)["samples"] for rank in (0, 1)]
+        assert samples[0] != samples[1]
+        assert [a + b for a, b in zip(*samples, strict=True)] == figures(alone / case)["samples"]
+        for rank in (0, 1):
+            same(tmp_path / case, alone / case, rank)
+        expected, got = (load_file(folder / case / "predictions.safetensors") for folder in (alone, tmp_path))
+        assert torch.equal(got.pop("pair"), expected.pop("pair"))
+        for name, value in expected.items():
+            torch.testing.assert_close(got[name], value, rtol=1e-6, atol=1e-7)
+    # cut at the third of six steps, after the second checkpoint
+    for name, expected in load_file(tmp_path / "plain/weights-0.safetensors").items():
+        assert torch.equal(load_file(tmp_path / "resumed/weights-1.safetensors")[name], expected)
+    assert figures(tmp_path / "resumed")["train/loss"] == figures(tmp_path / "plain")["train/loss"][2:]
+
+
+def test_what_is_left_out_is_counted(alone):
+    got = figures(alone / "spoiled")
+    assert got["train/left_out"] == [0, 7, 1, 15, 0, 0]  # of fifteen
+    assert got["train/skipped"] == [0, 0, 0, 1, 0, 0]
+    assert got["train/loss"][3] == 0
+    assert got["val/left_out"] == 7 + 1 + 15
+    assert figures(alone / "infinite")["train/skipped"] == [0, 1, 0, 0, 0, 0]
+    assert figures(alone / "filtered")["samples"] == [20, 20, 1, 20, 20, 1]
+    for weights in alone.glob("*/weights-0.safetensors"):
+        assert all(tensor.isfinite().all() for tensor in load_file(weights).values())
+
+
+@pytest.mark.slow
+def test_killed_and_resumed(alone, tmp_path):
+    """A process that is killed outright after the third step leaves a checkpoint that leads to the same weights."""
+    ((code, _),) = start(tmp_path, 1, "killed")
+    assert code == -signal.SIGKILL
+    run("killed", 1, tmp_path)
+    for name, expected in load_file(alone / "plain/weights-0.safetensors").items():
+        assert torch.equal(load_file(tmp_path / "killed/weights-0.safetensors")[name], expected)
+    assert figures(tmp_path / "killed")["train/loss"] == figures(alone / "plain")["train/loss"][2:]

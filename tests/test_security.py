@@ -1,0 +1,451 @@
+"""Files from strangers: nothing in them is run, and a small one takes no large memory. Each is built here."""
+
+import ast
+import json
+import pickle
+import re
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections import OrderedDict
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import pytorch_lightning as pl
+import torch
+from safetensors.torch import save_file
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data import store as stores
+from kornia_learnnorm.data.hloc import export_hloc, import_hloc
+from kornia_learnnorm.data.images import image_size, read_image
+from kornia_learnnorm.data.ngransac import import_ngransac
+from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
+from kornia_learnnorm.data.store import StoreReader, read_store, write_store
+from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.evaluation.run import read_arrays
+from lightning_modules.cli import main
+from lightning_modules.datamodule import CorrespondenceDataModule
+from lightning_modules.task import NormalizerTask
+
+ROOT = Path(__file__).parent.parent
+NETWORK = "model.normalizer.init_args.network.init_args"
+
+
+class Touches:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.fixture
+def made(tmp_path):
+    """The file that must not come to be."""
+    path = tmp_path / "made"
+    pickle.loads(pickle.dumps(Touches(path)))
+    assert path.exists()
+    path.unlink()
+    yield path
+    assert not path.exists()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The checkpoint of a run of the command, and its options."""
+    folder = tmp_path_factory.mktemp("run")
+    numbers = [f"--data.{stage}.init_args.number=64" for stage in ("train", "val", "test")]
+    options = [
+        *("--config", str(ROOT / "configs/crossview-synthetic.yaml"), *numbers, "--data.batch_size=16"),
+        *("--trainer.max_steps=2", "--trainer.enable_progress_bar=false", f"--{NETWORK}.width=8"),
+        *(f"--{NETWORK}.depth=1", f"--trainer.default_root_dir={folder}"),
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["learnnorm"])
+        assert main(["fit", *options]) == 0
+    return folder / "checkpoints/last.ckpt", options
+
+
+class TestCheckpoints:
+    @pytest.fixture(autouse=True)
+    def program(self, monkeypatch):
+        monkeypatch.setattr("sys.argv", ["learnnorm"])
+
+    def refused(self, trained, path, capsys, commands=("fit",)):
+        """The commands end with one line."""
+        for command in commands:
+            assert main([command, *trained[1], f"--ckpt_path={path}"]) == 2
+            error = capsys.readouterr().err
+            assert f"{path} is not a checkpoint of a training run" in error
+            assert error.count("\n") == 1
+
+    def test_code_is_not_run(self, trained, made, tmp_path, capsys):
+        checkpoint = torch.load(trained[0], weights_only=True)
+        torch.save(checkpoint | {"callbacks": Touches(made)}, tmp_path / "forged.ckpt")
+        self.refused(trained, tmp_path / "forged.ckpt", capsys, ["fit", "validate", "test", "predict"])
+        (tmp_path / "plain.ckpt").write_bytes(pickle.dumps(Touches(made)))
+        self.refused(trained, tmp_path / "plain.ckpt", capsys)
+
+    def test_code_is_not_run_by_the_trainer(self, trained, made, tmp_path):
+        torch.save(torch.load(trained[0], weights_only=True) | {"callbacks": Touches(made)}, tmp_path / "forged.ckpt")
+        source = SyntheticSamples(number=64)
+        task, data = NormalizerTask(kln.LearnedNormalizer()), CorrespondenceDataModule(source, source, batch_size=16)
+        trainer = pl.Trainer(logger=False, enable_checkpointing=False, max_steps=1, accelerator="cpu")
+        with pytest.raises(pickle.UnpicklingError):
+            trainer.fit(task, data, ckpt_path=tmp_path / "forged.ckpt", weights_only=True)
+
+    def test_a_checkpoint_configures_nothing(self, trained, made, tmp_path):
+        """Lightning's command takes the model's arguments from a checkpoint, and they can name classes."""
+        forged = {"normalizer": {"class_path": "subprocess.Popen", "init_args": {"args": ["touch", str(made)]}}}
+        torch.save(torch.load(trained[0], weights_only=True) | {"hyper_parameters": forged}, tmp_path / "forged.ckpt")
+        assert main(["validate", *trained[1], f"--ckpt_path={tmp_path / 'forged.ckpt'}"]) == 0
+
+    def test_broken(self, trained, tmp_path, capsys):
+        whole = trained[0].read_bytes()
+        for name, content in {"empty": b"", "cut": whole[:-50], "text": b"text", "zip": b"PK\x03\x04"}.items():
+            (tmp_path / f"{name}.ckpt").write_bytes(content)
+            self.refused(trained, tmp_path / f"{name}.ckpt", capsys)
+        for name, content in {"list": [1], "weights": {"state_dict": [1]}, "text": {"state_dict": {"a": "b"}}}.items():
+            torch.save(content, tmp_path / f"{name}.ckpt")
+            self.refused(trained, tmp_path / f"{name}.ckpt", capsys)
+
+    def test_bomb(self, trained, tmp_path, capsys):
+        """A compressed checkpoint, which PyTorch would unfold."""
+        path = tmp_path / "bomb.ckpt"
+        torch.save({"state_dict": {"a": torch.zeros(10**7)}}, tmp_path / "stored.ckpt")
+        with zipfile.ZipFile(tmp_path / "stored.ckpt") as stored, zipfile.ZipFile(path, "w", 8) as packed:
+            for entry in stored.infolist():
+                packed.writestr(entry.filename, stored.read(entry))
+        assert path.stat().st_size < 10**5
+        assert len(torch.load(path, weights_only=True)["state_dict"]["a"]) == 10**7
+        self.refused(trained, path, capsys)
+
+    def test_of_another_network(self, trained, capsys):
+        for command in ("fit", "test"):
+            assert main([command, *trained[1], f"--{NETWORK}.width=16", f"--ckpt_path={trained[0]}"]) == 2
+            error = capsys.readouterr().err
+            assert "holds another network than the one configured" in error
+            assert error.count("\n") == 1
+
+    def test_without_lightning(self, trained, tmp_path):
+        """The lines of docs/training.md, where Lightning cannot be imported, give the weights that were exported."""
+        text = (ROOT / "docs/training.md").read_text()
+        (lines,) = re.findall(r"## A checkpoint without Lightning.*?```python\n(.*?)```", text, flags=re.DOTALL)
+        lines = lines.replace("runs/crossview/checkpoints/last.ckpt", str(trained[0]))
+        lines = lines.replace("kln.CrossViewNetwork()", "kln.CrossViewNetwork(width=8, depth=1)")
+        check = f"""
+import sys
+sys.modules["pytorch_lightning"] = sys.modules["lightning"] = None
+{lines}
+exported = kln.LearnedNormalizer.from_pretrained({str(trained[0].parents[1] / "weights.safetensors")!r}).state_dict()
+assert exported.keys() == normalizer.state_dict().keys()
+assert all(torch.equal(value, exported[key]) for key, value in normalizer.state_dict().items())
+"""
+        subprocess.run([sys.executable, "-W", "error", "-c", check], check=True, cwd=tmp_path)
+
+
+class TestWeights:
+    def refused(self, path, message):
+        with pytest.raises(ValueError, match=message) as caught:
+            kln.LearnedNormalizer.from_pretrained(path)
+        assert "\n" not in str(caught.value)
+        assert path.name in str(caught.value)
+
+    @pytest.mark.parametrize(
+        "content",
+        [
+            struct.pack("<Q", 2**63) + b"{}",
+            struct.pack("<Q", 2**40) + b"{}",
+            struct.pack("<Q", 62) + b'{"a":{"dtype":"F32","shape":[1000000],"data_offsets":[0,4000000]}}'[:62],
+            struct.pack("<Q", 58) + b'{"a":{"dtype":"F32","shape":[9],"data_offsets":[0,99999]}}',
+            struct.pack("<Q", 64) + b'{"a":{"dtype":"F32","shape":[4294967296,4294967296],"data_offsets'[:64],
+            pickle.dumps(Touches(Path("/nowhere"))),
+        ],
+    )
+    def test_forged_headers(self, tmp_path, content):
+        (tmp_path / "forged.safetensors").write_bytes(content)
+        self.refused(tmp_path / "forged.safetensors", "is not a safetensors file")
+
+    @pytest.mark.parametrize(
+        ("numbers", "message"),
+        [
+            ({"width": 10**6, "depth": 4}, "numbers can be at most 4096, got 1000000"),
+            ({"width": 8, "depth": 10**9}, "numbers can be at most 4096, got 1000000000"),
+            ({"width": 4096, "depth": 100}, "the tensors do not fit the architecture"),  # 20 GB of weights
+            ({"width": -1, "depth": 1}, "describes no normaliser of this version"),
+        ],
+    )
+    def test_an_architecture_takes_no_memory_of_its_own(self, tmp_path, numbers, message):
+        architecture = {
+            "base": {"name": "Whitening", "floor": 1e-6},
+            "network": {"name": "CrossViewNetwork", **numbers},
+            "transform": "spd_transform",
+        }
+        metadata = {"format": "kornia_learnnorm.normalizer.v1", "architecture": json.dumps(architecture)}
+        save_file({"network.set_network.head.2.bias": torch.zeros(5)}, tmp_path / "forged.safetensors", metadata)
+        self.refused(tmp_path / "forged.safetensors", message)
+
+    def test_of_another_architecture(self, tmp_path):
+        small = kln.LearnedNormalizer(network=kln.CrossViewNetwork(width=8, depth=1))
+        small.save_pretrained(tmp_path / "small.safetensors")
+        with pytest.raises(RuntimeError, match="size mismatch"):
+            kln.LearnedNormalizer().load_state_dict(small.state_dict())
+        data = bytearray((tmp_path / "small.safetensors").read_bytes())
+        data = data.replace(b'\\"width\\": 8', b'\\"width\\": 9')
+        (tmp_path / "forged.safetensors").write_bytes(data)
+        self.refused(tmp_path / "forged.safetensors", "the tensors do not fit the architecture: .*size mismatch")
+
+
+class TestStores:
+    @pytest.fixture
+    def path(self, tmp_path):
+        write_store(tmp_path / "store.h5", synthetic_store(pairs=2, points=30, seed=1))
+        return tmp_path / "store.h5"
+
+    def declare(self, path, rows, **options):
+        """Declare rows that are not written: HDF5 reads them as zeros."""
+        with h5py.File(path, "r+") as file:
+            for name in ("points1", "points2", "ratio"):
+                tail = file[name].shape[1:]
+                del file[name]
+                file.create_dataset(name, (rows, *tail), "float32", chunks=(2048, *tail), **options)
+            file["offsets"][-1] = rows
+
+    @pytest.mark.parametrize("rows", [2 * 10**7, 10**12, 2**58])
+    def test_declared_rows(self, path, rows):
+        self.declare(path, rows, compression="gzip")
+        size = path.stat().st_size
+        limit = rf"more than the limit of {20 * size + 2**28} bytes, 20 times the size of the file and {2**28}"
+        for read in (read_store, StoreReader, lambda p: StoreSamples([str(p)])):
+            with pytest.raises(ValueError, match=rf"store\.h5 declares arrays of \d+ bytes, {limit}"):
+                read(path)
+
+    def test_compression(self, path, monkeypatch):
+        """Zeros that were written and compressed are bounded alike, in proportion to the file."""
+        monkeypatch.setattr(stores, "BEYOND", 0)
+        read_store(path)
+        self.declare(path, 10**6, compression="gzip")
+        with h5py.File(path, "r+") as file:
+            for name in ("points1", "points2", "ratio"):
+                file[name][:] = np.zeros(file[name].shape, np.float32)
+        assert 20 * path.stat().st_size < 20 * 10**6
+        with pytest.raises(ValueError, match="declares arrays of"):
+            read_store(path)
+
+    def test_a_store_that_compresses_well_is_read(self, path):
+        before = read_store(path)
+        with h5py.File(path, "r+") as file:
+            for name in ("points1", "points2", "ratio", "names"):
+                values, dtype = file[name][:], file[name].dtype
+                del file[name]
+                file.create_dataset(name, data=values, dtype=dtype, compression="gzip", chunks=True)
+        np.testing.assert_array_equal(read_store(path).points1, before.points1)
+        assert read_store(path).names == before.names
+
+    def test_offsets(self, path):
+        with h5py.File(path, "r+") as file:
+            file["offsets"][-1] = 2**62
+        with pytest.raises(ValueError, match=r"points1 must have shape \(4611686018427387904, 2\), got \(180, 2\)"):
+            read_store(path)
+        with h5py.File(path, "r+") as file:
+            del file["offsets"]
+            file.create_dataset("offsets", (2**50,), "int64", chunks=(128,))
+        with pytest.raises(ValueError, match="declares arrays of"):
+            read_store(path)
+
+    def test_one_name_for_all(self, path, monkeypatch):
+        """Texts lie outside the array of names, which can point at one of them again and again."""
+        with h5py.File(path, "r+") as file:
+            file["names"][0, 0] = "x" * 10**6
+            chunk = file["names"].id.get_chunk_info(0).byte_offset
+        data = bytearray(path.read_bytes())
+        data[chunk : chunk + 16 * 12] = data[chunk : chunk + 16] * 12
+        path.write_bytes(data)
+        assert read_store(path).names[5] == ("x" * 10**6,) * 2  # forged as meant
+        monkeypatch.setattr(stores, "UNFOLD", 1)
+        monkeypatch.setattr(stores, "BEYOND", 10**6)
+        with pytest.raises(ValueError, match=r"store\.h5: its names take more than the limit of \d+ bytes"):
+            read_store(path)
+
+    def test_other_files_are_not_opened(self, path, tmp_path):
+        """Links, raw bytes and virtual arrays can lead to whatever the reader may open."""
+        (tmp_path / "raw").write_bytes(bytes(720))
+        (tmp_path / "other.h5").write_bytes(path.read_bytes())
+        layout = h5py.VirtualLayout((180,), "float32")
+        layout[:] = h5py.VirtualSource(tmp_path / "other.h5", "ratio", (180,))
+        for change in (
+            lambda file: file.update(ratio=h5py.ExternalLink("other.h5", "ratio")),
+            lambda file: file.update(ratio=h5py.SoftLink("/offsets")),
+            lambda file: file.create_dataset("ratio", (180,), "float32", external=[(str(tmp_path / "raw"), 0, 720)]),
+            lambda file: file.create_virtual_dataset("ratio", layout),
+        ):
+            with h5py.File(path, "r+") as file:
+                del file["ratio"]
+                change(file)
+            with pytest.raises(ValueError, match="lacks the datasets ratio"):
+                read_store(path)
+
+    def test_names_that_are_no_texts(self, path):
+        with h5py.File(path, "r+") as file:
+            del file["names"]
+            file.create_dataset("names", (6, 2), h5py.vlen_dtype(np.int32))
+        with pytest.raises(ValueError, match="names must be texts"):
+            read_store(path)
+
+
+def png(width, height, pixels=b"", *before):
+    """A grey PNG of a declared size, with further chunks before its pixels."""
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    parts = [(b"IHDR", header), *before, (b"IDAT", zlib.compress(pixels)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+
+
+def keypoints_of(file) -> list[str]:
+    names = []
+    file.visit(names.append)
+    return [name for name in names if name.endswith("/keypoints")]
+
+
+class TestMatchFiles:
+    @pytest.fixture
+    def folder(self, tmp_path):
+        export_hloc(synthetic_store(pairs=2, points=30, seed=1), tmp_path / "features.h5", tmp_path / "matches.h5")
+        return tmp_path
+
+    def test_declared_keypoints(self, folder):
+        import_hloc(folder / "features.h5", folder / "matches.h5")
+        with h5py.File(folder / "features.h5", "r+") as file:
+            (image, *_) = keypoints_of(file)
+            del file[image]
+            file.create_dataset(image, (2**40, 2), "float32", chunks=(2048, 2))
+        with pytest.raises(ValueError, match=r"features\.h5 declares arrays of \d+ bytes, more than the limit"):
+            import_hloc(folder / "features.h5", folder / "matches.h5")
+
+    def test_other_files_are_not_opened(self, folder, tmp_path):
+        with h5py.File(tmp_path / "other.h5", "w") as other:
+            other["secret"] = np.zeros((5, 2), np.float32)
+        with h5py.File(folder / "features.h5", "r+") as file:
+            (image, *_) = keypoints_of(file)
+            del file[image]
+            file[image] = h5py.ExternalLink(str(tmp_path / "other.h5"), "secret")
+        with pytest.raises(ValueError, match=r"features\.h5 refers to data in other files"):
+            import_hloc(folder / "features.h5", folder / "matches.h5")
+
+    def test_lists_that_share_their_members(self, tmp_path):
+        shared = [0.0]
+        for _ in range(40):
+            shared = [shared, shared]
+        held = np.empty(9, object)
+        held[:] = [shared] * 9
+        (tmp_path / "matches").mkdir()
+        np.save(tmp_path / "matches" / "pair_0.npy", held, allow_pickle=True)
+        with pytest.raises(ValueError, match="its lists hold more than the file has bytes"):
+            import_ngransac(tmp_path / "matches")
+
+
+class TestImages:
+    def test_control(self, tmp_path):
+        (tmp_path / "small.png").write_bytes(png(3, 2, b"\0abc\0def"))
+        np.testing.assert_array_equal(read_image(tmp_path / "small.png"), [list(b"abc"), list(b"def")])
+
+    @pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (100_000, 100_000), (14_000, 14_000)])
+    def test_declared_pixels(self, tmp_path, size, monkeypatch):
+        monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+        path = tmp_path / "large.png"
+        path.write_bytes(png(*size, bytes(1000)))
+        with pytest.raises(ValueError, match=r"large\.png declares more than 178956970 pixels, the limit, 2 \* PIL"):
+            read_image(path)
+        assert image_size(path) == (0, 0)
+
+    def test_hidden_size(self, tmp_path, monkeypatch):
+        """A chunk that ends Pillow's parser does not get the pixels past the limit."""
+        monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+        path = tmp_path / "hidden.png"
+        path.write_bytes(png(30_000, 30_000, bytes(1000), (b"zTXt", b"a\0\0" + zlib.compress(bytes(10**7)))))
+        with pytest.raises(ValueError, match=r"hidden\.png"):
+            read_image(path)
+
+
+class TestArrays:
+    """Arrays that runs and filters leave on disk: of numbers only."""
+
+    def test_npz(self, made, tmp_path):
+        np.savez(tmp_path / "forged.npz", plain_residual=np.array([Touches(made)], object))
+        with pytest.raises(ValueError, match=r"forged\.npz is damaged"):
+            read_arrays(tmp_path / "forged.npz")
+
+    def test_cache_of_a_filter(self, made, tmp_path):
+        write_store(tmp_path / "store.h5", synthetic_store(pairs=2, points=30, seed=1))
+        source = StoreSamples([str(tmp_path / "store.h5")], cache=str(tmp_path / "cache"))
+        source.draw(0, 0)
+        (held,) = (tmp_path / "cache").iterdir()
+        np.save(held, np.array([Touches(made)], object))
+        with pytest.raises(ValueError, match="allow_pickle=False"):
+            source.draw(0, 0)
+
+    def test_attributes_of_a_store(self, made, tmp_path):
+        """Pickles in a store are bytes."""
+        write_store(tmp_path / "store.h5", synthetic_store(pairs=2, points=30, seed=1))
+        with h5py.File(tmp_path / "store.h5", "r+") as file:
+            file.attrs["dataset"] = np.void(pickle.dumps(Touches(made)))
+        read_store(tmp_path / "store.h5")
+
+
+def test_no_load_path_unpickles():
+    """``torch.load`` for weights alone, ``np.load`` for numbers alone, one unpickler, which runs nothing."""
+    unpicklers = OrderedDict()
+    for path in [*ROOT.glob("kornia_learnnorm/**/*.py"), *ROOT.glob("lightning_modules/*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                name, given = ast.unparse(node.func), {word.arg: ast.unparse(word.value) for word in node.keywords}
+                if name == "torch.load":
+                    assert given.get("weights_only") == "True", path
+                elif name in ("np.load", "numpy.load"):
+                    assert given.get("allow_pickle", "False") == "False", path
+                assert not re.fullmatch(r"(pickle|joblib|dill|cloudpickle|shelve|marshal)\.(loads?|open)", name), path
+            if isinstance(node, ast.ClassDef) and "pickle.Unpickler" in map(ast.unparse, node.bases):
+                unpicklers[path.name] = node.name
+    assert unpicklers == {"ngransac.py": "_Unpickler"}  # tested with the match files that it reads
+
+
+def test_actions_are_pinned():
+    """Should there be workflows, each action is named by the full hash of its commit."""
+    for path in (ROOT / ".github").glob("**/*.y*ml"):
+        for action in re.findall(r"uses:\s*(\S+)", path.read_text()):
+            assert action.startswith("./") or re.search(r"@[0-9a-f]{40}$", action), (path, action)
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        ("", "audit: not done (offline?): "),
+        ("echo requests.exceptions.ConnectionError; exit 1", "audit: not done (offline?): requests.exceptions.Conn"),
+        (
+            "echo 'Found 1 known vulnerability in 1 package' >&2; echo one 1.0 CVE-1; exit 1",
+            "audit: Found 1 known vuln",
+        ),
+        ("echo 'No known vulnerabilities found'", "audit: no known vulnerabilities"),
+    ],
+)
+def test_audit_never_fails(tmp_path, found, message):
+    """``make audit`` reports; where nothing can be reached or installed it says so and goes on."""
+    if found:
+        (tmp_path / "bin").mkdir()
+        (tmp_path / "bin/pip-audit").write_text(f"#!/bin/sh\n{found}\n")
+        (tmp_path / "bin/pip-audit").chmod(0o755)
+    command = ["make", "--no-print-directory", "audit", f"AUDIT={tmp_path}", "PYTHON=false"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(message)

@@ -1,0 +1,146 @@
+"""Train on one or several processes and write what came of it.
+
+    python train_processes.py PROCESSES FOLDER CASE...
+
+is started once for each process, with LOCAL_RANK, MASTER_ADDR and MASTER_PORT in its environment.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import warnings
+from pathlib import Path
+
+import pytorch_lightning as pl
+import torch
+from safetensors.torch import save_file
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.sources import Block, SyntheticSamples
+from lightning_modules.callbacks import Checkpoints, WritePredictions
+from lightning_modules.datamodule import CorrespondenceDataModule
+from lightning_modules.task import NormalizerTask
+
+
+class Pairs(SyntheticSamples):
+    """Ten image pairs, of pair k the samples of k + 1 scenes: processes that share a batch hold unequal numbers."""
+
+    def __init__(self):
+        super().__init__(number=55, num_heldout=4, max_residual=None)
+
+    def blocks(self, seed):
+        return [Block(55, 10)]
+
+    def draw(self, seed, block):
+        return super().draw(seed, block)._replace(pair=torch.repeat_interleave(torch.arange(10), torch.arange(1, 11)))
+
+
+class Filtered(SyntheticSamples):
+    """Three blocks of forty samples, of which the filter keeps 40, none and one."""
+
+    def __init__(self):
+        super().__init__(number=40, num_heldout=4, max_residual=None)
+
+    def blocks(self, seed):
+        return [Block(40, 40)] * 3
+
+    def draw(self, seed, block):
+        return super().draw(3 * seed + block, 0).select(torch.arange((40, 0, 1)[block]))
+
+
+class Spoil(pl.Callback):
+    """Put NaN into batches: all samples of the last process, one of them, and all samples of all."""
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        # Of two processes, the last one has every second sample.
+        last, every = (trainer.global_rank == 1, 1) if trainer.world_size == 2 else (True, 2)
+        rows = {1: slice(every - 1, None, every), 2: slice(every - 1, every), 3: slice(None)}
+        if batch_idx in rows and (last or batch_idx == 3):
+            batch.points1[rows[batch_idx]] = torch.nan
+
+    def on_validation_batch_start(self, trainer, pl_module, batch, batch_idx, dataloader_idx=0):
+        self.on_train_batch_start(trainer, pl_module, batch, batch_idx)
+
+
+class BlowUp(pl.Callback):
+    """Make the gradient of the second step infinite, in the last process."""
+
+    def on_before_backward(self, trainer, pl_module, loss):
+        if trainer.global_rank == trainer.world_size - 1 and trainer.global_step == 1:
+            loss.register_hook(lambda gradient: torch.inf * gradient)
+
+
+class Watch(pl.Callback):
+    """Keep the figures of each step, and how many samples this process had."""
+
+    def __init__(self):
+        self.seen = {"train/loss": [], "train/left_out": [], "train/skipped": []}
+        self.samples = []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.samples.append(len(batch.pair))
+        for name, values in self.seen.items():
+            values.append(trainer.callback_metrics[name].item())
+
+
+class Stop(pl.Callback):
+    """Stop at a step, by an error or as the machine would."""
+
+    def __init__(self, step, kill=False):
+        self.step, self.kill = step, kill
+
+    def on_train_batch_end(self, trainer, *_):
+        if trainer.global_step == self.step:
+            if self.kill:
+                os.kill(os.getpid(), signal.SIGKILL)
+            raise InterruptedError("as if the machine had stopped")
+
+
+def task_and_data(case):
+    torch.manual_seed(0)
+    task = NormalizerTask(
+        kln.LearnedNormalizer(network=kln.CrossViewNetwork(width=8, depth=1)).double(),  # so that rounding is small
+        loss=kln.EpipolarLoss(heldout_weight=0.5),
+        sample_gradient=0.1,
+    )
+    source = SyntheticSamples(number=75, num_heldout=4, max_residual=None)
+    train, batch = {"pairs": (Pairs(), 32), "filtered": (Filtered(), 20)}.get(case, (source, 15))
+    pairs = 3 if case == "pairs" else None
+    return task, CorrespondenceDataModule(train, source, source, batch_size=batch, batch_pairs=pairs)
+
+
+def run(case, processes, folder):
+    """Train for six steps, validate, predict, and write weights, figures and predictions to ``folder/case``."""
+    folder = Path(folder) / case
+    folder.mkdir(parents=True, exist_ok=True)
+    options = {
+        "max_steps": 6, "max_epochs": -1, "accelerator": "cpu", "devices": processes, "default_root_dir": folder,
+        "strategy": "ddp" if processes > 1 else "auto", "gradient_clip_val": 1.0, "logger": False,
+        "enable_progress_bar": False, "enable_model_summary": False, "num_sanity_val_steps": 0,
+    }  # fmt: skip
+    last = folder / "checkpoints" / "last.ckpt"
+    if case in ("resumed", "killed") and not last.exists():
+        callbacks = [Checkpoints(every_n_train_steps=1), Stop(3, kill=case == "killed")]
+        with contextlib.suppress(InterruptedError):
+            pl.Trainer(**options, callbacks=callbacks).fit(*task_and_data(case))
+    watch, more = Watch(), {"spoiled": [Spoil()], "infinite": [BlowUp()]}.get(case, [])
+    resume = last.exists()
+    more += [Checkpoints(every_n_train_steps=1)] if resume else []
+    trainer = pl.Trainer(**options, callbacks=[watch, *more, WritePredictions()], enable_checkpointing=resume)
+    task, data = task_and_data(case)
+    trainer.fit(task, data, ckpt_path=last if resume else None)
+    figures = {name: value.item() for name, value in trainer.callback_metrics.items()}
+    trainer.validate(task, data, verbose=False)
+    figures |= {name: value.item() for name, value in trainer.callback_metrics.items()}
+    trainer.predict(task, data)
+    rank = trainer.global_rank
+    (folder / f"figures-{rank}.json").write_text(json.dumps(figures | watch.seen | {"samples": watch.samples}))
+    save_file(task.normalizer.state_dict(), folder / f"weights-{rank}.safetensors")
+
+
+if __name__ == "__main__":
+    warnings.filterwarnings("ignore")
+    for name in sys.argv[3:]:
+        run(name, int(sys.argv[1]), sys.argv[2])
