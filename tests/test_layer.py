@@ -330,6 +330,7 @@ class TestBackEnds:
         assert up_to_sign(compiled(points1, points2).detach(), layer(points1, points2).detach()) < 1e-9
 
     @pytest.mark.slow
+    @pytest.mark.filterwarnings("ignore")  # Inductor's own
     def test_inductor(self):
         torch.compiler.reset()
         layer, points = EightPoint(shaken()), correspondences("handheld", 4)
