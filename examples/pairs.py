@@ -1,6 +1,7 @@
-"""What both examples share: image pairs with outliers and ground truth, and a small network over their correspondences.
+"""What the examples share: image pairs with outliers and ground truth, and a small network over their correspondences.
 
-With ``LEARNNORM_DATA``, pairs come from KITTI's sequences 03 (training) and 06 (held out); else they are synthetic.
+With ``LEARNNORM_DATA``, pairs come from KITTI's sequences, 03 or others for training and 06 held out; else they are
+synthetic.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ class Pairs(NamedTuple):
         columns = torch.randperm(self.feature.shape[1], generator=generator)[:num_points]
         return Pairs(*(value[rows][:, columns] for value in self[:3]), self.F_mat[rows])
 
+    def select(self, columns: slice) -> Pairs:
+        """Return some correspondences of all pairs."""
+        return Pairs(*(value[:, columns] for value in self[:3]), self.F_mat)
+
     def error(self, F_mat: Tensor, bound: float = 10.0) -> Tensor:
         """Return distances of ground-truth inliers in pixels, clamped, averaged per matrix (P, *, 3, 3)."""
         extra = F_mat.ndim - 3
@@ -55,19 +60,26 @@ class SetNetwork(nn.Module):
 
     def forward(self, pairs: Pairs) -> Tensor:
         """Return numbers (P, N), zero before training."""
-        views = [(p - p.mean(1, keepdim=True)) / p.std((1, 2), keepdim=True) for p in (pairs.points1, pairs.points2)]
-        x = self.stem(torch.cat([views[0], views[1] - views[0], pairs.feature[..., None]], -1))
+        points1, points2 = standardize(pairs.points1), standardize(pairs.points2)
+        x = self.stem(torch.cat([points1, points2 - points1, pairs.feature[..., None]], -1))
         for layer in self.layers:
             y = torch.nn.functional.layer_norm(x, x.shape[-1:])
             x = x + layer(torch.cat([y, y.mean(1, keepdim=True).expand_as(y)], -1)).relu()
         return self.head(x).squeeze(-1)
 
 
-def load_pairs() -> tuple[Pairs, Pairs]:
-    """Return pairs to learn from and pairs held out."""
+def standardize(points: Tensor) -> Tensor:
+    """Return points (P, N, 2) with their mean at zero and a spread of one."""
+    return (points - points.mean(1, keepdim=True)) / points.std((1, 2), keepdim=True)
+
+
+def load_pairs(*sequences: str, num_points: int = 1000, num_held_out: int = 1000) -> tuple[Pairs, Pairs]:
+    """Return pairs to learn from, of KITTI's sequence 03 where none is named, and pairs held out."""
     if folder := os.environ.get("LEARNNORM_DATA"):
         stores = Path(folder) / "correspondences"
-        return read_pairs(stores / "kitti_03.h5"), read_pairs(stores / "kitti_06.h5")
+        parts = [read_pairs(stores / f"kitti_{name}.h5", num_points) for name in sequences or ["03"]]
+        training = Pairs(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        return training, read_pairs(stores / "kitti_06.h5", num_held_out)
     return synthetic_pairs(400, seed=0), synthetic_pairs(50, seed=1)
 
 

@@ -1,4 +1,4 @@
-"""The scripts in examples/, cut short: they run, and what they train gets better."""
+"""The scripts in examples/, cut short: they run, what they train gets better, and they show what they say."""
 
 from __future__ import annotations
 
@@ -8,27 +8,45 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+from kornia.feature import DISK, LightGlue
+from kornia.geometry import RANSAC
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.synthetic import orbit
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-def run(name: str, monkeypatch, *args: str) -> tuple[float, float]:
+@pytest.fixture
+def example(monkeypatch):
+    """Import an example as when it is run: its folder is on the path."""
     monkeypatch.syspath_prepend(EXAMPLES)
-    for module in ("pairs", name):
-        monkeypatch.delitem(sys.modules, module, raising=False)
-    try:
-        return importlib.import_module(name).main(args)
-    finally:
-        sys.modules.pop("pairs", None)
+    names = [path.stem for path in EXAMPLES.glob("*.py")]
+    for name in names:
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    yield importlib.import_module
+    for name in names:
         sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def synthetic(monkeypatch):
+    monkeypatch.delenv("LEARNNORM_DATA", raising=False)
+
+
+@pytest.fixture
+def real():
+    pytest.importorskip("h5py")
+    if not os.environ.get("LEARNNORM_DATA"):
+        pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
 
 
 @pytest.mark.parametrize(
     ("name", "steps", "points", "gain"), [("predict_weights", 64, 128, 0.3), ("guided_sampling", 32, 128, 0.5)]
 )
-def test_learns_from_synthetic_pairs(name, steps, points, gain, monkeypatch, capsys):
-    monkeypatch.delenv("LEARNNORM_DATA", raising=False)
-    before, after = run(name, monkeypatch, "--steps", str(steps), "--points", str(points))
+def test_learns_from_synthetic_pairs(name, steps, points, gain, example, synthetic, capsys):
+    before, after = example(name).main(["--steps", str(steps), "--points", str(points)])
     assert after < gain * before
     printed = capsys.readouterr().out
     assert f"step {steps:4d}: loss " in printed
@@ -36,10 +54,111 @@ def test_learns_from_synthetic_pairs(name, steps, points, gain, monkeypatch, cap
 
 
 @pytest.mark.parametrize("name", ["predict_weights", "guided_sampling"])
-def test_runs_on_real_pairs(name, monkeypatch):
-    pytest.importorskip("h5py")
-    if not os.environ.get("LEARNNORM_DATA"):
-        pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
-    before, after = run(name, monkeypatch, "--steps", "2", "--points", "64", "--pairs", "2")
+def test_runs_on_real_pairs(name, example, real):
+    before, after = example(name).main(["--steps", "2", "--points", "64", "--pairs", "2"])
     assert 0 < before < 10
     assert 0 < after < 10
+
+
+def test_weights_are_learned_through_the_layer(example, synthetic):
+    main, short = example("weighting_network").main, ["--normalizers", "hartley", "--seeds", "0", "--points", "48"]
+    untrained, trained = (main([*short, "--steps", steps, "--last-steps", "0"])["hartley"][0] for steps in ("0", "80"))
+    assert trained[0] > untrained[0] + 10
+    assert trained[2] < 0.5 * untrained[2]
+
+
+def test_a_learned_normaliser_starts_as_hartleys_and_is_trained(example, synthetic):
+    short = ["--seeds", "0", "--points", "48", "--steps", "2", "--pairs", "4"]
+    start, trained = (
+        example("weighting_network").main([*short, "--normalizers", "hartley", "learned", "--last-steps", steps])
+        for steps in ("0", "2")
+    )
+    assert start["learned"][0] == pytest.approx(start["hartley"][0], rel=1e-5)
+    assert trained["learned"][0] != pytest.approx(trained["hartley"][0], rel=1e-5)
+
+
+def test_weighting_network_on_real_pairs(example, real, capsys):
+    short = ["--seeds", "0", "--steps", "1", "--last-steps", "1", "--pairs", "2", "--points", "480"]
+    results = example("weighting_network").main([*short, "--normalizers", "whitening", "crossview"])
+    assert all(0 <= row[0] <= 100 and row[2] > 0 for rows in results.values() for row in rows)
+    assert "crossview, mean of 1" in capsys.readouterr().out
+
+
+class Counting(torch.nn.Module):
+    """Hartley's normalisation that counts its calls by the number of points."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sizes: list[int] = []
+
+    def forward(self, points1, points2, weights=None):
+        self.sizes.append(points1.shape[1])
+        return kln.Hartley()(points1, points2, weights)
+
+
+def test_kornia_ransac_solves_and_refits_by_the_layer(example):
+    pair = orbit(1, 200, torch.Generator().manual_seed(0), noise=0.2, outliers=0.2)
+    counting = Counting()
+    F_mat, inliers = example("kornia_ransac").kornia_ransac(counting, 200)(pair.points1[0], pair.points2[0])
+    assert 8 in counting.sizes
+    assert max(counting.sizes) > 8
+    assert (inliers == pair.inliers[0]).float().mean() > 0.9
+    distance = kln.symmetric_epipolar_distance(pair.points1, pair.points2, F_mat[None])
+    assert distance[pair.inliers].median() < 1
+
+
+def test_kornia_ransac_calls_no_replaced_solver_by_default():
+    pair = orbit(1, 200, torch.Generator().manual_seed(0), noise=0.2, outliers=0.2)
+    ransac, counting = RANSAC("fundamental_8pt", inl_th=1.0, max_samples=200, seed=0), Counting()
+    ransac.minimal_solver = ransac.polisher_solver = kln.EightPoint(counting)
+    ransac(pair.points1[0], pair.points2[0])
+    assert counting.sizes == []
+
+
+def test_kornia_ransac_example(example, synthetic):
+    results = example("kornia_ransac").main(["--samples", "100", "--pairs", "2"])
+    assert len(results) == 7
+    assert all(f1 > 50 and error < 3 for f1, error in results.values())
+
+
+def test_lightglue_learns_through_the_layer(example):
+    before, after = example("match_and_estimate").main(["--steps", "60"])
+    assert after < 0.9 * before
+
+
+def test_gradients_reach_all_that_makes_lightglues_scores(example):
+    module = example("match_and_estimate")
+    torch.manual_seed(0)
+    lightglue = module.small_lightglue()
+    sides, F_mat = module.synthetic_sides(2, torch.Generator().manual_seed(0))
+    found = module.estimate(lightglue, kln.EightPoint(kln.LearnedNormalizer.from_pretrained()), sides)
+    assert found.determined.all()
+    module.error(found, sides, F_mat).sum().backward()
+    gradients = {name: p.grad for name, p in lightglue.named_parameters()}
+    # What stops early and the matching of the layers before the last do not enter the scores.
+    without = {name for name, gradient in gradients.items() if gradient is None}
+    assert all(name.startswith(("token_confidence", "log_assignment.0")) for name in without)
+    reached = [gradient for gradient in gradients.values() if gradient is not None]
+    assert all(gradient.isfinite().all() for gradient in reached)
+    assert sum(bool(gradient.any()) for gradient in reached) > 0.9 * len(reached)
+
+
+def test_images_are_matched_with_gradients(example, tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    module = example("match_and_estimate")
+    torch.manual_seed(0)
+    images = tmp_path / "image1.png", tmp_path / "image2.png"
+    for path in images:
+        cv2.imwrite(str(path), torch.randint(256, (64, 80), dtype=torch.uint8).numpy())
+    lightglue = LightGlue(None, input_dim=128, n_layers=1, flash=False, **module.EVERY_MATCH)
+    distance, norm = module.match_images(DISK().eval(), lightglue, images)
+    assert distance > 0
+    assert norm > 0
+
+
+def test_one_line_changes_nothing_but_the_solver(example, capsys):
+    errors = example("one_line").main(["--scenes", "300"])
+    kornia, same, whitening, learned = errors.values()
+    assert same == pytest.approx(kornia, rel=1e-3)
+    assert learned < whitening < kornia
+    assert f"{learned:.4f} degrees" in capsys.readouterr().out
