@@ -27,6 +27,7 @@ from kornia_learnnorm.ransac import RANSAC
 from kornia_learnnorm.refine import refine_fundamental
 from kornia_learnnorm.residuals import algebraic_distance, sampson_distance, symmetric_epipolar_distance
 from kornia_learnnorm.reweighting import ReweightedWhitening
+from kornia_learnnorm.sampling import ProsacSampler, WeightedSampler
 from kornia_learnnorm.search import SearchedNormalizer
 from kornia_learnnorm.soft import expected_loss, sample_minimal_sets
 from kornia_learnnorm.solver import find_fundamental
@@ -49,9 +50,11 @@ __all__ = [
     "LearnedNormalizer",
     "PaperNetwork",
     "PerView",
+    "ProsacSampler",
     "ReweightedWhitening",
     "SearchedNormalizer",
     "Truncated",
+    "WeightedSampler",
     "Whitening",
     "algebraic_distance",
     "better_rate",

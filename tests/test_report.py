@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import shutil
+import sys
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +18,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import plain_residual
 from kornia_learnnorm.data.store import read_store, write_store
 from kornia_learnnorm.data.synthesize import synthetic_store
-from kornia_learnnorm.evaluation import evaluate, example, record
+from kornia_learnnorm.evaluation import evaluate, example, predict_run, record
 from kornia_learnnorm.evaluation.methods import find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.motion import pair_motions
 from kornia_learnnorm.evaluation.report import write_report
@@ -82,6 +85,10 @@ class TestMethods:
         ("name", "error", "message"),
         [
             ("nothing", FileNotFoundError, "no weights 'nothing'"),
+            ("hartley+LM", FileNotFoundError, r"expected none, Hartley, .*paper, .*module:Name, .*\+LM or \+optimal"),
+            ("Hartley+foo", FileNotFoundError, r"no weights 'Hartley\+foo'"),
+            ("Hartley+optimal+LM", FileNotFoundError, "expected none, Hartley"),
+            (":Whitening", ValueError, "expected module:Name"),
             ("no.such.module:Thing", ValueError, "no normaliser at"),
             ("kornia_learnnorm:Nothing", ValueError, "no normaliser at"),
             ("kornia_learnnorm:__version__", ValueError, "cannot be called"),
@@ -103,7 +110,7 @@ class TestMethods:
 def test_predictions_are_those_of_the_functions(run, store):
     read, found = read_store(store), read_run(run)
     cell = found.cells[0]
-    samples, drawn = record._draw(read, 0.8, 0, None), cell.drawn
+    samples, drawn = predict_run.draw(read, 0.8, 0, None), cell.drawn
     assert drawn == len(samples.pair)
     raw = np.load(run / "scenes" / "filtered" / "crossview.npz")
     samples = samples.select(plain_residual(samples.points1, samples.points2) < 60)
@@ -117,7 +124,7 @@ def test_predictions_are_those_of_the_functions(run, store):
 
 def test_another_run_computes_nothing_and_adds_what_is_new(copied, store, monkeypatch):
     files = {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")}
-    monkeypatch.setattr(record, "_predict", pytest.fail)
+    monkeypatch.setattr(record, "predict", pytest.fail)
     assert main(["evaluate", str(store), "--out", str(copied), "--methods", *METHODS]) == 0
     assert {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")} == files
     monkeypatch.undo()
@@ -145,7 +152,7 @@ def test_a_run_of_an_older_format_is_refused(copied, store, capsys):
         del about[key]
     (copied / "run.json").write_text(json.dumps(about))
     assert main(["evaluate", str(store), "--out", str(copied), "--methods", *METHODS]) == 2
-    assert "format None, now 2" in capsys.readouterr().err
+    assert "format None, expected 2" in capsys.readouterr().err
     assert main(["report", str(copied)]) == 2
     assert "another version of the package made it" in capsys.readouterr().err
 
@@ -231,25 +238,160 @@ class TestReport:
         assert len(tables["By motion: scenes, filtered"].rows) == 8
         assert 0 < len(tables["Worst failures: scenes, filtered"].rows) <= 10
 
-    def test_without_the_baseline(self, copied, store):
-        about = json.loads((copied / "run.json").read_text())
-        del about["methods"]["Hartley"]
-        (copied / "run.json").write_text(json.dumps(about))
-        with pytest.raises(ValueError, match="compares with Hartley"):
-            write_report(copied)
+    def test_without_the_baseline(self, copied, capsys):
+        for protocol in ("filtered", "unfiltered"):
+            (copied / "scenes" / protocol / "Hartley.npz").unlink()
+        assert main(["report", str(copied)]) == 2
+        assert "compares with Hartley, the run has predictions of Hartley+LM, " in capsys.readouterr().err
 
     def test_not_a_run(self, tmp_path, capsys):
         assert main(["report", str(tmp_path)]) == 2
         assert "no run at" in capsys.readouterr().err
 
-    def test_incomplete_and_damaged(self, copied, capsys):
-        path = copied / "scenes" / "filtered" / "crossview.npz"
+    def test_what_is_there_of_a_run(self, copied, capsys):
+        """Of a run that was stopped, with what was left out."""
+        for path in ("scenes/filtered/crossview", "scenes/unfiltered/samples", "sizes/none"):
+            (copied / f"{path}.npz").unlink()
+        assert main(["report", str(copied)]) == 0
+        left = "crossview on scenes, filtered; all methods on scenes, unfiltered; none by the number of correspondences"
+        assert f"not there yet, so left out: {left}" in capsys.readouterr().err
+        assert f"Not there yet, so left out: {left}." in (copied / "report.md").read_text()
+        (copied / "example.npz").unlink()
+        assert write_report(copied).missing[-1] == "the example of a pair"
+        assert "Figure 11" not in (copied / "report.md").read_text()
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("{", "run.json is damaged, it is not JSON"),
+            ("[1]", "run.json is damaged: expected an object of JSON, got list"),
+            ('{"format": 2}', "run.json is damaged: stores, methods, trained_on, versions, seed, max_samples not as"),
+        ],
+    )
+    def test_what_is_no_run(self, copied, store, capsys, text, message):
+        (copied / "run.json").write_text(text)
+        for command in (["report", str(copied)], ["evaluate", str(store), "--out", str(copied)]):
+            assert main(command) == 2
+            assert message in capsys.readouterr().err
+
+    @pytest.mark.parametrize("name", ["scenes/filtered/crossview", "scenes/pairs", "sizes/none", "example"])
+    def test_damaged(self, copied, store, capsys, name):
+        path = copied / f"{name}.npz"
         path.write_bytes(path.read_bytes()[:200])
-        assert main(["report", str(copied)]) == 2
-        assert "crossview.npz is damaged" in capsys.readouterr().err
-        path.unlink()
-        assert main(["report", str(copied)]) == 2
-        assert "the run is not complete" in capsys.readouterr().err
+        for command in (["report", str(copied)], ["evaluate", str(store), "--out", str(copied), "--methods", *METHODS]):
+            assert main(command) == 2
+            assert f"{path.name} is damaged, remove it" in capsys.readouterr().err
+
+    def test_other_samples(self, copied, store, capsys):
+        """Files of the unfiltered samples in the place of the filtered ones."""
+        commands = ["report", str(copied)], ["evaluate", str(store), "--out", str(copied), "--methods", *METHODS]
+        shutil.copy(copied / "scenes" / "unfiltered" / "none.npz", copied / "scenes" / "filtered" / "none.npz")
+        for command in commands:
+            assert main(command) == 2
+            assert "none.npz is of other samples, remove it: expected" in capsys.readouterr().err
+        np.savez(copied / "scenes" / "filtered" / "none.npz", own=np.zeros(3))
+        for command in commands:
+            assert main(command) == 2
+            assert "expected arrays F_mat, heldout" in capsys.readouterr().err
+        shutil.rmtree(copied / "scenes" / "filtered")
+        shutil.copytree(copied / "scenes" / "unfiltered", copied / "scenes" / "filtered")
+        assert main(commands[1]) == 2
+        assert "samples.npz is of other samples, remove it" in capsys.readouterr().err
+
+
+class TestOwnCode:
+    """Normalisers in the folder that the command is called in."""
+
+    GOOD = "from kornia_learnnorm import Whitening as Mine\n"
+    PLACE = staticmethod(lambda folder: folder / "scenes" / "filtered" / "own_normaliser_Mine.npz")
+
+    @pytest.fixture(autouse=True)
+    def here(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(example, "TRIALS", 5)
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)
+        monkeypatch.chdir(tmp_path)
+
+    def evaluate(self, store, folder, text):
+        Path("own_normaliser.py").write_text(text)
+        sys.modules.pop("own_normaliser", None)
+        importlib.invalidate_caches()
+        methods = ["own_normaliser:Mine", "Hartley"]
+        return main(["evaluate", str(store), "--out", str(folder), "--methods", *methods, "--max-samples", "40"])
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("def Mine(a, b, c):\n    raise RuntimeError('boom')", "RuntimeError: boom"),
+            ("def Mine(a, b):\n    pass", "Mine() takes 2 positional arguments"),
+            ("def Mine(a, b, c):\n    return 1", "must return two transforms of shape"),
+            ("def Mine(a, b, c):\n    return 2 * [float('nan') * a.new_ones(len(a), 3, 3)]", "are not finite"),
+        ],
+    )
+    def test_one_that_fails_is_left_out(self, store, tmp_path, capsys, text, message):
+        folder = tmp_path / "run"
+        assert self.evaluate(store, folder, text) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert "own_normaliser:Mine failed, called with" in error
+        assert error.splitlines()[-1].endswith(f"All others are in {folder}")
+        assert [*read_run(folder).about["methods"]] == ["Hartley"]
+        assert main(["report", str(folder)]) == 0
+        assert self.evaluate(store, folder, self.GOOD) == 0
+        assert len(read_run(folder).cells[0].predictions) == 2
+
+    def test_one_that_fails_late_leaves_nothing(self, store, tmp_path):
+        """Of the filtered samples there is a file when the unfiltered ones fail."""
+        text = "n = []\ndef Mine(a, b, c):\n    n.append(a)\n    return Whitening()(a, b, c) if len(n) < 2 else None\n"
+        assert self.evaluate(store, tmp_path / "run", "from kornia_learnnorm import Whitening\n" + text) == 2
+        assert not self.PLACE(tmp_path / "run").exists()
+
+    def test_edited_code_is_refused(self, store, tmp_path, capsys):
+        assert self.evaluate(store, tmp_path / "run", self.GOOD) == 0
+        assert self.PLACE(tmp_path / "run").exists()
+        assert self.evaluate(store, tmp_path / "run", self.GOOD) == 0
+        assert self.evaluate(store, tmp_path / "run", self.GOOD + "# edited") == 2
+        assert "is a run of other options, remove it or write elsewhere: own_normaliser:Mine" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("class Mine:\n    def __init__(self, size):\n        pass", "cannot be made without arguments"),
+            ("Mine = (", "SyntaxError"),
+            ("1 / 0", "ZeroDivisionError"),
+        ],
+    )
+    def test_what_cannot_be_made(self, store, tmp_path, capsys, text, message):
+        assert self.evaluate(store, tmp_path / "run", text) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "run").exists()
+
+
+def test_a_store_without_ground_truth_has_no_example(tmp_path, capsys):
+    read = synthetic_store(pairs=2, points=60, seed=1)
+    write_store(tmp_path / "short.h5", read)
+    command = ["evaluate", str(tmp_path / "short.h5"), "--out", str(tmp_path / "run"), "--methods", "Hartley"]
+    assert main(command) == 0
+    assert "without Figures 10 and 11: no pair has 256 matches" in capsys.readouterr().err
+    assert main(["report", str(tmp_path / "run")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--out", "RUN", "--weights", "paper"], "with --out, weights are among --methods"),
+        (["--out", "RUN", "--max-residual", "60"], "the limit is 60 px"),
+        (["--out", ""], "--out is empty: expected a folder"),
+        (["--out", "FILE"], "FILE is a file: expected a folder"),
+        (["--out", "RUN", "--max-samples", "-1"], "--max-samples must be 0, for all, or more, got -1"),
+    ],
+)
+def test_options_that_are_refused(store, tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    Path("FILE").touch()
+    assert main(["evaluate", str(store), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not Path("RUN").exists()
 
 
 def test_methods_need_a_run(store, capsys):
@@ -264,7 +406,7 @@ def test_a_few_samples(store, tmp_path, monkeypatch, options, most):
     folder = tmp_path / "run"
     assert main(["evaluate", str(store), "--out", str(folder), "--methods", "Hartley", *options]) == 0
     assert json.loads((folder / "run.json").read_text())["max_samples"] == most
-    everything = [len(record._draw(read_store(store), ratio, 0, None).pair) for ratio in (0.8, None)]
+    everything = [len(predict_run.draw(read_store(store), ratio, 0, None).pair) for ratio in (0.8, None)]
     assert [cell.drawn for cell in read_run(folder).cells] == ([most, most] if most else everything)
 
 

@@ -12,10 +12,12 @@ import yaml
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.data.synthesize import synthetic_store
-from kornia_learnnorm.evaluation import record
+from kornia_learnnorm.evaluation import predict_run
 from kornia_learnnorm.evaluation.consensus import THRESHOLDS, consensus
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.report_rates import rate_tables
+from kornia_learnnorm.evaluation.report_motion import by_motion
+from kornia_learnnorm.evaluation.report_print import print_tables
+from kornia_learnnorm.evaluation.report_rates import Table, rate_tables
 from kornia_learnnorm.evaluation.run import Cell, Run
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.evaluation.trained import SHIPPED, saw, trained_on
@@ -35,7 +37,7 @@ def test_predictions_agree_with_the_expectation_under_known_noise():
     points1, points2 = (torch.from_numpy(p).reshape(40, 64, 2) for p in (store.points1, store.points2))
     samples = Samples(points1, points2, points1[:, :1], points2[:, :1], torch.arange(40))
     F_mat = torch.from_numpy(store.F)
-    found = record._predict(Method(kln.Hartley(), lambda *_: F_mat), samples, store, None)
+    found = predict_run.predict(Method(kln.Hartley(), lambda *_: F_mat), samples, store, None)
     x1, x2 = (np.concatenate([p.double().numpy(), np.ones((40, 64, 1))], -1) for p in (points1, points2))
     n2, n1 = (np.linalg.norm((x @ f)[..., :2], axis=-1) for x, f in ((x1, store.F.swapaxes(1, 2)), (x2, store.F)))
     deviation = 0.5 * np.hypot(n1, n2) * (1 / n1 + 1 / n2)
@@ -57,7 +59,7 @@ def test_the_rate_of_known_distributions():
     predictions = {name: {"own": torch.from_numpy(values)} for name, values in own.items()}
     cell = Cell("kitti_06", "filtered", torch.arange(20_000) // 100, 20_000, predictions)
     about = {"methods": dict.fromkeys(own, ""), "trained_on": {"Hartley": [], "crossview": ["kitti_06@0:3"]}}
-    (table, _) = rate_tables(Run(about, [cell], {}, {}, {}))
+    (table,) = rate_tables(Run(about, [cell], {}, {}, {}))
     rate, interval = table.rows[1][2].split(" ", 1)
     low, high = (float(end) for end in interval.strip("[] *").split(", "))
     assert table.rows[1][1] == "kitti_06@0:3"
@@ -133,3 +135,41 @@ class TestTrainedOn:
         assert not saw(["a", "b@3:6"], "b@6:9")
         assert not saw([], "a")
         assert not saw(["not known"], "a")
+
+
+def test_only_tables_that_fit_are_printed(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "60")
+    rows = [["mine", *(3 * ["12.3 [10.0, 14.0]"])]]
+    narrow = Table("Narrow", "What it shows.", ["method", "rate of a long name"], [row[:2] for row in rows])
+    print_tables([narrow, Table("Wide", "", ["method", "a", "b", "c"], rows)], Path("report.html"))
+    text = capsys.readouterr().out
+    assert "12.3 [10.0, 14.0]" in text
+    assert "rate of a" in text
+    assert "…" not in text
+    assert text.endswith("wider than the 60 columns here, in report.html:\n  Wide\n")
+
+
+def motion_cell(forward, truth):
+    """Six pairs of two samples each; the figures other than ``forward`` are not known."""
+    error = torch.tensor(truth, dtype=torch.float64).repeat_interleave(2)
+    errors = {"own": torch.arange(12) + 1.0, "heldout": torch.arange(12) + 1.0, "truth": error}
+    cell = Cell("a", "filtered", torch.arange(6).repeat_interleave(2), 12, {"Hartley": errors, "mine": errors})
+    unknown = np.full(6, np.nan)
+    pairs = {"rotation": unknown, "forward": np.array(forward), "parallax": unknown, "inliers": unknown}
+    return cell, Run({}, [cell], {"a": pairs}, {}, {})
+
+
+class TestByMotion:
+    def test_counts_and_digits(self):
+        """A median of 0.999555 that three digits round to 1, among samples of which some have no truth."""
+        nan = float("nan")
+        table = by_motion(*motion_cell([0.2, 0.4, 0.9995, 0.99961, 0.99962, 0.9997], [1, nan, 1, 1, nan, nan]), "mine")
+        assert [row[1:5] for row in table.rows] == [["up to 0.9996", "3", "6", "4"], ["above 0.9996", "3", "6", "2"]]
+        assert "Not shown: rotation, degrees, known of 0 of 6 pairs; parallax" in table.text
+
+    def test_what_hardly_differs_has_no_halves(self):
+        table = by_motion(*motion_cell([0.9995, 0.9996, 0.9997, 0.9998, 0.9998, 0.9998], 6 * [1]), "mine")
+        assert table.rows == []
+        assert "forward share of the translation, from 0.9995 to 0.9998 in all pairs" in table.text
+        table = by_motion(*motion_cell(6 * [0.5], 6 * [1]), "mine")
+        assert "forward share of the translation, 0.5 in all pairs" in table.text

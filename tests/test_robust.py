@@ -15,19 +15,18 @@ import torch
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.store import read_store, write_store
 from kornia_learnnorm.data.synthesize import synthetic_store
-from kornia_learnnorm.evaluation import example, hypotheses, robust, robust_estimators, robust_peers
+from kornia_learnnorm.evaluation import example, hypotheses, robust_estimators, robust_peers, robust_record
 from kornia_learnnorm.evaluation.hypotheses import expected_best, hypothesis_quality, picked
 from kornia_learnnorm.evaluation.report import write_report
 from kornia_learnnorm.evaluation.report_hypotheses import hypothesis_tables
 from kornia_learnnorm.evaluation.report_robust import PRINTED, robust_tables
+from kornia_learnnorm.evaluation.robust_budgets import minimal_samples, run_estimator
 from kornia_learnnorm.evaluation.robust_estimators import (
     DEFAULT_ESTIMATORS,
     estimator_names,
     find_estimator,
     find_solver,
     is_slow,
-    minimal_samples,
-    run_estimator,
 )
 from kornia_learnnorm.evaluation.robust_matches import draw_matches, measure
 from kornia_learnnorm.evaluation.robust_run import read_robust
@@ -274,8 +273,8 @@ class TestRun:
 
     def test_again_computes_nothing(self, copied, command, monkeypatch):
         before = times(copied)
-        monkeypatch.setattr(robust, "run_estimator", pytest.fail)
-        monkeypatch.setattr(robust, "hypothesis_quality", pytest.fail)
+        monkeypatch.setattr(robust_record, "run_estimator", pytest.fail)
+        monkeypatch.setattr(robust_record, "hypothesis_quality", pytest.fail)
         assert main([*command, str(copied)]) == 0
         assert times(copied) == before
 
@@ -386,6 +385,17 @@ class TestReport:
         other = found.cells[0].estimates["count:Hartley"][1.0]
         change = 100 * (figures["inliers"] - other["inliers"]).mean().item()
         assert tests["count:whitening"][5].startswith(f"{change:+.3f} [")
+
+    def test_without_ground_truth(self, run):
+        found = read_robust(run)
+        for by_threshold in found.cells[0].estimates.values():
+            for figures in by_threshold.values():
+                for key in ("f1", "error", "rotation_error", "translation_error"):
+                    figures[key][:] = torch.nan
+        table, pose, tests = robust_tables(found)[:3]
+        assert table.rows[0][1:] == [""] * 7
+        assert pose.rows[0][1] == "nan"
+        assert tests.rows[0][2:] == [""] * 6
 
     def test_numbers_of_hypotheses(self, run):
         found = read_robust(run)

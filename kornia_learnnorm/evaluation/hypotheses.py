@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.robust_estimators import Solver, minimal_samples
+from kornia_learnnorm.evaluation.robust_budgets import Solver, minimal_samples
 from kornia_learnnorm.evaluation.robust_matches import Matches
 from kornia_learnnorm.residuals import symmetric_epipolar_distance
 

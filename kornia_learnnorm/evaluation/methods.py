@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import sys
 from collections.abc import Callable, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
@@ -16,7 +18,7 @@ from kornia_learnnorm.normalizers import Hartley, Identity, Whitening
 from kornia_learnnorm.refine import refine_fundamental
 from kornia_learnnorm.reweighting import ReweightedWhitening
 from kornia_learnnorm.search import SearchedNormalizer
-from kornia_learnnorm.solver import find_fundamental
+from kornia_learnnorm.solver import find_fundamental, normalizing_transforms
 
 __all__ = ["DEFAULT_METHODS", "Method", "base_name", "find_method", "identify_method", "short_names"]
 
@@ -64,13 +66,14 @@ def find_method(name: str) -> Method:
 
     Args:
         name: ``none``, ``Hartley``, ``whitening``, ``reweighted`` or ``searched``; weights that ship or the path of a
-            ``.safetensors`` file; or the import path of a normaliser class or function, ``package.module:Name``. With
+            ``.safetensors`` file; or the import path of a normaliser class or function, ``package.module:Name``, which
+            is looked for in the current folder last. With
             ``+LM``, the result is refined by Levenberg-Marquardt on the Sampson distance; with ``+optimal``, the
             covariance-weighted correction takes the place of the projection to rank 2.
 
     Raises:
-        ValueError: if there is no such method.
-        FileNotFoundError: if there are no such weights.
+        ValueError: if there is no such class or function, or the class needs arguments.
+        FileNotFoundError: if there is no such normalisation and there are no such weights.
 
     """
     normalizer = _find_normalizer(base_name(name))
@@ -89,23 +92,59 @@ def base_name(name: str) -> str:
         'Hartley'
 
     """
-    return name.removesuffix(REFINED).removesuffix(OPTIMAL)
+    return name.removesuffix(REFINED if name.endswith(REFINED) else OPTIMAL)
 
 
 def _find_normalizer(name: str) -> Normalizer:
     if name in CLOSED_FORMS:
         return CLOSED_FORMS[name]()
-    if ":" not in name:
-        return LearnedNormalizer.from_pretrained(name)
-    module, _, attribute = name.partition(":")
+    if ":" in name:
+        return _own_normalizer(name)
+    shipped = sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
+    if name not in shipped and Path(name).suffix != ".safetensors":
+        raise FileNotFoundError(
+            f"no weights {name!r} and no such normalisation: expected {', '.join([*CLOSED_FORMS, *shipped])}, a"
+            f" .safetensors file or module:Name, each without suffix or with {REFINED} or {OPTIMAL}"
+        )
+    return LearnedNormalizer.from_pretrained(name)
+
+
+def _own_normalizer(name: str) -> Normalizer:
+    """Return a user's normaliser, made where it is a class, whose errors say whose they are."""
+    found = _import(name)
     try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"no normaliser at {name!r}: {error}") from error
-    made: Normalizer = found() if isinstance(found, type) else found
+        made = found() if isinstance(found, type) else found
+    except Exception as error:  # of code that is not ours
+        text = f"{type(error).__name__}: {error}"
+        raise ValueError(
+            f"{name!r} cannot be made without arguments, which a method's class must be: {text}"
+        ) from error
     if not callable(made):
         raise ValueError(f"{name!r} is not a normaliser: it cannot be called")
-    return made
+
+    def normalize(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        try:
+            return normalizing_transforms(made, points1, points2, weights)
+        except Exception as error:
+            text = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{name} failed, called with points1, points2 and weights: {text}") from error
+
+    return normalize
+
+
+def _import(name: str) -> Any:
+    """Import what an import path names, from the current folder too, as ``python -m`` does."""
+    module, _, attribute = name.partition(":")
+    if not module or not attribute:
+        raise ValueError(f"no normaliser at {name!r}: expected module:Name")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except Exception as error:  # importing runs code that is not ours
+        text = f"{type(error).__name__}: {error}"
+        raise ValueError(f"no normaliser at {name!r}, looked for in {here} too: {text}") from error
 
 
 def _solve(x1: Tensor, x2: Tensor, normalizer: Normalizer, rank2: Literal["optimal"] | None = None) -> Tensor:
@@ -113,12 +152,23 @@ def _solve(x1: Tensor, x2: Tensor, normalizer: Normalizer, rank2: Literal["optim
 
 
 def identify_method(name: str) -> str:
-    """Return what a method's predictions depend on: its name, of weights with the digest of their file."""
+    """Return what a method's predictions depend on: its name, of weights and own code with the digest of the files."""
     base = base_name(name)
-    if base in CLOSED_FORMS or ":" in base:
+    if base in CLOSED_FORMS:
         return name
-    path = Path(base) if Path(base).is_file() else WEIGHTS / f"{base}.safetensors"
-    return f"{name} {sha256(path.read_bytes()).hexdigest()[:16]}"
+    if ":" in base:
+        files = _source_files(base)
+    else:
+        files = [Path(base) if Path(base).is_file() else WEIGHTS / f"{base}.safetensors"]
+    return f"{name} {sha256(b''.join(path.read_bytes() for path in files)).hexdigest()[:16]}"
+
+
+def _source_files(name: str) -> list[Path]:
+    """Return the files of the module that an import path names and of that which defines what it found."""
+    found = _import(name)
+    parts = (sys.modules[name.partition(":")[0]], inspect.getmodule(found), inspect.getmodule(type(found)))
+    files = {getattr(part, "__file__", None) for part in parts}
+    return sorted(Path(file) for file in files if file)
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:

@@ -2,51 +2,55 @@
 
 A run is a folder. ``run.json`` says what it is of. Each store has a folder with its pairs and the protocols, in each of
 which are the samples and a file per method: NumPy archives of arrays in the order of the samples. What is there
-already is not computed again, and a run of other options is refused.
+already is read, to know that it is whole, and not computed again; a run of other options is refused. A method that
+fails is left out of the run, all others go on.
 """
 
 from __future__ import annotations
 
-import importlib.metadata
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from tqdm import tqdm
 
-from kornia_learnnorm.data.samples import RATIO, Samples, draw_samples, plain_residual
+from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.diagnostics import diagnose
-from kornia_learnnorm.evaluation.consensus import consensus
-from kornia_learnnorm.evaluation.example import median_distance, random_pair, sweep
-from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.example import random_pair, sweep
+from kornia_learnnorm.evaluation.manifest import begin_run, leave_out
+from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.motion import pair_motions
-from kornia_learnnorm.evaluation.predict import ground_truth_inliers
-from kornia_learnnorm.evaluation.run import FORMAT, file_name, read_arrays, within_limit
+from kornia_learnnorm.evaluation.predict_run import describe, draw, predict
+from kornia_learnnorm.evaluation.run import (
+    EXAMPLE,
+    PAIRS,
+    PREDICTIONS,
+    SAMPLES,
+    SWEEP,
+    file_name,
+    is_swept,
+    method_files,
+    read_arrays,
+    within_limit,
+)
 from kornia_learnnorm.evaluation.trained import trained_on
 from kornia_learnnorm.files import replacing
-from kornia_learnnorm.pose_metrics import relative_pose, rotation_error, translation_error
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
 
 __all__ = ["PROTOCOLS", "record_run"]
 
 PROTOCOLS: dict[str, float | None] = {"filtered": RATIO, "unfiltered": None}
-HELDOUT = 16
-BATCH = 2048
-JOINED = ("stores", "methods", "trained_on")
 
 Arrays = dict[str, NDArray[Any]]
+Methods = dict[str, Method]
+Failed = dict[str, str]
 
 
 def record_run(
     folder: str | Path, stores: Mapping[str, str], methods: list[str], seed: int = 0, max_samples: int | None = None
-) -> None:
+) -> str:
     """Compute what is not there yet of a run, with a progress bar.
 
     Args:
@@ -56,8 +60,12 @@ def record_run(
         seed: seed of the shuffles.
         max_samples: at most so many samples of each store and protocol, drawn at random; None for all.
 
+    Returns:
+        why there is no example of a pair; empty where there is one.
+
     Raises:
-        ValueError: if the folder holds a run of other options, or a store or a method is wrong.
+        ValueError: if the folder holds a run of other options, a store or a method is wrong, what is there is damaged,
+            or, at the end, if a method has failed.
         OSError: if a file is missing or cannot be written.
 
     """
@@ -69,122 +77,96 @@ def record_run(
         "methods": {names[name]: identify_method(name) for name in methods},
         "trained_on": {names[name]: trained_on(name) for name in methods},
     }
-    _begin(folder, joined, seed, max_samples)
+    new, failed = begin_run(folder, joined, seed, max_samples), Failed()
     with tqdm(total=len(read) * (2 * len(found) + 2), unit="step", disable=None) as bar:
         for name, store in read.items():
             bar.set_postfix_str(name)
-            _record_store(folder / name, store, found, seed, max_samples, bar)
-    _once(folder / "example.npz", partial(random_pair, read, seed))
-    example = read_arrays(folder / "example.npz")
-    for method_name, method in found.items():
-        if not method_name.startswith("searched"):
-            path = folder / "sizes" / f"{file_name(method_name)}.npz"
-            _once(path, partial(sweep, method, example, seed))
+            _record_store(folder / name, store, found, failed, seed, max_samples, bar)
+    about_example = _record_sizes(folder, read, found, failed, seed)
+    if failed:
+        _forget(folder, read, [name for name in failed if name in new])
+        # Own code says its name, since it fails elsewhere too.
+        texts = [text if text.startswith(base_name(name)) else f"{name}: {text}" for name, text in failed.items()]
+        raise ValueError(f"{'; '.join(texts)}. All others are in {folder}")
+    return about_example
 
 
 def _record_store(
-    folder: Path, store: CorrespondenceStore, methods: dict[str, Method], seed: int, max_samples: int | None, bar: tqdm
+    folder: Path,
+    store: CorrespondenceStore,
+    methods: Methods,
+    failed: Failed,
+    seed: int,
+    max_samples: int | None,
+    bar: tqdm,
 ) -> None:
     """Compute what is not there yet of a store's pairs, samples and predictions."""
-    _once(folder / "pairs.npz", partial(pair_motions, store))
+    _once(folder / "pairs.npz", partial(pair_motions, store), PAIRS, len(store))
     for protocol, ratio in PROTOCOLS.items():
         place = folder / protocol
-        drawn = _draw(store, ratio, seed, max_samples)
-        _once(place / "samples.npz", partial(_describe, drawn))
+        drawn = draw(store, ratio, seed, max_samples)
+        _once(place / "samples.npz", partial(describe, drawn, place), SAMPLES, len(drawn.pair))
+        if not np.array_equal(read_arrays(place / "samples.npz")["pair"], drawn.pair.numpy()):
+            raise ValueError(f"{place} is of other samples than the run's seed draws of the store, remove it")
         samples = drawn.select(within_limit(place))
         bar.update()
         for name, method in methods.items():
-            _once(place / f"{file_name(name)}.npz", partial(_predict, method, samples, store, ratio))
+            path, compute = place / f"{file_name(name)}.npz", partial(predict, method, samples, store, ratio)
+            _attempt(name, failed, path, compute, PREDICTIONS, len(samples.pair))
             bar.update()
 
 
-def _begin(folder: Path, joined: dict[str, dict[str, Any]], seed: int, max_samples: int | None) -> None:
-    """Write what the run is of, or refuse a folder of another run; further stores and methods may join one."""
-    about: dict[str, Any] = {
-        "format": FORMAT,
-        **joined,
-        "seed": seed,
-        "max_samples": max_samples,
-        "versions": {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")},
-    }
-    path = folder / "run.json"
-    if path.is_file():
-        had = json.loads(path.read_text(encoding="utf-8"))
-        differ = [
-            f"{key} {had.get(key)!r}, now {about[key]!r}"
-            for key in about
-            if key not in JOINED and had.get(key) != about[key]
-        ]
-        for key in JOINED:
-            differ += [
-                f"{name} {old!r}, now {about[key][name]!r}"
-                for name, old in had.get(key, {}).items()
-                if about[key].get(name, old) != old
-            ]
-            about[key] = {**had.get(key, {}), **about[key]}
-        if differ:
-            raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as beside:
-        beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
+def _record_sizes(
+    folder: Path, stores: Mapping[str, CorrespondenceStore], methods: Methods, failed: Failed, seed: int
+) -> str:
+    """Compute what is not there yet of the example and its errors, or return why there is no example."""
+    path = folder / "example.npz"
+    if not path.is_file():
+        try:
+            example = random_pair(stores, seed)
+        except ValueError as error:
+            return str(error)
+        _write(path, example)
+    example = read_arrays(path, EXAMPLE)
+    for name, method in methods.items():
+        if is_swept(name):
+            compute = partial(sweep, method, example, seed)
+            _attempt(name, failed, folder / "sizes" / f"{file_name(name)}.npz", compute, SWEEP)
+    return ""
 
 
-def _once(path: Path, compute: Callable[[], dict[str, Any]]) -> None:
-    """Write the arrays that ``compute`` returns unless the file is there."""
+def _once(path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None) -> None:
+    """Write the arrays that ``compute`` returns, unless the file is there: then see that it holds such arrays."""
     if path.is_file():
-        return
-    arrays = compute()
+        read_arrays(path, keys, rows)
+    else:
+        _write(path, compute())
+
+
+def _attempt(
+    name: str, failed: Failed, path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None
+) -> None:
+    """Do the same for a method that has not failed, and note if it does."""
+    if path.is_file():
+        read_arrays(path, keys, rows)
+    elif name not in failed:
+        try:
+            arrays = compute()
+        except ValueError as error:
+            failed[name] = str(error)
+        else:
+            _write(path, arrays)
+
+
+def _write(path: Path, arrays: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as beside:
         np.savez_compressed(beside, **arrays)
 
 
-def _draw(store: CorrespondenceStore, ratio: float | None, seed: int, max_samples: int | None) -> Samples:
-    generator = torch.Generator().manual_seed(seed)
-    samples = draw_samples(store, generator, 8, ratio, HELDOUT)
-    if max_samples is None or len(samples.pair) <= max_samples:
-        return samples
-    return samples.select(torch.randperm(len(samples.pair), generator=generator)[:max_samples].sort().values)
-
-
-def _describe(samples: Samples) -> Arrays:
-    residual = plain_residual(samples.points1, samples.points2)
-    return {"pair": samples.pair.numpy(), "plain_residual": residual.numpy()}
-
-
-@torch.no_grad()
-def _predict(method: Method, samples: Samples, store: CorrespondenceStore, max_ratio: float | None) -> Arrays:
-    """Everything that a report shows of a method's samples."""
-    truth = ground_truth_inliers(store)
-    parts = [
-        _predict_batch(method, samples.select(rows), store, truth)
-        for rows in torch.split(torch.arange(len(samples.pair)), BATCH)
-    ]
-    found = {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
-    found |= consensus(found["F_mat"], samples.pair, store, max_ratio)
-    return {key: value.numpy() for key, value in found.items()}
-
-
-def _predict_batch(method: Method, samples: Samples, store: CorrespondenceStore, truth: Tensor) -> dict[str, Tensor]:
-    x1, x2 = samples.points1.double(), samples.points2.double()
-    transforms = method.normalizer(x1, x2, None)  # once: the searched optimum takes its time
-
-    def known(*_: Tensor | None) -> tuple[Tensor, Tensor]:
-        return transforms
-
-    F_mat = method.solve(x1, x2, known)
-    inside = diagnose(x1, x2, known)
-    K, R, t = (torch.from_numpy(part)[samples.pair] for part in (store.K, store.R, store.t))
-    found = relative_pose(F_mat, K[:, 0], K[:, 1], x1, x2)
-    return {
-        "F_mat": F_mat,
-        "own": symmetric_epipolar_distance(x1, x2, F_mat).mean(-1),
-        "heldout": median_distance(torch.cat([samples.heldout1, samples.heldout2], -1).double(), F_mat),
-        "truth": median_distance(truth[samples.pair], F_mat),
-        "condition_number": inside.condition_number,
-        "rho": inside.singularity_ratio,
-        "distance1": inside.distance1,
-        "distance2": inside.distance2,
-        "rotation_error": rotation_error(found[0], R),
-        "translation_error": translation_error(found[1], t),
-    }
+def _forget(folder: Path, stores: Iterable[str], methods: list[str]) -> None:
+    """Take methods out of a run, with their files: they will not be the same when they come again."""
+    leave_out(folder, methods)
+    for name in methods:
+        for path in method_files(folder, stores, name):
+            path.unlink(missing_ok=True)

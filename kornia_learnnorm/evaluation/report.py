@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 import html
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.evaluation.report_figures import report_figures
 from kornia_learnnorm.evaluation.report_hypotheses import hypothesis_figures, hypothesis_tables
-from kornia_learnnorm.evaluation.report_rates import Table
+from kornia_learnnorm.evaluation.report_print import print_tables
+from kornia_learnnorm.evaluation.report_rates import Table, with_baseline
 from kornia_learnnorm.evaluation.report_robust import about_robust, robust_tables
 from kornia_learnnorm.evaluation.report_style import Picture
 from kornia_learnnorm.evaluation.report_tables import report_tables
@@ -19,7 +23,7 @@ from kornia_learnnorm.evaluation.run import Run, read_run
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import replacing
 
-__all__ = ["add_arguments", "run", "write_report"]
+__all__ = ["Report", "add_arguments", "run", "write_report"]
 
 STYLE = """
 :root { color-scheme: light dark; }
@@ -41,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm report``: write ``report.md``, ``report.html`` and the figures, and print the tables.
+    """Run ``learnnorm report``: write ``report.md``, ``report.html`` and the figures, and print what fits the terminal.
 
     Raises:
         FileNotFoundError: if the run is not there or not complete.
@@ -49,20 +53,34 @@ def run(args: argparse.Namespace) -> int:
         ImportError: if Matplotlib or rich is not installed.
 
     """
-    tables = write_report(args.folder)
-    _print(tables)
+    report = write_report(args.folder)
+    print_tables(report.tables, args.folder / "report.html")
+    if report.missing:
+        print(f"not there yet, so left out: {'; '.join(report.missing)}", file=sys.stderr)
     print(f"wrote {args.folder / 'report.md'} and {args.folder / 'report.html'}")
     return 0
 
 
-def write_report(folder: str | Path) -> list[Table]:
+class Report(NamedTuple):
+    """What a report has.
+
+    Attributes:
+        tables: the tables.
+        missing: what of the run is not there yet.
+    """
+
+    tables: list[Table]
+    missing: list[str]
+
+
+def write_report(folder: str | Path) -> Report:
     """Write ``report.md`` with its figures and a self-contained ``report.html`` into a run.
 
     Args:
         folder: what ``learnnorm evaluate --out`` or ``learnnorm robust --out`` wrote, or both.
 
     Returns:
-        the tables.
+        the tables, and what the run lacks.
 
     Raises:
         FileNotFoundError: if the run is not there or not complete.
@@ -72,10 +90,12 @@ def write_report(folder: str | Path) -> list[Table]:
     """
     folder, about = Path(folder), []
     tables: list[Table] = []
+    missing: list[str] = []
     pictures: list[Picture] = []
     robust = read_robust(folder)
     if robust is None or (folder / "run.json").is_file():
-        found = read_run(folder)
+        found = with_baseline(read_run(folder))
+        missing += found.missing
         about.append(_about(found))
         tables += report_tables(found)
         pictures += report_figures(found)
@@ -88,7 +108,7 @@ def write_report(folder: str | Path) -> list[Table]:
         _write(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", "#808890"))
     _write(folder / "report.md", _markdown(about, tables, pictures))
     _write(folder / "report.html", _html(about, tables, pictures))
-    return tables
+    return Report(tables, missing)
 
 
 def _write(path: Path, text: str) -> None:
@@ -99,11 +119,13 @@ def _write(path: Path, text: str) -> None:
 def _about(run: Run) -> str:
     stores = "; ".join(f"`{name}`: {text}" for name, text in run.about["stores"].items())
     versions = ", ".join(f"{name} {version}" for name, version in run.about["versions"].items())
+    missing = f" Not there yet, so left out: {'; '.join(run.missing)}." if run.missing else ""
     most = run.about["max_samples"]
     samples = "All samples" if most is None else f"At most {most} random samples"
     return (
-        f"Stores: {stores}. Methods: {', '.join(run.about['methods'])}. {samples} of each store, with and without the "
-        f"ratio test, seed {run.about['seed']}. {versions}."
+        f"Stores: {stores}. Methods: {', '.join(run.about['methods'])}. {samples} of each store, with the ratio test "
+        f"(the nearest descriptor less than {RATIO:g} times as far as the second nearest) and without, seed "
+        f"{run.about['seed']}. {versions}.{missing}"
     )
 
 
@@ -134,20 +156,3 @@ def _row(tag: str, cells: Sequence[str]) -> str:
 def _inline(text: str) -> str:
     """Escape a text and set what stands in backticks as code."""
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
-
-
-def _print(tables: Sequence[Table]) -> None:
-    """Print the tables in the terminal."""
-    try:
-        from rich.console import Console
-        from rich.table import Table as RichTable
-    except ImportError as error:
-        raise ImportError("printing tables needs rich: pip install 'kornia-learnnorm[report]'") from error
-    console = Console()
-    for table in tables:
-        shown = RichTable(title=table.title, title_justify="left", caption=table.text, caption_justify="left")
-        for place, name in enumerate(table.header):
-            shown.add_column(name, justify="left" if place == 0 else "right")
-        for row in table.rows:
-            shown.add_row(*row)
-        console.print(shown)

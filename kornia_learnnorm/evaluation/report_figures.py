@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kornia_learnnorm.evaluation.report_pair import draw_example
+from kornia_learnnorm.evaluation.example import TRIALS
+from kornia_learnnorm.evaluation.report_pair import THRESHOLD, draw_example, example_inliers
 from kornia_learnnorm.evaluation.report_style import COLORS, INK, Picture, make_figure, make_picture
 from kornia_learnnorm.evaluation.run import Cell, Run
 
@@ -12,6 +13,8 @@ __all__ = ["report_figures"]
 
 FRAMES = 20
 CONSECUTIVE = 100
+NORMALISATIONS = ("none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched")
+DASHES = "Dashed: learned."
 
 
 def report_figures(run: Run) -> list[Picture]:
@@ -24,7 +27,7 @@ def report_figures(run: Run) -> list[Picture]:
         ImportError: if Matplotlib is not installed.
 
     """
-    cell = next(cell for cell in run.cells if cell.protocol == "filtered")
+    cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
     colors = dict(zip(run.about["methods"], COLORS * 10, strict=False))
     return [
         _per_frame(cell, colors),
@@ -58,12 +61,12 @@ def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
 
 def _distribution(cell: Cell, colors: dict[str, str]) -> Picture:
     figure, (axes,) = make_figure(1, 1)
-    for name in _present(cell, "none", "Hartley", "whitening", "paper", "crossview", "searched", "Hartley+optimal"):
+    for name in _present(cell, *NORMALISATIONS, "Hartley+optimal"):
         own = np.sort(cell.predictions[name]["own"].numpy())
         axes.plot(own, np.arange(1, len(own) + 1) / len(own), _line(name), color=colors[name], label=name)
     axes.set(xlabel="symmetric epipolar distance of a sample, px", ylabel="share of samples below", xscale="log")
     axes.set(xlim=(0.01, 60), ylim=(0, 1))
-    text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}."
+    text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}. {DASHES}"
     return make_picture(figure, "figure-4b", "Distribution of errors (Figure 4b)", text)
 
 
@@ -71,7 +74,7 @@ def _distances(cell: Cell, colors: dict[str, str]) -> Picture:
     figure, views = make_figure(1, 2)
     bins = np.geomspace(0.7, 30, 60).tolist()
     for view, axes in enumerate(views, 1):
-        for name in _present(cell, "paper", "crossview", "searched"):
+        for name in _present(cell, "reweighted", "paper", "crossview", "searched"):
             values = cell.predictions[name][f"distance{view}"].numpy()
             axes.hist(values, bins, histtype="step", color=colors[name], label=name, linewidth=1.5)
         axes.axvline(2**0.5, color=colors.get("Hartley", INK), label="Hartley")
@@ -94,22 +97,34 @@ def _by_size(run: Run, colors: dict[str, str]) -> Picture:
         ticks = [8, 16, 32, 64, 128, 256]
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
         axes.minorticks_off()
-    text = "Median of 1,000 random samples of a random image pair of the first store, by the number of correspondences."
+    pair = run.example
+    outliers = 1 - float(example_inliers(pair).mean())
+    text = (
+        f"Median of {TRIALS:,} random samples of one random image pair, {' and '.join(pair['names'])} of "
+        f"{pair['store']}, by the number of correspondences, which are drawn from the {len(pair['points1'])} matches "
+        f"that pass the ratio test. {100 * outliers:.0f} % of these are farther than {THRESHOLD:g} px from the "
+        "ground truth. The larger a sample, the more of them it is sure to hold, and least squares does not reject "
+        "them: that is where errors of ground-truth inliers that grow with the number come from. Those of the sample's "
+        "own points also grow because the fewer they are, the closer they can be fitted."
+    )
     return make_picture(figure, "figure-11", "Number of correspondences (Figure 11)", text)
 
 
 def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
     figure, (axes,) = make_figure(1, 1)
-    names = _present(cell, "none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched")[::-1]
+    names = _present(cell, *NORMALISATIONS)[::-1]
     for place, name in enumerate(names):
         low, middle, high = np.nanquantile(cell.predictions[name]["condition_number"].numpy(), [0.25, 0.5, 0.75])
         axes.plot([low, high], [place, place], color=colors[name], linewidth=6, solid_capstyle="round", alpha=0.5)
         axes.plot(middle, place, "o", color=colors[name], markersize=8)
         axes.annotate(f"{middle:.3g}", (middle, place), (0, 8), textcoords="offset points", ha="center", color=INK)
     axes.set_yticks(range(len(names)), names)
-    axes.set(xscale="log", xlabel="condition number of the design matrix (no unit): median and quartiles")
+    axes.set(xscale="log", xlabel="condition number of the design matrix (no unit)")
     axes.set_ylim(-0.6, len(names) - 0.2)
-    text = f"Condition number of the design matrix by normalisation, {cell.title}."
+    text = (
+        "Condition number of the design matrix, its largest over its eighth singular value, by normalisation: median "
+        f"(dot) and quartiles (bar) over samples, {cell.title}."
+    )
     return make_picture(figure, "figure-12", "Condition numbers (Figure 12)", text, legend=False)
 
 
@@ -121,7 +136,9 @@ def _rho(cell: Cell, colors: dict[str, str]) -> Picture:
         axes.plot(np.arange(len(means)) * CONSECUTIVE, means, _line(name), color=colors[name], label=name)
     axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {CONSECUTIVE} samples (no unit)")
     text = (
-        f"Singularity ratio before the projection to rank 2, means of {CONSECUTIVE} successive samples, {cell.title}."
+        "Singularity ratio rho before the projection to rank 2, the second over the third singular value of the "
+        f"normalised matrix: the larger, the less the projection takes away. Means of {CONSECUTIVE} successive "
+        f"samples, {cell.title}. {DASHES}"
     )
     return make_picture(figure, "figure-13", "Singularity ratio (Figure 13)", text)
 

@@ -116,13 +116,13 @@ def hypothesis_figures(run: RobustRun) -> list[Picture]:
 
 def _draw(cells: list[RobustCell], name: str, colors: dict[str, str], relative: bool) -> Picture:
     figure, panels = make_figure(len(cells), len(TITLES), 6.5)
-    unit = f"/ {BASELINE}'s" if relative else "px"
+    unit = f" over {BASELINE}'s" if relative else ", px"
     for axes, (cell, kind) in zip(panels, product(cells, TITLES), strict=True):
         for solver, hypotheses in cell.hypotheses.items():
             x, y = _relative(kind, cell, solver) if relative else zip(*_curve(kind, hypotheses), strict=True)
             axes.plot(x, y, "--" if solver in ("paper", "crossview") else "-", color=colors[solver], label=solver)
         axes.set(xscale="log", xlabel="k, minimal samples", yscale="linear" if relative else "log")
-        axes.set_ylabel(f"{cell.protocol}: {'best of' if kind == 'best' else 'picked among'} k, {unit}")
+        axes.set_ylabel(f"{cell.protocol}, {kind}: error{unit}")
     text = (
         f"{cells[0].store}: expected smallest error of k minimal samples (left) and error of the one that MSAC picks "
         "(right), mean over image pairs"

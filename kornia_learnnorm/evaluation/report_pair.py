@@ -16,7 +16,7 @@ from kornia_learnnorm.residuals import symmetric_epipolar_distance
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_example"]
+__all__ = ["draw_example", "example_inliers"]
 
 THRESHOLD = 1.0  # pixels, of an inlier
 LINES = 5
@@ -32,14 +32,17 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
         colors: colours by method.
 
     Returns:
-        the picture; nothing where the run has no sample of the pair.
+        the picture; nothing where the run has no pair yet or no sample of it.
 
     Raises:
         ImportError: if Matplotlib is not installed.
 
     """
     pair = run.example
-    cell = next(cell for cell in run.cells if (cell.store, cell.protocol) == (str(pair["store"]), "filtered"))
+    place = (str(pair["store"]), "filtered") if pair else ("", "")
+    cell = next((cell for cell in run.cells if (cell.store, cell.protocol) == place), None)
+    if cell is None:
+        return []
     methods = [name for name in METHODS if name in cell.predictions]
     rows = torch.nonzero(cell.pair == int(pair["pair"])).flatten()
     if len(rows) == 0:
@@ -48,7 +51,7 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
     middle = rows[errors[methods[0]][rows].argsort()[(len(rows) - 1) // 2]]
     wide = float((pair["size"][:, 0] / pair["size"][:, 1]).min()) > 1.8
     figure, (first, second) = make_figure(2, 1, 6.2) if wide else make_figure(1, 2)
-    near = _inliers(pair)
+    near = example_inliers(pair)
     _draw_matches(first, pair, near)
     matrices = {name: cell.predictions[name]["F_mat"][middle].numpy() for name in methods} | {TRUTH: pair["F"]}
     _draw_lines(second, pair, near, matrices, {TRUTH: INK, **colors})
@@ -63,7 +66,13 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
     return [make_picture(figure, "figure-10", "Inliers, outliers and epipolar lines (Figure 10)", text)]
 
 
-def _inliers(pair: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def example_inliers(pair: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Return which matches of the image pair of a run lie within 1 px of the ground truth, boolean (M,).
+
+    Args:
+        pair: from :func:`~kornia_learnnorm.evaluation.example.random_pair`.
+
+    """
     points1, points2, F_mat = (torch.from_numpy(pair[key]) for key in ("points1", "points2", "F"))
     near: NDArray[np.bool_] = (symmetric_epipolar_distance(points1, points2, F_mat) < THRESHOLD).numpy()
     return near

@@ -46,7 +46,9 @@ def about_robust(run: RobustRun) -> str:
     peers = {
         identity for name, identity in about["estimators"].items() if identity and " " in identity and ":" not in name
     }
-    versions = ", ".join([*(f"{name} {text}" for name, text in about["versions"].items()), *sorted(peers)])
+    versions = ", ".join(
+        dict.fromkeys([*(f"{name} {text}" for name, text in about["versions"].items()), *sorted(peers)])
+    )
     left = f" Left out, since not installed: {', '.join(absent)}." if absent else ""
 
     def most(number: int) -> str:
@@ -88,10 +90,11 @@ def _agreement(cell: RobustCell) -> Table:
     for name, by_threshold in cell.estimates.items():
         cells = []
         for threshold in THRESHOLDS:
-            figures = {key: value[_known(cell, threshold)] for key, value in by_threshold[threshold].items()}
-            cells += [_mean(100 * figures["inliers"], 2), _mean(100 * figures["f1"], 2)]
-            cells.append(_mean(figures["error"].clamp(max=MOST_ERROR), 3))
-        rows.append([name, *cells, f"{figures['error'].quantile(0.5).item():.3f}"])
+            known = _known(cell, threshold)
+            inliers, f1, error = (by_threshold[threshold][key][known] for key in ("inliers", "f1", "error"))
+            error = error.clamp(max=MOST_ERROR)
+            cells += [_mean(100 * inliers, 2), _mean(100 * f1, 2), _mean(error, 3)]
+        rows.append([name, *cells, f"{error.quantile(0.5).item():.3f}" if len(error) else ""])
     for (stores, protocol), printed in PRINTED.items():
         if cell.store.startswith(tuple(stores)) and cell.protocol == protocol:
             for name, (a, b, c, d) in printed.items():
@@ -99,7 +102,7 @@ def _agreement(cell: RobustCell) -> Table:
     dropped = " and ".join(f"{int((~_known(cell, t)).sum())} at {t:g} px" for t in THRESHOLDS)
     text = (
         "Mean over image pairs and over runs, ± standard deviation of a run's mean where there are several. Inliers: "
-        "share of the matches with a symmetric epipolar distance below the threshold, which the estimator got too. F1: "
+        "share of the matches with a symmetric epipolar distance below the threshold that the estimator got. F1: "
         "against the ground truth's inliers at the threshold. Error: mean distance of the ground truth's inliers at 1 "
         f"px, at most {MOST_ERROR:g} px, which is that of a failure. Pairs without ground-truth inliers are left out: "
         f"{dropped}. `count:` is the best of 1,000 minimal samples, the same for all, without refinement; `time:` the "

@@ -7,46 +7,32 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from itertools import product
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from tqdm import tqdm
 
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.evaluation.consensus import THRESHOLDS
-from kornia_learnnorm.evaluation.hypotheses import hypothesis_quality, samples_of
-from kornia_learnnorm.evaluation.record import PROTOCOLS
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.evaluation.robust_budgets import Estimator
 from kornia_learnnorm.evaluation.robust_estimators import (
     DEFAULT_ESTIMATORS,
     DEFAULT_SOLVERS,
-    Estimator,
-    Solver,
     estimator_names,
     find_estimator,
     find_solver,
     identify_estimator,
-    is_slow,
-    run_estimator,
 )
-from kornia_learnnorm.evaluation.robust_matches import Matches, draw_matches, even_pairs, measure
 from kornia_learnnorm.evaluation.robust_peers import PEERS
-from kornia_learnnorm.evaluation.robust_run import begin_run, estimate_path, hypotheses_path
+from kornia_learnnorm.evaluation.robust_record import record_missing
+from kornia_learnnorm.evaluation.robust_run import begin_run
 from kornia_learnnorm.evaluation.tables import names_of
-from kornia_learnnorm.files import replacing
 
 __all__ = ["add_arguments", "record_robust", "run"]
 
 PAIRS = 48
 HYPOTHESES = 12  # image pairs
 SEEDS, SLOW_SEEDS = 5, 1
-
-Draw = Callable[..., Matches]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -129,6 +115,7 @@ def record_robust(
         raise ValueError(f"--redo {' '.join(sorted(unknown))}: not among the estimators and solvers of this command")
     names, solver_names = estimator_names(estimators), estimator_names(solvers)
     found = {name: _find(name) for name in estimators}
+    solve = {solver_names[name]: find_solver(name) for name in solvers}
     read = {name: read_store(path) for name, path in stores.items()}
     about: dict[str, Any] = {
         "stores": {name: f"{s.dataset}, {len(s)} pairs, {s.offsets[-1]} matches" for name, s in read.items()},
@@ -140,7 +127,7 @@ def record_robust(
     }
     begin_run(folder, about, [(names | solver_names)[name] for name in redo])
     present = {names[name]: estimator for name, estimator in found.items() if estimator is not None}
-    _record(folder, read, present, {solver_names[name]: find_solver(name) for name in solvers}, options)
+    record_missing(folder, read, present, solve, options)
 
 
 def _checked(options: Mapping[str, int]) -> dict[str, int]:
@@ -160,70 +147,3 @@ def _find(name: str) -> Estimator | None:
         if name in PEERS:
             return None
         raise
-
-
-def _record(
-    folder: Path,
-    stores: Mapping[str, CorrespondenceStore],
-    estimators: Mapping[str, Estimator],
-    solvers: Mapping[str, Solver],
-    options: Mapping[str, int],
-) -> None:
-    """Compute what is not there yet; a step of the bar is a run on an image pair, or a solver on one."""
-    seeds = {name: min(options["seeds"], options["slow_seeds"] if is_slow(name) else 10**9) for name in estimators}
-    chosen = {name: even_pairs(len(store), options["pairs"] or None) for name, store in stores.items()}
-    few = {name: even_pairs(len(store), options["hypotheses"] or None) for name, store in stores.items()}
-    steps = sum(len(chosen[name]) * sum(seeds.values()) + len(few[name]) * len(solvers) for name in stores)
-    with tqdm(total=steps * len(PROTOCOLS), unit="run", disable=None) as bar:
-        for (name, store), protocol in product(stores.items(), PROTOCOLS):
-            draw = partial(draw_matches, store, protocol=protocol, seed=options["seed"])
-            for label, estimator in estimators.items():
-                bar.set_postfix_str(f"{name}, {protocol}, {label}")
-                paths = {t: estimate_path(folder, name, protocol, t, label) for t in THRESHOLDS}
-                todo = {t: path for t, path in paths.items() if not path.is_file()}
-                _record_estimates(todo, estimator, draw, chosen[name], range(seeds[label]), bar)
-            for label, solver in solvers.items():
-                bar.set_postfix_str(f"{name}, {protocol}, hypotheses of {label}")
-                path = hypotheses_path(folder, name, protocol, label)
-                _record_hypotheses(path, solver, samples_of(label), draw, few[name], options["seed"], bar)
-
-
-def _record_estimates(
-    paths: Mapping[float, Path], estimator: Estimator, draw: Draw, pairs: Sequence[int], seeds: range, bar: tqdm
-) -> None:
-    """Run an estimator on every pair with every seed, and write its figures of each threshold."""
-    shape = len(pairs), len(seeds)
-    figures: dict[float, dict[str, NDArray[Any]]] = {threshold: {} for threshold in paths}
-    for (i, pair), seed in product(enumerate(pairs), seeds if paths else ()):
-        matches = draw(pair=pair, order=seed)
-        for threshold, estimate in zip(paths, run_estimator(estimator, matches, seed, [*paths]), strict=True):
-            row = {"seconds": estimate.seconds, "samples": estimate.samples}
-            for key, value in (row | measure(matches, estimate.F_mat, threshold)).items():
-                figures[threshold].setdefault(key, np.full(shape, np.nan))[i, seed] = value
-            figures[threshold].setdefault("F_mat", np.full((*shape, 3, 3), np.nan))[i, seed] = estimate.F_mat.numpy()
-        bar.update()
-    bar.update(0 if paths else len(pairs) * len(seeds))
-    for threshold, path in paths.items():
-        _write(path, {"pair": np.array(pairs), **figures[threshold]})
-
-
-def _record_hypotheses(
-    path: Path, solver: Solver, number: int, draw: Draw, pairs: Sequence[int], seed: int, bar: tqdm
-) -> None:
-    """Measure a minimal solver's hypotheses of every pair."""
-    if path.is_file():
-        bar.update(len(pairs))
-        return
-    errors, scores = [], []
-    for pair in pairs:
-        error, score = hypothesis_quality(solver, draw(pair=pair), number, seed)
-        errors.append(error.float().numpy())
-        scores.append(score.float().numpy())
-        bar.update()
-    _write(path, {"pair": np.array(pairs), "error": np.stack(errors), "score": np.stack(scores)})
-
-
-def _write(path: Path, arrays: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as beside:
-        np.savez_compressed(beside, **arrays)

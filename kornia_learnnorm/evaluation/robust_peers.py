@@ -103,7 +103,7 @@ def find_peer(name: str) -> Peer:
     """Return an estimator of another package.
 
     Args:
-        name: one of :data:`PEERS`.
+        name: one of the names in ``PEERS``.
 
     Raises:
         ImportError: if the package is not installed.
@@ -116,7 +116,7 @@ def peer_version(name: str) -> str:
     """Return the package of an estimator and its version.
 
     Args:
-        name: one of :data:`PEERS`, whose package is installed.
+        name: one of the names in ``PEERS``, whose package is installed.
 
     """
     package = PEERS[name][1]

@@ -77,7 +77,7 @@ def begin_run(folder: Path, about: dict[str, Any], redo: Sequence[str] = ()) -> 
 
     Args:
         folder: the run, made if missing.
-        about: options, and by the names of :data:`JOINED` what each store, estimator and solver is; an estimator that
+        about: options, and by the names of ``JOINED`` what each store, estimator and solver is; an estimator that
             is ``None`` is not installed.
         redo: estimators and solvers whose files are removed.
 

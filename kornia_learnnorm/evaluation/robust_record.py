@@ -1,0 +1,125 @@
+"""Running robust estimators and minimal solvers on stores, and keeping their figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.evaluation.consensus import THRESHOLDS
+from kornia_learnnorm.evaluation.hypotheses import hypothesis_quality, samples_of
+from kornia_learnnorm.evaluation.record import PROTOCOLS
+from kornia_learnnorm.evaluation.robust_budgets import Estimate, Estimator, Solver, run_estimator
+from kornia_learnnorm.evaluation.robust_estimators import is_slow, is_timed
+from kornia_learnnorm.evaluation.robust_matches import Matches, draw_matches, even_pairs, measure
+from kornia_learnnorm.evaluation.robust_run import estimate_path, hypotheses_path
+from kornia_learnnorm.files import replacing
+
+__all__ = ["record_missing"]
+
+Draw = Callable[..., Matches]
+
+
+class _Job(NamedTuple):
+    """An estimator, how often it runs on a pair, and the files by threshold that are missing."""
+
+    estimator: Estimator
+    runs: int
+    paths: dict[float, Path]
+
+
+def record_missing(
+    folder: Path,
+    stores: Mapping[str, CorrespondenceStore],
+    estimators: Mapping[str, Estimator],
+    solvers: Mapping[str, Solver],
+    options: Mapping[str, int],
+) -> None:
+    """Compute what is not there yet; a step of the bar is a run on an image pair, or a solver on one.
+
+    Args:
+        folder: the run.
+        stores: stores by name.
+        estimators: robust estimators by name.
+        solvers: minimal solvers by name.
+        options: ``pairs``, ``hypotheses``, ``seeds``, ``slow_seeds`` and ``seed``, as for the command.
+
+    """
+    runs = {name: min(options["seeds"], options["slow_seeds"] if is_slow(name) else 10**9) for name in estimators}
+    # What depends on time takes turns, so that the load of the machine is the same for all.
+    groups = [[name] for name in estimators if not is_timed(name)] + [[name for name in estimators if is_timed(name)]]
+    chosen = {name: even_pairs(len(store), options["pairs"] or None) for name, store in stores.items()}
+    few = {name: even_pairs(len(store), options["hypotheses"] or None) for name, store in stores.items()}
+    steps = sum(len(chosen[name]) * sum(runs.values()) + len(few[name]) * len(solvers) for name in stores)
+    with tqdm(total=steps * len(PROTOCOLS), unit="run", disable=None) as bar:
+        for (name, store), protocol in product(stores.items(), PROTOCOLS):
+            draw = partial(draw_matches, store, protocol=protocol, seed=options["seed"])
+            for group in groups:
+                bar.set_postfix_str(f"{name}, {protocol}, {', '.join(group)}")
+                jobs = [
+                    _Job(estimators[label], runs[label], _missing(folder, name, protocol, label)) for label in group
+                ]
+                _record_estimates(jobs, draw, chosen[name], bar)
+            for label, solver in solvers.items():
+                bar.set_postfix_str(f"{name}, {protocol}, hypotheses of {label}")
+                path = hypotheses_path(folder, name, protocol, label)
+                _record_hypotheses(path, solver, samples_of(label), draw, few[name], options["seed"], bar)
+
+
+def _missing(folder: Path, store: str, protocol: str, name: str) -> dict[float, Path]:
+    paths = {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
+    return {threshold: path for threshold, path in paths.items() if not path.is_file()}
+
+
+def _record_estimates(jobs: Sequence[_Job], draw: Draw, pairs: Sequence[int], bar: tqdm) -> None:
+    """Run estimators in turn on every pair with every seed, and write their figures of each threshold."""
+    todo = [job for job in jobs if job.paths]
+    bar.update(len(pairs) * sum(job.runs for job in jobs if not job.paths))
+    figures: dict[Path, dict[str, NDArray[Any]]] = {path: {} for job in todo for path in job.paths.values()}
+    for (place, pair), seed in product(enumerate(pairs), range(max((job.runs for job in todo), default=0))):
+        matches = draw(pair=pair, order=seed)
+        for job in todo:
+            if seed >= job.runs:
+                continue
+            estimates = run_estimator(job.estimator, matches, seed, [*job.paths])
+            for (threshold, path), estimate in zip(job.paths.items(), estimates, strict=True):
+                for key, value in _describe(matches, estimate, threshold).items():
+                    empty = np.full((len(pairs), job.runs, *np.shape(value)), np.nan)
+                    figures[path].setdefault(key, empty)[place, seed] = value
+            bar.update()
+    for path, arrays in figures.items():
+        _write(path, {"pair": np.array(pairs), **arrays})
+
+
+def _describe(matches: Matches, estimate: Estimate, threshold: float) -> dict[str, Any]:
+    figures = measure(matches, estimate.F_mat, threshold)
+    return {**figures, "F_mat": estimate.F_mat.numpy(), "seconds": estimate.seconds, "samples": estimate.samples}
+
+
+def _record_hypotheses(
+    path: Path, solver: Solver, number: int, draw: Draw, pairs: Sequence[int], seed: int, bar: tqdm
+) -> None:
+    """Measure a minimal solver's hypotheses of every pair."""
+    if path.is_file():
+        bar.update(len(pairs))
+        return
+    errors, scores = [], []
+    for pair in pairs:
+        error, score = hypothesis_quality(solver, draw(pair=pair), number, seed)
+        errors.append(error.float().numpy())
+        scores.append(score.float().numpy())
+        bar.update()
+    _write(path, {"pair": np.array(pairs), "error": np.stack(errors), "score": np.stack(scores)})
+
+
+def _write(path: Path, arrays: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as beside:
+        np.savez_compressed(beside, **arrays)
