@@ -57,13 +57,11 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
         A = A * (weights > 0).to(A)[..., None]
     with torch.no_grad():
         Q, R = torch.linalg.qr(A.mT, mode="complete")
-        h0: Tensor = Q[..., -1]
+        h0 = Q[..., -1]
         pivots = R.diagonal(dim1=-2, dim2=-1).abs()
         scale = pivots.amax(-1)
         determined = pivots.amin(-1) > 64 * torch.finfo(A.dtype).eps * scale
         scale = torch.where(determined, scale, 1.0)
-    if not torch.is_grad_enabled():
-        return h0
     bordered = torch.cat([A / scale[..., None, None], h0[..., None, :]], -2)
     # The substitute enters before the solve and its result is dropped after it: no derivative ever meets a singular
     # matrix.
@@ -131,9 +129,6 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
         gap = s[..., :-1].square() - s[..., -1:].square()
         simple = gap > 64 * torch.finfo(A.dtype).eps * s[..., :-1] * s[..., :1]
         inverse_gap = torch.where(simple, gap, torch.inf).reciprocal()
-        last: Tensor = Vh[..., -1, :]
-    if not torch.is_grad_enabled():
-        return last
     C = A @ Vh.mT
     G = C.mT @ (C if weights is None else C * weights[..., None])
     G11, g = G[..., :-1, :-1], G[..., :-1, -1]
