@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.consensus import THRESHOLDS
 from kornia_learnnorm.evaluation.hypotheses import MOST_ERROR
-from kornia_learnnorm.evaluation.report_rates import TESTS, Table
+from kornia_learnnorm.evaluation.report_rates import TESTS, Table, p_text
 from kornia_learnnorm.evaluation.robust_run import RobustCell, RobustRun
 from kornia_learnnorm.pair_metrics import paired_bootstrap
 from kornia_learnnorm.pose_accuracy import mean_average_accuracy, pose_auc
@@ -180,4 +180,4 @@ def _test(values: dict[str, Tensor], baseline: dict[str, Tensor], key: str, know
     if len(first) < 2:
         return ""
     found = paired_bootstrap(first, second, torch.arange(len(first)))
-    return f"{found.mean:+.3f} [{found.low:+.3f}, {found.high:+.3f}], {found.p_value:.3f}"
+    return f"{found.mean:+.3f} [{found.low:+.3f}, {found.high:+.3f}], {p_text(found.p_value)}"
