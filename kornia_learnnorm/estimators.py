@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, NoReturn
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from kornia_learnnorm.correspondences import (
     check_correspondences,
@@ -116,11 +117,11 @@ class EightPoint(nn.Module):
             the matrices, in the dtype of the points.
 
         Raises:
-            TypeError: if the points are not floating-point tensors of one dtype, the weights not floating-point, or the
-                mask not boolean.
+            TypeError: if the points are not floating-point tensors of one dtype, weights or cameras not floating-point,
+                or the mask not boolean.
             ShapeError: if a shape is wrong.
             ValueError: if there are fewer than eight rows, shapes do not pair up, an unmasked value is not finite, a
-                weight is negative, or only one camera is given.
+                weight is negative, or only one camera is given or one is not invertible.
 
         """
         if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
@@ -132,6 +133,8 @@ class EightPoint(nn.Module):
             points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
             weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
         check_correspondences(points1, points2, weights)
+        _check_cameras(K1, K2, len(points1))
+        weights = None if weights is None else _moderate(weights.to(solve_dtype(points1.device)))
         with torch.no_grad():
             determined = _determined(points1, points2, weights)
         F_mat = self._solve(points1, points2, weights, determined)
@@ -171,6 +174,9 @@ class EightPoint(nn.Module):
         with torch.no_grad():
             base = getattr(self.normalizer, "base", None) or Hartley()
             fallback = find_fundamental(points1, points2, weights, base, self.rank2)
+            values = torch.linalg.svdvals(fallback)
+            # Of one point or none, all lines are one: there are rows instead.
+            fallback = torch.where((values[:, 1] > 1e-10 * values[:, 0])[:, None, None], fallback, _rows(fallback))
         # No derivative meets an undetermined sample: a generic one stands in for it, and its result is dropped.
         rows = determined[:, None]
         stand_in = _generic_points(points1)
@@ -198,6 +204,31 @@ def _determined(points1: Tensor, points2: Tensor, weights: Tensor | None) -> Ten
     T1, T2 = Hartley()(x1, x2, w)
     x1, x2 = convert_points_to_homogeneous(x1) @ T1.mT, convert_points_to_homogeneous(x2) @ T2.mT
     return has_null_vector(design_matrix(x1, x2), w)
+
+
+def _moderate(weights: Tensor) -> Tensor:
+    """Scale weights whose largest would over- or underflow; only their ratios count. All below 1e-30 are zero."""
+    top = weights.detach().amax(-1, keepdim=True)
+    weights = torch.where(top < 1e-30, 0.0, weights)
+    return weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)
+
+
+def _rows(like: Tensor) -> Tensor:
+    """The fundamental matrix whose epipolar lines are the rows of the image."""
+    return normalize(like.new_tensor([0.0, 0, 0, 0, 0, -1, 0, 1, 0]), dim=-1).view(3, 3)
+
+
+def _check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int) -> None:
+    for name, K in (("K1", K1), ("K2", K2)):
+        if K is None:
+            continue
+        if not isinstance(K, Tensor) or not K.is_floating_point():
+            got = K.dtype if isinstance(K, Tensor) else type(K)
+            raise TypeError(f"{name} must be a floating-point tensor, got {got}")
+        if K.shape not in ((3, 3), (batch_size, 3, 3)):
+            raise ValueError(f"{name} must have shape [3, 3] or [{batch_size}, 3, 3], got {[*K.shape]}")
+        if is_true(~(K.isfinite().all() & (torch.linalg.det(K.detach().double()) != 0).all())):
+            raise ValueError(f"{name} must be finite and invertible")
 
 
 def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:

@@ -42,14 +42,14 @@ def correspondences_from_matches(
         keypoints2: pixels in the second images with shape :math:`(B, M_2, 2)`.
         matches: a list of B tensors :math:`(S_i, 2)` of index pairs, as of Kornia's LightGlue; or one tensor
             :math:`(B, M_1)` that holds for each keypoint of view 1 the index of its match, -1 for none, as of SuperGlue
-            and Transformers (``matches[:, 0]``).
+            and Transformers (``matches[:, 0]``); other negative numbers are none too.
         scores: optional, non-negative: a list of B tensors :math:`(S_i,)`, or one tensor :math:`(B, M_1)`.
 
     Returns:
         the correspondences; gradients reach keypoints and scores.
 
     Raises:
-        TypeError: if the matches are not integers.
+        TypeError: if keypoints, matches or scores are no tensors, matches not integers, or scores not floating-point.
         ShapeError: if the keypoints do not have the shape above.
         ValueError: if the matches do not fit the keypoints, or the scores not the matches.
 
@@ -60,7 +60,9 @@ def correspondences_from_matches(
         tensor([[ True,  True, False, False, False, False, False, False]])
 
     """
-    for keypoints in (keypoints1, keypoints2):
+    for name, keypoints in (("keypoints1", keypoints1), ("keypoints2", keypoints2)):
+        if not isinstance(keypoints, Tensor):
+            raise TypeError(f"{name} must be a tensor, got {type(keypoints)}")
         KORNIA_CHECK_SHAPE(keypoints, ["B", "M", "2"])
     if isinstance(matches, Tensor):
         matches, scores = _pairs_of_matches(keypoints1, matches, scores)
@@ -68,14 +70,18 @@ def correspondences_from_matches(
         raise ValueError(
             f"matches of every pair are needed, got {len(matches)} for {len(keypoints1)} and {len(keypoints2)} pairs"
         )
+    if scores is not None and len(scores) != len(matches):
+        raise ValueError(f"scores of every pair are needed, got {len(scores)} for {len(matches)} pairs")
     for k, pairs in enumerate(matches):
-        _check_pairs(k, pairs, keypoints1.shape[1], keypoints2.shape[1], None if scores is None else scores[k])
+        _check_pairs(k, pairs, keypoints1.shape[1], keypoints2.shape[1])
+        if scores is not None:
+            _check_scores(k, scores[k], len(pairs))
     length = max(8, *(len(pairs) for pairs in matches)) if len(matches) else 8
     index = pad_sequence([*matches, keypoints1.new_zeros(length, 2, dtype=torch.int64)], batch_first=True)[:-1].long()
     present = torch.tensor([len(pairs) for pairs in matches], device=index.device)
     mask = torch.arange(length, device=index.device) < present[:, None]
     points1, points2 = (
-        keypoints.gather(1, index[..., k : k + 1].expand(-1, -1, 2))
+        _at_least_one(keypoints).gather(1, index[..., k : k + 1].expand(-1, -1, 2))
         for k, keypoints in enumerate((keypoints1, keypoints2))
     )
     if scores is None:
@@ -87,6 +93,11 @@ def correspondences_from_matches(
     return Correspondences(points1, points2, weights, mask)
 
 
+def _at_least_one(keypoints: Tensor) -> Tensor:
+    """Padded rows take the first keypoint, and a view may have none."""
+    return keypoints if keypoints.shape[1] else keypoints.new_zeros(len(keypoints), 1, 2)
+
+
 def _pairs_of_matches(
     keypoints1: Tensor, matches: Tensor, scores: Tensor | Sequence[Tensor] | None
 ) -> tuple[list[Tensor], list[Tensor] | None]:
@@ -95,21 +106,32 @@ def _pairs_of_matches(
         raise ValueError(f"matches must have shape {[*keypoints1.shape[:2]]} or be a list, got {[*matches.shape]}")
     if scores is not None and (not isinstance(scores, Tensor) or scores.shape != matches.shape):
         raise ValueError(f"scores must have the shape of the matches, {[*matches.shape]}, got {_shape(scores)}")
+    if matches.is_floating_point() or matches.dtype == torch.bool:
+        raise TypeError(f"matches must be tensors of integers, got {matches.dtype}")
     rows = [torch.nonzero(row >= 0)[:, 0] for row in matches]
     pairs = [torch.stack([own, row[own]], -1) for own, row in zip(rows, matches, strict=True)]
     return pairs, None if scores is None else [row[own] for own, row in zip(rows, scores, strict=True)]
 
 
-def _check_pairs(k: int, pairs: Tensor, number1: int, number2: int, scores: Tensor | None) -> None:
-    if pairs.is_floating_point() or pairs.dtype == torch.bool:
-        raise TypeError(f"matches must be integers, got {pairs.dtype}")
+def _check_pairs(k: int, pairs: Tensor, number1: int, number2: int) -> None:
+    if not isinstance(pairs, Tensor) or pairs.is_floating_point() or pairs.dtype == torch.bool:
+        got = pairs.dtype if isinstance(pairs, Tensor) else type(pairs)
+        raise TypeError(f"matches must be tensors of integers, got {got}")
     if pairs.ndim != 2 or pairs.shape[1] != 2:
         raise ValueError(f"matches of pair {k} must have shape [S, 2], got {[*pairs.shape]}")
     limit = torch.tensor([number1, number2], device=pairs.device)
     if bool(((pairs < 0) | (pairs >= limit)).any()):
         raise ValueError(f"matches of pair {k} must be indices of {number1} and {number2} keypoints, got others")
-    if scores is not None and scores.shape != pairs.shape[:1]:
-        raise ValueError(f"scores of pair {k} must have shape {[len(pairs)]}, got {[*scores.shape]}")
+
+
+def _check_scores(k: int, scores: Tensor, number: int) -> None:
+    if not isinstance(scores, Tensor) or not scores.is_floating_point():
+        got = scores.dtype if isinstance(scores, Tensor) else type(scores)
+        raise TypeError(f"scores must be floating-point tensors, got {got}")
+    if scores.shape != (number,):
+        raise ValueError(f"scores of pair {k} must have shape {[number]}, got {[*scores.shape]}")
+    if not bool((scores.detach() >= 0).all()) or not bool(scores.detach().isfinite().all()):
+        raise ValueError(f"scores of pair {k} must be finite and not negative")
 
 
 def _shape(value: object) -> object:

@@ -59,7 +59,7 @@ class RANSAC(nn.Module):
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
 
     Raises:
-        TypeError: if ``factor`` or ``sampler`` cannot be called.
+        TypeError: if ``factor`` or ``sampler`` cannot be called or ``seed`` is not a whole number.
         ValueError: if a number is out of its range or ``rank2`` is neither of its values.
 
     Reference:
@@ -99,6 +99,8 @@ class RANSAC(nn.Module):
             raise ValueError(f"max_iter must be a whole number of samples, at least 1, got {max_iter}")
         if max_seconds is not None and not max_seconds > 0:
             raise ValueError(f"max_seconds must be positive or None, got {max_seconds}")
+        if seed is not None and not isinstance(seed, int):
+            raise TypeError(f"seed must be a whole number or None, got {seed!r}")
         if not 0 < confidence <= 1:
             raise ValueError(f"confidence must lie in (0, 1], got {confidence}")
         check_rank2(rank2)
@@ -123,7 +125,8 @@ class RANSAC(nn.Module):
 
         Returns:
             the matrix :math:`(3, 3)` of unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, and the inliers :math:`(N,)`,
-            boolean. Zeros and no inliers where no matrix has more than eight of them. Where no sample determines a
+            boolean. Zeros and no inliers where no matrix of rank 2 has more than eight of them, and where fewer than
+            eight weights are positive. Where no sample determines a
             matrix, as of a plane without noise or a camera that does not move, it is one of those that fit.
 
         Raises:
@@ -151,6 +154,8 @@ class RANSAC(nn.Module):
         if len(pool.F_mat) == 0:
             return failure
         F = self._polish(scorer, pool, x1, x2) if self.refine else pool.F_mat[:1]
+        if scorer.rank(F) < 2:
+            return failure
         F_mat = F[0].to(kp1.dtype)
         inliers = finite.clone()
         inliers[finite] = self._inliers(x1, x2, F_mat[None].to(x1))[0]
@@ -228,7 +233,8 @@ def _check(kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> None:
         return
     if not isinstance(weights, Tensor) or not weights.is_floating_point():
         got = weights.dtype if isinstance(weights, Tensor) else type(weights)
-        raise TypeError(f"weights must be a floating-point tensor, got {got}")
+        hint = "; of a boolean mask, take the rows" if got == torch.bool else ""
+        raise TypeError(f"weights must be a floating-point tensor, got {got}{hint}")
     if weights.shape != kp1.shape[:1]:
         raise ValueError(f"weights must have shape {[*kp1.shape[:1]]}, got {[*weights.shape]}")
     known = weights[(kp1.isfinite() & kp2.isfinite()).all(-1)]

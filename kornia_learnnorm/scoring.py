@@ -91,6 +91,11 @@ class PairScorer:
         gains: Tensor = 1 - distance.div_(self.threshold).square_()
         return gains.nan_to_num_(nan=-1.0)
 
+    def rank(self, F_mat: Tensor) -> int:
+        """Return the rank of a matrix (1, 3, 3) of pixels in Hartley's coordinates, to nine digits."""
+        values = torch.linalg.svdvals(transform_fundamental(F_mat, self.inverse1, self.inverse2))[0]
+        return int((values > 1e-9 * values[0]).sum())
+
     def determined(self, points1: Tensor, points2: Tensor, share: float = 0.01) -> Tensor:
         r"""Tell the minimal samples that determine a matrix from those that do not, as on one line or plane.
 

@@ -93,6 +93,20 @@ class TestZeroWeights:
             assert gradient[:, :10].any()
 
 
+class TestExtremeWeights:
+    @pytest.mark.parametrize("size", [1e-40, 1e-29, 1e-20, 1e20, 1e38])
+    def test_only_ratios_count(self, layer, size):
+        points = [p.float() for p in correspondences("handheld", 3, 12)]
+        weights = uniform(3, 12, low=0.5)
+        extreme = (size * weights).float().requires_grad_()
+        estimate = layer.estimate(*points, extreme)
+        assert estimate.determined.all() == (size > 1e-30)
+        estimate.F_mat.abs().sum().backward()
+        assert extreme.grad.isfinite().all()
+        if size > 1e-30:
+            assert up_to_sign(estimate.F_mat.detach(), layer(*points, weights.float()).detach()) < 1e-3
+
+
 class TestDetermined:
     def test_points_in_space(self, layer):
         assert layer.estimate(*correspondences("handheld", 10, 12)).determined.all()
@@ -122,9 +136,16 @@ class TestDetermined:
         assert layer.estimate(*points, None, weights > 0).determined.tolist() == [False, False, True, True]
         assert not layer.estimate(*points, torch.zeros(4, 12)).determined.any()
 
+    @pytest.mark.parametrize("number", [0, 1, 2])
+    def test_few_points_give_a_matrix_of_rank_two(self, layer, number):
+        mask = torch.arange(12).expand(3, 12) < number
+        F_mat = layer(*correspondences("handheld", 3, 12), None, mask).detach()
+        assert np.linalg.matrix_rank(unit(F_mat.numpy()), tol=1e-12).min() == 2 or number == 2
+        assert F_mat.isfinite().all()
+
     def test_falls_back_on_the_base(self):
         points1, points2 = correspondences("handheld", 4)
-        points1[2] = points1[2, :1]
+        points2[2] = 0.9 * points1[2] + 20
         normalizer = shaken()
         F_mat = EightPoint(normalizer)(points1, points2).detach()
         base = find_fundamental(points1, points2, normalizer=normalizer.base)
@@ -167,6 +188,20 @@ class TestCameras:
         ]
         pixels = EightPoint().estimate(scene.points1, scene.points2, K1=scene.K1, K2=scene.K2)
         assert up_to_sign(EightPoint()(*rays), pixels.E_mat) < 1e-6  # square pixels, or the projection would differ
+
+    @pytest.mark.parametrize(
+        ("K", "error", "message"),
+        [
+            (torch.rand(3, 4), ValueError, r"K1 must have shape \[3, 3\] or \[20, 3, 3\], got \[3, 4\]"),
+            (torch.eye(3).expand(4, 3, 3), ValueError, r"got \[4, 3, 3\]"),
+            (torch.zeros(3, 3), ValueError, "K1 must be finite and invertible"),
+            (torch.eye(3).long(), TypeError, r"K1 must be a floating-point tensor, got torch\.int64"),
+            (np.eye(3), TypeError, "got <class 'numpy.ndarray'>"),
+        ],
+    )
+    def test_wrong_cameras(self, K, error, message):
+        with pytest.raises(error, match=message):
+            EightPoint().estimate(*correspondences(), K1=K, K2=torch.eye(3))
 
     def test_one_camera(self):
         with pytest.raises(ValueError, match="of both views or of none"):

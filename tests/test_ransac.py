@@ -86,6 +86,8 @@ class TestExceptions:
     def test_names_for_functions(self):
         with pytest.raises(TypeError, match="sampler must be a function or a class, got 'prosac'"):
             RANSAC(sampler="prosac")
+        with pytest.raises(TypeError, match="seed must be a whole number or None, got 'a'"):
+            RANSAC(seed="a")
         with pytest.raises(TypeError, match="factor must be a function"):
             RANSAC(factor="sampson")
 
@@ -250,9 +252,7 @@ class TestHardInput:
     def test_on_a_line(self):
         along = torch.linspace(0, 300, 60, dtype=torch.float64)
         points = torch.stack([along, 2 * along], -1)
-        F_mat, inliers = RANSAC(seed=0, max_iter=2000)(points, points + 3)
-        assert F_mat.isfinite().all()
-        assert inliers.all() or failed((F_mat, inliers))
+        assert failed(RANSAC(seed=0, max_iter=2000)(points, points + 3))
 
     @pytest.mark.parametrize("planes", [1, 2])
     def test_planes(self, planes):
