@@ -227,7 +227,7 @@ def _check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int) -> Non
             raise TypeError(f"{name} must be a floating-point tensor, got {got}")
         if K.shape not in ((3, 3), (batch_size, 3, 3)):
             raise ValueError(f"{name} must have shape [3, 3] or [{batch_size}, 3, 3], got {[*K.shape]}")
-        if is_true(~(K.isfinite().all() & (torch.linalg.det(K.detach().double()) != 0).all())):
+        if is_true(~(K.isfinite().all() & (torch.linalg.det(K.detach().to(solve_dtype(K.device))) != 0).all())):
             raise ValueError(f"{name} must be finite and invertible")
 
 

@@ -126,8 +126,8 @@ class RANSAC(nn.Module):
         Returns:
             the matrix :math:`(3, 3)` of unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, and the inliers :math:`(N,)`,
             boolean. Zeros and no inliers where no matrix of rank 2 has more than eight of them, and where fewer than
-            eight weights are positive. Where no sample determines a
-            matrix, as of a plane without noise or a camera that does not move, it is one of those that fit.
+            eight weights are positive. Where no sample determines a matrix, as of a plane without noise or a camera
+            that does not move, it is one of those that fit.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or the weights not floating-point.

@@ -79,7 +79,7 @@ class UniformSampler:
 
     def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
         """Return the share of inliers to the power of eight."""
-        return float(inliers.double().mean() ** SAMPLE_SIZE)
+        return float(inliers.cpu().double().mean() ** SAMPLE_SIZE)
 
 
 class ProsacSampler:
@@ -124,8 +124,8 @@ class ProsacSampler:
 
     def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
         """Return the largest share of inliers among the best correspondences to the power of eight."""
-        ranked = inliers[self.weights[rows].argsort(descending=True, stable=True)].double()
-        shares = ranked.cumsum(-1) / torch.arange(1, len(ranked) + 1, device=ranked.device)
+        ranked = inliers[self.weights[rows].argsort(descending=True, stable=True)].cpu().double()
+        shares = ranked.cumsum(-1) / torch.arange(1, len(ranked) + 1)
         return float(shares[int(self.LEAST * len(shares)) :].max() ** SAMPLE_SIZE)
 
 
@@ -154,5 +154,5 @@ class WeightedSampler:
 
     def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
         """Return the share of the weights that inliers have to the power of eight."""
-        weights = self.weights[rows].double()
-        return float(((weights * inliers).sum() / weights.sum()) ** SAMPLE_SIZE)
+        weights = self.weights[rows].cpu().double()
+        return float(((weights * inliers.cpu()).sum() / weights.sum()) ** SAMPLE_SIZE)

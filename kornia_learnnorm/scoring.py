@@ -96,16 +96,15 @@ class PairScorer:
         values = torch.linalg.svdvals(transform_fundamental(F_mat, self.inverse1, self.inverse2))[0]
         return int((values > 1e-9 * values[0]).sum())
 
-    def determined(self, points1: Tensor, points2: Tensor, share: float = 0.01) -> Tensor:
+    def determined(self, points1: Tensor, points2: Tensor) -> Tensor:
         r"""Tell the minimal samples that determine a matrix from those that do not, as on one line or plane.
 
         The eight constraints must be independent: each row of the design matrix is farther from the span of the rows
-        before it than a shift of the point by a share of the threshold could bring it.
+        before it than a shift of the point by a hundredth of the threshold could bring it.
 
         Args:
             points1: minimal samples in pixels with shape :math:`(K, 8, 2)`.
             points2: their counterparts with shape :math:`(K, 8, 2)`.
-            share: of the threshold.
 
         Returns:
             booleans with shape :math:`(K,)`.
@@ -114,7 +113,7 @@ class PairScorer:
         x1, x2 = self._normalize(points1, points2)
         distance = torch.linalg.qr(design_matrix(x1, x2).mT, mode="r")[1].diagonal(dim1=-2, dim2=-1).abs().amin(-1)
         scale = torch.minimum(self.T1[0, 0, 0], self.T2[0, 0, 0])
-        determined: Tensor = distance > share * self.threshold * scale
+        determined: Tensor = distance > 0.01 * self.threshold * scale
         return determined
 
     def _normalize(self, points1: Tensor, points2: Tensor) -> tuple[Tensor, Tensor]:

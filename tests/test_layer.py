@@ -136,11 +136,11 @@ class TestDetermined:
         assert layer.estimate(*points, None, weights > 0).determined.tolist() == [False, False, True, True]
         assert not layer.estimate(*points, torch.zeros(4, 12)).determined.any()
 
-    @pytest.mark.parametrize("number", [0, 1, 2])
+    @pytest.mark.parametrize("number", [0, 1])
     def test_few_points_give_a_matrix_of_rank_two(self, layer, number):
         mask = torch.arange(12).expand(3, 12) < number
         F_mat = layer(*correspondences("handheld", 3, 12), None, mask).detach()
-        assert np.linalg.matrix_rank(unit(F_mat.numpy()), tol=1e-12).min() == 2 or number == 2
+        assert np.linalg.matrix_rank(unit(F_mat.numpy()), tol=1e-12).min() == 2
         assert F_mat.isfinite().all()
 
     def test_falls_back_on_the_base(self):
