@@ -11,20 +11,23 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor, nn
 
+from kornia_learnnorm.constrained_fit import constrained_fit
 from kornia_learnnorm.correspondences import solve_dtype
-from kornia_learnnorm.normalizers import Hartley
-from kornia_learnnorm.objectives import Cauchy, Factor, Loss, Truncated, sampson_factor
-from kornia_learnnorm.refine import refine_fundamental
+from kornia_learnnorm.epipolar_cost import EpipolarCost
+from kornia_learnnorm.minimal import are_determined, solve_samples
+from kornia_learnnorm.objectives import Cauchy, Factor, Truncated, sampson_factor
+from kornia_learnnorm.rank2_manifold import decompose
+from kornia_learnnorm.refine import minimize
 from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.scoring import Hypotheses, PairScorer, epipolar_distance
 from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
 
 __all__ = ["RANSAC"]
 
-BATCHES = (128, 1024)  # hypotheses in the first batch, and in the largest
-POOL = 4  # hypotheses that are refined in the end
-OPTIMIZED = 4  # hypotheses of a batch that are optimised
+BATCHES = (32, 1024)  # hypotheses in the first batch, and in the largest
+POOL = 4  # hypotheses of a batch, and in the end, that are optimised
 SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on
+SCALES = (3.0, 1.5, 1.0)  # of the threshold in the steps of local optimisation
 STEPS = 10  # of Levenberg-Marquardt, at most
 TOLERANCE = 1e-3
 
@@ -107,7 +110,7 @@ class RANSAC(nn.Module):
         for name, value in (("factor", factor), ("sampler", sampler)):
             if not callable(value):
                 raise TypeError(f"{name} must be a function or a class, got {value!r}")
-        self.normalizer = Hartley() if normalizer is None else normalizer
+        self.normalizer = normalizer
         self.rank2: Literal["optimal"] | None = "optimal" if normalizer is None else rank2
         self.inl_th, self.max_iter, self.max_seconds, self.confidence = inl_th, max_iter, max_seconds, confidence
         self.factor, self.refine, self.sampler, self.seed = factor, refine, sampler, seed
@@ -137,6 +140,14 @@ class RANSAC(nn.Module):
 
         """
         _check(kp1, kp2, weights)
+        if self.normalizer is not None:
+            return self._estimate(kp1, kp2, weights)
+        # Faster than without gradient alone, but what a normaliser keeps of it would be of no use in training.
+        with torch.inference_mode():
+            F_mat, inliers = self._estimate(kp1, kp2, weights)
+        return F_mat.clone(), inliers.clone()
+
+    def _estimate(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         failure = kp1.new_zeros(3, 3), torch.zeros(len(kp1), dtype=torch.bool, device=kp1.device)
         finite = (kp1.isfinite() & kp2.isfinite()).all(-1)
         x1, x2 = (kp[finite].to(solve_dtype(kp.device)) for kp in (kp1, kp2))
@@ -153,68 +164,81 @@ class RANSAC(nn.Module):
         pool = self._search(scorer, scored, x1, x2, sampler, generator)
         if len(pool.F_mat) == 0:
             return failure
-        F = self._polish(scorer, pool, x1, x2) if self.refine else pool.F_mat[:1]
-        if scorer.rank(F) < 2:
+        F = self._polish(scorer, pool, x1, x2) if self.refine else decompose(pool.F_mat[:1]).matrix()
+        if _rank(F) < 2:
             return failure
-        F_mat = F[0].to(kp1.dtype)
-        inliers = finite.clone()
-        inliers[finite] = self._inliers(x1, x2, F_mat[None].to(x1))[0]
-        return (F_mat, inliers) if int(inliers.sum()) > SAMPLE_SIZE else failure
+        F = scorer.to_pixels(F)
+        F_mat = (F / torch.linalg.matrix_norm(F))[0].to(kp1.dtype)
+        finite[finite.clone()] = epipolar_distance(x1[None], x2[None], F_mat[None].to(x1), self.factor)[0] <= self.inl_th
+        return (F_mat, finite) if int(finite.sum()) > SAMPLE_SIZE else failure
 
     def _search(
         self, scorer: PairScorer, scored: Tensor, x1: Tensor, x2: Tensor, sampler: Sampler, generator: torch.Generator
     ) -> Hypotheses:
         """Return the best hypotheses that enough minimal samples of pixels (N, 2) give, best first."""
-        pool = Hypotheses(x1.new_zeros(0, 3, 3), x1.new_zeros(0), x1.new_zeros(0))
+        pool = Hypotheses(x1.new_zeros(0, 3, 3), x1.new_zeros(0))
         (batch, largest), drawn, needed, start = BATCHES, 0, self.max_iter, time.perf_counter()
         while drawn < needed and (self.max_seconds is None or time.perf_counter() - start < self.max_seconds):
             rows = sampler.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, largest)
-            determined = scorer.determined(x1[rows], x2[rows])
-            rows = rows[determined] if bool(determined.any()) else rows
-            found = scorer.best(find_fundamental(x1[rows], x2[rows], None, self.normalizer, self.rank2), POOL)
+            found = scorer.best(self._solve(scorer, x1[rows], x2[rows]), POOL)
             pool = pool.join(found, POOL)
             needed = self._samples_needed(pool, scorer, scored, sampler)
             # A pool that ends the search is refined anyway.
             if self.refine and drawn < needed and len(found.F_mat):
-                pool = pool.join(self._optimize(scorer, found.F_mat[:OPTIMIZED]), POOL)
+                pool = pool.join(self._optimize(scorer, found.F_mat), POOL)
                 needed = self._samples_needed(pool, scorer, scored, sampler)
         return pool
 
+    def _solve(self, scorer: PairScorer, samples1: Tensor, samples2: Tensor) -> Tensor:
+        """Return the matrices of minimal samples of pixels (K, 8, 2) that determine one; of all, if none does."""
+        x1, x2 = scorer.homogeneous(samples1, samples2)
+        if self.normalizer is None:
+            F_mat = solve_samples(x1, x2, 0.01 * self.inl_th)
+            if len(F_mat):
+                return F_mat
+        else:
+            determined = are_determined(x1, x2, 0.01 * self.inl_th)
+            if bool(determined.any()):
+                samples1, samples2 = samples1[determined], samples2[determined]
+        return scorer.from_pixels(find_fundamental(samples1, samples2, None, self.normalizer, self.rank2))
+
     def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
-        """Refit the first matrix to its inliers, refine all, and rate what comes out."""
-        points1, points2 = scorer.points1[None], scorer.points2[None]
-        inliers = self._inliers(scorer.points1, scorer.points2, F_mat[:1]).to(points1)
-        refit = find_fundamental(points1, points2, inliers, self.normalizer, self.rank2)
+        """Fit matrices to their inliers, and with a normaliser the first by it, and rate what comes out."""
+        if self.normalizer is not None:
+            inliers = scorer.inliers(F_mat[:1]).to(F_mat)
+            points1, points2 = scorer.points1[None], scorer.points2[None]
+            refit = find_fundamental(points1, points2, inliers, self.normalizer, self.rank2)
+            F_mat = torch.cat([scorer.from_pixels(refit), F_mat])
         # Samples with noise or an outlier see too few of their inliers within the threshold itself.
-        loss = Truncated(2 * self.inl_th)
-        start = torch.cat([refit, F_mat])
-        refined = refine_fundamental(points1, points2, start, None, self.factor, loss, 5, TOLERANCE)
-        return scorer.best(torch.cat([refined.F_mat, refit]), POOL)
+        losses = [Truncated(scale * self.inl_th) for scale in SCALES]
+        return scorer.best(constrained_fit(scorer.x1, scorer.x2, F_mat, losses, None, self.factor), POOL)
 
     def _polish(self, scorer: PairScorer, pool: Hypotheses, x1: Tensor, x2: Tensor) -> Tensor:
-        """Return the refined matrix (1, 3, 3): of the pool on the scorer's points, then of the best one on all."""
-        points1, points2 = scorer.points1[None], scorer.points2[None]
-        loss: Loss = Truncated(self.inl_th)
-        refined = refine_fundamental(points1, points2, pool.F_mat, None, self.factor, loss, STEPS, TOLERANCE)
-        F_mat = pool.join(scorer.best(refined.F_mat, 1), 1).F_mat
-        inliers = self._inliers(x1, x2, F_mat).to(x1)
+        """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the optimised pool."""
+        F_mat = pool.join(self._optimize(scorer, pool.F_mat), 1).F_mat
+        x1, x2 = scorer.homogeneous(x1, x2)
         loss = Cauchy(self.inl_th / 3)  # the threshold is taken as three standard deviations of the noise
-        return refine_fundamental(x1[None], x2[None], F_mat, inliers, self.factor, loss, STEPS, TOLERANCE).F_mat
-
-    def _inliers(self, x1: Tensor, x2: Tensor, F_mat: Tensor) -> Tensor:
-        """Tell the inliers (1, N) of a matrix (1, 3, 3) among pixels (N, 2)."""
-        return epipolar_distance(x1[None], x2[None], F_mat, self.factor) <= self.inl_th
+        cost = EpipolarCost(x1.mT[None], x2.mT[None], torch.ones_like(x1[None, :, 0]), self.factor, loss)
+        inliers = cost.distances(F_mat).abs() <= self.inl_th
+        cost = cost._replace(weights=inliers.to(F_mat))
+        F_mat = constrained_fit(cost.x1[0], cost.x2[0], F_mat, 4 * [loss], cost.weights[0], self.factor)
+        return minimize(cost, decompose(F_mat), STEPS, TOLERANCE)[1].state.matrix()
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, scored: Tensor, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
         if len(pool.F_mat) == 0 or self.confidence == 1:
             return self.max_iter
-        inliers = self._inliers(scorer.points1, scorer.points2, pool.F_mat[:1])[0]
-        hit_rate = min(sampler.hit_rate(inliers, scored), 1 - 1e-9)
+        hit_rate = min(sampler.hit_rate(scorer.inliers(pool.F_mat[:1])[0], scored), 1 - 1e-9)
         if hit_rate == 0:
             return self.max_iter
         return math.ceil(min(self.max_iter, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
+
+
+def _rank(F_mat: Tensor) -> int:
+    """The rank of a matrix (1, 3, 3) in a scorer's coordinates, to nine digits."""
+    values = torch.linalg.svdvals(F_mat)[0]
+    return int((values > 1e-9 * values[0]).sum())
 
 
 def _check(kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> None:

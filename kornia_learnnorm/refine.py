@@ -21,7 +21,7 @@ from kornia_learnnorm.optimal_rank2 import check_fundamental
 from kornia_learnnorm.rank2_manifold import Rank2, decompose, retract, tangents
 from kornia_learnnorm.transforms import transform_fundamental
 
-__all__ = ["Refinement", "refine_fundamental"]
+__all__ = ["Refinement", "minimize", "refine_fundamental"]
 
 
 class Refinement(NamedTuple):
@@ -121,8 +121,8 @@ def refine_fundamental(
     x1, x2 = T1 @ convert_points_to_homogeneous(x1).mT, T2 @ convert_points_to_homogeneous(x2).mT
     objective = EpipolarCost(x1, x2, w, factor, loss)
     with torch.no_grad():
-        before, best = _search(objective, decompose(F), max_iterations, tolerance)
-    state = Rank2(best.axes, best.A)
+        before, best = minimize(objective, decompose(F), max_iterations, tolerance)
+    state = best.state
     if torch.is_grad_enabled() and (x1.requires_grad or x2.requires_grad or w.requires_grad):
         state = _attach_gradient(objective, state, best.converged)
     F = transform_fundamental(state.matrix(), T1, T2)
@@ -143,11 +143,15 @@ class _Estimate(NamedTuple):
     damping: Tensor
     iterations: Tensor
 
+    @property
+    def state(self) -> Rank2:
+        return Rank2(self.axes, self.A)
+
     def select(self, rows: Tensor) -> _Estimate:
         return _Estimate(*(value[rows] for value in self))
 
 
-def _search(objective: EpipolarCost, state: Rank2, max_iterations: int, tolerance: float) -> tuple[Tensor, _Estimate]:
+def minimize(objective: EpipolarCost, state: Rank2, max_iterations: int, tolerance: float) -> tuple[Tensor, _Estimate]:
     """Return the costs at the states and the best estimates found from there."""
     # What a step computes of so many correspondences stays in the cache of a CPU: 2.5 times faster than all at once.
     size = (2**14 if state.A.device.type == "cpu" else 2**24) // objective.x1.shape[-1]
@@ -179,7 +183,7 @@ def _try_step(objective: EpipolarCost, estimate: _Estimate, active: Tensor, tole
     damped = estimate.normal.clone()
     damped.diagonal(dim1=-2, dim2=-1).mul_(1 + estimate.damping[:, None])
     step = -torch.linalg.solve_ex(damped, estimate.gradient)[0]
-    state, iterations = retract(Rank2(estimate.axes, estimate.A), step), estimate.iterations + active
+    state, iterations = retract(estimate.state, step), estimate.iterations + active
     moved = _evaluate(objective, state, tolerance, 0.1 * estimate.damping, iterations)
     better = active & (moved.cost < estimate.cost)  # not where either is NaN
     if better.all():

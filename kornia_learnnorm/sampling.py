@@ -51,13 +51,12 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
         tensor([[0, 1, 2]])
 
     """
-    drawn = torch.empty(len(totals), size, dtype=torch.int64, device=totals.device)
+    last = totals[:, None] - size + torch.arange(size, device=totals.device)
     uniform = torch.rand(len(totals), size, generator=generator, device=totals.device)
-    for k in range(size):
-        last = totals - size + k
-        index = (uniform[:, k] * (last + 1)).long().clamp(max=last)
-        met = (drawn[:, :k] == index[:, None]).any(-1)
-        drawn[:, k] = torch.where(met, last, index)
+    drawn = (uniform * (last + 1)).long().clamp_(max=last)
+    for k in range(1, size):
+        met = (drawn[:, :k] == drawn[:, k, None]).any(-1)
+        drawn[:, k] = torch.where(met, last[:, k], drawn[:, k])
     return drawn
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.evaluation.robust_matches import Matches
 from kornia_learnnorm.evaluation.robust_peers import Peer
+from kornia_learnnorm.minimal import are_determined
 from kornia_learnnorm.ransac import RANSAC
 from kornia_learnnorm.sampling import SAMPLE_SIZE, draw_distinct
 from kornia_learnnorm.scoring import PairScorer
@@ -123,8 +124,8 @@ def best_of(number: int, solver: Solver) -> Estimator:
             scorer = PairScorer(x1, x2, threshold)
             kept = F_mat
             if solver.size == SAMPLE_SIZE:
-                kept = F_mat[scorer.determined(x1[rows], x2[rows])]
-            best = scorer.best(kept.flatten(0, 1), 1).F_mat
+                kept = F_mat[are_determined(*scorer.homogeneous(x1[rows], x2[rows]), 0.01 * threshold)]
+            best = scorer.to_pixels(scorer.best(scorer.from_pixels(kept.flatten(0, 1)), 1).F_mat)
             seconds = shared + time.perf_counter() - start
             found.append(Estimate(best[0] if len(best) else _failure(), seconds, number))
         return found

@@ -1,0 +1,80 @@
+r"""Many minimal samples of eight correspondences at once, without derivatives.
+
+:func:`~kornia_learnnorm.find_fundamental` with ``rank2="optimal"`` gives the same matrices. It also serves more points,
+weights, any normaliser and gradients, at several times the cost.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.linear import design_matrix
+from kornia_learnnorm.reweighting import adjugate
+
+__all__ = ["are_determined", "solve_samples"]
+
+
+def are_determined(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
+    r"""Tell the minimal samples that determine a matrix from those that do not, as on one line or plane.
+
+    The eight constraints must be independent: each row of the design matrix is farther from the span of the rows before
+    it than a shift of the point could bring it.
+
+    Args:
+        x1: homogeneous points of view 1 with shape :math:`(K, 8, 3)`, pixels and a third coordinate as large.
+        x2: their counterparts with shape :math:`(K, 8, 3)`.
+        shift: in pixels.
+
+    Returns:
+        booleans with shape :math:`(K,)`.
+
+    """
+    return _independent(torch.linalg.qr(design_matrix(x1, x2).mT, mode="r")[1], x1, x2, shift)
+
+
+def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
+    r"""Solve minimal samples exactly and correct the matrices to rank 2 with their covariances.
+
+    A QR factorisation of the transposed design matrix, :math:`A^\top = Q R`, tells which samples determine a matrix
+    and gives both the null vector, which is the last column of :math:`Q`, and a factor of its covariance,
+    :math:`V_0 = L L^\top` with :math:`L = Q_{:,1:8} R^{-\top} \mathrm{diag}(\sqrt{(u, V_i u)})`, see
+    :func:`~kornia_learnnorm.optimal_rank2`.
+
+    Args:
+        x1: homogeneous points of view 1 with shape :math:`(K, 8, 3)`, pixels and a third coordinate as large.
+        x2: their counterparts with shape :math:`(K, 8, 3)`.
+        shift: of a point that must not make a sample undetermined, see :func:`are_determined`, pixels.
+
+    Returns:
+        matrices of unit norm of the samples that determine one, :math:`(M, 3, 3)`, :math:`M \le K`; of rank 2 up to
+        the convergence of three steps.
+
+    Reference:
+        K. Kanatani, Y. Sugaya, Fundamental matrix computation: theory and practice, Memoirs of the Faculty of
+        Engineering, Okayama University 42, 2008, on a posteriori correction.
+
+    """
+    Q, R = torch.linalg.qr(design_matrix(x1, x2).mT, mode="complete")
+    determined = _independent(R, x1, x2, shift)
+    if not bool(determined.all()):
+        Q, R, x1, x2 = Q[determined], R[determined], x1[determined], x2[determined]
+    u = Q[..., 8]
+    F = torch.unflatten(u, -1, (3, 3))
+    line1, line2 = (x2 @ F)[..., :2], (x1 @ F.mT)[..., :2]
+    deviation = (line1.square().sum(-1) + line2.square().sum(-1)).sqrt()
+    L = Q[..., :8] @ torch.linalg.solve_triangular(R[..., :8, :].mT, torch.diag_embed(deviation), upper=False)
+    for step in range(3):
+        L = L - u[..., None] * (u[:, None] @ L) if step else L
+        cofactors = adjugate(torch.unflatten(u, -1, (3, 3))).mT.flatten(-2)
+        slope = cofactors[:, None] @ L
+        change = (L @ slope.mT)[..., 0] / slope.square().sum(-1)
+        u = u - (u * cofactors).sum(-1, keepdim=True) / 3 * change
+        u = u / u.norm(dim=-1, keepdim=True)
+    return torch.unflatten(u, -1, (3, 3))
+
+
+def _independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
+    distance = R.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
+    determined: Tensor = distance > shift * torch.minimum(x1[0, 0, 2], x2[0, 0, 2])
+    return determined
