@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.objectives import Factor, Loss, sampson_factor
-from kornia_learnnorm.reweighting import adjugate
 
 __all__ = ["constrained_fit"]
 
@@ -58,17 +57,18 @@ def constrained_fit(
     F, xi = given, (x2[:, None] * x1).flatten(0, 1)
     floor = torch.finfo(F.dtype).eps ** 2  # below it the direction of a line is rounding
     system, right = F.new_zeros(len(F), 11, 11), F.new_zeros(len(F), 11)
+    moments, constraints, multipliers = system[:, :9, :9], system[:, 9:, :9], system[:, :9, 9:]
     right[:, 9] = 1
     for loss in losses:
-        u, cofactors = F.flatten(1), adjugate(F).mT.flatten(1)
+        u, cofactors = F.flatten(1), torch.linalg.cross(F.roll(-1, 1), F.roll(-2, 1)).flatten(1)
         normal1, normal2 = (F.mT[:, :2] @ x2).square_().sum(1), (F[:, :2] @ x1).square_().sum(1)
-        squared = factor(normal1.clamp_(min=floor), normal2.clamp_(min=floor))[0].square()
-        w = loss((u @ xi).square_() * squared)[1] * squared
-        moments = (xi * (w if weights is None else w * weights)[:, None]) @ xi.mT
-        bounds = torch.stack([u, cofactors], 1)
-        system[:, :9, :9] = moments / moments.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
-        system[:, 9:, :9], system[:, :9, 9:] = bounds, bounds.mT
-        right[:, 10] = (cofactors * u).sum(-1) * (2 / 3)
+        g = factor(normal1.clamp_(min=floor), normal2.clamp_(min=floor))[0].square_()
+        w = loss((u @ xi).square_().mul_(g))[1] * g
+        products = (xi * (w if weights is None else w * weights)[:, None]) @ xi.mT
+        torch.div(products, products.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None], out=moments)
+        torch.stack([u, cofactors], 1, out=constraints)
+        multipliers.copy_(constraints.mT)
+        torch.mul((cofactors * u).sum(-1), 2 / 3, out=right[:, 10])
         v = torch.linalg.solve_ex(system, right)[0][:, :9]
         F = torch.unflatten(v / v.norm(dim=-1, keepdim=True), -1, (3, 3))
     return torch.where(F.isfinite().all(-1).all(-1)[:, None, None], F, given)

@@ -16,7 +16,7 @@ from kornia_learnnorm.correspondences import solve_dtype
 from kornia_learnnorm.epipolar_cost import EpipolarCost
 from kornia_learnnorm.minimal import are_determined, solve_samples
 from kornia_learnnorm.objectives import Cauchy, Factor, Truncated, sampson_factor
-from kornia_learnnorm.rank2_manifold import decompose
+from kornia_learnnorm.rank2_manifold import Rank2, decompose
 from kornia_learnnorm.refine import minimize
 from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.scoring import Hypotheses, PairScorer, epipolar_distance
@@ -25,9 +25,12 @@ from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
 __all__ = ["RANSAC"]
 
 BATCHES = (32, 1024)  # hypotheses in the first batch, and in the largest
-POOL = 4  # hypotheses of a batch, and in the end, that are optimised
+POOL = 4  # hypotheses of a batch that are optimised
+FINAL = 2  # hypotheses that are optimised in the end
 SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on
-SCALES = (3.0, 1.5, 1.0)  # of the threshold in the steps of local optimisation
+SCALES = (3.0, 1.5, 1.0)  # of the threshold in the steps of local optimisation: samples with noise see few inliers
+FINAL_SCALES = (2.0,)  # the same in the end
+REWEIGHTINGS = 4  # on the loss of the final refinement, before it
 STEPS = 10  # of Levenberg-Marquardt, at most
 TOLERANCE = 1e-3
 
@@ -157,88 +160,79 @@ class RANSAC(nn.Module):
         generator = torch.Generator(kp1.device)
         generator.manual_seed(int(torch.randint(2**62, ())) if self.seed is None else self.seed)
         sampler = UniformSampler(len(w), w.device) if weights is None else self.sampler(w)
-        scored = torch.arange(len(x1), device=x1.device)
+        scored: Tensor | slice = slice(None)
         if len(x1) > SCORED:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:SCORED]
-        scorer = PairScorer(x1[scored], x2[scored], self.inl_th, self.factor)
-        pool = self._search(scorer, scored, x1, x2, sampler, generator)
+        scorer = PairScorer(x1, x2, self.inl_th, self.factor, scored)
+        pool = self._search(scorer, sampler, generator)
         if len(pool.F_mat) == 0:
             return failure
-        F = self._polish(scorer, pool, x1, x2) if self.refine else decompose(pool.F_mat[:1]).matrix()
-        if _rank(F) < 2:
+        state = self._polish(scorer, pool) if self.refine else decompose(pool.F_mat[:1])
+        if state.A.det().abs() < 1e-9:
             return failure
-        F = scorer.to_pixels(F)
+        F = scorer.to_pixels(state.matrix())
         F_mat = (F / torch.linalg.matrix_norm(F))[0].to(kp1.dtype)
         finite[finite.clone()] = epipolar_distance(x1[None], x2[None], F_mat[None].to(x1), self.factor)[0] <= self.inl_th
         return (F_mat, finite) if int(finite.sum()) > SAMPLE_SIZE else failure
 
-    def _search(
-        self, scorer: PairScorer, scored: Tensor, x1: Tensor, x2: Tensor, sampler: Sampler, generator: torch.Generator
-    ) -> Hypotheses:
-        """Return the best hypotheses that enough minimal samples of pixels (N, 2) give, best first."""
-        pool = Hypotheses(x1.new_zeros(0, 3, 3), x1.new_zeros(0))
+    def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> Hypotheses:
+        """Return the best hypotheses that enough minimal samples give, best first."""
+        pool = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0))
         (batch, largest), drawn, needed, start = BATCHES, 0, self.max_iter, time.perf_counter()
         while drawn < needed and (self.max_seconds is None or time.perf_counter() - start < self.max_seconds):
             rows = sampler.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, largest)
-            found = scorer.best(self._solve(scorer, x1[rows], x2[rows]), POOL)
+            found = scorer.best(self._solve(scorer, rows), POOL)
             pool = pool.join(found, POOL)
-            needed = self._samples_needed(pool, scorer, scored, sampler)
-            # A pool that ends the search is refined anyway.
+            needed = self._samples_needed(pool, scorer, sampler)
+            # A pool that ends the search is optimised anyway.
             if self.refine and drawn < needed and len(found.F_mat):
-                pool = pool.join(self._optimize(scorer, found.F_mat), POOL)
-                needed = self._samples_needed(pool, scorer, scored, sampler)
+                pool = pool.join(self._optimize(scorer, found.F_mat, SCALES), POOL)
+                needed = self._samples_needed(pool, scorer, sampler)
         return pool
 
-    def _solve(self, scorer: PairScorer, samples1: Tensor, samples2: Tensor) -> Tensor:
-        """Return the matrices of minimal samples of pixels (K, 8, 2) that determine one; of all, if none does."""
-        x1, x2 = scorer.homogeneous(samples1, samples2)
+    def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
+        """Return the matrices of the minimal samples (K, 8) that determine one; of all, if none does."""
+        x1, x2 = (x[:, rows].movedim(0, -1) for x in (scorer.x1, scorer.x2))
         if self.normalizer is None:
             F_mat = solve_samples(x1, x2, 0.01 * self.inl_th)
             if len(F_mat):
                 return F_mat
         else:
             determined = are_determined(x1, x2, 0.01 * self.inl_th)
-            if bool(determined.any()):
-                samples1, samples2 = samples1[determined], samples2[determined]
-        return scorer.from_pixels(find_fundamental(samples1, samples2, None, self.normalizer, self.rank2))
+            rows = rows[determined] if bool(determined.any()) else rows
+        points1, points2 = scorer.points1[rows], scorer.points2[rows]
+        return scorer.from_pixels(find_fundamental(points1, points2, None, self.normalizer, self.rank2))
 
-    def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
+    def _optimize(self, scorer: PairScorer, F_mat: Tensor, scales: tuple[float, ...]) -> Hypotheses:
         """Fit matrices to their inliers, and with a normaliser the first by it, and rate what comes out."""
         if self.normalizer is not None:
             inliers = scorer.inliers(F_mat[:1]).to(F_mat)
-            points1, points2 = scorer.points1[None], scorer.points2[None]
+            points1, points2 = scorer.points1[None, scorer.rows], scorer.points2[None, scorer.rows]
             refit = find_fundamental(points1, points2, inliers, self.normalizer, self.rank2)
             F_mat = torch.cat([scorer.from_pixels(refit), F_mat])
-        # Samples with noise or an outlier see too few of their inliers within the threshold itself.
-        losses = [Truncated(scale * self.inl_th) for scale in SCALES]
-        return scorer.best(constrained_fit(scorer.x1, scorer.x2, F_mat, losses, None, self.factor), POOL)
+        losses = [Truncated(scale * self.inl_th) for scale in scales]
+        x1, x2 = scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows]
+        return scorer.best(constrained_fit(x1, x2, F_mat, losses, None, self.factor), POOL)
 
-    def _polish(self, scorer: PairScorer, pool: Hypotheses, x1: Tensor, x2: Tensor) -> Tensor:
+    def _polish(self, scorer: PairScorer, pool: Hypotheses) -> Rank2:
         """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the optimised pool."""
-        F_mat = pool.join(self._optimize(scorer, pool.F_mat), 1).F_mat
-        x1, x2 = scorer.homogeneous(x1, x2)
+        F_mat = pool.join(self._optimize(scorer, pool.F_mat[:FINAL], FINAL_SCALES), 1).F_mat
         loss = Cauchy(self.inl_th / 3)  # the threshold is taken as three standard deviations of the noise
-        cost = EpipolarCost(x1.mT[None], x2.mT[None], torch.ones_like(x1[None, :, 0]), self.factor, loss)
+        cost = EpipolarCost(scorer.x1[None], scorer.x2[None], scorer.x1.new_ones(1, 1), self.factor, loss)
         inliers = cost.distances(F_mat).abs() <= self.inl_th
         cost = cost._replace(weights=inliers.to(F_mat))
-        F_mat = constrained_fit(cost.x1[0], cost.x2[0], F_mat, 4 * [loss], cost.weights[0], self.factor)
-        return minimize(cost, decompose(F_mat), STEPS, TOLERANCE)[1].state.matrix()
+        F_mat = constrained_fit(scorer.x1, scorer.x2, F_mat, REWEIGHTINGS * [loss], cost.weights[0], self.factor)
+        return minimize(cost, decompose(F_mat), STEPS, TOLERANCE)[1].state
 
-    def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, scored: Tensor, sampler: Sampler) -> int:
+    def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
         if len(pool.F_mat) == 0 or self.confidence == 1:
             return self.max_iter
-        hit_rate = min(sampler.hit_rate(scorer.inliers(pool.F_mat[:1])[0], scored), 1 - 1e-9)
+        hit_rate = min(sampler.hit_rate(scorer.inliers(pool.F_mat[:1])[0], scorer.rows), 1 - 1e-9)
         if hit_rate == 0:
             return self.max_iter
         return math.ceil(min(self.max_iter, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
-
-
-def _rank(F_mat: Tensor) -> int:
-    """The rank of a matrix (1, 3, 3) in a scorer's coordinates, to nine digits."""
-    values = torch.linalg.svdvals(F_mat)[0]
-    return int((values > 1e-9 * values[0]).sum())
 
 
 def _check(kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> None:

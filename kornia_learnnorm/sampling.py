@@ -19,12 +19,12 @@ class Sampler(Protocol):
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return the indices of the next ``count`` minimal samples, (count, 8) int64."""
 
-    def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
+    def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the probability that a sample holds no outlier.
 
         Args:
             inliers: which correspondences are inliers of the best matrix so far, (M,) boolean.
-            rows: which correspondences these are, (M,) int64.
+            rows: which correspondences these are, (M,) int64 or a slice.
 
         """
 
@@ -76,7 +76,7 @@ class UniformSampler:
         """Return the indices of the next samples."""
         return draw_distinct(self.total.expand(count), SAMPLE_SIZE, generator)
 
-    def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
+    def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the share of inliers to the power of eight."""
         return float(inliers.cpu().double().mean() ** SAMPLE_SIZE)
 
@@ -121,7 +121,7 @@ class ProsacSampler:
         uniform = draw_distinct(torch.full_like(last, total), SAMPLE_SIZE, generator)
         return self.order[torch.where(grown[:, None] < len(self.until), ranked, uniform)]
 
-    def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
+    def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the largest share of inliers among the best correspondences to the power of eight."""
         ranked = inliers[self.weights[rows].argsort(descending=True, stable=True)].cpu().double()
         shares = ranked.cumsum(-1) / torch.arange(1, len(ranked) + 1)
@@ -151,7 +151,7 @@ class WeightedSampler:
         uniform = torch.rand(count, len(self.weights), generator=generator, device=self.weights.device)
         return (uniform.log() / self.weights).topk(SAMPLE_SIZE).indices
 
-    def hit_rate(self, inliers: Tensor, rows: Tensor) -> float:
+    def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the share of the weights that inliers have to the power of eight."""
         weights = self.weights[rows].cpu().double()
         return float(((weights * inliers.cpu()).sum() / weights.sum()) ** SAMPLE_SIZE)

@@ -50,31 +50,35 @@ class PairScorer:
         threshold: largest distance :math:`\tau` of an inlier, pixels.
         factor: which distance: :func:`~kornia_learnnorm.objectives.sampson_factor` or
             :func:`~kornia_learnnorm.objectives.symmetric_factor`.
+        rows: the correspondences that count in scores; all by default.
 
     Attributes:
         T1: from pixels of view 1 to the coordinates, (3, 3).
         T2: the same of view 2.
-        x1: the correspondences in them, (3, N).
+        x1: all correspondences in them, (3, N).
         x2: the same of view 2.
 
     """
 
-    def __init__(self, points1: Tensor, points2: Tensor, threshold: float, factor: Factor = sampson_factor) -> None:
-        self.points1, self.points2, self.threshold, self.factor = points1, points2, threshold, factor
+    def __init__(
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        threshold: float,
+        factor: Factor = sampson_factor,
+        rows: Tensor | slice = slice(None),
+    ) -> None:
+        self.points1, self.points2, self.threshold, self.factor, self.rows = points1, points2, threshold, factor, rows
         both = torch.stack([points1, points2])
         origin = both.mean(1)
         spread = (both - origin[:, None]).abs().mean((1, 2))
         T = torch.eye(3, dtype=both.dtype, device=both.device).repeat(2, 1, 1)
         T[:, :2, 2], T[:, 2, 2] = -origin, torch.where(spread > 0, spread, 1.0)
         self.T1, self.T2 = T
-        self.x1, self.x2 = (x.mT.contiguous() for x in self.homogeneous(points1, points2))
-        self.residuals = (self.x2[:, None] * self.x1).flatten(0, 1).float()
-        self.normals1, self.normals2 = _monomials(self.x2.float()), _monomials(self.x1.float())
-
-    def homogeneous(self, points1: Tensor, points2: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pixels (*, N, 2) of both views in the scorer's coordinates, (*, N, 3)."""
-        x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
-        return x1 @ self.T1.mT, x2 @ self.T2.mT
+        self.x1, self.x2 = T @ convert_points_to_homogeneous(both).mT
+        x1, x2 = self.x1[:, rows], self.x2[:, rows]
+        self.residuals = (x2[:, None] * x1).flatten(0, 1).float()
+        self.normals1, self.normals2 = _monomials(x2.float()), _monomials(x1.float())
 
     def from_pixels(self, F_mat: Tensor) -> Tensor:
         """Return matrices (K, 3, 3) of pixels in the scorer's coordinates."""
@@ -92,18 +96,18 @@ class PairScorer:
             number: largest number of matrices.
 
         """
-        blocks = torch.split(F_mat, max(1, BLOCK // self.x1.shape[-1]))
+        blocks = torch.split(F_mat, max(1, BLOCK // self.residuals.shape[-1]))
         scores = torch.cat([self._gains(block).clamp_(min=0).sum(-1) for block in blocks])
         score, order = scores.topk(min(number, len(scores)))
         positive = score > 0
         return Hypotheses(F_mat[order[positive]], score[positive])
 
     def inliers(self, F_mat: Tensor) -> Tensor:
-        """Tell the inliers (K, N) of matrices (K, 3, 3)."""
+        """Tell the inliers (K, M) of matrices (K, 3, 3) among the correspondences that count."""
         return self._gains(F_mat) >= 0
 
     def _gains(self, F_mat: Tensor) -> Tensor:
-        """What each correspondence would add to each score if it were not truncated, (K, N); -1 for NaN."""
+        """What each correspondence would add to each score if it were not truncated, (K, M); -1 for NaN."""
         F = (F_mat / torch.linalg.matrix_norm(F_mat, keepdim=True)).float()
         tiny = torch.finfo(F.dtype).tiny
         normal1 = (_coefficients(F[:, :, :2] @ F[:, :, :2].mT) @ self.normals1).clamp_(min=tiny)
