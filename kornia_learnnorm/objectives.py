@@ -48,7 +48,7 @@ def sampson_factor(normal1: Tensor, normal2: Tensor) -> tuple[Tensor, Tensor, Te
     """
     total = normal1 + normal2
     factor = total.rsqrt()
-    slope = -factor / (2 * total)
+    slope = factor / (-2 * total)
     return factor, slope, slope
 
 

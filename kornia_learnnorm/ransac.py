@@ -15,7 +15,7 @@ from kornia_learnnorm.constrained_fit import constrained_fit
 from kornia_learnnorm.correspondences import solve_dtype
 from kornia_learnnorm.epipolar_cost import EpipolarCost
 from kornia_learnnorm.minimal import are_determined, solve_samples
-from kornia_learnnorm.objectives import Cauchy, Factor, Truncated, sampson_factor
+from kornia_learnnorm.objectives import Factor, GemanMcClure, Truncated, sampson_factor
 from kornia_learnnorm.rank2_manifold import Rank2, decompose
 from kornia_learnnorm.refine import minimize
 from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
@@ -24,14 +24,15 @@ from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
 
 __all__ = ["RANSAC"]
 
-BATCHES = (32, 1024)  # hypotheses in the first batch, and in the largest
-POOL = 4  # hypotheses of a batch that are optimised
-FINAL = 2  # hypotheses that are optimised in the end
+BATCHES = (32, 1024)  # samples in the first batch, and in the largest
 SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on
-SCALES = (3.0, 1.5, 1.0)  # of the threshold in the steps of local optimisation: samples with noise see few inliers
-FINAL_SCALES = (2.0,)  # the same in the end
-REWEIGHTINGS = 4  # on the loss of the final refinement, before it
-STEPS = 10  # of Levenberg-Marquardt, at most
+POOL = 8  # hypotheses of a batch that are optimised,
+SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the threshold in each step: a noisy sample sees few of its inliers
+FINAL_POOL = 2  # the same in the end,
+FINAL_SCALES = (2.0,)
+LOSS_SCALE = 0.6  # of the threshold, for the loss of the final refinement:
+REWEIGHTINGS = 4  # first these steps of least squares,
+STEPS = 10  # then these of Levenberg-Marquardt, at most
 TOLERANCE = 1e-3
 
 
@@ -154,12 +155,12 @@ class RANSAC(nn.Module):
         failure = kp1.new_zeros(3, 3), torch.zeros(len(kp1), dtype=torch.bool, device=kp1.device)
         finite = (kp1.isfinite() & kp2.isfinite()).all(-1)
         x1, x2 = (kp[finite].to(solve_dtype(kp.device)) for kp in (kp1, kp2))
-        w = torch.ones_like(x1[:, 0]) if weights is None else weights[finite].to(x1)
-        if int((w > 0).sum()) < SAMPLE_SIZE:
+        w = None if weights is None else weights[finite].to(x1)
+        if (len(x1) if w is None else int((w > 0).sum())) < SAMPLE_SIZE:
             return failure
         generator = torch.Generator(kp1.device)
         generator.manual_seed(int(torch.randint(2**62, ())) if self.seed is None else self.seed)
-        sampler = UniformSampler(len(w), w.device) if weights is None else self.sampler(w)
+        sampler = UniformSampler(len(x1), x1.device) if w is None else self.sampler(w)
         scored: Tensor | slice = slice(None)
         if len(x1) > SCORED:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:SCORED]
@@ -172,8 +173,9 @@ class RANSAC(nn.Module):
             return failure
         F = scorer.to_pixels(state.matrix())
         F_mat = (F / torch.linalg.matrix_norm(F))[0].to(kp1.dtype)
-        finite[finite.clone()] = epipolar_distance(x1[None], x2[None], F_mat[None].to(x1), self.factor)[0] <= self.inl_th
-        return (F_mat, finite) if int(finite.sum()) > SAMPLE_SIZE else failure
+        inliers = finite.clone()
+        inliers[finite] = epipolar_distance(x1[None], x2[None], F_mat[None].to(x1), self.factor)[0] <= self.inl_th
+        return (F_mat, inliers) if int(inliers.sum()) > SAMPLE_SIZE else failure
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> Hypotheses:
         """Return the best hypotheses that enough minimal samples give, best first."""
@@ -217,12 +219,10 @@ class RANSAC(nn.Module):
 
     def _polish(self, scorer: PairScorer, pool: Hypotheses) -> Rank2:
         """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the optimised pool."""
-        F_mat = pool.join(self._optimize(scorer, pool.F_mat[:FINAL], FINAL_SCALES), 1).F_mat
-        loss = Cauchy(self.inl_th / 3)  # the threshold is taken as three standard deviations of the noise
+        F_mat = pool.join(self._optimize(scorer, pool.F_mat[:FINAL_POOL], FINAL_SCALES), 1).F_mat
+        loss = GemanMcClure(LOSS_SCALE * self.inl_th)
+        F_mat = constrained_fit(scorer.x1, scorer.x2, F_mat, REWEIGHTINGS * [loss], None, self.factor)
         cost = EpipolarCost(scorer.x1[None], scorer.x2[None], scorer.x1.new_ones(1, 1), self.factor, loss)
-        inliers = cost.distances(F_mat).abs() <= self.inl_th
-        cost = cost._replace(weights=inliers.to(F_mat))
-        F_mat = constrained_fit(scorer.x1, scorer.x2, F_mat, REWEIGHTINGS * [loss], cost.weights[0], self.factor)
         return minimize(cost, decompose(F_mat), STEPS, TOLERANCE)[1].state
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:

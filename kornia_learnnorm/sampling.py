@@ -54,9 +54,9 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
     last = totals[:, None] - size + torch.arange(size, device=totals.device)
     uniform = torch.rand(len(totals), size, generator=generator, device=totals.device)
     drawn = (uniform * (last + 1)).long().clamp_(max=last)
-    for k in range(1, size):
-        met = (drawn[:, :k] == drawn[:, k, None]).any(-1)
-        drawn[:, k] = torch.where(met, last[:, k], drawn[:, k])
+    for k, (column, end) in enumerate(zip(drawn.unbind(-1), last.unbind(-1), strict=True)):
+        met = (drawn[:, :k] == column[:, None]).any(-1)
+        torch.where(met, end, column, out=column)
     return drawn
 
 

@@ -78,7 +78,7 @@ class PairScorer:
         self.x1, self.x2 = T @ convert_points_to_homogeneous(both).mT
         x1, x2 = self.x1[:, rows], self.x2[:, rows]
         self.residuals = (x2[:, None] * x1).flatten(0, 1).float()
-        self.normals1, self.normals2 = _monomials(x2.float()), _monomials(x1.float())
+        self.products1, self.products2 = ((x[:, None] * x).flatten(0, 1).float() for x in (x1, x2))
 
     def from_pixels(self, F_mat: Tensor) -> Tensor:
         """Return matrices (K, 3, 3) of pixels in the scorer's coordinates."""
@@ -108,11 +108,11 @@ class PairScorer:
 
     def _gains(self, F_mat: Tensor) -> Tensor:
         """What each correspondence would add to each score if it were not truncated, (K, M); -1 for NaN."""
-        F = (F_mat / torch.linalg.matrix_norm(F_mat, keepdim=True)).float()
+        F = (F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)).float()
         tiny = torch.finfo(F.dtype).tiny
-        normal1 = (_coefficients(F[:, :, :2] @ F[:, :, :2].mT) @ self.normals1).clamp_(min=tiny)
-        normal2 = (_coefficients(F[:, :2].mT @ F[:, :2]) @ self.normals2).clamp_(min=tiny)
-        distance = (F.flatten(-2) @ self.residuals).mul_(self.factor(normal1, normal2)[0])
+        normal1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ self.products2).clamp_(min=tiny)
+        normal2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ self.products1).clamp_(min=tiny)
+        distance = (F.flatten(1) @ self.residuals).mul_(self.factor(normal1, normal2)[0])
         gains: Tensor = 1 - distance.div_(self.threshold).square_()
         return gains.nan_to_num_(nan=-1.0)
 
@@ -134,13 +134,3 @@ def epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor, factor: F
     line1, line2 = x2 @ F_mat, x1 @ F_mat.mT
     normal1, normal2 = (line[..., :2].square().sum(-1) for line in (line1, line2))
     return (x2 * line2).sum(-1).abs() * factor(normal1, normal2)[0]
-
-
-def _monomials(x: Tensor) -> Tensor:
-    a, b, c = x
-    return torch.stack([a * a, b * b, c * c, 2 * a * b, 2 * a * c, 2 * b * c])
-
-
-def _coefficients(M: Tensor) -> Tensor:
-    """Entries of symmetric matrices that belong to the monomials of ``x^T M x``."""
-    return M.flatten(-2)[..., [0, 4, 8, 1, 2, 5]]
