@@ -40,18 +40,18 @@ class RANSAC(nn.Module):
     r"""Robust estimation of a fundamental matrix from correspondences with outliers.
 
     Minimal samples of eight run through :func:`~kornia_learnnorm.find_fundamental` with any normaliser, a thousand at
-    once, and MSAC scores them all. The best of each batch is refitted to its inliers by the same function, and with the
-    next best refined by Levenberg-Marquardt (local optimisation); the inliers of the best matrix so far say how many
-    samples are still needed. In the end the four best are refined on the truncated squared distance, and the best of
-    these on the Cauchy loss of its inliers.
+    once, and MSAC scores them all. The best of each batch are fitted to their inliers by reweighted least squares, and
+    the first also by the normaliser (local optimisation); the inliers of the best matrix so far say how many samples
+    are still needed. In the end the best matrix is refined on Geman and McClure's loss, by reweighted least squares
+    and by Levenberg-Marquardt.
 
     Called and answering like ``kornia.geometry.RANSAC(model_type="fundamental_8pt")``. What differs: ``max_iter``
     counts samples, the matrix has unit Frobenius norm, and weights steer the sampling.
 
     Args:
         normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, in whose coordinates matrices
-            are projected to rank 2. When not given, it is :class:`~kornia_learnnorm.Hartley`'s and ``rank2`` is
-            ``"optimal"``, which takes fewer samples than any normalisation.
+            are projected to rank 2. When not given, none is needed, since ``rank2`` is ``"optimal"``: that takes fewer
+            samples than any normalisation, and a fraction of the time.
         inl_th: largest distance of an inlier, pixels.
         max_iter: largest number of minimal samples.
         max_seconds: time after which no further samples are drawn; with it the result depends on the machine.
@@ -195,7 +195,7 @@ class RANSAC(nn.Module):
 
     def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
         """Return the matrices of the minimal samples (K, 8) that determine one; of all, if none does."""
-        x1, x2 = (x[:, rows].movedim(0, -1) for x in (scorer.x1, scorer.x2))
+        x1, x2 = scorer.samples(rows)
         if self.normalizer is None:
             F_mat = solve_samples(x1, x2, 0.01 * self.inl_th)
             if len(F_mat):

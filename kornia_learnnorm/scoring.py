@@ -80,6 +80,10 @@ class PairScorer:
         self.residuals = (x2[:, None] * x1).flatten(0, 1).float()
         self.products1, self.products2 = ((x[:, None] * x).flatten(0, 1).float() for x in (x1, x2))
 
+    def samples(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return samples (K, M) of all correspondences in the scorer's coordinates, (K, M, 3)."""
+        return self.x1[:, rows].movedim(0, -1), self.x2[:, rows].movedim(0, -1)
+
     def from_pixels(self, F_mat: Tensor) -> Tensor:
         """Return matrices (K, 3, 3) of pixels in the scorer's coordinates."""
         return transform_fundamental(F_mat, torch.linalg.inv_ex(self.T1)[0], torch.linalg.inv_ex(self.T2)[0])

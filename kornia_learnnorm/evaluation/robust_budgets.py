@@ -124,8 +124,7 @@ def best_of(number: int, solver: Solver) -> Estimator:
             scorer = PairScorer(x1, x2, threshold)
             kept = F_mat
             if solver.size == SAMPLE_SIZE:
-                samples = (x[:, rows].movedim(0, -1) for x in (scorer.x1, scorer.x2))
-                kept = F_mat[are_determined(*samples, 0.01 * threshold)]
+                kept = F_mat[are_determined(*scorer.samples(rows), 0.01 * threshold)]
             best = scorer.to_pixels(scorer.best(scorer.from_pixels(kept.flatten(0, 1)), 1).F_mat)
             seconds = shared + time.perf_counter() - start
             found.append(Estimate(best[0] if len(best) else _failure(), seconds, number))

@@ -1,0 +1,136 @@
+"""Minimal samples solved many at once against the solver that takes any, and samples that determine nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from two_view import SCENES, correspondences, epipolar_distances, scenes, uniform, up_to_sign
+
+from kornia_learnnorm import find_fundamental
+from kornia_learnnorm.minimal import are_determined, solve_samples
+from kornia_learnnorm.scoring import PairScorer
+
+NOISY = ["driving", "handheld", "orbit"]
+
+
+def coordinates(points1, points2):
+    """Homogeneous points (K, 8, 3) in coordinates of all samples together."""
+    scorer = PairScorer(points1.flatten(0, 1), points2.flatten(0, 1), 1.0)
+    return scorer.samples(torch.arange(points1[..., 0].numel()).view(-1, 8))
+
+
+def solve(points1, points2):
+    """Matrices of pixels."""
+    scorer = PairScorer(points1.flatten(0, 1), points2.flatten(0, 1), 1.0)
+    F = scorer.to_pixels(solve_samples(*coordinates(points1, points2), 0.01))
+    return F / torch.linalg.matrix_norm(F, keepdim=True)
+
+
+def reference(x1, x2) -> np.ndarray:
+    """Null vectors by SVD, covariances by pseudo-inverses, one sample after another."""
+    corrected = []
+    for a, b in zip(x1.numpy(), x2.numpy(), strict=True):
+        xi = np.stack([np.kron(q, p) for p, q in zip(a, b, strict=True)])
+        u = np.linalg.svd(xi)[2][8]
+        lines1, lines2 = (b @ u.reshape(3, 3))[:, :2], (a @ u.reshape(3, 3).T)[:, :2]
+        variances = (lines1**2).sum(1) + (lines2**2).sum(1)
+        V = np.linalg.pinv(xi.T / variances @ xi, rcond=1e-12)
+        for _ in range(3):
+            V = (np.eye(9) - np.outer(u, u)) @ V @ (np.eye(9) - np.outer(u, u))
+            F = u.reshape(3, 3)
+            cofactors = np.stack([np.cross(F[1], F[2]), np.cross(F[2], F[0]), np.cross(F[0], F[1])]).ravel()
+            u = u - np.linalg.det(F) / (cofactors @ V @ cofactors) * V @ cofactors
+            u = u / np.linalg.norm(u)
+        corrected.append(u.reshape(3, 3))
+    return np.stack(corrected)
+
+
+class TestSolve:
+    @pytest.mark.parametrize("name", SCENES)
+    def test_against_a_loop_in_numpy(self, name):
+        x1, x2 = coordinates(*correspondences(name, 30))
+        for found, expected in zip(solve_samples(x1, x2, 0.01), reference(x1, x2), strict=True):
+            assert up_to_sign(found[None], expected[None]) < 1e-5
+
+    @pytest.mark.parametrize("name", NOISY)
+    def test_as_the_solver_of_any(self, name):
+        """Both end near the optimal correction of the same null vector, along different ways."""
+        points = correspondences(name, 200, noise=0.3)
+        found, expected = solve(*points), find_fundamental(*points, rank2="optimal")
+        assert np.median([up_to_sign(f[None], e[None]) for f, e in zip(found, expected, strict=True)]) < 2e-3
+        distances = [np.median(epipolar_distances(*points, F).mean(1)) for F in (found, expected)]
+        assert distances[0] == pytest.approx(distances[1], rel=0.1)
+
+    @pytest.mark.parametrize("name", NOISY)
+    def test_exact_points(self, name):
+        scene = scenes(name, 50, noise=0.0)
+        x1, x2 = scene.points1, scene.points2
+        kept = are_determined(*coordinates(x1, x2), 0.01)
+        for found, expected in zip(solve(x1, x2), scene.F_mat[kept], strict=True):
+            assert up_to_sign(found[None], expected[None] / expected.norm()) < 1e-6
+
+    def test_singular_and_of_unit_norm(self):
+        F = solve_samples(*coordinates(*correspondences("handheld", 100)), 0.01)
+        values = torch.linalg.svdvals(F)
+        assert torch.allclose(values.norm(dim=-1), torch.ones(len(F), dtype=F.dtype))
+        assert (values[:, 2] / values[:, 1]).median() < 1e-6
+
+    def test_leaves_undetermined_samples_out(self):
+        points1, points2 = correspondences("handheld", 6)
+        for points in (points1, points2):
+            points[2, 5] = points[2, 4]
+        x1, x2 = coordinates(points1, points2)
+        others = torch.tensor([0, 1, 3, 4, 5])
+        assert torch.allclose(solve_samples(x1, x2, 0.01), solve_samples(x1[others], x2[others], 0.01))
+        assert solve_samples(x1[2:3], x2[2:3], 0.01).shape == (0, 3, 3)
+
+    @given(order=st.permutations(range(8)))
+    def test_the_order_of_the_points_does_not_count(self, order):
+        points1, points2 = correspondences("orbit", 5)
+        assert up_to_sign(solve(points1, points2), solve(points1[:, order], points2[:, order])) < 1e-6
+
+    @given(scale=st.floats(0.1, 10), x=st.floats(-1e4, 1e4), y=st.floats(-1e4, 1e4))
+    def test_similarities_of_the_pixels(self, scale, x, y):
+        points = correspondences("orbit", 5)
+        moved = [scale * p + torch.tensor([x, y], dtype=p.dtype) for p in points]
+        distances = epipolar_distances(*points, solve(*points)).mean(1)
+        np.testing.assert_allclose(epipolar_distances(*moved, solve(*moved)).mean(1), scale * distances, rtol=1e-4)
+
+    def test_swapping_the_views_transposes(self):
+        points1, points2 = correspondences("driving", 5)
+        assert up_to_sign(solve(points2, points1), solve(points1, points2).mT) < 1e-6
+
+
+class TestDetermined:
+    def test_samples_in_space(self):
+        points1, points2 = correspondences("random", 200)
+        assert are_determined(*coordinates(points1, points2), 0.01).float().mean() > 0.98
+
+    def test_coincident(self):
+        points1, points2 = correspondences("handheld", 20)
+        for points in (points1, points2):
+            points[:, 5] = points[:, 2]
+        assert not are_determined(*coordinates(points1, points2), 0.01).any()
+
+    def test_on_a_line(self):
+        along = torch.linspace(0, 300, 8, dtype=torch.float64)
+        points1 = torch.stack([along, 2 * along + 5], -1)[None]
+        points2 = uniform(1, 8, 2, high=500)
+        points2[..., 1] = 3 * points2[..., 0]
+        assert not are_determined(*coordinates(points1, points2), 0.01).any()
+
+    def test_on_a_plane(self):
+        H = torch.tensor([[1.1, 0.02, 30], [0.01, 0.95, -12], [1e-4, 2e-5, 1]], dtype=torch.float64)
+        points1 = uniform(50, 8, 2, high=500)
+        x2 = torch.cat([points1, torch.ones(50, 8, 1)], -1) @ H.mT
+        assert not are_determined(*coordinates(points1, x2[..., :2] / x2[..., 2:]), 0.01).any()
+
+    def test_seven_on_a_plane(self):
+        H = torch.tensor([[1.0, 0, 30], [0, 1, -12], [0, 0, 1]], dtype=torch.float64)
+        points1 = uniform(50, 8, 2, high=500)
+        points2 = (torch.cat([points1, torch.ones(50, 8, 1)], -1) @ H.mT)[..., :2]
+        points2[:, 7] += 20
+        assert not are_determined(*coordinates(points1, points2), 0.01).any()
