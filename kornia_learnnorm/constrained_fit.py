@@ -55,6 +55,7 @@ def constrained_fit(
     """
     given = F_mat / torch.linalg.matrix_norm(F_mat, keepdim=True)
     F, xi = given, (x2[:, None] * x1).flatten(0, 1)
+    products = (xi[:, None] * xi).flatten(0, 1).mT
     floor = torch.finfo(F.dtype).eps ** 2  # below it the direction of a line is rounding
     system, right = F.new_zeros(len(F), 11, 11), F.new_zeros(len(F), 11)
     moments, constraints, multipliers = system[:, :9, :9], system[:, 9:, :9], system[:, :9, 9:]
@@ -64,8 +65,8 @@ def constrained_fit(
         normal1, normal2 = (F.mT[:, :2] @ x2).square_().sum(1), (F[:, :2] @ x1).square_().sum(1)
         g = factor(normal1.clamp_(min=floor), normal2.clamp_(min=floor))[0].square_()
         w = loss((u @ xi).square_().mul_(g))[1] * g
-        products = (xi * (w if weights is None else w * weights)[:, None]) @ xi.mT
-        torch.div(products, products.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None], out=moments)
+        sums = torch.unflatten((w if weights is None else w * weights) @ products, 1, (9, 9))
+        torch.div(sums, sums.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None], out=moments)
         torch.stack([u, cofactors], 1, out=constraints)
         multipliers.copy_(constraints.mT)
         torch.mul((cofactors * u).sum(-1), 2 / 3, out=right[:, 10])

@@ -21,6 +21,7 @@ from kornia_learnnorm.refine import minimize
 from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.scoring import Hypotheses, PairScorer, epipolar_distance
 from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
+from kornia_learnnorm.threads import one_thread
 
 __all__ = ["RANSAC"]
 
@@ -44,6 +45,8 @@ class RANSAC(nn.Module):
     the first also by the normaliser (local optimisation); the inliers of the best matrix so far say how many samples
     are still needed. In the end the best matrix is refined on Geman and McClure's loss, by reweighted least squares
     and by Levenberg-Marquardt.
+
+    Without a normaliser, PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.threads.one_thread`.
 
     Called and answering like ``kornia.geometry.RANSAC(model_type="fundamental_8pt")``. What differs: ``max_iter``
     counts samples, the matrix has unit Frobenius norm, and weights steer the sampling.
@@ -146,8 +149,8 @@ class RANSAC(nn.Module):
         _check(kp1, kp2, weights)
         if self.normalizer is not None:
             return self._estimate(kp1, kp2, weights)
-        # Faster than without gradient alone, but what a normaliser keeps of it would be of no use in training.
-        with torch.inference_mode():
+        # Faster for small matrices. But a network may be worth more threads, and keep what it computes for training.
+        with one_thread(), torch.inference_mode():
             F_mat, inliers = self._estimate(kp1, kp2, weights)
         return F_mat.clone(), inliers.clone()
 

@@ -101,7 +101,7 @@ class PairScorer:
 
         """
         blocks = torch.split(F_mat, max(1, BLOCK // self.residuals.shape[-1]))
-        scores = torch.cat([self._gains(block).clamp_(min=0).sum(-1) for block in blocks])
+        scores = torch.cat([self._gains(block).clamp_(min=0).sum(-1) for block in blocks]).nan_to_num_(nan=0.0)
         score, order = scores.topk(min(number, len(scores)))
         positive = score > 0
         return Hypotheses(F_mat[order[positive]], score[positive])
@@ -111,14 +111,14 @@ class PairScorer:
         return self._gains(F_mat) >= 0
 
     def _gains(self, F_mat: Tensor) -> Tensor:
-        """What each correspondence would add to each score if it were not truncated, (K, M); -1 for NaN."""
+        """What each correspondence would add to each score if it were not truncated, (K, M)."""
         F = (F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)).float()
         tiny = torch.finfo(F.dtype).tiny
         normal1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ self.products2).clamp_(min=tiny)
         normal2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ self.products1).clamp_(min=tiny)
-        distance = (F.flatten(1) @ self.residuals).mul_(self.factor(normal1, normal2)[0])
-        gains: Tensor = 1 - distance.div_(self.threshold).square_()
-        return gains.nan_to_num_(nan=-1.0)
+        ratio = ((F / self.threshold).flatten(1) @ self.residuals).mul_(self.factor(normal1, normal2)[0])
+        gains: Tensor = ratio.square_().neg_().add_(1)
+        return gains
 
 
 def epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor, factor: Factor = sampson_factor) -> Tensor:

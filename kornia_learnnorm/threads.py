@@ -1,0 +1,47 @@
+"""One thread for many small operations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Lock
+
+import torch
+
+__all__ = ["one_thread"]
+
+
+class _Held:
+    """How many callers hold PyTorch to one thread, and the number of threads before."""
+
+    lock, callers, threads = Lock(), 0, 1
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold PyTorch's operations on the CPU to one thread.
+
+    To wake others costs more than they save where matrices are small, and on a busy machine many times what the work
+    itself does. The number of threads belongs to the process: others that run meanwhile are held too, and the number
+    that the first one found returns with each that leaves.
+
+    Example:
+        >>> before = torch.get_num_threads()
+        >>> with one_thread():
+        ...     torch.get_num_threads()
+        1
+        >>> torch.get_num_threads() == before
+        True
+
+    """
+    with _Held.lock:
+        if _Held.callers == 0:
+            _Held.threads = torch.get_num_threads()
+        _Held.callers += 1
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _Held.lock:
+            _Held.callers -= 1
+            torch.set_num_threads(_Held.threads)

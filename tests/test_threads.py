@@ -1,0 +1,62 @@
+"""The number of threads comes back, however the block ends and whoever else is in one."""
+
+from __future__ import annotations
+
+from threading import Barrier, Thread
+
+import pytest
+import torch
+
+from kornia_learnnorm import RANSAC
+from kornia_learnnorm.threads import one_thread
+
+
+@pytest.fixture(autouse=True)
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_one_inside_and_all_after():
+    with one_thread():
+        assert torch.get_num_threads() == 1
+        with one_thread():
+            assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 3
+
+
+def test_after_an_error():
+    with pytest.raises(ValueError, match="inside"), one_thread():
+        raise ValueError("inside")
+    assert torch.get_num_threads() == 3
+
+
+def test_callers_that_overlap():
+    barrier, seen = Barrier(2), []
+
+    def first():
+        with one_thread():
+            barrier.wait()
+            barrier.wait()
+        seen.append(torch.get_num_threads())
+
+    def second():
+        barrier.wait()
+        with one_thread():
+            barrier.wait()
+        seen.append(torch.get_num_threads())
+
+    threads = [Thread(target=first), Thread(target=second)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert seen == [3, 3]
+    assert torch.get_num_threads() == 3
+
+
+def test_ransac_gives_the_threads_back():
+    RANSAC(seed=0, max_iter=64)(torch.rand(20, 2), torch.rand(20, 2))
+    assert torch.get_num_threads() == 3
