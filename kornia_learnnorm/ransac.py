@@ -147,11 +147,12 @@ class RANSAC(nn.Module):
 
         """
         _check(kp1, kp2, weights)
-        if self.normalizer is not None:
-            return self._estimate(kp1, kp2, weights)
-        # Faster for small matrices. But a network may be worth more threads, and keep what it computes for training.
-        with one_thread(), torch.inference_mode():
-            F_mat, inliers = self._estimate(kp1, kp2, weights)
+        with torch.autocast(kp1.device.type, enabled=False):
+            if self.normalizer is not None:
+                return self._estimate(kp1, kp2, weights)
+            # Faster for small matrices. But a network may be worth more threads and keep what it computes for training.
+            with one_thread(), torch.inference_mode():
+                F_mat, inliers = self._estimate(kp1, kp2, weights)
         return F_mat.clone(), inliers.clone()
 
     def _estimate(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:

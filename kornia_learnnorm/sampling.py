@@ -78,7 +78,7 @@ class UniformSampler:
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the share of inliers to the power of eight."""
-        return float(inliers.cpu().double().mean() ** SAMPLE_SIZE)
+        return float(inliers.float().mean()) ** SAMPLE_SIZE
 
 
 class ProsacSampler:

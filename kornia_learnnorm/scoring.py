@@ -103,8 +103,8 @@ class PairScorer:
         blocks = torch.split(F_mat, max(1, BLOCK // self.residuals.shape[-1]))
         scores = torch.cat([self._gains(block).clamp_(min=0).sum(-1) for block in blocks]).nan_to_num_(nan=0.0)
         score, order = scores.topk(min(number, len(scores)))
-        positive = score > 0
-        return Hypotheses(F_mat[order[positive]], score[positive])
+        positive = int((score > 0).sum())
+        return Hypotheses(F_mat[order[:positive]], score[:positive])
 
     def inliers(self, F_mat: Tensor) -> Tensor:
         """Tell the inliers (K, M) of matrices (K, 3, 3) among the correspondences that count."""

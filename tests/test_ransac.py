@@ -183,6 +183,25 @@ class TestSeeds:
         assert not torch.equal(found[0], found[2])
 
 
+class TestContexts:
+    @pytest.mark.parametrize("normalizer", [None, kln.Whitening()])
+    def test_autocast_changes_nothing(self, normalizer, dtype):
+        points = [p.to(dtype) for p in pair(num_points=100)[:2]]
+        plain = RANSAC(normalizer, seed=0)(*points)
+        with torch.autocast("cpu", torch.bfloat16):
+            mixed = RANSAC(normalizer, seed=0)(*points)
+        assert torch.equal(plain[0], mixed[0])
+        assert torch.equal(plain[1], mixed[1])
+
+    def test_result_serves_in_training(self):
+        points1, points2, _, _ = pair(num_points=100)
+        points1.requires_grad_()
+        F_mat, inliers = RANSAC(seed=0)(points1, points2)
+        distance = kln.symmetric_epipolar_distance(points1[None], points2[None], F_mat[None])
+        distance[0, inliers].sum().backward()
+        assert points1.grad.isfinite().all()
+
+
 class TestBudget:
     def count(self, monkeypatch, points, weights=None, **options) -> int:
         drawn = []
