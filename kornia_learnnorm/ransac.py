@@ -226,7 +226,7 @@ class RANSAC(nn.Module):
         F_mat = pool.join(self._optimize(scorer, pool.F_mat[:FINAL_POOL], FINAL_SCALES), 1).F_mat
         loss = GemanMcClure(LOSS_SCALE * self.inl_th)
         F_mat = constrained_fit(scorer.x1, scorer.x2, F_mat, REWEIGHTINGS * [loss], None, self.factor)
-        cost = EpipolarCost(scorer.x1[None], scorer.x2[None], scorer.x1.new_ones(1, 1), self.factor, loss)
+        cost = EpipolarCost(scorer.x1[None], scorer.x2[None], torch.ones_like(scorer.x1[:1]), self.factor, loss)
         return minimize(cost, decompose(F_mat), STEPS, TOLERANCE)[1].state
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
