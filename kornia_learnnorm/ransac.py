@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from numbers import Integral, Real
 from typing import Literal
 
 import torch
@@ -46,10 +47,11 @@ class RANSAC(nn.Module):
     are still needed. In the end the best matrix is refined on Geman and McClure's loss, by reweighted least squares
     and by Levenberg-Marquardt.
 
-    Without a normaliser, PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.threads.one_thread`.
+    PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.threads.one_thread`.
 
-    Called and answering like ``kornia.geometry.RANSAC(model_type="fundamental_8pt")``. What differs: ``max_iter``
-    counts samples, the matrix has unit Frobenius norm, and weights steer the sampling.
+    Its call takes and returns what that of ``kornia.geometry.RANSAC(model_type="fundamental_8pt")`` does. What differs:
+    the arguments below, of which ``max_iter`` counts samples; the matrix has unit Frobenius norm; and weights steer the
+    sampling.
 
     Args:
         normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, in whose coordinates matrices
@@ -57,7 +59,8 @@ class RANSAC(nn.Module):
             samples than any normalisation, and a fraction of the time.
         inl_th: largest distance of an inlier, pixels.
         max_iter: largest number of minimal samples.
-        max_seconds: time after which no further samples are drawn; with it the result depends on the machine.
+        max_seconds: time after which no further batch of samples, 32 at first and up to 1,024, is drawn; with it the
+            result depends on the machine.
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
             best matrix so far has found all inliers; 1 draws all ``max_iter`` samples.
         factor: the distance, :func:`~kornia_learnnorm.objectives.sampson_factor` or
@@ -69,7 +72,7 @@ class RANSAC(nn.Module):
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
 
     Raises:
-        TypeError: if ``factor`` or ``sampler`` cannot be called or ``seed`` is not a whole number.
+        TypeError: if ``normalizer``, ``factor`` or ``sampler`` cannot be called, or a number is none.
         ValueError: if a number is out of its range or ``rank2`` is neither of its values.
 
     Reference:
@@ -103,24 +106,31 @@ class RANSAC(nn.Module):
         seed: int | None = None,
     ) -> None:
         super().__init__()
+        for name, value in {"inl_th": inl_th, "confidence": confidence, "max_seconds": max_seconds}.items():
+            if not isinstance(value, Real) and (value is not None or name != "max_seconds"):
+                raise TypeError(f"{name} must be a number, got {value!r}")
         if not (math.isfinite(inl_th) and inl_th > 0):
             raise ValueError(f"inl_th must be a positive number of pixels, got {inl_th}")
-        if not isinstance(max_iter, int) or max_iter < 1:
+        if not _is_whole(max_iter) or max_iter < 1:
             raise ValueError(f"max_iter must be a whole number of samples, at least 1, got {max_iter}")
         if max_seconds is not None and not max_seconds > 0:
             raise ValueError(f"max_seconds must be positive or None, got {max_seconds}")
-        if seed is not None and not isinstance(seed, int):
+        if seed is not None and not _is_whole(seed):
             raise TypeError(f"seed must be a whole number or None, got {seed!r}")
+        if seed is not None and not 0 <= seed < 2**63:
+            raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
         if not 0 < confidence <= 1:
             raise ValueError(f"confidence must lie in (0, 1], got {confidence}")
+        if normalizer is not None and (isinstance(normalizer, type) or not callable(normalizer)):
+            raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
         check_rank2(rank2)
-        for name, value in (("factor", factor), ("sampler", sampler)):
-            if not callable(value):
-                raise TypeError(f"{name} must be a function or a class, got {value!r}")
+        for name, function in (("factor", factor), ("sampler", sampler)):
+            if not callable(function):
+                raise TypeError(f"{name} must be a function or a class, got {function!r}")
         self.normalizer = normalizer
         self.rank2: Literal["optimal"] | None = "optimal" if normalizer is None else rank2
         self.inl_th, self.max_iter, self.max_seconds, self.confidence = inl_th, max_iter, max_seconds, confidence
-        self.factor, self.refine, self.sampler, self.seed = factor, refine, sampler, seed
+        self.factor, self.refine, self.sampler, self.seed = factor, refine, sampler, None if seed is None else int(seed)
 
     @torch.no_grad()
     def forward(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -147,11 +157,11 @@ class RANSAC(nn.Module):
 
         """
         _check(kp1, kp2, weights)
-        with torch.autocast(kp1.device.type, enabled=False):
+        with one_thread(), torch.autocast(kp1.device.type, enabled=False):
             if self.normalizer is not None:
                 return self._estimate(kp1, kp2, weights)
-            # Faster for small matrices. But a network may be worth more threads and keep what it computes for training.
-            with one_thread(), torch.inference_mode():
+            # Faster still. What a normaliser keeps of it would be of no use in training.
+            with torch.inference_mode():
                 F_mat, inliers = self._estimate(kp1, kp2, weights)
         return F_mat.clone(), inliers.clone()
 
@@ -177,15 +187,18 @@ class RANSAC(nn.Module):
             return failure
         F = scorer.to_pixels(state.matrix())
         F_mat = (F / torch.linalg.matrix_norm(F))[0].to(kp1.dtype)
+        distance = epipolar_distance(scorer.points1[None], scorer.points2[None], F_mat[None].to(x1), self.factor)[0]
         inliers = finite.clone()
-        inliers[finite] = epipolar_distance(x1[None], x2[None], F_mat[None].to(x1), self.factor)[0] <= self.inl_th
+        inliers[finite] = distance <= self.inl_th
         return (F_mat, inliers) if int(inliers.sum()) > SAMPLE_SIZE else failure
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> Hypotheses:
         """Return the best hypotheses that enough minimal samples give, best first."""
         pool = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0))
         (batch, largest), drawn, needed, start = BATCHES, 0, self.max_iter, time.perf_counter()
-        while drawn < needed and (self.max_seconds is None or time.perf_counter() - start < self.max_seconds):
+        while drawn < needed:
+            if self.max_seconds is not None and drawn and time.perf_counter() - start > self.max_seconds:
+                break
             rows = sampler.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, largest)
             found = scorer.best(self._solve(scorer, rows), POOL)
@@ -237,6 +250,10 @@ class RANSAC(nn.Module):
         if hit_rate == 0:
             return self.max_iter
         return math.ceil(min(self.max_iter, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def _check(kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> None:

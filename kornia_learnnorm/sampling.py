@@ -52,7 +52,7 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
 
     """
     last = totals[:, None] - size + torch.arange(size, device=totals.device)
-    uniform = torch.rand(len(totals), size, generator=generator, device=totals.device)
+    uniform = torch.rand(len(totals), size, generator=generator, device=totals.device, dtype=torch.float32)
     drawn = (uniform * (last + 1)).long().clamp_(max=last)
     for k, (column, end) in enumerate(zip(drawn.unbind(-1), last.unbind(-1), strict=True)):
         met = (drawn[:, :k] == column[:, None]).any(-1)
@@ -148,7 +148,9 @@ class WeightedSampler:
         return torch.cat([self._draw_block(len(block), generator) for block in blocks])
 
     def _draw_block(self, count: int, generator: torch.Generator) -> Tensor:
-        uniform = torch.rand(count, len(self.weights), generator=generator, device=self.weights.device)
+        uniform = torch.rand(
+            count, len(self.weights), generator=generator, device=self.weights.device, dtype=torch.float32
+        )
         return (uniform.log() / self.weights).topk(SAMPLE_SIZE).indices
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:

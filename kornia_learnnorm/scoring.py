@@ -13,6 +13,7 @@ from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["Hypotheses", "PairScorer", "epipolar_distance"]
 
+FARTHEST = 1e6
 BLOCK = 1 << 15  # distances of a block, which stay in a core's cache
 
 
@@ -41,8 +42,9 @@ class PairScorer:
     lines' normals are quadratic in the points. So three matrix products give the distances of all correspondences under
     all matrices, in float32.
 
-    All matrices are in coordinates in which the first two are pixels from the centroid and the third is as large as
-    these are on average. They are conditioned as Hartley's, and distances in them are those in pixels.
+    All matrices are in coordinates of which the first two are pixels from the points' median, and the third is the
+    median of their absolute values. They are conditioned like Hartley's, whatever the outliers, and distances in them
+    are those in pixels.
 
     Args:
         points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`.
@@ -53,6 +55,8 @@ class PairScorer:
         rows: the correspondences that count in scores; all by default.
 
     Attributes:
+        points1: pixels in the first image, those beyond a million times the median brought back to there, (N, 2).
+        points2: the same in the second image.
         T1: from pixels of view 1 to the coordinates, (3, 3).
         T2: the same of view 2.
         x1: all correspondences in them, (3, N).
@@ -68,12 +72,17 @@ class PairScorer:
         factor: Factor = sampson_factor,
         rows: Tensor | slice = slice(None),
     ) -> None:
-        self.points1, self.points2, self.threshold, self.factor, self.rows = points1, points2, threshold, factor, rows
+        self.threshold, self.factor, self.rows = threshold, factor, rows
         both = torch.stack([points1, points2])
-        origin = both.mean(1)
-        spread = (both - origin[:, None]).abs().mean((1, 2))
+        origin = both.median(1).values
+        spread = (both - origin[:, None]).abs().flatten(1).median(-1).values
+        spread = torch.where(spread > 0, spread, 1.0)
+        # A point may be wrong by any number, whose powers must not overflow.
+        reach = FARTHEST * spread[:, None]
+        both = torch.maximum(torch.minimum(both, (origin + reach)[:, None]), (origin - reach)[:, None])
+        self.points1, self.points2 = both
         T = torch.eye(3, dtype=both.dtype, device=both.device).repeat(2, 1, 1)
-        T[:, :2, 2], T[:, 2, 2] = -origin, torch.where(spread > 0, spread, 1.0)
+        T[:, :2, 2], T[:, 2, 2] = -origin, spread
         self.T1, self.T2 = T
         self.x1, self.x2 = T @ convert_points_to_homogeneous(both).mT
         x1, x2 = self.x1[:, rows], self.x2[:, rows]

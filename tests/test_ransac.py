@@ -77,6 +77,7 @@ class TestExceptions:
             ({"max_seconds": 0.0}, "max_seconds"),
             ({"confidence": 1.5}, r"confidence must lie in \(0, 1\], got 1.5"),
             ({"confidence": 0.0}, "confidence"),
+            ({"seed": 2**64}, r"seed must lie in \[0, 2\^63\), got 18446744073709551616"),
         ],
     )
     def test_options(self, wrong, message):
@@ -90,6 +91,15 @@ class TestExceptions:
             RANSAC(seed="a")
         with pytest.raises(TypeError, match="factor must be a function"):
             RANSAC(factor="sampson")
+        with pytest.raises(TypeError, match="normalizer must be a module or function, got 'fundamental'"):
+            RANSAC("fundamental")
+
+    @pytest.mark.parametrize("name", ["inl_th", "confidence", "max_seconds"])
+    def test_no_numbers(self, name):
+        with pytest.raises(TypeError, match=f"{name} must be a number, got '1'"):
+            RANSAC(**{name: "1"})
+        with pytest.raises(TypeError, match="seed must be a whole number or None, got True"):
+            RANSAC(seed=True)
 
     def test_points(self):
         points = uniform(20, 2)
@@ -167,6 +177,16 @@ class TestSeeds:
         assert torch.equal(first[0], second[0])
         assert torch.equal(first[1], second[1])
 
+    def test_seeds_of_numpy_and_other_default_dtypes(self):
+        points1, points2, _, _ = pair(num_points=50)
+        first = RANSAC(seed=3)(points1.float(), points2.float())
+        torch.set_default_dtype(torch.float64)
+        try:
+            second = RANSAC(seed=np.int64(3))(points1.float(), points2.float())
+        finally:
+            torch.set_default_dtype(torch.float32)
+        assert torch.equal(first[0], second[0])
+
     def test_seeded_calls_leave_the_global_generator(self):
         points1, points2, _, _ = pair(num_points=50)
         state = torch.get_rng_state()
@@ -227,6 +247,10 @@ class TestBudget:
         RANSAC(max_iter=10**9, max_seconds=0.2, seed=0)(points1, points2)
         assert time.perf_counter() - start < 10
 
+    def test_a_batch_at_least(self):
+        points1, points2, _, true = pair(outliers=0.05)
+        assert RANSAC(max_seconds=1e-9, seed=0)(points1, points2)[1][true].float().mean() > 0.9
+
     def test_good_weights_spare_samples(self, monkeypatch):
         points1, points2, _, true = pair(outliers=0.7)
         good = true + 0.5 * uniform(400)
@@ -258,6 +282,17 @@ class TestHardInput:
         F_mat, inliers = RANSAC(seed=0, max_iter=2000)(points, points)
         assert F_mat.isfinite().all()
         assert inliers.all() or failed((F_mat, inliers))
+
+    @pytest.mark.parametrize("normalizer", [None, kln.Hartley(), kln.ReweightedWhitening()])
+    @pytest.mark.parametrize("value", [1e10, 1e30, -1e150, 1e300])
+    def test_points_that_are_far_away(self, normalizer, value):
+        points1, points2, _, true = pair(num_points=200)
+        points1[:3], points2[2:4] = value, -value
+        true[:4] = False
+        F_mat, inliers = RANSAC(normalizer, seed=0)(points1, points2)
+        assert F_mat.isfinite().all()
+        assert inliers[true].float().mean() > 0.85
+        assert not inliers[:4].any()
 
     @pytest.mark.parametrize("number", [9, 200])
     def test_nothing_moves(self, number, dtype):
