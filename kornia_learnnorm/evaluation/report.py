@@ -100,6 +100,7 @@ def write_report(folder: str | Path) -> Report:
         tables += report_tables(found)
         pictures += report_figures(found)
     if robust is not None:
+        missing += robust.missing
         about.append(about_robust(robust))
         tables += [*robust_tables(robust), *hypothesis_tables(robust)]
         pictures += hypothesis_figures(robust)

@@ -106,11 +106,13 @@ def hypothesis_figures(run: RobustRun) -> list[Picture]:
     """
     colors = dict(zip(run.about["solvers"], COLORS * 10, strict=False))
     pictures = []
-    for place, store in enumerate(run.about["stores"] if colors else (), 1):
-        cells = [cell for cell in run.cells if cell.store == store]
-        pictures.append(_draw(cells, f"hypotheses-{place}", colors, relative=False))
-        if BASELINE in colors:
-            pictures.append(_draw(cells, f"hypotheses-{place}-relative", colors, relative=True))
+    for place, store in enumerate(run.about["stores"], 1):
+        cells = [cell for cell in run.cells if cell.store == store and cell.hypotheses]
+        based = [cell for cell in cells if BASELINE in cell.hypotheses]
+        if cells:
+            pictures.append(_draw(cells, f"hypotheses-{place}", colors, relative=False))
+        if based:
+            pictures.append(_draw(based, f"hypotheses-{place}-relative", colors, relative=True))
     return pictures
 
 

@@ -50,6 +50,7 @@ def about_robust(run: RobustRun) -> str:
         dict.fromkeys([*(f"{name} {text}" for name, text in about["versions"].items()), *sorted(peers)])
     )
     left = f" Left out, since not installed: {', '.join(absent)}." if absent else ""
+    left += f" Not there yet, so left out: {'; '.join(run.missing)}." if run.missing else ""
 
     def most(number: int) -> str:
         return f"at most {number} evenly spaced" if number else "all"

@@ -25,7 +25,7 @@ from kornia_learnnorm.evaluation.robust_estimators import (
 )
 from kornia_learnnorm.evaluation.robust_peers import PEERS
 from kornia_learnnorm.evaluation.robust_record import record_missing
-from kornia_learnnorm.evaluation.robust_run import begin_run
+from kornia_learnnorm.evaluation.robust_run import begin_run, leave_out
 from kornia_learnnorm.evaluation.tables import names_of
 
 __all__ = ["add_arguments", "record_robust", "run"]
@@ -106,7 +106,8 @@ def record_robust(
         redo: estimators or solvers whose figures are computed again.
 
     Raises:
-        ValueError: if the folder holds a run of other options, or an option, a store or an estimator is wrong.
+        ValueError: if the folder holds a run of other options, an option, a store or an estimator is wrong, a file that
+            is there is damaged, or, at the end, if an estimator or solver has failed.
         OSError: if a file is missing or cannot be written.
 
     """
@@ -127,7 +128,10 @@ def record_robust(
     }
     begin_run(folder, about, [(names | solver_names)[name] for name in redo])
     present = {names[name]: estimator for name, estimator in found.items() if estimator is not None}
-    record_missing(folder, read, present, solve, options)
+    failed = record_missing(folder, read, present, solve, options)
+    if failed:
+        leave_out(folder, [*failed])
+        raise ValueError(f"{'; '.join(dict.fromkeys(failed.values()))}. All others are in {folder}")
 
 
 def _checked(options: Mapping[str, int]) -> dict[str, int]:

@@ -133,15 +133,14 @@ def best_of(number: int, solver: Solver) -> Estimator:
     return estimate
 
 
-class _Counted:
-    """A normaliser that counts the samples it is given."""
+class _Counted(RANSAC):
+    """RANSAC that counts the samples it draws."""
 
-    def __init__(self, normalizer: Normalizer) -> None:
-        self.normalizer, self.samples = normalizer, 0
+    samples = 0
 
-    def __call__(self, x1: Tensor, x2: Tensor, w: Tensor | None) -> tuple[Tensor, Tensor]:
-        self.samples += len(x1) if x1.shape[1] == SAMPLE_SIZE else 0
-        return self.normalizer(x1, x2, w)
+    def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
+        self.samples += len(rows)
+        return super()._solve(scorer, rows)
 
 
 def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
@@ -156,12 +155,12 @@ def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
     def estimate(matches: Matches, seed: int, thresholds: Sequence[float]) -> list[Estimate]:
         found = []
         for threshold in thresholds:
-            counted = None if normalizer is None else _Counted(normalizer)
+            estimator = _Counted(normalizer, inl_th=threshold, seed=seed, **options)
             start = time.perf_counter()
-            F_mat = RANSAC(counted, inl_th=threshold, seed=seed, **options)(matches.points1, matches.points2)[0]
+            F_mat = estimator(matches.points1, matches.points2)[0]
             seconds = time.perf_counter() - start
             F_mat = F_mat if bool(F_mat.any()) else _failure()
-            found.append(Estimate(F_mat, seconds, counted.samples if counted else math.nan))
+            found.append(Estimate(F_mat, seconds, estimator.samples))
         return found
 
     return estimate

@@ -97,11 +97,11 @@ def is_timed(name: str) -> bool:
 
 
 def identify_estimator(name: str) -> str:
-    """Return what an estimator's figures depend on: its package's version, or the digest of its weights."""
+    """Return what an estimator's or solver's figures depend on: a package's version, or the digest of weights."""
     if name in PEERS:
         return peer_version(name)
-    kind, _, method = name.partition(":")
-    return f"{kind}:{identify_method(method)}" if method and method != SEVEN_POINT else name
+    kind, colon, method = _split(name)
+    return name if method in (DEFAULTS, SEVEN_POINT) else f"{kind}{colon}{identify_method(method)}"
 
 
 def estimator_names(names: Sequence[str]) -> dict[str, str]:
@@ -116,11 +116,16 @@ def estimator_names(names: Sequence[str]) -> dict[str, str]:
     """
     short = {}
     for name in names:
-        kind, colon, method = name.partition(":") if name.startswith(KINDS) else ("", "", name)
+        kind, colon, method = _split(name)
         short[name] = kind + colon + short_names([method])[method]
     if len(set(short.values())) < len(names):
         raise ValueError(f"two estimators have the same name: {', '.join(names)}")
     return short
+
+
+def _split(name: str) -> tuple[str, str, str]:
+    """Return kind, colon and method; a method may have a colon of its own."""
+    return name.partition(":") if name.startswith(KINDS) else ("", "", name)
 
 
 def _ransac(name: str, options: dict[str, Any]) -> Estimator:

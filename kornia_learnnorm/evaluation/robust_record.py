@@ -20,6 +20,7 @@ from kornia_learnnorm.evaluation.robust_budgets import Estimate, Estimator, Solv
 from kornia_learnnorm.evaluation.robust_estimators import is_slow, is_timed
 from kornia_learnnorm.evaluation.robust_matches import Matches, draw_matches, even_pairs, measure
 from kornia_learnnorm.evaluation.robust_run import estimate_path, hypotheses_path
+from kornia_learnnorm.evaluation.run import read_arrays
 from kornia_learnnorm.files import replacing
 
 __all__ = ["record_missing"]
@@ -30,6 +31,7 @@ Draw = Callable[..., Matches]
 class _Job(NamedTuple):
     """An estimator, how often it runs on a pair, and the files by threshold that are missing."""
 
+    name: str
     estimator: Estimator
     runs: int
     paths: dict[float, Path]
@@ -41,7 +43,7 @@ def record_missing(
     estimators: Mapping[str, Estimator],
     solvers: Mapping[str, Solver],
     options: Mapping[str, int],
-) -> None:
+) -> dict[str, str]:
     """Compute what is not there yet; a step of the bar is a run on an image pair, or a solver on one.
 
     Args:
@@ -51,7 +53,14 @@ def record_missing(
         solvers: minimal solvers by name.
         options: ``pairs``, ``hypotheses``, ``seeds``, ``slow_seeds`` and ``seed``, as for the command.
 
+    Returns:
+        why estimators and solvers failed, by name; all others go on.
+
+    Raises:
+        ValueError: if a file that is there is damaged.
+
     """
+    failed = dict[str, str]()
     runs = {name: min(options["seeds"], options["slow_seeds"] if is_slow(name) else 10**9) for name in estimators}
     # What depends on time takes turns, so that the load of the machine is the same for all.
     groups = [[name] for name in estimators if not is_timed(name)] + [[name for name in estimators if is_timed(name)]]
@@ -64,21 +73,36 @@ def record_missing(
             for group in groups:
                 bar.set_postfix_str(f"{name}, {protocol}, {', '.join(group)}")
                 jobs = [
-                    _Job(estimators[label], runs[label], _missing(folder, name, protocol, label)) for label in group
+                    _Job(label, estimators[label], runs[label], _missing(folder, name, protocol, label))
+                    for label in group
+                    if label not in failed
                 ]
-                _record_estimates(jobs, draw, chosen[name], bar)
+                _record_estimates(jobs, draw, chosen[name], failed, bar)
             for label, solver in solvers.items():
+                if label in failed:
+                    continue
                 bar.set_postfix_str(f"{name}, {protocol}, hypotheses of {label}")
                 path = hypotheses_path(folder, name, protocol, label)
-                _record_hypotheses(path, solver, samples_of(label), draw, few[name], options["seed"], bar)
+                try:
+                    _record_hypotheses(path, solver, samples_of(label), draw, few[name], options["seed"], bar)
+                except ValueError as error:
+                    failed[label] = str(error)
+    return failed
 
 
 def _missing(folder: Path, store: str, protocol: str, name: str) -> dict[float, Path]:
     paths = {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
-    return {threshold: path for threshold, path in paths.items() if not path.is_file()}
+    return {threshold: path for threshold, path in paths.items() if not _is_there(path)}
 
 
-def _record_estimates(jobs: Sequence[_Job], draw: Draw, pairs: Sequence[int], bar: tqdm) -> None:
+def _is_there(path: Path) -> bool:
+    """Tell whether a file is there; a damaged one is an error."""
+    return path.is_file() and bool(read_arrays(path))
+
+
+def _record_estimates(
+    jobs: Sequence[_Job], draw: Draw, pairs: Sequence[int], failed: dict[str, str], bar: tqdm
+) -> None:
     """Run estimators in turn on every pair with every seed, and write their figures of each threshold."""
     todo = [job for job in jobs if job.paths]
     bar.update(len(pairs) * sum(job.runs for job in jobs if not job.paths))
@@ -86,16 +110,22 @@ def _record_estimates(jobs: Sequence[_Job], draw: Draw, pairs: Sequence[int], ba
     for (place, pair), seed in product(enumerate(pairs), range(max((job.runs for job in todo), default=0))):
         matches = draw(pair=pair, order=seed)
         for job in todo:
-            if seed >= job.runs:
+            if seed >= job.runs or job.name in failed:
                 continue
-            estimates = run_estimator(job.estimator, matches, seed, [*job.paths])
+            try:
+                estimates = run_estimator(job.estimator, matches, seed, [*job.paths])
+            except ValueError as error:
+                failed[job.name] = str(error)
+                continue
             for (threshold, path), estimate in zip(job.paths.items(), estimates, strict=True):
                 for key, value in _describe(matches, estimate, threshold).items():
                     empty = np.full((len(pairs), job.runs, *np.shape(value)), np.nan)
                     figures[path].setdefault(key, empty)[place, seed] = value
             bar.update()
-    for path, arrays in figures.items():
-        _write(path, {"pair": np.array(pairs), **arrays})
+    for job in todo:
+        if job.name not in failed:
+            for path in job.paths.values():
+                _write(path, {"pair": np.array(pairs), **figures[path]})
 
 
 def _describe(matches: Matches, estimate: Estimate, threshold: float) -> dict[str, Any]:
@@ -107,7 +137,7 @@ def _record_hypotheses(
     path: Path, solver: Solver, number: int, draw: Draw, pairs: Sequence[int], seed: int, bar: tqdm
 ) -> None:
     """Measure a minimal solver's hypotheses of every pair."""
-    if path.is_file():
+    if _is_there(path):
         bar.update(len(pairs))
         return
     errors, scores = [], []

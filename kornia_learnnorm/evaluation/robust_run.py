@@ -20,7 +20,7 @@ from kornia_learnnorm.evaluation.consensus import THRESHOLDS
 from kornia_learnnorm.evaluation.run import file_name, read_arrays
 from kornia_learnnorm.files import replacing
 
-__all__ = ["RobustCell", "RobustRun", "begin_run", "estimate_path", "hypotheses_path", "read_robust"]
+__all__ = ["RobustCell", "RobustRun", "begin_run", "estimate_path", "hypotheses_path", "leave_out", "read_robust"]
 
 FORMAT = 1
 JOINED = ("stores", "estimators", "solvers")
@@ -56,10 +56,12 @@ class RobustRun:
     Attributes:
         about: what the run is of, from ``robust.json``.
         cells: stores and protocols.
+        missing: what is not there yet.
     """
 
     about: dict[str, Any]
     cells: list[RobustCell]
+    missing: list[str]
 
 
 def estimate_path(folder: Path, store: str, protocol: str, threshold: float, name: str) -> Path:
@@ -87,7 +89,7 @@ def begin_run(folder: Path, about: dict[str, Any], redo: Sequence[str] = ()) -> 
     """
     path, about = folder / "robust.json", {"format": FORMAT, **about}
     if path.is_file():
-        had = json.loads(path.read_text(encoding="utf-8"))
+        had = _read_about(folder)
         differ = [
             f"{key} {had.get(key)!r}, now {now!r}"
             for key, now in about.items()
@@ -107,6 +109,37 @@ def begin_run(folder: Path, about: dict[str, Any], redo: Sequence[str] = ()) -> 
             old.unlink()
     with replacing(path) as beside:
         beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
+
+
+def leave_out(folder: Path, names: Sequence[str]) -> None:
+    """Take estimators and solvers out of what a run is of, but for those that have files.
+
+    Args:
+        folder: the run.
+        names: of estimators and solvers.
+
+    """
+    about = _read_about(folder)
+    for key in ("estimators", "solvers"):
+        for name in [name for name in names if not any(folder.glob(f"*/**/{file_name(name)}.npz"))]:
+            about[key].pop(name, None)
+    with replacing(folder / "robust.json") as beside:
+        beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
+
+
+def _read_about(folder: Path) -> dict[str, Any]:
+    path = folder / "robust.json"
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged, it is not JSON: {error}") from error
+    if not isinstance(about, dict):
+        raise ValueError(f"{path} is damaged: expected an object of JSON, got {type(about).__name__}")
+    if about.get("format") != FORMAT:
+        raise ValueError(f"{path} is of format {about.get('format')}, expected {FORMAT}")
+    if wrong := [key for key in JOINED if not isinstance(about.get(key), dict)]:
+        raise ValueError(f"{path} is damaged: {', '.join(wrong)} not as they should be")
+    return about
 
 
 def _join(
@@ -132,32 +165,42 @@ def read_robust(folder: str | Path) -> RobustRun | None:
         the run; nothing where the folder has none.
 
     Raises:
-        FileNotFoundError: if it is not complete.
         ValueError: if another version of the package made it, or a file is damaged.
 
     """
     folder = Path(folder)
     if not (folder / "robust.json").is_file():
         return None
-    about = json.loads((folder / "robust.json").read_text(encoding="utf-8"))
-    if about.get("format") != FORMAT:
-        raise ValueError(f"{folder}: robust.json is of format {about.get('format')}, expected {FORMAT}")
+    about, missing = _read_about(folder), list[str]()
     cells = [
-        _read_cell(folder, about, store, protocol)
+        _read_cell(folder, about, store, protocol, missing)
         for store in about["stores"]
         for protocol in ("filtered", "unfiltered")
     ]
-    return RobustRun(about, cells)
+    return RobustRun(about, cells, missing)
 
 
-def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str) -> RobustCell:
+def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, missing: list[str]) -> RobustCell:
     estimates = {
-        name: {t: _figures(estimate_path(folder, store, protocol, t, name)) for t in THRESHOLDS}
+        name: {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
         for name, identity in about["estimators"].items()
         if identity is not None
     }
-    hypotheses = {name: _figures(hypotheses_path(folder, store, protocol, name)) for name in about["solvers"]}
-    return RobustCell(store, protocol, estimates, hypotheses)
+    hypotheses = {name: hypotheses_path(folder, store, protocol, name) for name in about["solvers"]}
+    lacking = [name for name, paths in estimates.items() if not all(path.is_file() for path in paths.values())]
+    unsolved = [name for name, path in hypotheses.items() if not path.is_file()]
+    missing += [f"{name} ({store}, {protocol})" for name in lacking]
+    missing += [f"hypotheses of {name} ({store}, {protocol})" for name in unsolved]
+    return RobustCell(
+        store,
+        protocol,
+        {
+            name: {threshold: _figures(path) for threshold, path in paths.items()}
+            for name, paths in estimates.items()
+            if name not in lacking
+        },
+        {name: _figures(path) for name, path in hypotheses.items() if name not in unsolved},
+    )
 
 
 def _figures(path: Path) -> Figures:

@@ -180,7 +180,9 @@ def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -
 
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path} is not there: the run is not complete, learnnorm evaluate goes on with it")
+        raise FileNotFoundError(
+            f"{path} is not there: the run is not complete, the command that made it goes on with it"
+        )
     try:
         with path.open("rb") as file, np.load(file) as data:
             found = dict(data)
