@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -87,6 +88,8 @@ class _RobustLoss:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.scale, Real):
+            raise TypeError(f"scale must be a number of pixels, got {self.scale!r}")
         if not self.scale > 0:
             raise ValueError(f"scale must be positive, got {self.scale}")
 

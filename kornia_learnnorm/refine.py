@@ -91,7 +91,7 @@ def refine_fundamental(
         TypeError: if an argument is not a floating-point tensor or the points are not of one dtype.
         ShapeError: if a shape is wrong.
         ValueError: if there are fewer than eight correspondences, shapes do not pair up, a value is not finite, a
-            matrix is zero, or ``max_iterations`` or ``tolerance`` is negative.
+            matrix is zero, or ``max_iterations`` or ``tolerance`` is wrong.
 
     Reference:
         A. Bartoli, P. Sturm, Nonlinear estimation of the fundamental matrix with minimal parameters, TPAMI 2004; R.
@@ -109,8 +109,12 @@ def refine_fundamental(
     check_fundamental(F_mat, F_mat if len(points1) == 1 else points1)
     if isinstance(loss, type):
         raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
-    if max_iterations < 0 or not tolerance >= 0:
-        raise ValueError(f"max_iterations and tolerance must be >= 0, got {max_iterations} and {tolerance}")
+    if not callable(loss):
+        raise TypeError(f"loss must be a function or an instance such as Huber(1.0), got {loss!r}")
+    if not isinstance(max_iterations, int) or max_iterations < 0 or not tolerance >= 0:
+        raise ValueError(
+            f"max_iterations must be a whole number and it and tolerance >= 0, got {max_iterations} and {tolerance}"
+        )
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     w = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)

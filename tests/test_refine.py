@@ -395,9 +395,18 @@ class TestObjectives:
     def test_scale_must_be_positive(self, kind, scale):
         with pytest.raises(ValueError, match=f"scale must be positive, got {scale}"):
             kind(scale)
+        with pytest.raises(TypeError, match="scale must be a number of pixels, got '1'"):
+            kind("1")
 
 
 class TestExceptions:
+    def test_options(self):
+        points, F_mat = uniform(1, 10, 2), uniform(1, 3, 3)
+        with pytest.raises(TypeError, match="loss must be a function or an instance .* got 'huber'"):
+            refine_fundamental(points, points, F_mat, loss="huber")
+        with pytest.raises(ValueError, match="max_iterations must be a whole number .* got 2.5"):
+            refine_fundamental(points, points, F_mat, max_iterations=2.5)
+
     @pytest.mark.parametrize(
         ("F_mat", "error", "message"),
         [
