@@ -88,8 +88,9 @@ class _RobustLoss:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.scale, Real):
-            raise TypeError(f"scale must be a number of pixels, got {self.scale!r}")
+        scale: object = self.scale
+        if not isinstance(scale, Real):
+            raise TypeError(f"scale must be a number of pixels, got {scale!r}")
         if not self.scale > 0:
             raise ValueError(f"scale must be positive, got {self.scale}")
 

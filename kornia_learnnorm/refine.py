@@ -88,10 +88,11 @@ def refine_fundamental(
         the matrices with their costs, in the dtype of the points; costs carry no gradient.
 
     Raises:
-        TypeError: if an argument is not a floating-point tensor or the points are not of one dtype.
+        TypeError: if an argument is not a floating-point tensor, the points are not of one dtype, ``loss`` cannot be
+            called or ``max_iterations`` is not a whole number.
         ShapeError: if a shape is wrong.
         ValueError: if there are fewer than eight correspondences, shapes do not pair up, a value is not finite, a
-            matrix is zero, or ``max_iterations`` or ``tolerance`` is wrong.
+            matrix is zero, or ``max_iterations`` or ``tolerance`` is negative.
 
     Reference:
         A. Bartoli, P. Sturm, Nonlinear estimation of the fundamental matrix with minimal parameters, TPAMI 2004; R.
@@ -111,10 +112,10 @@ def refine_fundamental(
         raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
     if not callable(loss):
         raise TypeError(f"loss must be a function or an instance such as Huber(1.0), got {loss!r}")
-    if not isinstance(max_iterations, int) or max_iterations < 0 or not tolerance >= 0:
-        raise ValueError(
-            f"max_iterations must be a whole number and it and tolerance >= 0, got {max_iterations} and {tolerance}"
-        )
+    if not isinstance(max_iterations, int):
+        raise TypeError(f"max_iterations must be a whole number, got {max_iterations!r}")
+    if max_iterations < 0 or not tolerance >= 0:
+        raise ValueError(f"max_iterations and tolerance must be >= 0, got {max_iterations} and {tolerance}")
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     w = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)
