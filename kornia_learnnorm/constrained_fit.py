@@ -22,7 +22,6 @@ def constrained_fit(
     x2: Tensor,
     F_mat: Tensor,
     losses: Iterable[Loss],
-    weights: Tensor | None = None,
     factor: Factor = sampson_factor,
 ) -> Tensor:
     r"""Fit matrices to correspondences that they share, one step for each loss.
@@ -31,7 +30,7 @@ def constrained_fit(
     :math:`d_i = (u, \xi_i)\, g_i` and the cofactors :math:`u^\dagger` of :math:`F`, the gradient of its determinant, a
     step is
 
-    .. math:: \min_v \sum_i w_i\, \rho'(d_i^2)\, g_i^2\, (v, \xi_i)^2 \quad \text{subject to} \quad
+    .. math:: \min_v \sum_i \rho'(d_i^2)\, g_i^2\, (v, \xi_i)^2 \quad \text{subject to} \quad
               (u, v) = 1, \quad \det F + (u^\dagger, v - u) = 0,
 
     followed by :math:`u \leftarrow v / \|v\|`.
@@ -41,7 +40,6 @@ def constrained_fit(
         x2: the same of view 2.
         F_mat: where to start, with shape :math:`(K, 3, 3)`, any scale but zero.
         losses: :math:`\rho` of each step, see :mod:`kornia_learnnorm.objectives`.
-        weights: optional weights :math:`w` with shape :math:`(N,)`.
         factor: :math:`g`, see :mod:`kornia_learnnorm.objectives`.
 
     Returns:
@@ -63,9 +61,9 @@ def constrained_fit(
     for loss in losses:
         u, cofactors = F.flatten(1), torch.linalg.cross(F.roll(-1, 1), F.roll(-2, 1)).flatten(1)
         normal1, normal2 = (F.mT[:, :2] @ x2).square_().sum(1), (F[:, :2] @ x1).square_().sum(1)
-        g = factor(normal1.clamp_(min=floor), normal2.clamp_(min=floor))[0].square_()
+        g = factor(normal1.clamp_(min=floor), normal2.clamp_(min=floor))[0].square()
         w = loss((u @ xi).square_().mul_(g))[1] * g
-        sums = torch.unflatten((w if weights is None else w * weights) @ products, 1, (9, 9))
+        sums = torch.unflatten(w @ products, 1, (9, 9))
         torch.div(sums, sums.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None], out=moments)
         torch.stack([u, cofactors], 1, out=constraints)
         multipliers.copy_(constraints.mT)

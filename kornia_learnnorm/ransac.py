@@ -232,13 +232,13 @@ class RANSAC(nn.Module):
             F_mat = torch.cat([scorer.from_pixels(refit), F_mat])
         losses = [Truncated(scale * self.inl_th) for scale in scales]
         x1, x2 = scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows]
-        return scorer.best(constrained_fit(x1, x2, F_mat, losses, None, self.factor), POOL)
+        return scorer.best(constrained_fit(x1, x2, F_mat, losses, self.factor), POOL)
 
     def _polish(self, scorer: PairScorer, pool: Hypotheses) -> Rank2:
         """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the optimised pool."""
         F_mat = pool.join(self._optimize(scorer, pool.F_mat[:FINAL_POOL], FINAL_SCALES), 1).F_mat
         loss = GemanMcClure(LOSS_SCALE * self.inl_th)
-        F_mat = constrained_fit(scorer.x1, scorer.x2, F_mat, REWEIGHTINGS * [loss], None, self.factor)
+        F_mat = constrained_fit(scorer.x1, scorer.x2, F_mat, REWEIGHTINGS * [loss], self.factor)
         cost = EpipolarCost(scorer.x1[None], scorer.x2[None], torch.ones_like(scorer.x1[:1]), self.factor, loss)
         return minimize(cost, decompose(F_mat), STEPS, TOLERANCE)[1].state
 

@@ -36,7 +36,7 @@ def factors(F, x1, x2, factor):
     return factor(*normals)[0].numpy()
 
 
-def reference(x1, x2, F_mat, losses, factor, weights) -> np.ndarray:
+def reference(x1, x2, F_mat, losses, factor) -> np.ndarray:
     """The same steps, the constraints solved by their null space."""
     x1, x2, fitted = x1.numpy(), x2.numpy(), []
     xi = np.einsum("jn,kn->njk", x2, x1).reshape(-1, 9)
@@ -45,7 +45,7 @@ def reference(x1, x2, F_mat, losses, factor, weights) -> np.ndarray:
         for loss in losses:
             F = u.reshape(3, 3)
             g = factors(F, x1, x2, factor)
-            w = weights * loss(torch.from_numpy((xi @ u * g) ** 2))[1].numpy() * g**2
+            w = loss(torch.from_numpy((xi @ u * g) ** 2))[1].numpy() * g**2
             gradient = np.linalg.det(F) * np.linalg.inv(F).T if np.linalg.matrix_rank(F, 1e-12) == 3 else None
             if gradient is None:
                 U, s, Vh = np.linalg.svd(F)
@@ -65,9 +65,8 @@ class TestSteps:
     @pytest.mark.parametrize("losses", [[squared_loss], [Truncated(3.0), Truncated(1.0)], 3 * [Cauchy(0.5)]])
     def test_against_null_spaces_in_numpy(self, scene, factor, losses):
         scorer, F0 = begin(scene)
-        weights = uniform(200)
-        found = constrained_fit(scorer.x1, scorer.x2, F0, losses, weights, factor)
-        expected = reference(scorer.x1, scorer.x2, F0, losses, factor, weights.numpy())
+        found = constrained_fit(scorer.x1, scorer.x2, F0, losses, factor)
+        expected = reference(scorer.x1, scorer.x2, F0, losses, factor)
         for f, e in zip(found, expected, strict=True):
             assert up_to_sign(f[None], e[None]) < 1e-6
 
@@ -75,7 +74,7 @@ class TestSteps:
         """From there Levenberg-Marquardt hardly lowers the cost; the derivatives of the factor are all that is left."""
         scorer, F0 = begin(scene, 8)
         loss = Truncated(2.0)
-        F_mat = scorer.to_pixels(constrained_fit(scorer.x1, scorer.x2, F0, 12 * [loss], None, factor))
+        F_mat = scorer.to_pixels(constrained_fit(scorer.x1, scorer.x2, F0, 12 * [loss], factor))
         refined = refine_fundamental(scene.points1, scene.points2, F_mat, None, factor, loss)
         assert (refined.cost_before / refined.cost).median() < 1.01
 
@@ -83,15 +82,15 @@ class TestSteps:
     def test_the_order_of_the_points_does_not_count(self, factor, order):
         scorer, F0 = begin(scenes("handheld", 1, 200, noise=0.5))
         fitted = [
-            constrained_fit(x1, x2, F0, 3 * [Cauchy(1.0)], None, factor)
+            constrained_fit(x1, x2, F0, 3 * [Cauchy(1.0)], factor)
             for x1, x2 in ((scorer.x1, scorer.x2), (scorer.x1[:, order], scorer.x2[:, order]))
         ]
         assert torch.allclose(*fitted, rtol=1e-6)
 
     def test_swapping_the_views_transposes(self, scene, factor):
         scorer, F0 = begin(scene)
-        forth = constrained_fit(scorer.x1, scorer.x2, F0, 3 * [Cauchy(1.0)], None, factor)
-        back = constrained_fit(scorer.x2, scorer.x1, F0.mT, 3 * [Cauchy(1.0)], None, factor)
+        forth = constrained_fit(scorer.x1, scorer.x2, F0, 3 * [Cauchy(1.0)], factor)
+        back = constrained_fit(scorer.x2, scorer.x1, F0.mT, 3 * [Cauchy(1.0)], factor)
         assert torch.allclose(forth, back.mT, rtol=1e-6)
 
 
@@ -112,12 +111,11 @@ class TestResults:
         assert torch.allclose(values.norm(dim=-1), torch.ones(3, dtype=F.dtype))
         assert (values[:, 2] < 1e-5 * values[:, 1]).all()
 
-    def test_weights_of_zero_are_as_if_absent(self, scene):
-        scorer, F0 = begin(scene)
-        weights = (uniform(200) > 0.3).double()
-        some = weights > 0
-        fitted = constrained_fit(scorer.x1, scorer.x2, F0, 3 * [Cauchy(1.0)], weights)
-        assert torch.allclose(fitted, constrained_fit(scorer.x1[:, some], scorer.x2[:, some], F0, 3 * [Cauchy(1.0)]))
+    def test_truncated_points_are_as_if_absent(self, scene):
+        scorer, F0 = begin(scene, 1)
+        near = scorer.inliers(F0)[0]
+        fitted = constrained_fit(scorer.x1, scorer.x2, F0, [Truncated(1.0)])
+        assert torch.allclose(fitted, constrained_fit(scorer.x1[:, near], scorer.x2[:, near], F0, [squared_loss]))
 
     def test_what_cannot_be_fitted_stays(self):
         """Without inliers a step has no equations, and another matrix in the batch must not notice."""
