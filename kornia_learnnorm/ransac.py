@@ -168,8 +168,9 @@ class RANSAC(nn.Module):
     def _estimate(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         failure = kp1.new_zeros(3, 3), torch.zeros(len(kp1), dtype=torch.bool, device=kp1.device)
         finite = (kp1.isfinite() & kp2.isfinite()).all(-1)
-        x1, x2 = (kp[finite].to(solve_dtype(kp.device)) for kp in (kp1, kp2))
-        w = None if weights is None else weights[finite].to(x1)
+        rows = slice(None) if bool(finite.all()) else finite
+        x1, x2 = (kp[rows].to(solve_dtype(kp.device)) for kp in (kp1, kp2))
+        w = None if weights is None else weights[rows].to(x1)
         if (len(x1) if w is None else int((w > 0).sum())) < SAMPLE_SIZE:
             return failure
         generator = torch.Generator(kp1.device)
@@ -189,7 +190,7 @@ class RANSAC(nn.Module):
         F_mat = (F / torch.linalg.matrix_norm(F))[0].to(kp1.dtype)
         distance = epipolar_distance(scorer.points1[None], scorer.points2[None], F_mat[None].to(x1), self.factor)[0]
         inliers = finite.clone()
-        inliers[finite] = distance <= self.inl_th
+        inliers[rows] = distance <= self.inl_th
         return (F_mat, inliers) if int(inliers.sum()) > SAMPLE_SIZE else failure
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> Hypotheses:

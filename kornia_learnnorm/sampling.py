@@ -54,7 +54,7 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
     last = totals[:, None] - size + torch.arange(size, device=totals.device)
     uniform = torch.rand(len(totals), size, generator=generator, device=totals.device, dtype=torch.float32)
     drawn = (uniform * (last + 1)).long().clamp_(max=last)
-    for k, (column, end) in enumerate(zip(drawn.unbind(-1), last.unbind(-1), strict=True)):
+    for k, (column, end) in enumerate(zip(drawn.unbind(-1)[1:], last.unbind(-1)[1:], strict=True), 1):
         met = (drawn[:, :k] == column[:, None]).any(-1)
         torch.where(met, end, column, out=column)
     return drawn

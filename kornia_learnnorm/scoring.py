@@ -55,7 +55,8 @@ class PairScorer:
         rows: the correspondences that count in scores; all by default.
 
     Attributes:
-        points1: pixels in the first image, those beyond a million times the median brought back to there, (N, 2).
+        points1: pixels in the first image, with those out of all proportion brought back to a million times the
+            median, (N, 2).
         points2: the same in the second image.
         T1: from pixels of view 1 to the coordinates, (3, 3).
         T2: the same of view 2.
@@ -74,17 +75,17 @@ class PairScorer:
     ) -> None:
         self.threshold, self.factor, self.rows = threshold, factor, rows
         both = torch.stack([points1, points2])
-        origin = both.median(1).values
-        spread = (both - origin[:, None]).abs().flatten(1).median(-1).values
-        spread = torch.where(spread > 0, spread, 1.0)
+        origin = both.median(1, keepdim=True).values
+        centred = both - origin
+        spread = centred.abs().flatten(1).median(-1).values
+        spread = torch.where(spread > 0, spread, 1.0)[:, None, None]
         # A point may be wrong by any number, whose powers must not overflow.
-        reach = FARTHEST * spread[:, None]
-        both = torch.maximum(torch.minimum(both, (origin + reach)[:, None]), (origin - reach)[:, None])
-        self.points1, self.points2 = both
+        centred = centred.clamp(-FARTHEST * spread, FARTHEST * spread)
+        self.points1, self.points2 = centred + origin
+        self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[..., :1])], -1).mT.contiguous()
         T = torch.eye(3, dtype=both.dtype, device=both.device).repeat(2, 1, 1)
-        T[:, :2, 2], T[:, 2, 2] = -origin, spread
+        T[:, :2, 2:], T[:, 2:, 2:] = -origin.mT, spread
         self.T1, self.T2 = T
-        self.x1, self.x2 = T @ convert_points_to_homogeneous(both).mT
         x1, x2 = self.x1[:, rows], self.x2[:, rows]
         self.residuals = (x2[:, None] * x1).flatten(0, 1).float()
         self.products1, self.products2 = ((x[:, None] * x).flatten(0, 1).float() for x in (x1, x2))
