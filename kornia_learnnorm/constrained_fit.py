@@ -12,7 +12,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.objectives import Factor, Loss, sampson_factor
+from kornia_learnnorm.objectives import Factor, Loss, factor_alone, sampson_factor
 
 __all__ = ["constrained_fit"]
 
@@ -61,7 +61,7 @@ def constrained_fit(
     for loss in losses:
         u, cofactors = F.flatten(1), torch.linalg.cross(F.roll(-1, 1), F.roll(-2, 1)).flatten(1)
         normal1, normal2 = (F.mT[:, :2] @ x2).square_().sum(1), (F[:, :2] @ x1).square_().sum(1)
-        g = factor(normal1.clamp_(min=floor), normal2.clamp_(min=floor))[0].square()
+        g = factor_alone(factor, normal1.clamp_(min=floor), normal2.clamp_(min=floor)).square()
         w = loss((u @ xi).square_().mul_(g))[1] * g
         sums = torch.unflatten(w @ products, 1, (9, 9))
         torch.div(sums, sums.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None], out=moments)

@@ -20,6 +20,7 @@ __all__ = [
     "GemanMcClure",
     "Huber",
     "Truncated",
+    "factor_alone",
     "sampson_factor",
     "squared_loss",
     "symmetric_factor",
@@ -81,6 +82,22 @@ def squared_loss(squares: Tensor) -> tuple[Tensor, Tensor]:
 
     """
     return squares, torch.ones_like(squares)
+
+
+def factor_alone(factor: Factor, normal1: Tensor, normal2: Tensor) -> Tensor:
+    """Return the factor without its derivatives, which cost more than the factor itself.
+
+    Args:
+        factor: from algebraic residuals to distances.
+        normal1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
+        normal2: the same in view 2.
+
+    Example:
+        >>> factor_alone(sampson_factor, torch.tensor(2.0), torch.tensor(2.0))
+        tensor(0.5000)
+
+    """
+    return (normal1 + normal2).rsqrt() if factor is sampson_factor else factor(normal1, normal2)[0]
 
 
 @dataclass(frozen=True)

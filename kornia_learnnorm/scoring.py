@@ -8,7 +8,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.objectives import Factor, sampson_factor
+from kornia_learnnorm.objectives import Factor, factor_alone, sampson_factor
 from kornia_learnnorm.transforms import transform_fundamental
 
 __all__ = ["Hypotheses", "PairScorer", "epipolar_distance"]
@@ -30,6 +30,8 @@ class Hypotheses(NamedTuple):
 
     def join(self, other: Hypotheses, number: int) -> Hypotheses:
         """Return the best of both, at most so many; ``other`` comes first in ties."""
+        if len(self.score) == 0:
+            return Hypotheses(other.F_mat[:number], other.score[:number])
         both = Hypotheses(*(torch.cat([theirs, ours]) for ours, theirs in zip(self, other, strict=True)))
         order = both.score.argsort(descending=True, stable=True)[:number]
         return Hypotheses(*(values[order] for values in both))
@@ -126,7 +128,7 @@ class PairScorer:
         tiny = torch.finfo(F.dtype).tiny
         normal1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ self.products2).clamp_(min=tiny)
         normal2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ self.products1).clamp_(min=tiny)
-        ratio = ((F / self.threshold).flatten(1) @ self.residuals).mul_(self.factor(normal1, normal2)[0])
+        ratio = ((F / self.threshold).flatten(1) @ self.residuals).mul_(factor_alone(self.factor, normal1, normal2))
         gains: Tensor = ratio.square_().neg_().add_(1)
         return gains
 
@@ -147,4 +149,4 @@ def epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor, factor: F
     x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
     line1, line2 = x2 @ F_mat, x1 @ F_mat.mT
     normal1, normal2 = (line[..., :2].square().sum(-1) for line in (line1, line2))
-    return (x2 * line2).sum(-1).abs() * factor(normal1, normal2)[0]
+    return (x2 * line2).sum(-1).abs() * factor_alone(factor, normal1, normal2)

@@ -31,6 +31,7 @@ from kornia_learnnorm.objectives import (
     GemanMcClure,
     Huber,
     Truncated,
+    factor_alone,
     sampson_factor,
     squared_loss,
     symmetric_factor,
@@ -389,6 +390,11 @@ class TestObjectives:
         torch.testing.assert_close(weight.detach(), torch.autograd.grad(value.sum(), squares)[0])
         assert loss(torch.zeros(1))[0] == 0
         assert loss(torch.zeros(1))[1] == 1
+
+    @pytest.mark.parametrize("factor", [sampson_factor, symmetric_factor])
+    def test_factor_alone(self, factor):
+        normals = uniform(20, low=0.1), uniform(20, low=0.1, seed=1)
+        assert torch.equal(factor_alone(factor, *normals), factor(*normals)[0])
 
     @pytest.mark.parametrize("kind", [Huber, Cauchy, GemanMcClure, Truncated])
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
