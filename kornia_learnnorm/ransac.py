@@ -96,7 +96,7 @@ class RANSAC(nn.Module):
         self,
         normalizer: Normalizer | None = None,
         inl_th: float = 1.0,
-        max_iter: int = 20_000,
+        max_iter: int = 50_000,
         max_seconds: float | None = None,
         confidence: float = 0.999,
         factor: Factor = sampson_factor,

@@ -26,6 +26,7 @@ __all__ = [
 SEVEN_POINT = "seven-point"
 COUNT = 1000  # samples of a run of equal hypotheses
 SECONDS = 0.05  # of a run of equal time
+MOST = 20_000  # samples of RANSAC with a normaliser, which can be a network
 DEFAULTS = "RANSAC"
 KINDS = ("count:", "time:", f"{DEFAULTS}:")
 _SOLVERS = ("Hartley", "whitening", "paper", "crossview", "Hartley+optimal")
@@ -61,8 +62,9 @@ def find_estimator(name: str) -> Estimator:
 
     Args:
         name: one of those in :mod:`~kornia_learnnorm.evaluation.robust_peers`; ``count:SOLVER``, the best of 1,000
-            minimal samples, the same for all solvers; ``time:METHOD``, the best of those of 50 ms; ``RANSAC`` or
-            ``RANSAC:METHOD``, :class:`~kornia_learnnorm.RANSAC` with its defaults and with another normaliser.
+            minimal samples, the same for all solvers; ``time:METHOD``, the best of those of 50 ms; ``RANSAC``,
+            :class:`~kornia_learnnorm.RANSAC` with its defaults; ``RANSAC:METHOD``, with another normaliser and at most
+            20,000 samples.
 
     Raises:
         ValueError: if there is no such estimator.
@@ -78,7 +80,7 @@ def find_estimator(name: str) -> Estimator:
     if name == DEFAULTS:
         return ransac(None, {})
     if kind == DEFAULTS and method:
-        return _ransac(method, {})
+        return _ransac(method, {"max_iter": MOST})
     if kind == "time" and method:
         return _ransac(method, {"max_iter": 10**7, "max_seconds": SECONDS, "confidence": 1, "refine": False})
     raise ValueError(
