@@ -10,7 +10,7 @@ from typing import Any
 
 from kornia_learnnorm.files import replacing
 
-__all__ = ["begin_run", "leave_out", "read_about"]
+__all__ = ["begin_run", "leave_out", "read_about", "read_object"]
 
 FORMAT = 2  # of what a run keeps; others are refused
 JOINED = ("stores", "methods", "trained_on")
@@ -37,12 +37,7 @@ def read_about(folder: Path) -> About:
     path = folder / "run.json"
     if not path.is_file():
         raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged, it is not JSON: {error}") from error
-    if not isinstance(about, dict):
-        raise ValueError(f"{path} is damaged: expected an object of JSON, got {type(about).__name__}")
+    about = read_object(path)
     if about.get("format") != FORMAT:
         raise ValueError(
             f"{folder} is a run of format {about.get('format')}, expected {FORMAT}: another version of the package made"
@@ -52,6 +47,25 @@ def read_about(folder: Path) -> About:
     wrong += [key for key in ("seed", "max_samples") if key not in about]
     if wrong or about["methods"].keys() != about["trained_on"].keys():
         raise ValueError(f"{path} is damaged: {', '.join(wrong or ['methods and trained_on'])} not as they should be")
+    return about
+
+
+def read_object(path: Path) -> About:
+    """Return the object of a JSON file.
+
+    Args:
+        path: the file.
+
+    Raises:
+        ValueError: if the file is damaged.
+
+    """
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged, it is not JSON: {error}") from error
+    if not isinstance(about, dict):
+        raise ValueError(f"{path} is damaged: expected an object of JSON, got {type(about).__name__}")
     return about
 
 

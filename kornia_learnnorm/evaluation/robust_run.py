@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.consensus import THRESHOLDS
+from kornia_learnnorm.evaluation.manifest import read_object
 from kornia_learnnorm.evaluation.run import file_name, read_arrays
 from kornia_learnnorm.files import replacing
 
@@ -107,8 +108,7 @@ def begin_run(folder: Path, about: dict[str, Any], redo: Sequence[str] = ()) -> 
             *folder.glob(f"hypotheses/*/*/{file_name(name)}.npz"),
         ]:
             old.unlink()
-    with replacing(path) as beside:
-        beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
+    _write_about(folder, about)
 
 
 def leave_out(folder: Path, names: Sequence[str]) -> None:
@@ -123,23 +123,22 @@ def leave_out(folder: Path, names: Sequence[str]) -> None:
     for key in ("estimators", "solvers"):
         for name in [name for name in names if not any(folder.glob(f"*/**/{file_name(name)}.npz"))]:
             about[key].pop(name, None)
-    with replacing(folder / "robust.json") as beside:
-        beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
+    _write_about(folder, about)
 
 
 def _read_about(folder: Path) -> dict[str, Any]:
     path = folder / "robust.json"
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged, it is not JSON: {error}") from error
-    if not isinstance(about, dict):
-        raise ValueError(f"{path} is damaged: expected an object of JSON, got {type(about).__name__}")
+    about = read_object(path)
     if about.get("format") != FORMAT:
         raise ValueError(f"{path} is of format {about.get('format')}, expected {FORMAT}")
     if wrong := [key for key in JOINED if not isinstance(about.get(key), dict)]:
         raise ValueError(f"{path} is damaged: {', '.join(wrong)} not as they should be")
     return about
+
+
+def _write_about(folder: Path, about: dict[str, Any]) -> None:
+    with replacing(folder / "robust.json") as beside:
+        beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
 
 
 def _join(
