@@ -1,20 +1,38 @@
-r"""Reweighted least squares under the singularity constraint: a fast way close to a robust optimum.
+r"""Reweighted least squares under the singularity constraint: a fast way to a robust optimum.
 
 Each step holds the weights, which turn squared algebraic residuals into losses of distances, and solves one linear
-system for the matrix that minimises their sum on the linearised constraint. It needs none of the derivatives of the
-distances, so that a step is a fraction of one of Levenberg-Marquardt, and ends next to the same optimum.
+system for the matrix at which the sum of losses is stationary on the linearised constraint. It is a fraction of a step
+of Levenberg-Marquardt, and ends at the same optimum.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.objectives import Factor, Loss, factor_alone, sampson_factor
+from kornia_learnnorm.objectives import Factor, Loss, sampson_factor
 
-__all__ = ["constrained_fit"]
+__all__ = ["Fit", "constrained_fit"]
+
+LENGTH = 1.3  # of a step: bounded losses make those of least squares too short
+
+
+class Fit(NamedTuple):
+    """Matrices and how good they are.
+
+    Attributes:
+        F_mat: matrices of unit norm, singular up to the square of the last step, (K, 3, 3).
+        cost: what their last losses added up to before the last step, (K,).
+        gain: the share of it that a step of least squares could still take away then, (K,); close to an optimum where
+            small.
+    """
+
+    F_mat: Tensor
+    cost: Tensor
+    gain: Tensor
 
 
 def constrained_fit(
@@ -23,51 +41,68 @@ def constrained_fit(
     F_mat: Tensor,
     losses: Iterable[Loss],
     factor: Factor = sampson_factor,
-) -> Tensor:
+) -> Fit:
     r"""Fit matrices to correspondences that they share, one step for each loss.
 
-    With :math:`u = \mathrm{vec}(F)`, :math:`\|u\| = 1`, :math:`\xi_i = x_{2,i} \otimes x_{1,i}`, the distances
-    :math:`d_i = (u, \xi_i)\, g_i` and the cofactors :math:`u^\dagger` of :math:`F`, the gradient of its determinant, a
-    step is
+    With :math:`u = \mathrm{vec}(F)`, :math:`\|u\| = 1`, :math:`\xi_i = x_{2,i} \otimes x_{1,i}`, the factors
+    :math:`g_i(n_{1,i}, n_{2,i})` of the squared norms :math:`n_{v,i} = (u, V_{v,i} u)` of the epipolar lines' normals,
+    the distances :math:`d_i = (u, \xi_i)\, g_i` and the cofactors :math:`u^\dagger` of :math:`F`, the gradient of its
+    determinant, a step is
 
-    .. math:: \min_v \sum_i \rho'(d_i^2)\, g_i^2\, (v, \xi_i)^2 \quad \text{subject to} \quad
-              (u, v) = 1, \quad \det F + (u^\dagger, v - u) = 0,
+    .. math:: X &= \sum_i \rho'(d_i^2) \Big( g_i^2\, \xi_i \xi_i^\top + 2\, (u, \xi_i)^2\, g_i
+              \sum_{v = 1, 2} \frac{\partial g_i}{\partial n_{v,i}} V_{v,i} \Big), \\
+              u' &= \arg \operatorname*{stat}_{u'}\, (u', X u') \quad \text{subject to} \quad
+              (u, u') = 1, \quad \det F + \alpha\, (u^\dagger, u' - u) = 0,
 
-    followed by :math:`u \leftarrow v / \|v\|`.
+    followed by :math:`u \leftarrow N[u + \alpha\, (u' - u)]`, :math:`\alpha = 1.3`. The first step comes from afar:
+    there :math:`\alpha = 1`, and the derivatives of :math:`g`, which could make :math:`X` indefinite, are left out.
 
     Args:
         x1: homogeneous points of view 1 with shape :math:`(3, N)`, the first two coordinates in pixels.
         x2: the same of view 2.
         F_mat: where to start, with shape :math:`(K, 3, 3)`, any scale but zero.
-        losses: :math:`\rho` of each step, see :mod:`kornia_learnnorm.objectives`.
+        losses: :math:`\rho` of each step, at least one, see :mod:`kornia_learnnorm.objectives`.
         factor: :math:`g`, see :mod:`kornia_learnnorm.objectives`.
 
     Returns:
-        matrices of unit norm with shape :math:`(K, 3, 3)`; singular up to the square of the last step. Where a step
-        cannot be computed, as with fewer than seven inliers, the matrix that was given.
+        the matrices with their costs. Where a step cannot be computed, as with fewer than seven inliers, the matrix
+        that was given and an infinite cost.
 
     Reference:
-        K. Kanatani, Y. Sugaya, Compact fundamental matrix computation, IPSJ Transactions on Computer Vision and
-        Applications 2, 2010, compares schemes of this kind.
+        W. Chojnacki, M. Brooks, A. van den Hengel, D. Gawley, On the fitting of surfaces to data with covariances,
+        TPAMI 2000, for :math:`X`; K. Kanatani, Y. Sugaya, Compact fundamental matrix computation, IPSJ Transactions on
+        Computer Vision and Applications 2, 2010, for schemes with the constraint.
 
     """
-    given = F_mat / torch.linalg.matrix_norm(F_mat, keepdim=True)
+    given = F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)
     F, xi = given, (x2[:, None] * x1).flatten(0, 1)
-    products = (xi[:, None] * xi).flatten(0, 1).mT
+    products, products1, products2 = ((x[:, None] * x).flatten(0, 1).mT for x in (xi, x1, x2))
     floor = torch.finfo(F.dtype).eps ** 2  # below it the direction of a line is rounding
     system, right = F.new_zeros(len(F), 11, 11), F.new_zeros(len(F), 11)
-    moments, constraints, multipliers = system[:, :9, :9], system[:, 9:, :9], system[:, :9, 9:]
+    X, constraints, multipliers = system[:, :9, :9], system[:, 9:, :9], system[:, :9, 9:]
+    entries = torch.unflatten(torch.unflatten(X, 2, (3, 3)), 1, (3, 3))
+    in_view1, in_view2 = entries.diagonal(dim1=2, dim2=4)[..., :2], entries.diagonal(dim1=1, dim2=3)[..., :2]
     right[:, 9] = 1
-    for loss in losses:
+    for step, loss in enumerate(losses):
+        length = LENGTH if step else 1.0
         u, cofactors = F.flatten(1), torch.linalg.cross(F.roll(-1, 1), F.roll(-2, 1)).flatten(1)
         normal1, normal2 = (F.mT[:, :2] @ x2).square_().sum(1), (F[:, :2] @ x1).square_().sum(1)
-        g = factor_alone(factor, normal1.clamp_(min=floor), normal2.clamp_(min=floor)).square()
-        w = loss((u @ xi).square_().mul_(g))[1] * g
-        sums = torch.unflatten(w @ products, 1, (9, 9))
-        torch.div(sums, sums.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None], out=moments)
+        g, slope1, slope2 = factor(normal1.clamp_(min=floor), normal2.clamp_(min=floor))
+        algebraic, g_squared = (u @ xi).square_(), g.square()
+        values, weights = loss(algebraic * g_squared)
+        X.copy_(torch.unflatten((weights * g_squared) @ products, 1, (9, 9)))
+        if step:
+            pull = (2 * weights).mul_(algebraic).mul_(g)
+            in_view1.add_(torch.unflatten((pull * slope1) @ products2, 1, (3, 3))[..., None])
+            in_view2.add_(torch.unflatten((pull * slope2) @ products1, 1, (3, 3))[..., None])
+        size = X.diagonal(dim1=1, dim2=2).sum(-1)
+        X.div_(size[:, None, None])
         torch.stack([u, cofactors], 1, out=constraints)
         multipliers.copy_(constraints.mT)
-        torch.mul((cofactors * u).sum(-1), 2 / 3, out=right[:, 10])
-        v = torch.linalg.solve_ex(system, right)[0][:, :9]
-        F = torch.unflatten(v / v.norm(dim=-1, keepdim=True), -1, (3, 3))
-    return torch.where(F.isfinite().all(-1).all(-1)[:, None, None], F, given)
+        torch.mul((cofactors * u).sum(-1), 1 - 1 / (3 * length), out=right[:, 10])
+        change = torch.linalg.solve_ex(system, right)[0][:, :9] - u
+        u = torch.add(u, change, alpha=length)
+        F = torch.unflatten(u / torch.linalg.vector_norm(u, dim=-1, keepdim=True), 1, (3, 3))
+    found, cost = F.isfinite().all(-1).all(-1), values.sum(-1)
+    gain = (change[:, None] @ X @ change[..., None])[:, 0, 0].mul_(size).abs_() / cost
+    return Fit(torch.where(found[:, None, None], F, given), torch.where(found, cost, torch.inf), gain)

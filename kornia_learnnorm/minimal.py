@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.linear import design_matrix
-from kornia_learnnorm.reweighting import adjugate
 
 __all__ = ["are_determined", "solve_samples"]
 
@@ -40,7 +39,7 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     A QR factorisation of the transposed design matrix, :math:`A^\top = Q R`, tells which samples determine a matrix
     and gives both the null vector, which is the last column of :math:`Q`, and a factor of its covariance,
     :math:`V_0 = L L^\top` with :math:`L = Q_{:,1:8} R^{-\top} \mathrm{diag}(\sqrt{(u, V_i u)})`, see
-    :func:`~kornia_learnnorm.optimal_rank2`.
+    :func:`~kornia_learnnorm.optimal_rank2`, whose steps these are but that :math:`V_0` stays as it is.
 
     Args:
         x1: homogeneous points of view 1 with shape :math:`(K, 8, 3)`, pixels and a third coordinate as large.
@@ -65,14 +64,15 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     line1, line2 = (x2 @ F)[..., :2], (x1 @ F.mT)[..., :2]
     deviation = (line1.square().sum(-1) + line2.square().sum(-1)).sqrt()
     L = Q[..., :8] @ torch.linalg.solve_triangular(R[..., :8, :].mT, torch.diag_embed(deviation), upper=False)
-    for step in range(3):
-        L = L - u[..., None] * (u[:, None] @ L) if step else L
-        cofactors = adjugate(torch.unflatten(u, -1, (3, 3))).mT.flatten(-2)
-        slope = cofactors[:, None] @ L
-        change = (L @ slope.mT)[..., 0] / slope.square().sum(-1)
-        u = u - (u * cofactors).sum(-1, keepdim=True) / 3 * change
-        u = u / u.norm(dim=-1, keepdim=True)
-    return torch.unflatten(u, -1, (3, 3))
+    V = L @ L.mT
+    for _ in range(3):
+        cofactors = torch.linalg.cross(F.roll(-1, 1), F.roll(-2, 1)).flatten(1)
+        change = (V @ cofactors[..., None])[..., 0]
+        excess = (u * cofactors).sum(-1, keepdim=True) / (3 * (change * cofactors).sum(-1, keepdim=True))
+        u = u - excess * change
+        u = u / torch.linalg.vector_norm(u, dim=-1, keepdim=True)
+        F = torch.unflatten(u, -1, (3, 3))
+    return F
 
 
 def _independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:

@@ -16,11 +16,11 @@ from kornia_learnnorm.constrained_fit import constrained_fit
 from kornia_learnnorm.correspondences import solve_dtype
 from kornia_learnnorm.epipolar_cost import EpipolarCost
 from kornia_learnnorm.minimal import are_determined, solve_samples
-from kornia_learnnorm.objectives import Factor, GemanMcClure, Truncated, sampson_factor
+from kornia_learnnorm.objectives import Factor, GemanMcClure, Loss, Truncated, sampson_factor
 from kornia_learnnorm.rank2_manifold import Rank2, decompose
 from kornia_learnnorm.refine import minimize
 from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
-from kornia_learnnorm.scoring import Hypotheses, PairScorer, epipolar_distance
+from kornia_learnnorm.scoring import Hypotheses, PairScorer
 from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
 from kornia_learnnorm.threads import one_thread
 
@@ -30,12 +30,13 @@ BATCHES = (32, 1024)  # samples in the first batch, and in the largest
 SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on
 POOL = 8  # hypotheses of a batch that are optimised,
 SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the threshold in each step: a noisy sample sees few of its inliers
-FINAL_POOL = 2  # the same in the end,
-FINAL_SCALES = (2.0,)
-LOSS_SCALE = 0.6  # of the threshold, for the loss of the final refinement:
-REWEIGHTINGS = 4  # first these steps of least squares,
-STEPS = 10  # then these of Levenberg-Marquardt, at most
-TOLERANCE = 1e-3
+FINAL_POOL = 3  # the same in the end,
+FINAL_SCALE = 2.0  # of the threshold in the first step
+LOSS_SCALE = 0.7  # and of that of the final loss in all others:
+REWEIGHTINGS = 4  # so many of least squares,
+TOLERANCE = 1e-4  # which end close enough to the optimum where they have this share of the cost to gain; elsewhere
+STEPS = 10  # so many of Levenberg-Marquardt, at most,
+COSINE = 1e-3  # until the derivatives are this close to orthogonal
 
 
 class RANSAC(nn.Module):
@@ -44,8 +45,8 @@ class RANSAC(nn.Module):
     Minimal samples of eight run through :func:`~kornia_learnnorm.find_fundamental` with any normaliser, a thousand at
     once, and MSAC scores them all. The best of each batch are fitted to their inliers by reweighted least squares, and
     the first also by the normaliser (local optimisation); the inliers of the best matrix so far say how many samples
-    are still needed. In the end the best matrix is refined on Geman and McClure's loss, by reweighted least squares
-    and by Levenberg-Marquardt.
+    are still needed. In the end the best few are fitted on Geman and McClure's loss, and the one of least cost goes on
+    to Levenberg-Marquardt where least squares have not converged.
 
     PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.threads.one_thread`.
 
@@ -166,32 +167,34 @@ class RANSAC(nn.Module):
         return F_mat.clone(), inliers.clone()
 
     def _estimate(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        failure = kp1.new_zeros(3, 3), torch.zeros(len(kp1), dtype=torch.bool, device=kp1.device)
+        if math.isfinite(kp1.sum() + kp2.sum()):
+            return self._estimate_finite(kp1, kp2, weights)
         finite = (kp1.isfinite() & kp2.isfinite()).all(-1)
-        rows = slice(None) if bool(finite.all()) else finite
-        x1, x2 = (kp[rows].to(solve_dtype(kp.device)) for kp in (kp1, kp2))
-        w = None if weights is None else weights[rows].to(x1)
-        if (len(x1) if w is None else int((w > 0).sum())) < SAMPLE_SIZE:
-            return failure
+        kept = None if weights is None else weights[finite]
+        F_mat, inliers = self._estimate_finite(kp1[finite], kp2[finite], kept)
+        return F_mat, torch.zeros_like(finite).masked_scatter(finite, inliers)
+
+    def _estimate_finite(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        if (len(kp1) if weights is None else int((weights > 0).sum())) < SAMPLE_SIZE:
+            return _failure(kp1)
+        x1, x2 = (kp.to(solve_dtype(kp.device)) for kp in (kp1, kp2))
         generator = torch.Generator(kp1.device)
         generator.manual_seed(int(torch.randint(2**62, ())) if self.seed is None else self.seed)
-        sampler = UniformSampler(len(x1), x1.device) if w is None else self.sampler(w)
+        sampler = UniformSampler(len(x1), x1.device) if weights is None else self.sampler(weights.to(x1))
         scored: Tensor | slice = slice(None)
         if len(x1) > SCORED:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:SCORED]
         scorer = PairScorer(x1, x2, self.inl_th, self.factor, scored)
         pool = self._search(scorer, sampler, generator)
         if len(pool.F_mat) == 0:
-            return failure
+            return _failure(kp1)
         state = self._polish(scorer, pool) if self.refine else decompose(pool.F_mat[:1])
         if state.A.det().abs() < 1e-9:
-            return failure
+            return _failure(kp1)
         F = scorer.to_pixels(state.matrix())
-        F_mat = (F / torch.linalg.matrix_norm(F))[0].to(kp1.dtype)
-        distance = epipolar_distance(scorer.points1[None], scorer.points2[None], F_mat[None].to(x1), self.factor)[0]
-        inliers = finite.clone()
-        inliers[rows] = distance <= self.inl_th
-        return (F_mat, inliers) if int(inliers.sum()) > SAMPLE_SIZE else failure
+        F_mat = (F / torch.linalg.vector_norm(F)).to(kp1.dtype)
+        inliers = scorer.distances(scorer.from_pixels(F_mat.to(x1))[0]) <= self.inl_th
+        return (F_mat[0], inliers) if int(inliers.sum()) > SAMPLE_SIZE else _failure(kp1)
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> Hypotheses:
         """Return the best hypotheses that enough minimal samples give, best first."""
@@ -207,7 +210,7 @@ class RANSAC(nn.Module):
             needed = self._samples_needed(pool, scorer, sampler)
             # A pool that ends the search is optimised anyway.
             if self.refine and drawn < needed and len(found.F_mat):
-                pool = pool.join(self._optimize(scorer, found.F_mat, SCALES), POOL)
+                pool = pool.join(self._optimize(scorer, found.F_mat), POOL)
                 needed = self._samples_needed(pool, scorer, sampler)
         return pool
 
@@ -221,27 +224,31 @@ class RANSAC(nn.Module):
         else:
             determined = are_determined(x1, x2, 0.01 * self.inl_th)
             rows = rows[determined] if bool(determined.any()) else rows
-        points1, points2 = scorer.points1[rows], scorer.points2[rows]
+        points1, points2 = (points[rows] for points in scorer.pixels)
         return scorer.from_pixels(find_fundamental(points1, points2, None, self.normalizer, self.rank2))
 
-    def _optimize(self, scorer: PairScorer, F_mat: Tensor, scales: tuple[float, ...]) -> Hypotheses:
+    def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
         """Fit matrices to their inliers, and with a normaliser the first by it, and rate what comes out."""
         if self.normalizer is not None:
             inliers = scorer.inliers(F_mat[:1]).to(F_mat)
-            points1, points2 = scorer.points1[None, scorer.rows], scorer.points2[None, scorer.rows]
+            points1, points2 = (points[None, scorer.rows] for points in scorer.pixels)
             refit = find_fundamental(points1, points2, inliers, self.normalizer, self.rank2)
             F_mat = torch.cat([scorer.from_pixels(refit), F_mat])
-        losses = [Truncated(scale * self.inl_th) for scale in scales]
+        losses = [Truncated(scale * self.inl_th) for scale in SCALES]
         x1, x2 = scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows]
-        return scorer.best(constrained_fit(x1, x2, F_mat, losses, self.factor), POOL)
+        return scorer.best(constrained_fit(x1, x2, F_mat, losses, self.factor).F_mat, POOL)
 
     def _polish(self, scorer: PairScorer, pool: Hypotheses) -> Rank2:
-        """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the optimised pool."""
-        F_mat = pool.join(self._optimize(scorer, pool.F_mat[:FINAL_POOL], FINAL_SCALES), 1).F_mat
+        """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
         loss = GemanMcClure(LOSS_SCALE * self.inl_th)
-        F_mat = constrained_fit(scorer.x1, scorer.x2, F_mat, REWEIGHTINGS * [loss], self.factor)
+        losses: list[Loss] = [Truncated(FINAL_SCALE * self.inl_th), *REWEIGHTINGS * [loss]]
+        fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL], losses, self.factor)
+        best = fit.cost.argmin()
+        state = decompose(fit.F_mat[best][None])
+        if fit.gain[best] <= TOLERANCE:
+            return state
         cost = EpipolarCost(scorer.x1[None], scorer.x2[None], torch.ones_like(scorer.x1[:1]), self.factor, loss)
-        return minimize(cost, decompose(F_mat), STEPS, TOLERANCE)[1].state
+        return minimize(cost, state, STEPS, COSINE)[1].state
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
@@ -251,6 +258,10 @@ class RANSAC(nn.Module):
         if hit_rate == 0:
             return self.max_iter
         return math.ceil(min(self.max_iter, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
+
+
+def _failure(kp: Tensor) -> tuple[Tensor, Tensor]:
+    return kp.new_zeros(3, 3), torch.zeros(len(kp), dtype=torch.bool, device=kp.device)
 
 
 def _is_whole(value: object) -> bool:

@@ -2,18 +2,19 @@ r"""Scores of many fundamental matrices on the correspondences of one image pair
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.objectives import Factor, factor_alone, sampson_factor
 from kornia_learnnorm.transforms import transform_fundamental
 
-__all__ = ["Hypotheses", "PairScorer", "epipolar_distance"]
+__all__ = ["Hypotheses", "PairScorer"]
 
 FARTHEST = 1e6
+MEDIAN_OF = 256  # correspondences, at least
 BLOCK = 1 << 15  # distances of a block, which stay in a core's cache
 
 
@@ -57,13 +58,11 @@ class PairScorer:
         rows: the correspondences that count in scores; all by default.
 
     Attributes:
-        points1: pixels in the first image, with those out of all proportion brought back to a million times the
-            median, (N, 2).
-        points2: the same in the second image.
-        T1: from pixels of view 1 to the coordinates, (3, 3).
-        T2: the same of view 2.
-        x1: all correspondences in them, (3, N).
+        x1: all correspondences in the coordinates of view 1, those out of all proportion brought back to a million
+            times the median, (3, N).
         x2: the same of view 2.
+        T1: from pixels of view 1 to its coordinates, (3, 3).
+        T2: the same of view 2.
 
     """
 
@@ -76,21 +75,25 @@ class PairScorer:
         rows: Tensor | slice = slice(None),
     ) -> None:
         self.threshold, self.factor, self.rows = threshold, factor, rows
-        both = torch.stack([points1, points2])
-        origin = both.median(1, keepdim=True).values
-        centred = both - origin
-        spread = centred.abs().flatten(1).median(-1).values
+        both = torch.stack([points1.mT, points2.mT])
+        some = both[..., :: max(1, len(points1) // MEDIAN_OF)]
+        origin = some.median(-1, keepdim=True).values
+        spread = (some - origin).abs().flatten(1).median(-1).values
         spread = torch.where(spread > 0, spread, 1.0)[:, None, None]
         # A point may be wrong by any number, whose powers must not overflow.
-        centred = centred.clamp(-FARTHEST * spread, FARTHEST * spread)
-        self.points1, self.points2 = centred + origin
-        self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[..., :1])], -1).mT.contiguous()
-        T = torch.eye(3, dtype=both.dtype, device=both.device).repeat(2, 1, 1)
-        T[:, :2, 2:], T[:, 2:, 2:] = -origin.mT, spread
+        centred = (both - origin).clamp(-FARTHEST * spread, FARTHEST * spread)
+        self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[:, :1])], 1)
+        T = torch.eye(3, dtype=both.dtype, device=both.device).expand(2, 3, 3).clone()
+        T[:, :2, 2:], T[:, 2:, 2:] = -origin, spread
         self.T1, self.T2 = T
         x1, x2 = self.x1[:, rows], self.x2[:, rows]
         self.residuals = (x2[:, None] * x1).flatten(0, 1).float()
         self.products1, self.products2 = ((x[:, None] * x).flatten(0, 1).float() for x in (x1, x2))
+
+    @cached_property
+    def pixels(self) -> tuple[Tensor, Tensor]:
+        """All correspondences in pixels, those out of all proportion as in ``x1`` and ``x2``, (N, 2) each."""
+        return (self.x1[:2] - self.T1[:2, 2:]).mT, (self.x2[:2] - self.T2[:2, 2:]).mT
 
     def samples(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return samples (K, M) of all correspondences in the scorer's coordinates, (K, M, 3)."""
@@ -112,7 +115,8 @@ class PairScorer:
             number: largest number of matrices.
 
         """
-        blocks = torch.split(F_mat, max(1, BLOCK // self.residuals.shape[-1]))
+        size = max(1, BLOCK // self.residuals.shape[-1])
+        blocks = (F_mat[start : start + size] for start in range(0, len(F_mat), size))
         scores = torch.cat([self._gains(block).clamp_(min=0).sum(-1) for block in blocks]).nan_to_num_(nan=0.0)
         score, order = scores.topk(min(number, len(scores)))
         positive = int((score > 0).sum())
@@ -121,6 +125,13 @@ class PairScorer:
     def inliers(self, F_mat: Tensor) -> Tensor:
         """Tell the inliers (K, M) of matrices (K, 3, 3) among the correspondences that count."""
         return self._gains(F_mat) >= 0
+
+    def distances(self, F_mat: Tensor) -> Tensor:
+        """Return the distances of all correspondences from one matrix (3, 3), pixels, (N,); NaN on an epipole."""
+        line1, line2 = F_mat.mT[:2] @ self.x2, F_mat @ self.x1
+        normal1, normal2 = line1.square_().sum(0), line2[:2].square().sum(0)
+        distances: Tensor = (self.x2 * line2).sum(0).abs_() * factor_alone(self.factor, normal1, normal2)
+        return distances
 
     def _gains(self, F_mat: Tensor) -> Tensor:
         """What each correspondence would add to each score if it were not truncated, (K, M)."""
@@ -131,22 +142,3 @@ class PairScorer:
         ratio = ((F / self.threshold).flatten(1) @ self.residuals).mul_(factor_alone(self.factor, normal1, normal2))
         gains: Tensor = ratio.square_().neg_().add_(1)
         return gains
-
-
-def epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor, factor: Factor = sampson_factor) -> Tensor:
-    r"""Return the distance that a factor stands for, :math:`|x_2^\top F x_1|\, g`.
-
-    Args:
-        points1: pixels in the first image with shape :math:`(B, N, 2)`.
-        points2: pixels in the second image with shape :math:`(B, N, 2)`.
-        F_mat: matrices with shape :math:`(B, 3, 3)`, any scale but zero.
-        factor: :math:`g`, see :mod:`kornia_learnnorm.objectives`.
-
-    Returns:
-        distances in pixels with shape :math:`(B, N)`; NaN for a point on an epipole.
-
-    """
-    x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
-    line1, line2 = x2 @ F_mat, x1 @ F_mat.mT
-    normal1, normal2 = (line[..., :2].square().sum(-1) for line in (line1, line2))
-    return (x2 * line2).sum(-1).abs() * factor_alone(factor, normal1, normal2)

@@ -30,32 +30,33 @@ def begin(scene, number: int = 3):
     return scorer, scorer.from_pixels(find_fundamental(*(p[rows] for p in points)))
 
 
-def factors(F, x1, x2, factor):
-    lines1, lines2 = (F.T @ x2)[:2], (F @ x1)[:2]
-    normals = torch.from_numpy((lines1**2).sum(0)), torch.from_numpy((lines2**2).sum(0))
-    return factor(*normals)[0].numpy()
-
-
 def reference(x1, x2, F_mat, losses, factor) -> np.ndarray:
-    """The same steps, the constraints solved by their null space."""
-    x1, x2, fitted = x1.numpy(), x2.numpy(), []
-    xi = np.einsum("jn,kn->njk", x2, x1).reshape(-1, 9)
+    """The same steps one correspondence at a time, the constraints solved by their null space."""
+    x1, x2, fitted, flat = x1.numpy().T, x2.numpy().T, [], np.diag([1.0, 1, 0])
+    xi = np.stack([np.kron(b, a) for a, b in zip(x1, x2, strict=True)])
+    covariances1 = np.stack([np.kron(np.outer(b, b), flat) for b in x2])
+    covariances2 = np.stack([np.kron(flat, np.outer(a, a)) for a in x1])
     for F in F_mat.numpy():
         u = F.ravel() / np.linalg.norm(F)
-        for loss in losses:
+        for step, loss in enumerate(losses):
             F = u.reshape(3, 3)
-            g = factors(F, x1, x2, factor)
-            w = loss(torch.from_numpy((xi @ u * g) ** 2))[1].numpy() * g**2
-            gradient = np.linalg.det(F) * np.linalg.inv(F).T if np.linalg.matrix_rank(F, 1e-12) == 3 else None
-            if gradient is None:
-                U, s, Vh = np.linalg.svd(F)
-                gradient = s[0] * s[1] * np.outer(U[:, 2], Vh[2]) * np.linalg.det(U) * np.linalg.det(Vh)
-            C = np.stack([u, gradient.ravel()])
-            particular = np.linalg.pinv(C) @ [1, gradient.ravel() @ u - np.linalg.det(F)]
+            normals = [torch.from_numpy(np.einsum("j,njk,k->n", u, V, u)) for V in (covariances1, covariances2)]
+            g, slope1, slope2 = (values.numpy() for values in factor(*normals))
+            weights = loss(torch.from_numpy((xi @ u * g) ** 2))[1].numpy()
+            X = np.einsum("n,nj,nk->jk", weights * g**2, xi, xi)
+            if step:
+                for slope, V in ((slope1, covariances1), (slope2, covariances2)):
+                    X += np.einsum("n,njk->jk", 2 * weights * (xi @ u) ** 2 * g * slope, V)
+            U, s, Vh = np.linalg.svd(F)
+            minors = np.diag([s[1] * s[2], s[2] * s[0], s[0] * s[1]])
+            cofactors = np.linalg.det(U) * np.linalg.det(Vh) * (U @ minors @ Vh).ravel()
+            C = np.stack([u, cofactors])
+            length = 1.3 if step else 1
+            particular = np.linalg.pinv(C) @ [1, cofactors @ u - np.linalg.det(F) / length]
             null = np.linalg.svd(C)[2][2:].T
-            A = np.sqrt(w)[:, None] * xi
-            v = particular - null @ np.linalg.lstsq(A @ null, A @ particular, rcond=None)[0]
-            u = v / np.linalg.norm(v)
+            v = particular - null @ np.linalg.solve(null.T @ X @ null, null.T @ X @ particular)
+            u = u + length * (v - u)
+            u /= np.linalg.norm(u)
         fitted.append(u.reshape(3, 3))
     return np.stack(fitted)
 
@@ -65,32 +66,43 @@ class TestSteps:
     @pytest.mark.parametrize("losses", [[squared_loss], [Truncated(3.0), Truncated(1.0)], 3 * [Cauchy(0.5)]])
     def test_against_null_spaces_in_numpy(self, scene, factor, losses):
         scorer, F0 = begin(scene)
-        found = constrained_fit(scorer.x1, scorer.x2, F0, losses, factor)
+        found = constrained_fit(scorer.x1, scorer.x2, F0, losses, factor).F_mat
         expected = reference(scorer.x1, scorer.x2, F0, losses, factor)
         for f, e in zip(found, expected, strict=True):
             assert up_to_sign(f[None], e[None]) < 1e-6
 
-    def test_next_to_the_optimum(self, scene, factor):
-        """From there Levenberg-Marquardt hardly lowers the cost; the derivatives of the factor are all that is left."""
+    def test_ends_at_the_optimum(self, scene, factor):
+        """From there Levenberg-Marquardt does not lower the cost."""
         scorer, F0 = begin(scene, 8)
         loss = Truncated(2.0)
-        F_mat = scorer.to_pixels(constrained_fit(scorer.x1, scorer.x2, F0, 12 * [loss], factor))
-        refined = refine_fundamental(scene.points1, scene.points2, F_mat, None, factor, loss)
-        assert (refined.cost_before / refined.cost).median() < 1.002
+        fit = constrained_fit(scorer.x1, scorer.x2, F0, 40 * [loss], factor)
+        refined = refine_fundamental(
+            scene.points1, scene.points2, scorer.to_pixels(fit.F_mat), None, factor, loss, tolerance=1e-5
+        )
+        np.testing.assert_allclose(refined.cost_before, refined.cost, rtol=1e-6)
+        np.testing.assert_allclose(fit.cost, refined.cost, rtol=1e-6)
+        assert fit.gain.max() < 1e-10
+
+    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
+    def test_gain(self, name, factor):
+        """Close to the optimum of least squares a step is to take away what is there above it."""
+        scorer, F0 = begin(scenes(name, 1, 200, noise=0.5), 8)
+        near, optimum = (constrained_fit(scorer.x1, scorer.x2, F0, n * [squared_loss], factor) for n in (4, 30))
+        assert (near.gain / (near.cost / optimum.cost - 1)).median() == pytest.approx(1, rel=0.15)
 
     @given(order=st.permutations(range(200)))
     def test_the_order_of_the_points_does_not_count(self, factor, order):
         scorer, F0 = begin(scenes("handheld", 1, 200, noise=0.5))
         fitted = [
-            constrained_fit(x1, x2, F0, 3 * [Cauchy(1.0)], factor)
+            constrained_fit(x1, x2, F0, 3 * [Cauchy(1.0)], factor).F_mat
             for x1, x2 in ((scorer.x1, scorer.x2), (scorer.x1[:, order], scorer.x2[:, order]))
         ]
         assert torch.allclose(*fitted, rtol=1e-6)
 
     def test_swapping_the_views_transposes(self, scene, factor):
         scorer, F0 = begin(scene)
-        forth = constrained_fit(scorer.x1, scorer.x2, F0, 3 * [Cauchy(1.0)], factor)
-        back = constrained_fit(scorer.x2, scorer.x1, F0.mT, 3 * [Cauchy(1.0)], factor)
+        forth = constrained_fit(scorer.x1, scorer.x2, F0, 3 * [Cauchy(1.0)], factor).F_mat
+        back = constrained_fit(scorer.x2, scorer.x1, F0.mT, 3 * [Cauchy(1.0)], factor).F_mat
         assert torch.allclose(forth, back.mT, rtol=1e-6)
 
 
@@ -100,13 +112,13 @@ class TestResults:
         scorer, F0 = begin(scene)
         fitted = constrained_fit(
             scorer.x1, scorer.x2, F0 + 1e-3 * uniform(3, 3, 3) * F0.abs().max(), 6 * [squared_loss]
-        )
+        ).F_mat
         for F in scorer.to_pixels(fitted):
             assert epipolar_distances(scene.points1, scene.points2, F[None]).max() < 1e-6
 
     def test_singular_and_of_unit_norm(self, scene):
         scorer, F0 = begin(scene)
-        F = constrained_fit(scorer.x1, scorer.x2, -3 * F0, 4 * [Truncated(1.5)])
+        F = constrained_fit(scorer.x1, scorer.x2, -3 * F0, 10 * [Truncated(1.5)]).F_mat
         values = torch.linalg.svdvals(F)
         assert torch.allclose(values.norm(dim=-1), torch.ones(3, dtype=F.dtype))
         assert (values[:, 2] < 1e-5 * values[:, 1]).all()
@@ -115,14 +127,19 @@ class TestResults:
         scorer, F0 = begin(scene, 1)
         near = scorer.inliers(F0)[0]
         fitted = constrained_fit(scorer.x1, scorer.x2, F0, [Truncated(1.0)])
-        assert torch.allclose(fitted, constrained_fit(scorer.x1[:, near], scorer.x2[:, near], F0, [squared_loss]))
+        alone = constrained_fit(scorer.x1[:, near], scorer.x2[:, near], F0, [squared_loss])
+        assert torch.allclose(fitted.F_mat, alone.F_mat)
+        assert torch.allclose(fitted.cost, alone.cost + (~near).sum())
 
     def test_what_cannot_be_fitted_stays(self):
         """Without inliers a step has no equations, and another matrix in the batch must not notice."""
         scorer, F0 = begin(scenes("handheld", 1, 200, noise=0.5))
         hopeless = torch.tensor([[[0.0, 0, 0], [0, 0, -1], [0, 1, 1e4]]], dtype=F0.dtype)
-        fitted = constrained_fit(scorer.x1, scorer.x2, torch.cat([F0, hopeless]), 2 * [Truncated(1.0)])
-        assert torch.allclose(fitted[3], hopeless[0] / hopeless.norm())
-        assert torch.allclose(fitted[:3], constrained_fit(scorer.x1, scorer.x2, F0, 2 * [Truncated(1.0)]))
+        fit = constrained_fit(scorer.x1, scorer.x2, torch.cat([F0, hopeless]), 2 * [Truncated(1.0)])
+        others = constrained_fit(scorer.x1, scorer.x2, F0, 2 * [Truncated(1.0)])
+        assert torch.allclose(fit.F_mat[3], hopeless[0] / hopeless.norm())
+        assert torch.allclose(fit.F_mat[:3], others.F_mat)
+        assert torch.allclose(fit.cost[:3], others.cost)
+        assert fit.cost[3] == torch.inf
         zero = constrained_fit(scorer.x1, scorer.x2, torch.zeros_like(F0), [squared_loss])
-        assert not bool(zero.isfinite().any())
+        assert not bool(zero.F_mat.isfinite().any())

@@ -39,7 +39,6 @@ def reference(x1, x2) -> np.ndarray:
         variances = (lines1**2).sum(1) + (lines2**2).sum(1)
         V = np.linalg.pinv(xi.T / variances @ xi, rcond=1e-12)
         for _ in range(3):
-            V = (np.eye(9) - np.outer(u, u)) @ V @ (np.eye(9) - np.outer(u, u))
             F = u.reshape(3, 3)
             cofactors = np.stack([np.cross(F[1], F[2]), np.cross(F[2], F[0]), np.cross(F[0], F[1])]).ravel()
             u = u - np.linalg.det(F) / (cofactors @ V @ cofactors) * V @ cofactors

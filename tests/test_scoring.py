@@ -11,7 +11,7 @@ from two_view import correspondences, epipolar_distances, scenes
 
 from kornia_learnnorm import find_fundamental, sampson_distance
 from kornia_learnnorm.objectives import sampson_factor, symmetric_factor
-from kornia_learnnorm.scoring import PairScorer, epipolar_distance
+from kornia_learnnorm.scoring import PairScorer
 
 
 @pytest.fixture
@@ -71,6 +71,11 @@ class TestBest:
         F = torch.stack([torch.zeros(3, 3), torch.full((3, 3), torch.nan), torch.full((3, 3), torch.inf)]).double()
         assert len(PairScorer(*pair, 1.0, factor).best(F, 3).F_mat) == 0
 
-    def test_distance(self, pair, matrices, factor):
-        got = epipolar_distance(pair[0][None], pair[1][None], matrices, factor)
+    def test_distances(self, pair, matrices, factor):
+        scorer = PairScorer(*pair, 1.5, factor, torch.arange(10))
+        got = np.stack([scorer.distances(F) for F in scorer.from_pixels(matrices)])
         assert np.allclose(got, distances(*pair, matrices, factor), rtol=1e-6)
+
+    def test_pixels(self, pair, factor):
+        for back, points in zip(PairScorer(*pair, 1.5, factor).pixels, pair, strict=True):
+            assert torch.allclose(back, points)
