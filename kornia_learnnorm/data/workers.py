@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 import time
@@ -90,12 +91,16 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
         return
     try:
         from distributed import Client, KilledWorker
+        from distributed.comm.addressing import get_address_host_port
     except ImportError as error:
         raise ImportError("a Dask scheduler needs Dask: pip install 'kornia-learnnorm[dask]'") from error
     try:
-        client = Client(dask)  # type: ignore[no-untyped-call]
+        get_address_host_port(dask)
     except ValueError as error:
         raise ValueError(f"a Dask scheduler has an address as tcp://host:8786, got {dask!r}: {error}") from error
+    # The finaliser of a client that could not connect takes a lock that the next one holds while it starts.
+    gc.collect()
+    client = Client(dask)  # type: ignore[no-untyped-call]
     try:
         with client, joblib.parallel_config("dask", client=client):
             yield Workers(n_jobs=-1)
