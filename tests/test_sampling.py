@@ -34,6 +34,24 @@ class TestDrawDistinct:
         assert sum(counts) == 20_000
         assert max(abs(count - expected) for count in counts) < 5 * expected**0.5
 
+
+class TestUniform:
+    @given(total=st.integers(8, 200), count=st.integers(1, 100), seed=st.integers(0, 2**32))
+    def test_distinct_and_in_range(self, total, count, seed):
+        drawn = UniformSampler(total, CPU).draw(count, torch.Generator().manual_seed(seed))
+        assert drawn.shape == (count, 8)
+        assert 0 <= drawn.min() <= drawn.max() < total
+        assert (drawn.sort(-1).values.diff(dim=-1) > 0).all()
+
+    @pytest.mark.parametrize("total", [10, 60])
+    def test_every_pair_is_as_likely(self, total, generator):
+        """Whether most rows come from draws one by one or from Floyd's algorithm."""
+        drawn = UniformSampler(total, CPU).draw(40_000, generator)
+        together = torch.zeros(40_000, total).scatter_(1, drawn, 1.0)
+        counts = (together.mT @ together)[*torch.triu_indices(total, total, 1)]
+        expected = 40_000 * 28 / comb(total, 2)
+        assert (counts - expected).abs().max() < 5 * expected**0.5
+
     def test_all_of_few(self, generator):
         drawn = UniformSampler(8, CPU).draw(10, generator)
         assert (drawn.sort(-1).values == torch.arange(8)).all()
