@@ -53,7 +53,7 @@ class TestEstimators:
         (found,) = run_estimator(estimator, drawn, 0, [1.0])
         assert found.F_mat.shape == (3, 3)
         assert found.F_mat.dtype == torch.float64
-        assert found.seconds > 0
+        assert found.seconds > 0 or name == "ground-truth"
         figures = measure(drawn, found.F_mat, 1.0)
         assert figures["error"] < 1.5
         assert figures["f1"] > 0.5

@@ -107,8 +107,9 @@ def _agreement(cell: RobustCell) -> Table:
         "against the ground truth's inliers at the threshold. Error: mean distance of the ground truth's inliers at 1 "
         f"px, at most {MOST_ERROR:g} px, which is that of a failure. Pairs without ground-truth inliers are left out: "
         f"{dropped}. `count:` is the best of 1,000 minimal samples, the same for all, without refinement; `time:` the "
-        "best of those of 50 ms, which depends on the machine; `RANSAC` is the package's own with its defaults; all "
-        "others are other packages' with their defaults."
+        "best of those of 50 ms, which depends on the machine; `RANSAC` is the package's own with its defaults; "
+        "`ground-truth` is what the others are measured with: where its inliers are few, F1 says little. All others "
+        "are other packages' with their defaults."
     )
     return Table(f"Robust estimation: {cell.title}{NUMBER[cell.protocol]}", text, header, rows)
 

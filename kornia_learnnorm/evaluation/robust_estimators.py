@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 from kornia.geometry.epipolar.fundamental import run_7point
 
 from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.robust_budgets import Estimator, Solver, best_of, peer_estimator, ransac
+from kornia_learnnorm.evaluation.robust_budgets import Estimate, Estimator, Solver, best_of, peer_estimator, ransac
+from kornia_learnnorm.evaluation.robust_matches import Matches
 from kornia_learnnorm.evaluation.robust_peers import PEERS, find_peer, peer_version
 from kornia_learnnorm.sampling import SAMPLE_SIZE
 
@@ -24,6 +26,7 @@ __all__ = [
 ]
 
 SEVEN_POINT = "seven-point"
+TRUTH = "ground-truth"
 COUNT = 1000  # samples of a run of equal hypotheses
 SECONDS = 0.05  # of a run of equal time
 MOST = 20_000  # samples of RANSAC with a normaliser, which can be a network
@@ -37,6 +40,7 @@ DEFAULT_ESTIMATORS = (
     *(f"time:{name}" for name in _SOLVERS),
     DEFAULTS,
     f"{DEFAULTS}:crossview",
+    TRUTH,
 )
 
 
@@ -64,7 +68,7 @@ def find_estimator(name: str) -> Estimator:
         name: one of those in :mod:`~kornia_learnnorm.evaluation.robust_peers`; ``count:SOLVER``, the best of 1,000
             minimal samples, the same for all solvers; ``time:METHOD``, the best of those of 50 ms; ``RANSAC``,
             :class:`~kornia_learnnorm.RANSAC` with its defaults; ``RANSAC:METHOD``, with another normaliser and at most
-            20,000 samples.
+            20,000 samples; ``ground-truth``, the true matrix, which says how far the others' figures can be trusted.
 
     Raises:
         ValueError: if there is no such estimator.
@@ -74,6 +78,8 @@ def find_estimator(name: str) -> Estimator:
     """
     if name in PEERS:
         return peer_estimator(find_peer(name))
+    if name == TRUTH:
+        return _truth
     kind, _, method = name.partition(":")
     if kind == "count" and method:
         return best_of(COUNT, find_solver(method))
@@ -84,13 +90,14 @@ def find_estimator(name: str) -> Estimator:
     if kind == "time" and method:
         return _ransac(method, {"max_iter": 10**7, "max_seconds": SECONDS, "confidence": 1, "refine": False})
     raise ValueError(
-        f"no estimator {name!r}: expected {', '.join(PEERS)}, count:SOLVER, time:METHOD, RANSAC or RANSAC:METHOD"
+        f"no estimator {name!r}: expected {', '.join(PEERS)}, count:SOLVER, time:METHOD, RANSAC, RANSAC:METHOD or "
+        f"{TRUTH}"
     )
 
 
 def is_slow(name: str) -> bool:
     """Return whether an estimator can take a second and more where inliers are few."""
-    return not name.startswith(("opencv", *KINDS[:2]))
+    return not name.startswith(("opencv", TRUTH, *KINDS[:2]))
 
 
 def is_timed(name: str) -> bool:
@@ -103,7 +110,7 @@ def identify_estimator(name: str) -> str:
     if name in PEERS:
         return peer_version(name)
     kind, colon, method = _split(name)
-    return name if method in (DEFAULTS, SEVEN_POINT) else f"{kind}{colon}{identify_method(method)}"
+    return name if method in (DEFAULTS, SEVEN_POINT, TRUTH) else f"{kind}{colon}{identify_method(method)}"
 
 
 def estimator_names(names: Sequence[str]) -> dict[str, str]:
@@ -128,6 +135,10 @@ def estimator_names(names: Sequence[str]) -> dict[str, str]:
 def _split(name: str) -> tuple[str, str, str]:
     """Return kind, colon and method; a method may have a colon of its own."""
     return name.partition(":") if name.startswith(KINDS) else ("", "", name)
+
+
+def _truth(matches: Matches, _: int, thresholds: Sequence[float]) -> list[Estimate]:
+    return [Estimate(matches.F_mat, 0.0, math.nan) for _ in thresholds]
 
 
 def _ransac(name: str, options: dict[str, Any]) -> Estimator:
