@@ -116,7 +116,7 @@ class PairScorer:
 
         """
         size = max(1, BLOCK // self.residuals.shape[-1])
-        blocks = (F_mat[start : start + size] for start in range(0, len(F_mat), size))
+        blocks = (F_mat[start : start + size] for start in range(0, max(1, len(F_mat)), size))
         scores = torch.cat([self._gains(block).clamp_(min=0).sum(-1) for block in blocks]).nan_to_num_(nan=0.0)
         score, order = scores.topk(min(number, len(scores)))
         positive = int((score > 0).sum())

@@ -57,6 +57,7 @@ class TestBest:
         scorer = PairScorer(*pair, 1.5, factor)
         matrices = scorer.from_pixels(matrices)
         assert len(scorer.best(matrices[:3], 8).F_mat) <= 3
+        assert scorer.best(matrices[:0], 8).F_mat.shape == (0, 3, 3)
         best, joined = scorer.best(matrices, 8), scorer.best(matrices[100:], 8).join(scorer.best(matrices[:100], 8), 8)
         assert torch.equal(best.score, joined.score)
 
