@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from numbers import Integral, Real
 from typing import Literal
 
@@ -26,11 +27,11 @@ from kornia_learnnorm.threads import one_thread
 
 __all__ = ["RANSAC"]
 
-BATCHES = (32, 1024)  # samples in the first batch, and in the largest
+BATCHES = (64, 1024)  # samples in the first batch, and in the largest
 SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on
 POOL = 8  # hypotheses of a batch that are optimised,
 SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the threshold in each step: a noisy sample sees few of its inliers
-FINAL_POOL = 3  # the same in the end,
+FINAL_POOL = 4  # the same in the end,
 FINAL_SCALE = 2.0  # of the threshold in the first step
 LOSS_SCALE = 0.7  # and of that of the final loss in all others:
 REWEIGHTINGS = 4  # so many of least squares,
@@ -60,7 +61,7 @@ class RANSAC(nn.Module):
             samples than any normalisation, and a fraction of the time.
         inl_th: largest distance of an inlier, pixels.
         max_iter: largest number of minimal samples.
-        max_seconds: time after which no further batch of samples, 32 at first and up to 1,024, is drawn; with it the
+        max_seconds: time after which no further batch of samples, 64 at first and up to 1,024, is drawn; with it the
             result depends on the machine.
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
             best matrix so far has found all inliers; 1 draws all ``max_iter`` samples.
@@ -133,7 +134,6 @@ class RANSAC(nn.Module):
         self.inl_th, self.max_iter, self.max_seconds, self.confidence = inl_th, max_iter, max_seconds, confidence
         self.factor, self.refine, self.sampler, self.seed = factor, refine, sampler, None if seed is None else int(seed)
 
-    @torch.no_grad()
     def forward(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         r"""Estimate the fundamental matrix of one image pair.
 
@@ -158,12 +158,12 @@ class RANSAC(nn.Module):
 
         """
         _check(kp1, kp2, weights)
-        with one_thread(), torch.autocast(kp1.device.type, enabled=False):
-            if self.normalizer is not None:
-                return self._estimate(kp1, kp2, weights)
-            # Faster still. What a normaliser keeps of it would be of no use in training.
-            with torch.inference_mode():
-                F_mat, inliers = self._estimate(kp1, kp2, weights)
+        device = kp1.device.type
+        precision = torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+        # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
+        no_gradient = torch.inference_mode() if self.normalizer is None else torch.no_grad()
+        with one_thread(), precision, no_gradient:
+            F_mat, inliers = self._estimate(kp1, kp2, weights)
         return F_mat.clone(), inliers.clone()
 
     def _estimate(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:

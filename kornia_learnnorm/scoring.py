@@ -15,7 +15,7 @@ __all__ = ["Hypotheses", "PairScorer"]
 
 FARTHEST = 1e6
 MEDIAN_OF = 256  # correspondences, at least
-BLOCK = 1 << 15  # distances of a block, which stay in a core's cache
+BLOCK = 1 << 16  # distances of a block, which stay in a core's cache
 
 
 class Hypotheses(NamedTuple):
