@@ -2,7 +2,8 @@ r"""Reweighted least squares under the singularity constraint: a fast way to a r
 
 Each step holds the weights, which turn squared algebraic residuals into losses of distances, and solves one linear
 system for the matrix at which the sum of losses is stationary on the linearised constraint. It is a fraction of a step
-of Levenberg-Marquardt, and ends at the same optimum.
+of Levenberg-Marquardt, and with a robust loss ends at an optimum too. Nothing holds it there: of least squares with
+outliers, it may not converge.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from kornia_learnnorm.objectives import Factor, Loss, sampson_factor
 
 __all__ = ["Fit", "constrained_fit"]
 
+NEAREST = 1e-4  # of the points' size
 LENGTH = 1.3  # of a step: bounded losses make those of least squares too short
 
 
@@ -65,8 +67,11 @@ def constrained_fit(
         factor: :math:`g`, see :mod:`kornia_learnnorm.objectives`.
 
     Returns:
-        the matrices with their costs. Where a step cannot be computed, as with fewer than seven inliers, the matrix
-        that was given and an infinite cost.
+        the matrices with their costs. Where a step cannot be computed, as without inliers, the matrix that was given
+        and an infinite cost. Fewer than seven inliers fit one of many matrices.
+
+    Raises:
+        ValueError: if there is no loss.
 
     Reference:
         W. Chojnacki, M. Brooks, A. van den Hengel, D. Gawley, On the fitting of surfaces to data with covariances,
@@ -74,10 +79,14 @@ def constrained_fit(
         Computer Vision and Applications 2, 2010, for schemes with the constraint.
 
     """
+    losses = [*losses]
+    if not losses:
+        raise ValueError("constrained_fit needs a loss for each step, got none")
     given = F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)
     F, xi = given, (x2[:, None] * x1).flatten(0, 1)
     products, products1, products2 = ((x[:, None] * x).flatten(0, 1).mT for x in (xi, x1, x2))
-    floor = torch.finfo(F.dtype).eps ** 2  # below it the direction of a line is rounding
+    # A point this close to the epipole has a line of no certain direction, and must not outweigh all others.
+    floor1, floor2 = (NEAREST**2 * x.square().mean() for x in (x2, x1))
     system, right = F.new_zeros(len(F), 11, 11), F.new_zeros(len(F), 11)
     X, constraints, multipliers = system[:, :9, :9], system[:, 9:, :9], system[:, :9, 9:]
     entries = torch.unflatten(torch.unflatten(X, 2, (3, 3)), 1, (3, 3))
@@ -87,7 +96,7 @@ def constrained_fit(
         length = LENGTH if step else 1.0
         u, cofactors = F.flatten(1), torch.linalg.cross(F.roll(-1, 1), F.roll(-2, 1)).flatten(1)
         normal1, normal2 = (F.mT[:, :2] @ x2).square_().sum(1), (F[:, :2] @ x1).square_().sum(1)
-        g, slope1, slope2 = factor(normal1.clamp_(min=floor), normal2.clamp_(min=floor))
+        g, slope1, slope2 = factor(normal1.clamp_(min=floor1), normal2.clamp_(min=floor2))
         algebraic, g_squared = (u @ xi).square_(), g.square()
         values, weights = loss(algebraic * g_squared)
         X.copy_(torch.unflatten((weights * g_squared) @ products, 1, (9, 9)))

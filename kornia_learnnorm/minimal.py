@@ -19,7 +19,7 @@ def are_determined(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     r"""Tell the minimal samples that determine a matrix from those that do not, as on one line or plane.
 
     The eight constraints must be independent: each row of the design matrix is farther from the span of the rows before
-    it than a shift of the point could bring it.
+    it than the least that a shift of the point moves it.
 
     Args:
         x1: homogeneous points of view 1 with shape :math:`(K, 8, 3)`, pixels and a third coordinate as large.
@@ -77,5 +77,5 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
 
 def _independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     distance = R.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
-    determined: Tensor = distance > shift * torch.minimum(x1[0, 0, 2], x2[0, 0, 2])
+    determined: Tensor = distance > shift * torch.minimum(x1[..., 2], x2[..., 2]).amin(-1)
     return determined

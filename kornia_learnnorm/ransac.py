@@ -21,7 +21,7 @@ from kornia_learnnorm.objectives import Factor, GemanMcClure, Loss, Truncated, s
 from kornia_learnnorm.rank2_manifold import Rank2, decompose
 from kornia_learnnorm.refine import minimize
 from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
-from kornia_learnnorm.scoring import Hypotheses, PairScorer
+from kornia_learnnorm.scoring import FARTHEST, Hypotheses, PairScorer, in_proportion
 from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
 from kornia_learnnorm.threads import one_thread
 
@@ -109,10 +109,10 @@ class RANSAC(nn.Module):
     ) -> None:
         super().__init__()
         for name, value in {"inl_th": inl_th, "confidence": confidence, "max_seconds": max_seconds}.items():
-            if not isinstance(value, Real) and (value is not None or name != "max_seconds"):
+            if not _is_number(value) and (value is not None or name != "max_seconds"):
                 raise TypeError(f"{name} must be a number, got {value!r}")
-        if not (math.isfinite(inl_th) and inl_th > 0):
-            raise ValueError(f"inl_th must be a positive number of pixels, got {inl_th}")
+        if not 1e-12 <= inl_th <= 1e12:
+            raise ValueError(f"inl_th must be a positive number of pixels, from 1e-12 to 1e12, got {inl_th}")
         if not _is_whole(max_iter) or max_iter < 1:
             raise ValueError(f"max_iter must be a whole number of samples, at least 1, got {max_iter}")
         if max_seconds is not None and not max_seconds > 0:
@@ -139,16 +139,17 @@ class RANSAC(nn.Module):
 
         Args:
             kp1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, float32 or float64. Rows that are
-                not finite are no inliers.
+                not finite, or a million times as far from the others as these from each other, are no inliers.
             kp2: pixels in the second image with shape :math:`(N, 2)`.
             weights: optional non-negative scores :math:`(N,)`, higher is better, such as one minus Lowe's ratio. They
                 steer sampling only; zero is never sampled.
 
         Returns:
             the matrix :math:`(3, 3)` of unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, and the inliers :math:`(N,)`,
-            boolean. Zeros and no inliers where no matrix of rank 2 has more than eight of them, and where fewer than
-            eight weights are positive. Where no sample determines a matrix, as of a plane without noise or a camera
-            that does not move, it is one of those that fit.
+            boolean, which are those of the matrix before it is rounded to float32. Neither has a gradient. Zeros and no
+            inliers where no matrix of rank 2 was found that has more than eight of them, and where fewer than eight
+            weights are positive. Where no sample determines a matrix, as of a plane without noise or a camera that does
+            not move, it is one of those that fit.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or the weights not floating-point.
@@ -167,14 +168,13 @@ class RANSAC(nn.Module):
         return F_mat.clone(), inliers.clone()
 
     def _estimate(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        if math.isfinite(kp1.sum() + kp2.sum()):
-            return self._estimate_finite(kp1, kp2, weights)
-        finite = (kp1.isfinite() & kp2.isfinite()).all(-1)
-        kept = None if weights is None else weights[finite]
-        F_mat, inliers = self._estimate_finite(kp1[finite], kp2[finite], kept)
-        return F_mat, torch.zeros_like(finite).masked_scatter(finite, inliers)
+        if torch.maximum(kp1.abs().max(), kp2.abs().max()) <= FARTHEST * self.inl_th:  # and no NaN
+            return self._estimate_kept(kp1, kp2, weights)
+        kept = in_proportion(kp1, kp2, self.inl_th)
+        F_mat, inliers = self._estimate_kept(kp1[kept], kp2[kept], None if weights is None else weights[kept])
+        return F_mat, torch.zeros_like(kept).masked_scatter(kept, inliers)
 
-    def _estimate_finite(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _estimate_kept(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         if (len(kp1) if weights is None else int((weights > 0).sum())) < SAMPLE_SIZE:
             return _failure(kp1)
         x1, x2 = (kp.to(solve_dtype(kp.device)) for kp in (kp1, kp2))
@@ -191,10 +191,11 @@ class RANSAC(nn.Module):
         state = self._polish(scorer, pool) if self.refine else decompose(pool.F_mat[:1])
         if state.A.det().abs() < 1e-9:
             return _failure(kp1)
-        F = scorer.to_pixels(state.matrix())
-        F_mat = (F / torch.linalg.vector_norm(F)).to(kp1.dtype)
-        inliers = scorer.distances(scorer.from_pixels(F_mat.to(x1))[0]) <= self.inl_th
-        return (F_mat[0], inliers) if int(inliers.sum()) > SAMPLE_SIZE else _failure(kp1)
+        F = state.matrix()
+        inliers = scorer.distances(F[0]) <= self.inl_th
+        F_mat = scorer.to_pixels(F)[0]
+        F_mat = (F_mat / torch.linalg.vector_norm(F_mat)).to(kp1.dtype)
+        return (F_mat, inliers) if int(inliers.sum()) > SAMPLE_SIZE else _failure(kp1)
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> Hypotheses:
         """Return the best hypotheses that enough minimal samples give, best first."""
@@ -244,11 +245,16 @@ class RANSAC(nn.Module):
         losses: list[Loss] = [Truncated(FINAL_SCALE * self.inl_th), *REWEIGHTINGS * [loss]]
         fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL], losses, self.factor)
         best = fit.cost.argmin()
-        state = decompose(fit.F_mat[best][None])
-        if fit.gain[best] <= TOLERANCE:
-            return state
-        cost = EpipolarCost(scorer.x1[None], scorer.x2[None], torch.ones_like(scorer.x1[:1]), self.factor, loss)
-        return minimize(cost, state, STEPS, COSINE)[1].state
+        state, cost = decompose(fit.F_mat[best][None]), fit.cost[best]
+        if not fit.gain[best] <= TOLERANCE:
+            ones = torch.ones_like(scorer.x1[:1])
+            objective = EpipolarCost(scorer.x1[None], scorer.x2[None], ones, self.factor, loss)
+            optimum = minimize(objective, state, STEPS, COSINE)[1]
+            state, cost = optimum.state, optimum.cost[0]
+        # The loss is nowhere above that of MSAC, so that the pool's best has no more of it than this but for a margin.
+        share = 1 - pool.score[0] / scorer.residuals.shape[-1]
+        most = self.inl_th**2 * (1.1 * share * scorer.x1.shape[-1] + SAMPLE_SIZE)
+        return state if cost <= most else decompose(pool.F_mat[:1])
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
@@ -262,6 +268,10 @@ class RANSAC(nn.Module):
 
 def _failure(kp: Tensor) -> tuple[Tensor, Tensor]:
     return kp.new_zeros(3, 3), torch.zeros(len(kp), dtype=torch.bool, device=kp.device)
+
+
+def _is_number(value: object) -> bool:
+    return not isinstance(value, bool) and isinstance(value, Real)
 
 
 def _is_whole(value: object) -> bool:

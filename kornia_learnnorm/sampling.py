@@ -11,6 +11,7 @@ __all__ = ["ProsacSampler", "Sampler", "UniformSampler", "WeightedSampler", "dra
 
 SAMPLE_SIZE = 8
 BLOCK = 1 << 22  # random numbers in memory at once
+SMALLEST = 1e-30  # a weight, of the largest
 
 
 class Sampler(Protocol):
@@ -131,7 +132,11 @@ class ProsacSampler:
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the largest share of inliers among the best correspondences to the power of eight."""
-        ranked = inliers[self.weights[rows].argsort(descending=True, stable=True)].cpu().double()
+        weights = self.weights[rows]
+        order = weights.argsort(descending=True, stable=True)[: int((weights > 0).sum())]
+        if len(order) == 0:
+            return 0.0
+        ranked = inliers[order].cpu().double()
         shares = ranked.cumsum(-1) / torch.arange(1, len(ranked) + 1)
         return float(shares[int(self.LEAST * len(shares)) :].max() ** SAMPLE_SIZE)
 
@@ -148,7 +153,8 @@ class WeightedSampler:
     """
 
     def __init__(self, weights: Tensor) -> None:
-        self.weights = weights.float() / weights.max().float()
+        share = weights.double() / weights.max().double()
+        self.weights = torch.where(share > 0, share.clamp(min=SMALLEST), 0.0).float()
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return the indices of the next samples."""
@@ -159,7 +165,7 @@ class WeightedSampler:
         uniform = torch.rand(
             count, len(self.weights), generator=generator, device=self.weights.device, dtype=torch.float32
         )
-        return (uniform.log() / self.weights).topk(SAMPLE_SIZE).indices
+        return (uniform.clamp_(min=SMALLEST).log() / self.weights).topk(SAMPLE_SIZE).indices
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the share of the weights that inliers have to the power of eight."""

@@ -11,10 +11,9 @@ from torch import Tensor
 from kornia_learnnorm.objectives import Factor, factor_alone, sampson_factor
 from kornia_learnnorm.transforms import transform_fundamental
 
-__all__ = ["Hypotheses", "PairScorer"]
+__all__ = ["FARTHEST", "Hypotheses", "PairScorer", "in_proportion"]
 
-FARTHEST = 1e6
-MEDIAN_OF = 256  # correspondences, at least
+FARTHEST = 1e6  # times the median distance from the median point, or the threshold
 BLOCK = 1 << 16  # distances of a block, which stay in a core's cache
 
 
@@ -46,11 +45,11 @@ class PairScorer:
     all matrices, in float32.
 
     All matrices are in coordinates of which the first two are pixels from the points' median, and the third is the
-    median of their absolute values. They are conditioned like Hartley's, whatever the outliers, and distances in them
-    are those in pixels.
+    median of their absolute values, or the threshold where that is larger. They are conditioned like Hartley's,
+    whatever the outliers, and distances in them are those in pixels.
 
     Args:
-        points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`.
+        points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, :func:`in_proportion`.
         points2: pixels in the second image with shape :math:`(N, 2)`.
         threshold: largest distance :math:`\tau` of an inlier, pixels.
         factor: which distance: :func:`~kornia_learnnorm.objectives.sampson_factor` or
@@ -58,8 +57,7 @@ class PairScorer:
         rows: the correspondences that count in scores; all by default.
 
     Attributes:
-        x1: all correspondences in the coordinates of view 1, those out of all proportion brought back to a million
-            times the median, (3, N).
+        x1: all correspondences in the coordinates of view 1, (3, N).
         x2: the same of view 2.
         T1: from pixels of view 1 to its coordinates, (3, 3).
         T2: the same of view 2.
@@ -76,12 +74,9 @@ class PairScorer:
     ) -> None:
         self.threshold, self.factor, self.rows = threshold, factor, rows
         both = torch.stack([points1.mT, points2.mT])
-        some = both[..., :: max(1, len(points1) // MEDIAN_OF)]
-        origin = some.median(-1, keepdim=True).values
-        spread = (some - origin).abs().flatten(1).median(-1).values
-        spread = torch.where(spread > 0, spread, 1.0)[:, None, None]
-        # A point may be wrong by any number, whose powers must not overflow.
-        centred = (both - origin).clamp(-FARTHEST * spread, FARTHEST * spread)
+        origin = both.median(-1, keepdim=True).values
+        centred = both - origin
+        spread = centred.abs().flatten(1).median(-1).values.clamp_(min=threshold)[:, None, None]
         self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[:, :1])], 1)
         T = torch.eye(3, dtype=both.dtype, device=both.device).expand(2, 3, 3).clone()
         T[:, :2, 2:], T[:, 2:, 2:] = -origin, spread
@@ -92,7 +87,7 @@ class PairScorer:
 
     @cached_property
     def pixels(self) -> tuple[Tensor, Tensor]:
-        """All correspondences in pixels, those out of all proportion as in ``x1`` and ``x2``, (N, 2) each."""
+        """All correspondences in pixels, (N, 2) each."""
         return (self.x1[:2] - self.T1[:2, 2:]).mT, (self.x2[:2] - self.T2[:2, 2:]).mT
 
     def samples(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -142,3 +137,24 @@ class PairScorer:
         ratio = ((F / self.threshold).flatten(1) @ self.residuals).mul_(factor_alone(self.factor, normal1, normal2))
         gains: Tensor = ratio.square_().neg_().add_(1)
         return gains
+
+
+def in_proportion(points1: Tensor, points2: Tensor, threshold: float) -> Tensor:
+    r"""Tell the correspondences that are finite and not so far from all others that powers of them would overflow.
+
+    Args:
+        points1: pixels in the first image with shape :math:`(N, 2)`.
+        points2: pixels in the second image with shape :math:`(N, 2)`.
+        threshold: largest distance of an inlier, pixels.
+
+    Returns:
+        booleans with shape :math:`(N,)`.
+
+    """
+    kept = (points1.isfinite() & points2.isfinite()).all(-1)
+    if not bool(kept.any()):
+        return kept
+    for points in (points1.double(), points2.double()):
+        offset = (points - points[kept].median(0).values).abs()
+        kept = kept & (offset <= FARTHEST * offset[kept].median().clamp(min=threshold)).all(-1)
+    return kept

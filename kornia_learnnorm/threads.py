@@ -23,7 +23,8 @@ def one_thread() -> Iterator[None]:
 
     To wake others costs more than they save where matrices are small, and on a busy machine many times what the work
     itself does. The number of threads belongs to the process: others that run meanwhile are held too, and the number
-    that the first one found returns with each that leaves.
+    that the first one found returns with each that leaves. A thread that uses PyTorch for the first time meanwhile
+    keeps to one, until it sets the number itself.
 
     Example:
         >>> before = torch.get_num_threads()

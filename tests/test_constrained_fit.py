@@ -143,3 +143,8 @@ class TestResults:
         assert fit.cost[3] == torch.inf
         zero = constrained_fit(scorer.x1, scorer.x2, torch.zeros_like(F0), [squared_loss])
         assert not bool(zero.F_mat.isfinite().any())
+
+    def test_no_loss(self):
+        scorer, F0 = begin(scenes("handheld", 1, 200, noise=0.5))
+        with pytest.raises(ValueError, match="needs a loss for each step, got none"):
+            constrained_fit(scorer.x1, scorer.x2, F0, [])

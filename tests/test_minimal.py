@@ -86,6 +86,11 @@ class TestSolve:
         assert torch.allclose(solve_samples(x1, x2, 0.01), solve_samples(x1[others], x2[others], 0.01))
         assert solve_samples(x1[2:3], x2[2:3], 0.01).shape == (0, 3, 3)
 
+    def test_no_samples(self):
+        none = uniform(0, 8, 3)
+        assert solve_samples(none, none, 0.01).shape == (0, 3, 3)
+        assert are_determined(none, none, 0.01).shape == (0,)
+
     @given(order=st.permutations(range(8)))
     def test_the_order_of_the_points_does_not_count(self, order):
         points1, points2 = correspondences("orbit", 5)

@@ -19,7 +19,7 @@ from two_view import epipolar_distances, scenes, shaken, uniform, up_to_sign
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.objectives import symmetric_factor
+from kornia_learnnorm.objectives import sampson_factor, symmetric_factor
 from kornia_learnnorm.pair_metrics import f1_score
 from kornia_learnnorm.sampling import WeightedSampler
 
@@ -71,6 +71,7 @@ class TestExceptions:
         [
             ({"inl_th": 0.0}, "inl_th .* got 0.0"),
             ({"inl_th": float("nan")}, "inl_th"),
+            ({"inl_th": 1e300}, "inl_th .* to 1e12, got 1e[+]300"),
             ({"max_iter": 0}, "max_iter must be .* at least 1, got 0"),
             ({"max_iter": 1.5}, "whole number of samples"),
             ({"rank2": "foo"}, "rank2 must be None or 'optimal', got 'foo'"),
@@ -293,6 +294,61 @@ class TestHardInput:
         assert F_mat.isfinite().all()
         assert inliers[true].float().mean() > 0.85
         assert not inliers[:4].any()
+
+    def test_many_points_that_are_far_away(self):
+        """Each anywhere, so that no two are alike."""
+        points1, points2, _, true = pair(num_points=600, outliers=0.0)
+        points1[::3] = uniform(200, 2, high=1e9)
+        true[::3] = False
+        _, inliers = RANSAC(seed=0)(points1, points2)
+        assert inliers[true].float().mean() > 0.9
+        assert not inliers[::3].any()
+
+    @pytest.mark.parametrize("jitter", [0.0, 1e-6, 1e-4])
+    def test_many_points_that_nearly_agree(self, jitter):
+        points1, points2, _, _ = pair(num_points=1000, outliers=0.0)
+        for k, points in enumerate((points1, points2)):
+            points[:550] = points[0] + jitter * uniform(550, 2, low=-1, seed=k)
+        F_mat, inliers = RANSAC(seed=0)(points1, points2)
+        assert inliers[550:].float().mean() > 0.9
+        assert (kln.sampson_distance(points1, points2, F_mat)[inliers] < 1.001).all()
+
+    @pytest.mark.parametrize("size", [(256, 256), (320, 240)])
+    def test_dense_matches_in_the_order_of_the_rows(self, size, dtype):
+        rows, columns = torch.meshgrid(*map(torch.arange, size), indexing="ij")
+        points1 = torch.stack([columns, rows], -1).flatten(0, 1).double() + 1e-6 * uniform(size[0] * size[1], 2)
+        depth = uniform(len(points1), 1, low=4, high=8)
+        points2 = points1 + 150 / depth + 0.1 * uniform(len(points1), 2, low=-1, seed=1)
+        _, inliers = RANSAC(seed=0)(points1.to(dtype), points2.to(dtype))
+        assert inliers.float().mean() > 0.99
+
+    @pytest.mark.parametrize("factor", [sampson_factor, symmetric_factor])
+    @pytest.mark.parametrize("number", [100, 1000])
+    def test_match_on_the_epipole(self, number, factor):
+        epipole = torch.full((2,), 300.0, dtype=torch.float64)
+        points1 = uniform(number, 2, high=600)
+        points2 = epipole + (points1 - epipole) * uniform(number, 1, low=1.1, high=1.4, seed=1)
+        points1[0] = points2[0] = epipole
+        _, inliers = RANSAC(factor=factor, seed=0)(points1, points2)
+        assert inliers[1:].all()
+
+    def test_a_refinement_that_went_wrong_is_dropped(self, monkeypatch):
+        points1, points2, _, true = pair(outliers=0.2)
+        fit = kln.ransac.constrained_fit
+        wrong = kln.find_fundamental(uniform(1, 20, 2), uniform(1, 20, 2, seed=1))
+
+        def lost(x1, x2, F_mat, losses, factor):
+            found = fit(x1, x2, wrong.expand_as(F_mat), losses, factor)
+            return found._replace(gain=torch.zeros_like(found.gain))
+
+        monkeypatch.setattr(kln.ransac, "constrained_fit", lost)
+        assert RANSAC(seed=0)(points1, points2)[1][true].float().mean() > 0.5
+
+    def test_float32_far_from_the_origin(self):
+        """Their matrix means nothing any more, but which are inliers is known."""
+        points1, points2, _, true = pair(outliers=0.2)
+        _, inliers = RANSAC(seed=0)(points1.float() + 3e5, points2.float() + 3e5)
+        assert inliers[true].float().mean() > 0.9
 
     @pytest.mark.parametrize("number", [9, 200])
     def test_nothing_moves(self, number, dtype):

@@ -108,6 +108,16 @@ class TestWeighted:
         assert rows.shape == (50, 8)
         assert all(len(set(row)) == 8 for row in rows.tolist())
 
+    @pytest.mark.parametrize("weight", [1e-50, 1e300])
+    def test_weights_beyond_float32(self, weight, generator):
+        drawn = WeightedSampler(torch.full((50,), weight, dtype=torch.float64)).draw(500, generator)
+        assert len(drawn.sort(-1).values.unique(dim=0)) > 490
+
+    def test_zero_is_less_than_next_to_nothing(self, generator):
+        weights = torch.zeros(50, dtype=torch.float64)
+        weights[:4], weights[4:12] = 1e10, 1e-30
+        assert WeightedSampler(weights).draw(500, generator).max() < 12
+
 
 @pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
 def test_zero_is_never_drawn(sampler, generator):
@@ -128,6 +138,12 @@ class TestHitRate:
     def test_prosac_looks_at_the_best_but_not_at_few(self, best, share):
         sampler = ProsacSampler(torch.linspace(1, 0.1, 100))
         assert sampler.hit_rate(best > self.ROWS, self.ROWS) == pytest.approx(share**8)
+
+    def test_prosac_does_not_see_what_it_never_draws(self):
+        weights = torch.cat([torch.linspace(1, 2, 100), torch.zeros(2000)])
+        inliers = torch.arange(2100) < 100
+        assert ProsacSampler(weights).hit_rate(inliers, slice(None)) == 1
+        assert ProsacSampler(weights).hit_rate(inliers, slice(100, None)) == 0
 
     def test_weighted(self):
         weights = torch.where(self.ROWS < 10, 9.0, 1.0)
