@@ -104,8 +104,6 @@ def constrained_fit(
             pull = (2 * weights).mul_(algebraic).mul_(g)
             in_view1.add_(torch.unflatten((pull * slope1) @ products2, 1, (3, 3))[..., None])
             in_view2.add_(torch.unflatten((pull * slope2) @ products1, 1, (3, 3))[..., None])
-        size = X.diagonal(dim1=1, dim2=2).sum(-1)
-        X.div_(size[:, None, None])
         torch.stack([u, cofactors], 1, out=constraints)
         multipliers.copy_(constraints.mT)
         torch.mul((cofactors * u).sum(-1), 1 - 1 / (3 * length), out=right[:, 10])
@@ -113,5 +111,5 @@ def constrained_fit(
         u = torch.add(u, change, alpha=length)
         F = torch.unflatten(u / torch.linalg.vector_norm(u, dim=-1, keepdim=True), 1, (3, 3))
     found, cost = F.isfinite().all(-1).all(-1), values.sum(-1)
-    gain = (change[:, None] @ X @ change[..., None])[:, 0, 0].mul_(size).abs_() / cost
+    gain = (change[:, None] @ X @ change[..., None])[:, 0, 0].abs_() / cost
     return Fit(torch.where(found[:, None, None], F, given), torch.where(found, cost, torch.inf), gain)

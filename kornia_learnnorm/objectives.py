@@ -172,7 +172,7 @@ class GemanMcClure(_RobustLoss):
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
         """Return the losses and their derivatives by the squared distances."""
-        weight = 1 / (1 + squares / self.scale**2)
+        weight = (1 + squares / self.scale**2).reciprocal()
         return squares * weight, weight.square()
 
 
