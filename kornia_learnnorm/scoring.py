@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_learnnorm.objectives import Factor, factor_alone, sampson_factor
 from kornia_learnnorm.transforms import transform_fundamental
 
-__all__ = ["FARTHEST", "Hypotheses", "PairScorer", "in_proportion"]
+__all__ = ["Hypotheses", "PairScorer", "in_proportion"]
 
 FARTHEST = 1e6  # times the median distance from the median point, or the threshold
 BLOCK = 1 << 16  # distances of a block, which stay in a core's cache
