@@ -250,14 +250,16 @@ class TestDask:
         return done[0]
 
     def test_nobody_at_the_address(self, images, tmp_path):
-        dask = pytest.importorskip("dask", reason="Dask is not installed")
+        pytest.importorskip("distributed", reason="Dask is not installed")  # before its settings are changed
+        import dask
+
         with dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}), pytest.raises(OSError, match="tcp"):
             collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask="tcp://127.0.0.1:1")
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.parametrize("address", ["127.0.0.1:bad", "", "http://127.0.0.1:1"])
     def test_no_address(self, images, tmp_path, address):
-        pytest.importorskip("dask", reason="Dask is not installed")
+        pytest.importorskip("distributed", reason="Dask is not installed")
         with pytest.raises(ValueError, match=f"address as tcp://host:8786, got '{address}'"):
             collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask=address)
 

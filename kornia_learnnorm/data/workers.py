@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import threading
 import time
 import warnings
@@ -109,7 +110,11 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when ``parent`` was killed: it would wait for ever to write to a pipe that nobody reads."""
+    """End this process when ``parent`` was killed: it would wait for ever to write to a pipe that nobody reads.
+
+    An interrupt from the keyboard reaches all processes at once. It is for the parent, which ends the others.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
         while os.getppid() == parent:
