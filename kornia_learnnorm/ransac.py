@@ -21,21 +21,20 @@ from kornia_learnnorm.objectives import Factor, GemanMcClure, Loss, Truncated, s
 from kornia_learnnorm.rank2_manifold import Rank2, decompose
 from kornia_learnnorm.refine import minimize
 from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
-from kornia_learnnorm.scoring import FARTHEST, Hypotheses, PairScorer, in_proportion
+from kornia_learnnorm.scoring import COARSE, FARTHEST, Hypotheses, PairScorer, in_proportion
 from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
 from kornia_learnnorm.threads import one_thread
 
 __all__ = ["RANSAC"]
 
 BATCHES = (64, 1024)  # samples in the first batch, and in the largest
-SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on
+SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on, at most
 POOL = 8  # hypotheses of a batch that are optimised,
 SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the threshold in each step: a noisy sample sees few of its inliers
-FINAL_POOL = 4  # the same in the end,
-FINAL_SCALE = 2.0  # of the threshold in the first step
-LOSS_SCALE = 0.7  # and of that of the final loss in all others:
-REWEIGHTINGS = 4  # so many of least squares,
-TOLERANCE = 1e-4  # which end close enough to the optimum where they have this share of the cost to gain; elsewhere
+FINAL_POOL = 4  # the same in the end, first to their inliers, then
+LOSS_SCALE = 0.7  # on a loss of this times the threshold:
+REWEIGHTINGS = 3  # so many steps of least squares,
+TOLERANCE = 1e-3  # which end close enough to the optimum where they have this share of the cost to gain; elsewhere
 STEPS = 10  # so many of Levenberg-Marquardt, at most,
 COSINE = 1e-3  # until the derivatives are this close to orthogonal
 
@@ -64,7 +63,8 @@ class RANSAC(nn.Module):
         max_seconds: time after which no further batch of samples, 64 at first and up to 1,024, is drawn; with it the
             result depends on the machine.
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
-            best matrix so far has found all inliers; 1 draws all ``max_iter`` samples.
+            best matrix so far has found all inliers; 1 draws all ``max_iter`` samples. It is close to 1 by default,
+            since a sample must not have much noise either.
         factor: the distance, :func:`~kornia_learnnorm.objectives.sampson_factor` or
             :func:`~kornia_learnnorm.objectives.symmetric_factor` (Fan et al., Eq. 7).
         rank2: how the singularity constraint is enforced, see :func:`~kornia_learnnorm.find_fundamental`.
@@ -100,7 +100,7 @@ class RANSAC(nn.Module):
         inl_th: float = 1.0,
         max_iter: int = 50_000,
         max_seconds: float | None = None,
-        confidence: float = 0.999,
+        confidence: float = 0.999999,
         factor: Factor = sampson_factor,
         rank2: Literal["optimal"] | None = None,
         refine: bool = True,
@@ -182,7 +182,7 @@ class RANSAC(nn.Module):
         generator.manual_seed(int(torch.randint(2**62, ())) if self.seed is None else self.seed)
         sampler = UniformSampler(len(x1), x1.device) if weights is None else self.sampler(weights.to(x1))
         scored: Tensor | slice = slice(None)
-        if len(x1) > SCORED:
+        if len(x1) >= 2 * COARSE:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:SCORED]
         scorer = PairScorer(x1, x2, self.inl_th, self.factor, scored)
         pool = self._search(scorer, sampler, generator)
@@ -206,7 +206,8 @@ class RANSAC(nn.Module):
                 break
             rows = sampler.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, largest)
-            found = scorer.best(self._solve(scorer, rows), POOL)
+            F_mat = self._solve(scorer, rows)
+            found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL)
             pool = pool.join(found, POOL)
             needed = self._samples_needed(pool, scorer, sampler)
             # A pool that ends the search is optimised anyway.
@@ -242,7 +243,7 @@ class RANSAC(nn.Module):
     def _polish(self, scorer: PairScorer, pool: Hypotheses) -> Rank2:
         """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
         loss = GemanMcClure(LOSS_SCALE * self.inl_th)
-        losses: list[Loss] = [Truncated(FINAL_SCALE * self.inl_th), *REWEIGHTINGS * [loss]]
+        losses: list[Loss] = [Truncated(self.inl_th), *REWEIGHTINGS * [loss]]
         fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL], losses, self.factor)
         best = fit.cost.argmin()
         state, cost = decompose(fit.F_mat[best][None]), fit.cost[best]
@@ -252,7 +253,7 @@ class RANSAC(nn.Module):
             optimum = minimize(objective, state, STEPS, COSINE)[1]
             state, cost = optimum.state, optimum.cost[0]
         # The loss is nowhere above that of MSAC, so that the pool's best has no more of it than this but for a margin.
-        share = 1 - pool.score[0] / scorer.residuals.shape[-1]
+        share = 1 - pool.score[0] / scorer.terms.shape[-1]
         most = self.inl_th**2 * (1.1 * share * scorer.x1.shape[-1] + SAMPLE_SIZE)
         return state if cost <= most else decompose(pool.F_mat[:1])
 

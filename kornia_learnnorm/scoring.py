@@ -15,6 +15,8 @@ __all__ = ["Hypotheses", "PairScorer", "in_proportion"]
 
 FARTHEST = 1e6  # times the median distance from the median point, or the threshold
 BLOCK = 1 << 16  # distances of a block, which stay in a core's cache
+SHORTLIST = 64  # matrices, by their scores on
+COARSE = 512  # correspondences
 
 
 class Hypotheses(NamedTuple):
@@ -54,7 +56,7 @@ class PairScorer:
         threshold: largest distance :math:`\tau` of an inlier, pixels.
         factor: which distance: :func:`~kornia_learnnorm.objectives.sampson_factor` or
             :func:`~kornia_learnnorm.objectives.symmetric_factor`.
-        rows: the correspondences that count in scores; all by default.
+        rows: the correspondences that count in scores, those that count in :meth:`shortlist` first; all by default.
 
     Attributes:
         x1: all correspondences in the coordinates of view 1, (3, N).
@@ -82,8 +84,8 @@ class PairScorer:
         T[:, :2, 2:], T[:, 2:, 2:] = -origin, spread
         self.T1, self.T2 = T
         x1, x2 = self.x1[:, rows], self.x2[:, rows]
-        self.residuals = (x2[:, None] * x1).flatten(0, 1).float()
-        self.products1, self.products2 = ((x[:, None] * x).flatten(0, 1).float() for x in (x1, x2))
+        # What the algebraic residuals are linear in, and the squared norms of the normals of lines in view 1 and 2.
+        self.terms = torch.cat([x2[:, None] * x1, x2[:, None] * x2, x1[:, None] * x1]).flatten(0, 1).float()
 
     @cached_property
     def pixels(self) -> tuple[Tensor, Tensor]:
@@ -110,16 +112,25 @@ class PairScorer:
             number: largest number of matrices.
 
         """
-        size = max(1, BLOCK // self.residuals.shape[-1])
-        blocks = (F_mat[start : start + size] for start in range(0, max(1, len(F_mat)), size))
-        scores = torch.cat([self._gains(block).clamp_(min=0).sum(-1) for block in blocks]).nan_to_num_(nan=0.0)
+        scores = self._scores(F_mat, self.terms)
         score, order = scores.topk(min(number, len(scores)))
         positive = int((score > 0).sum())
         return Hypotheses(F_mat[order[:positive]], score[:positive])
 
+    def shortlist(self, F_mat: Tensor) -> Tensor:
+        """Return the 64 matrices of highest score on the first 512 correspondences that count; all if it saves little.
+
+        Args:
+            F_mat: matrices, any scale, with shape :math:`(K, 3, 3)`.
+
+        """
+        if self.terms.shape[-1] < 2 * COARSE or len(F_mat) <= SHORTLIST:
+            return F_mat
+        return F_mat[self._scores(F_mat, self.terms[:, :COARSE]).topk(SHORTLIST).indices]
+
     def inliers(self, F_mat: Tensor) -> Tensor:
         """Tell the inliers (K, M) of matrices (K, 3, 3) among the correspondences that count."""
-        return self._gains(F_mat) >= 0
+        return self._gains(F_mat, self.terms) >= 0
 
     def distances(self, F_mat: Tensor) -> Tensor:
         """Return the distances of all correspondences from one matrix (3, 3), pixels, (N,); NaN on an epipole."""
@@ -128,14 +139,20 @@ class PairScorer:
         distances: Tensor = (self.x2 * line2).sum(0).abs_() * factor_alone(self.factor, normal1, normal2)
         return distances
 
-    def _gains(self, F_mat: Tensor) -> Tensor:
+    def _scores(self, F_mat: Tensor, terms: Tensor) -> Tensor:
+        size = max(1, BLOCK // terms.shape[-1])
+        blocks = (F_mat[start : start + size] for start in range(0, max(1, len(F_mat)), size))
+        return torch.cat([self._gains(block, terms).clamp_(min=0).sum(-1) for block in blocks]).nan_to_num_(nan=0.0)
+
+    def _gains(self, F_mat: Tensor, terms: Tensor) -> Tensor:
         """What each correspondence would add to each score if it were not truncated, (K, M)."""
         F = (F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)).float()
         tiny = torch.finfo(F.dtype).tiny
-        normal1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ self.products2).clamp_(min=tiny)
-        normal2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ self.products1).clamp_(min=tiny)
-        ratio = ((F / self.threshold).flatten(1) @ self.residuals).mul_(factor_alone(self.factor, normal1, normal2))
-        gains: Tensor = ratio.square_().neg_().add_(1)
+        residuals, products2, products1 = torch.unflatten(terms, 0, (3, 9))
+        normal1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ products2).clamp_(min=tiny)
+        normal2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ products1).clamp_(min=tiny)
+        ratio = ((F / self.threshold).flatten(1) @ residuals).mul_(factor_alone(self.factor, normal1, normal2))
+        gains: Tensor = 1 - ratio.square_()
         return gains
 
 

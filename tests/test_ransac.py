@@ -313,6 +313,12 @@ class TestHardInput:
         assert inliers[550:].float().mean() > 0.9
         assert (kln.sampson_distance(points1, points2, F_mat)[inliers] < 1.001).all()
 
+    def test_outliers_that_come_first(self):
+        points1, points2, _, true = pair(num_points=2400, outliers=0.75)
+        order = true.long().argsort()
+        _, inliers = RANSAC(seed=0)(points1[order], points2[order])
+        assert inliers[true[order]].float().mean() > 0.95
+
     @pytest.mark.parametrize("size", [(256, 256), (320, 240)])
     def test_dense_matches_in_the_order_of_the_rows(self, size, dtype):
         rows, columns = torch.meshgrid(*map(torch.arange, size), indexing="ij")

@@ -61,6 +61,26 @@ class TestBest:
         best, joined = scorer.best(matrices, 8), scorer.best(matrices[100:], 8).join(scorer.best(matrices[:100], 8), 8)
         assert torch.equal(best.score, joined.score)
 
+    def test_shortlist(self, factor):
+        scene = scenes("handheld", 1, 1200, noise=0.5, outliers=0.3)
+        points = scene.points1[0], scene.points2[0]
+        samples = torch.rand(300, 1200, generator=torch.Generator().manual_seed(1)).topk(8).indices
+        matrices = find_fundamental(*(p[samples] for p in points))
+        rows = torch.randperm(1200, generator=torch.Generator().manual_seed(2))
+        scorer = PairScorer(*points, 1.5, factor, rows)
+        matrices = scorer.from_pixels(matrices)
+        kept = scorer.shortlist(matrices)
+        few = PairScorer(*(p[rows[:512]] for p in points), 1.5, factor)
+        expected = few.best(few.from_pixels(scorer.to_pixels(matrices)), 64)
+        assert torch.allclose(few.best(few.from_pixels(scorer.to_pixels(kept)), 64).score, expected.score, rtol=1e-3)
+        assert torch.equal(scorer.best(kept, 8).F_mat, scorer.best(matrices, 8).F_mat)
+
+    def test_no_shortlist_of_few(self, pair, matrices, factor):
+        many = [points.repeat(3, 1) for points in pair]
+        assert len(PairScorer(*many, 1.5, factor).shortlist(matrices)) == 64
+        assert len(PairScorer(*many, 1.5, factor).shortlist(matrices[:50])) == 50
+        assert len(PairScorer(*pair, 1.5, factor).shortlist(matrices)) == 200
+
     @given(scale=st.sampled_from([-1e6, -1.0, 1e-6, 3.0]))
     def test_scale_and_sign_do_not_count(self, factor, scale):
         points = correspondences("driving", 1, 60)
