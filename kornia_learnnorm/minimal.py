@@ -70,9 +70,9 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
         change = (V @ cofactors[..., None])[..., 0]
         excess = (u * cofactors).sum(-1, keepdim=True) / (3 * (change * cofactors).sum(-1, keepdim=True))
         u = u - excess * change
-        u = u / torch.linalg.vector_norm(u, dim=-1, keepdim=True)
         F = torch.unflatten(u, -1, (3, 3))
-    return F
+    F_mat: Tensor = F / torch.linalg.vector_norm(F, dim=(1, 2), keepdim=True)
+    return F_mat
 
 
 def _independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:

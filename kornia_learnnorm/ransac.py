@@ -245,15 +245,15 @@ class RANSAC(nn.Module):
         loss = GemanMcClure(LOSS_SCALE * self.inl_th)
         losses: list[Loss] = [Truncated(self.inl_th), *REWEIGHTINGS * [loss]]
         fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL], losses, self.factor)
-        best = fit.cost.argmin()
-        state, cost = decompose(fit.F_mat[best][None]), fit.cost[best]
-        if not fit.gain[best] <= TOLERANCE:
+        best = int(fit.cost.argmin())
+        state, cost = decompose(fit.F_mat[best : best + 1]), float(fit.cost[best])
+        if not float(fit.gain[best]) <= TOLERANCE:
             ones = torch.ones_like(scorer.x1[:1])
             objective = EpipolarCost(scorer.x1[None], scorer.x2[None], ones, self.factor, loss)
             optimum = minimize(objective, state, STEPS, COSINE)[1]
-            state, cost = optimum.state, optimum.cost[0]
+            state, cost = optimum.state, float(optimum.cost[0])
         # The loss is nowhere above that of MSAC, so that the pool's best has no more of it than this but for a margin.
-        share = 1 - pool.score[0] / scorer.terms.shape[-1]
+        share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
         most = self.inl_th**2 * (1.1 * share * scorer.x1.shape[-1] + SAMPLE_SIZE)
         return state if cost <= most else decompose(pool.F_mat[:1])
 

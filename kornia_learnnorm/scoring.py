@@ -79,13 +79,14 @@ class PairScorer:
         origin = both.median(-1, keepdim=True).values
         centred = both - origin
         spread = centred.abs().flatten(1).median(-1).values.clamp_(min=threshold)[:, None, None]
-        self.x1, self.x2 = torch.cat([centred, spread.expand_as(centred[:, :1])], 1)
-        T = torch.eye(3, dtype=both.dtype, device=both.device).expand(2, 3, 3).clone()
-        T[:, :2, 2:], T[:, 2:, 2:] = -origin, spread
-        self.T1, self.T2 = T
-        x1, x2 = self.x1[:, rows], self.x2[:, rows]
-        # What the algebraic residuals are linear in, and the squared norms of the normals of lines in view 1 and 2.
-        self.terms = torch.cat([x2[:, None] * x1, x2[:, None] * x2, x1[:, None] * x1]).flatten(0, 1).float()
+        x = torch.cat([centred, spread.expand_as(centred[:, :1])], 1)
+        self.x1, self.x2 = x
+        columns = torch.eye(3, 2, dtype=both.dtype, device=both.device).expand(2, 3, 2)
+        self.T1, self.T2 = torch.cat([columns, torch.cat([-origin, spread], 1)], 2)
+        x = x[..., rows]
+        x1, x2 = x
+        # What the algebraic residuals are linear in, and the squared norms of the normals of lines in view 2 and 1.
+        self.terms = torch.cat([(x2[:, None] * x1)[None], x[:, :, None] * x[:, None]]).flatten(0, 2).float()
 
     @cached_property
     def pixels(self) -> tuple[Tensor, Tensor]:
@@ -148,7 +149,7 @@ class PairScorer:
         """What each correspondence would add to each score if it were not truncated, (K, M)."""
         F = (F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)).float()
         tiny = torch.finfo(F.dtype).tiny
-        residuals, products2, products1 = torch.unflatten(terms, 0, (3, 9))
+        residuals, products1, products2 = torch.unflatten(terms, 0, (3, 9))
         normal1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ products2).clamp_(min=tiny)
         normal2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ products1).clamp_(min=tiny)
         ratio = ((F / self.threshold).flatten(1) @ residuals).mul_(factor_alone(self.factor, normal1, normal2))
