@@ -43,7 +43,7 @@ class RANSAC(nn.Module):
     r"""Robust estimation of a fundamental matrix from correspondences with outliers.
 
     Minimal samples of eight run through :func:`~kornia_learnnorm.find_fundamental` with any normaliser, a thousand at
-    once, and MSAC scores them all. The best of each batch are fitted to their inliers by reweighted least squares, and
+    once, and MSAC scores them. The best of each batch are fitted to their inliers by reweighted least squares, and
     the first also by the normaliser (local optimisation); the inliers of the best matrix so far say how many samples
     are still needed. In the end the best few are fitted on Geman and McClure's loss, and the one of least cost goes on
     to Levenberg-Marquardt where least squares have not converged.
