@@ -12,8 +12,8 @@ import torch
 from pairs import Pairs, SetNetwork, load_pairs, parse
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.sampling import WeightedSampler
-from kornia_learnnorm.soft import SoftChoice, expected_loss, sample_minimal_sets
+from kornia_learnnorm.ransac.samplers import WeightedSampler
+from kornia_learnnorm.ransac.soft import SoftChoice, expected_loss, sample_minimal_sets
 
 
 def choose(pairs: Pairs, logits: torch.Tensor, generator: torch.Generator, count: int = 32) -> SoftChoice:

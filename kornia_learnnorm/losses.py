@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
-from kornia_learnnorm.correspondences import solve_dtype
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.checks import solve_dtype
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["EpipolarLoss"]
 

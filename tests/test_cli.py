@@ -17,7 +17,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store, write_store
 from kornia_learnnorm.data.synthesize import synthetic_store
-from kornia_learnnorm.metrics import bootstrap_interval
+from kornia_learnnorm.metrics.better_rate import bootstrap_interval
 from lightning_modules.cli import main
 
 FOLDER = Path(__file__).parent.parent / "configs"

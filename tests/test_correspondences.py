@@ -7,7 +7,7 @@ import pytest
 import torch
 from two_view import uniform
 
-from kornia_learnnorm.correspondences import check_correspondences, solve_dtype, weighted_mean
+from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype, weighted_mean
 
 
 class TestCorrespondences:

@@ -14,7 +14,7 @@ from torch.autograd import gradcheck
 from two_view import SCENES, correspondences, epipolar_distances, homogeneous, shaken, uniform
 
 from kornia_learnnorm import Diagnostics, Hartley, Identity, LearnedNormalizer, ReweightedWhitening, Whitening, diagnose
-from kornia_learnnorm.diagnostics import condition_number, normalized_distance, singularity_ratio
+from kornia_learnnorm.evaluation.diagnostics import condition_number, normalized_distance, singularity_ratio
 
 NORMALIZERS = [Identity(), Hartley(), Whitening(), ReweightedWhitening(3)]
 

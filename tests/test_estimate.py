@@ -18,8 +18,8 @@ from kornia_learnnorm.evaluation import pair as module
 from kornia_learnnorm.evaluation.estimate import add_arguments, run
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
 from kornia_learnnorm.files import replacing
-from kornia_learnnorm.normalizers import Hartley, Whitening
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 

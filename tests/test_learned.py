@@ -32,7 +32,7 @@ from kornia_learnnorm import (
     learned,
     spd_transform,
 )
-from kornia_learnnorm.transforms import affine_transform
+from kornia_learnnorm.geometry.transforms import affine_transform
 
 SHIPPED = ["crossview", "crossview-synthetic"]
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from two_view import uniform
 
-from kornia_learnnorm.matches import correspondences_from_matches
+from kornia_learnnorm.estimators.matches import correspondences_from_matches
 
 KEYPOINTS = uniform(2, 30, 2, high=600), uniform(2, 25, 2, high=600, seed=1)
 

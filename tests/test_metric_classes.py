@@ -13,16 +13,16 @@ pytest.importorskip("torchmetrics")
 from torchmetrics import MetricCollection
 
 from kornia_learnnorm import better_rate
-from kornia_learnnorm.metric_classes import (
+from kornia_learnnorm.metrics.modules import (
     BetterRateMetric,
     EpipolarErrorMetric,
     F1Metric,
     InlierShareMetric,
     PoseAUCMetric,
 )
-from kornia_learnnorm.pair_metrics import epipolar_error, f1_score, inlier_share
-from kornia_learnnorm.pose_accuracy import pose_auc
-from kornia_learnnorm.pose_metrics import pose_error, relative_pose
+from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
+from kornia_learnnorm.metrics.pose_accuracy import pose_auc
+from kornia_learnnorm.metrics.poses import pose_error, relative_pose
 
 NAN = float("nan")
 

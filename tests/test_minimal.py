@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from two_view import SCENES, correspondences, epipolar_distances, scenes, uniform, up_to_sign
 
 from kornia_learnnorm import find_fundamental
-from kornia_learnnorm.minimal import are_determined, solve_samples
-from kornia_learnnorm.scoring import PairScorer
+from kornia_learnnorm.estimators.minimal import are_determined, solve_samples
+from kornia_learnnorm.ransac.scoring import PairScorer
 
 NOISY = ["driving", "handheld", "orbit"]
 

@@ -16,7 +16,7 @@ from torch.autograd import gradcheck
 from two_view import correspondences, numpy_whitening, shaken, uniform
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer, networks
-from kornia_learnnorm.networks import SetNetwork
+from kornia_learnnorm.normalizers.networks.crossview import SetNetwork
 
 FEATURES = ["epipolar", "both", "own"]
 

@@ -14,7 +14,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from two_view import SCENES, correspondences, homogeneous, numpy_hartley, numpy_whitening, uniform
 
 from kornia_learnnorm import Hartley, Identity, PerView, ReweightedWhitening, Whitening
-from kornia_learnnorm.transforms import inverse_sqrt
+from kornia_learnnorm.geometry.transforms import inverse_sqrt
 
 ALL = {
     "identity": Identity(),

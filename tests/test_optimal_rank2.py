@@ -29,7 +29,7 @@ from two_view import (
 from kornia_learnnorm import Hartley, Whitening, find_fundamental
 from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.optimal_rank2 import optimal_rank2
+from kornia_learnnorm.geometry.rank2 import optimal_rank2
 
 
 def linear(points1, points2, weights=None) -> torch.Tensor:

@@ -14,7 +14,7 @@ from two_view import scenes
 
 from kornia_learnnorm import bootstrap_interval
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.pair_metrics import epipolar_error, f1_score, inlier_share, paired_bootstrap
+from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share, paired_bootstrap
 
 INF, NAN = float("inf"), float("nan")
 ROWS = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]], dtype=torch.float64)  # y1 - y2

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.pose_accuracy import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
 
 INF, NAN = float("inf"), float("nan")
 ERRORS = st.lists(st.one_of(st.floats(0, 30), st.integers(0, 12), st.just(INF)), min_size=1, max_size=30)

@@ -14,7 +14,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from two_view import SCENES, homogeneous, scenes
 
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.pose_metrics import pose_error, relative_pose, rotation_error, translation_error
+from kornia_learnnorm.metrics.poses import pose_error, relative_pose, rotation_error, translation_error
 
 INF, NAN = float("inf"), float("nan")
 

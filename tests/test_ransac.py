@@ -19,9 +19,9 @@ from two_view import epipolar_distances, scenes, shaken, uniform, up_to_sign
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.objectives import sampson_factor, symmetric_factor
-from kornia_learnnorm.pair_metrics import f1_score
-from kornia_learnnorm.sampling import WeightedSampler
+from kornia_learnnorm.estimators.robust_losses import sampson_factor, symmetric_factor
+from kornia_learnnorm.metrics.pairs import f1_score
+from kornia_learnnorm.ransac.samplers import WeightedSampler
 
 NORMALIZERS = [None, kln.Whitening(), kln.ReweightedWhitening()]
 

@@ -26,7 +26,7 @@ from two_view import (
 )
 
 from kornia_learnnorm import find_fundamental, sampson_distance, symmetric_epipolar_distance
-from kornia_learnnorm.objectives import (
+from kornia_learnnorm.estimators.robust_losses import (
     Cauchy,
     GemanMcClure,
     Huber,
@@ -36,7 +36,7 @@ from kornia_learnnorm.objectives import (
     squared_loss,
     symmetric_factor,
 )
-from kornia_learnnorm.refine import refine_fundamental
+from kornia_learnnorm.estimators.refinement import refine_fundamental
 
 DISTANCES = {
     "sampson": (sampson_factor, sampson_distance),

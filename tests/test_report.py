@@ -25,7 +25,7 @@ from kornia_learnnorm.evaluation.report import write_report
 from kornia_learnnorm.evaluation.report_pair import draw_example
 from kornia_learnnorm.evaluation.report_tables import report_tables
 from kornia_learnnorm.evaluation.run import read_run
-from kornia_learnnorm.learned import WEIGHTS
+from kornia_learnnorm.normalizers.learned import WEIGHTS
 from lightning_modules.cli import main
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
@@ -70,7 +70,7 @@ class TestMethods:
 
     def test_an_own_normaliser(self):
         x1, x2 = self.scene()
-        for name in ("kornia_learnnorm.normalizers:Whitening", "kornia_learnnorm:Whitening"):
+        for name in ("kornia_learnnorm.normalizers.closed_form:Whitening", "kornia_learnnorm:Whitening"):
             expected = kln.find_fundamental(x1, x2, normalizer=kln.Whitening())
             assert torch.equal(find_method(name).estimate(x1, x2), expected)
 

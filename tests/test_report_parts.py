@@ -21,8 +21,8 @@ from kornia_learnnorm.evaluation.report_rates import Table, rate_tables
 from kornia_learnnorm.evaluation.run import Cell, Run
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.evaluation.trained import SHIPPED, saw, trained_on
-from kornia_learnnorm.learned import WEIGHTS
-from kornia_learnnorm.pair_metrics import f1_score, inlier_share
+from kornia_learnnorm.normalizers.learned import WEIGHTS
+from kornia_learnnorm.metrics.pairs import f1_score, inlier_share
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

@@ -30,7 +30,7 @@ from kornia_learnnorm.evaluation.robust_estimators import (
 )
 from kornia_learnnorm.evaluation.robust_matches import draw_matches, measure
 from kornia_learnnorm.evaluation.robust_run import read_robust
-from kornia_learnnorm.pair_metrics import f1_score
+from kornia_learnnorm.metrics.pairs import f1_score
 from lightning_modules.cli import main
 
 ESTIMATORS = ["kornia-8pt", "count:Hartley", "count:whitening", "time:Hartley", "time:whitening", "RANSAC"]

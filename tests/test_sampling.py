@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.sampling import ProsacSampler, UniformSampler, WeightedSampler, draw_distinct
+from kornia_learnnorm.ransac.samplers import ProsacSampler, UniformSampler, WeightedSampler, draw_distinct
 
 GROWTH = ProsacSampler.GROWTH
 
@@ -103,7 +103,7 @@ class TestWeighted:
         assert np.abs(drawn.numpy() - reference).max() < 0.02
 
     def test_in_blocks(self, monkeypatch, generator):
-        monkeypatch.setattr("kornia_learnnorm.sampling.BLOCK", 100)
+        monkeypatch.setattr("kornia_learnnorm.ransac.samplers.BLOCK", 100)
         rows = WeightedSampler(torch.ones(30)).draw(50, generator)
         assert rows.shape == (50, 8)
         assert all(len(set(row)) == 8 for row in rows.tolist())

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from two_view import correspondences, epipolar_distances, scenes, uniform
 
 from kornia_learnnorm import find_fundamental, sampson_distance
-from kornia_learnnorm.objectives import sampson_factor, symmetric_factor
-from kornia_learnnorm.scoring import PairScorer, in_proportion
+from kornia_learnnorm.estimators.robust_losses import sampson_factor, symmetric_factor
+from kornia_learnnorm.ransac.scoring import PairScorer, in_proportion
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from two_view import (
 )
 
 from kornia_learnnorm import Hartley, Whitening, symmetric_epipolar_distance
-from kornia_learnnorm.soft import expected_loss, sample_minimal_sets
+from kornia_learnnorm.ransac.soft import expected_loss, sample_minimal_sets
 
 
 def target(F):

@@ -35,7 +35,7 @@ from kornia_learnnorm import (
     null_vector,
     rank2_projection,
 )
-from kornia_learnnorm.linear import smallest_right_singular_vector
+from kornia_learnnorm.geometry.linear import smallest_right_singular_vector
 
 # Each normaliser with its independent computation.
 REFERENCES = {

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kornia_learnnorm import RANSAC
-from kornia_learnnorm.threads import one_thread
+from kornia_learnnorm.ransac.threads import one_thread
 
 
 @pytest.fixture(autouse=True)

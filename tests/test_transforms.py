@@ -12,7 +12,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from two_view import homogeneous, uniform
 
 from kornia_learnnorm import paper_transform, spd_transform
-from kornia_learnnorm.transforms import affine_transform, transform_fundamental
+from kornia_learnnorm.geometry.transforms import affine_transform, transform_fundamental
 
 
 def mapped(T, points) -> np.ndarray:

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
-from kornia_learnnorm.learned import LearnedNormalizer
-from kornia_learnnorm.networks import CrossViewNetwork
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
 

@@ -201,7 +201,7 @@ def orbit(
 
     Example:
         >>> scene = orbit(2, 100, torch.Generator().manual_seed(0), noise=0.0)
-        >>> from kornia_learnnorm.residuals import symmetric_epipolar_distance
+        >>> from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
         >>> bool(symmetric_epipolar_distance(scene.points1, scene.points2, scene.F_mat).max() < 1e-9)
         True
 

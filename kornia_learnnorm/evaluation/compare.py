@@ -13,8 +13,8 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.evaluate import beside_closed_forms, evaluation_samples
 from kornia_learnnorm.evaluation.predict import Normalizer, Residuals, evaluate_normalizers
 from kornia_learnnorm.evaluation.tables import format_table, names_of
-from kornia_learnnorm.learned import LearnedNormalizer
-from kornia_learnnorm.metrics import better_rate, bootstrap_interval, comparable
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.metrics.better_rate import better_rate, bootstrap_interval, comparable
 
 __all__ = ["add_arguments", "compare", "run"]
 

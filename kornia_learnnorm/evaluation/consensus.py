@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["THRESHOLDS", "consensus"]
 
@@ -16,7 +16,7 @@ THRESHOLDS = (0.1, 1.0)  # pixels
 def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
     """Measure share of inliers and F1 of many matrices, each over all correspondences of its image pair.
 
-    What :func:`~kornia_learnnorm.pair_metrics.inlier_share` and :func:`~kornia_learnnorm.pair_metrics.f1_score` say of
+    What :func:`~kornia_learnnorm.metrics.pairs.inlier_share` and :func:`~kornia_learnnorm.metrics.pairs.f1_score` say of
     one matrix, with the distances computed once for both and for all of :data:`THRESHOLDS`.
 
     Args:

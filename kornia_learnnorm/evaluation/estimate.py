@@ -9,7 +9,7 @@ from pathlib import Path
 from kornia_learnnorm.data.images import read_image
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
 from kornia_learnnorm.files import replacing
-from kornia_learnnorm.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 
 __all__ = ["add_arguments", "run"]
 

@@ -14,7 +14,7 @@ from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.methods import Method
 from kornia_learnnorm.evaluation.predict import ground_truth_inliers
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["median_distance", "random_pair", "sweep"]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.robust_budgets import Solver, minimal_samples
 from kornia_learnnorm.evaluation.robust_matches import Matches
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["MOST_ERROR", "NUMBERS", "expected_best", "hypothesis_quality", "picked", "samples_of"]
 

@@ -13,12 +13,12 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.predict import Normalizer
-from kornia_learnnorm.learned import WEIGHTS, LearnedNormalizer
-from kornia_learnnorm.normalizers import Hartley, Identity, Whitening
-from kornia_learnnorm.refine import refine_fundamental
-from kornia_learnnorm.reweighting import ReweightedWhitening
-from kornia_learnnorm.search import SearchedNormalizer
-from kornia_learnnorm.solver import find_fundamental, normalizing_transforms
+from kornia_learnnorm.normalizers.learned import WEIGHTS, LearnedNormalizer
+from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
+from kornia_learnnorm.estimators.refinement import refine_fundamental
+from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
+from kornia_learnnorm.evaluation.search import SearchedNormalizer
+from kornia_learnnorm.estimators.fundamental import find_fundamental, normalizing_transforms
 
 __all__ = ["DEFAULT_METHODS", "Method", "base_name", "find_method", "identify_method", "short_names"]
 

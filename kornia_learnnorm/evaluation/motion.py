@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["pair_motions"]
 

@@ -16,8 +16,8 @@ from torch import Tensor
 from kornia_learnnorm.data.images import import_cv2, read_image
 from kornia_learnnorm.data.matching import match_images
 from kornia_learnnorm.files import replacing
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
-from kornia_learnnorm.solver import find_fundamental
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.estimators.fundamental import find_fundamental
 
 __all__ = ["PairEstimate", "estimate_pair", "write_json"]
 

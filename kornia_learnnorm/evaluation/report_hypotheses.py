@@ -12,7 +12,7 @@ from kornia_learnnorm.evaluation.hypotheses import MOST_ERROR, NUMBERS, expected
 from kornia_learnnorm.evaluation.report_rates import BASELINE, Table
 from kornia_learnnorm.evaluation.report_style import COLORS, Picture, make_figure, make_picture
 from kornia_learnnorm.evaluation.robust_run import RobustCell, RobustRun
-from kornia_learnnorm.pair_metrics import paired_bootstrap
+from kornia_learnnorm.metrics.pairs import paired_bootstrap
 
 __all__ = ["hypothesis_figures", "hypothesis_tables"]
 

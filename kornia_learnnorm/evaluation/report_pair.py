@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kornia_learnnorm.evaluation.figures import INLIER, OUTLIER, clip_lines, import_matplotlib
 from kornia_learnnorm.evaluation.report_style import INK, Picture, make_figure, make_picture
 from kornia_learnnorm.evaluation.run import Run
-from kornia_learnnorm.residuals import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,8 +11,8 @@ from kornia_learnnorm.evaluation.consensus import THRESHOLDS
 from kornia_learnnorm.evaluation.hypotheses import MOST_ERROR
 from kornia_learnnorm.evaluation.report_rates import TESTS, Table, p_text
 from kornia_learnnorm.evaluation.robust_run import RobustCell, RobustRun
-from kornia_learnnorm.pair_metrics import paired_bootstrap
-from kornia_learnnorm.pose_accuracy import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.pairs import paired_bootstrap
+from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
 
 __all__ = ["about_robust", "robust_tables"]
 

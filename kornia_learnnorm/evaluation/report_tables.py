@@ -20,8 +20,8 @@ from kornia_learnnorm.evaluation.report_rates import (
     rate_text,
 )
 from kornia_learnnorm.evaluation.run import Cell, Run
-from kornia_learnnorm.pair_metrics import paired_bootstrap
-from kornia_learnnorm.pose_accuracy import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.pairs import paired_bootstrap
+from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
 
 __all__ = ["report_tables"]
 

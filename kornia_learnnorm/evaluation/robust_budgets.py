@@ -14,10 +14,10 @@ from torch import Tensor
 from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.evaluation.robust_matches import Matches
 from kornia_learnnorm.evaluation.robust_peers import Peer
-from kornia_learnnorm.minimal import are_determined
-from kornia_learnnorm.ransac import RANSAC
-from kornia_learnnorm.sampling import SAMPLE_SIZE, draw_distinct
-from kornia_learnnorm.scoring import PairScorer
+from kornia_learnnorm.estimators.minimal import are_determined
+from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, draw_distinct
+from kornia_learnnorm.ransac.scoring import PairScorer
 
 __all__ = ["Estimate", "Estimator", "Solver", "best_of", "minimal_samples", "peer_estimator", "ransac", "run_estimator"]
 

@@ -12,7 +12,7 @@ from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, fin
 from kornia_learnnorm.evaluation.robust_budgets import Estimate, Estimator, Solver, best_of, peer_estimator, ransac
 from kornia_learnnorm.evaluation.robust_matches import Matches
 from kornia_learnnorm.evaluation.robust_peers import PEERS, find_peer, peer_version
-from kornia_learnnorm.sampling import SAMPLE_SIZE
+from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 
 __all__ = [
     "DEFAULT_ESTIMATORS",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.predict import Residuals
-from kornia_learnnorm.metrics import better_rate
+from kornia_learnnorm.metrics.better_rate import better_rate
 
 __all__ = ["format_table", "method_rows", "names_of"]
 

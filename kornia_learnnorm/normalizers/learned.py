@@ -14,11 +14,11 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from kornia_learnnorm import networks, normalizers, paper_network, reweighting, transforms
-from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
+from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
 from kornia_learnnorm.files import replacing
-from kornia_learnnorm.networks import CrossViewNetwork
-from kornia_learnnorm.normalizers import Whitening
-from kornia_learnnorm.transforms import spd_transform
+from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
+from kornia_learnnorm.normalizers.closed_form import Whitening
+from kornia_learnnorm.geometry.transforms import spd_transform
 
 __all__ = ["LearnedNormalizer"]
 
@@ -37,7 +37,7 @@ class LearnedNormalizer(nn.Module):
     Args:
         base: normaliser ``(points1, points2, weights) -> (T1, T2)``; whitening when not given.
         network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates; a fresh
-            :class:`~kornia_learnnorm.networks.CrossViewNetwork` when not given.
+            :class:`~kornia_learnnorm.normalizers.networks.crossview.CrossViewNetwork` when not given.
         transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
 
     Reference:

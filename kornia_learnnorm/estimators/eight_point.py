@@ -10,17 +10,17 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.correspondences import (
+from kornia_learnnorm.geometry.checks import (
     check_correspondences,
     check_mask,
     is_true,
     solve_dtype,
 )
-from kornia_learnnorm.linear import design_matrix, has_null_vector
-from kornia_learnnorm.matches import correspondences_from_matches
-from kornia_learnnorm.normalizers import Hartley
-from kornia_learnnorm.solver import check_rank2, find_fundamental
-from kornia_learnnorm.transforms import transform_fundamental
+from kornia_learnnorm.geometry.linear import design_matrix, has_null_vector
+from kornia_learnnorm.estimators.matches import correspondences_from_matches
+from kornia_learnnorm.normalizers.closed_form import Hartley
+from kornia_learnnorm.estimators.fundamental import check_rank2, find_fundamental
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["EightPoint", "TwoViewEstimate"]
 
@@ -46,7 +46,7 @@ class EightPoint(nn.Module):
 
     For finite input, the output and all its derivatives are finite. A correspondence that is masked, or of weight zero,
     counts as absent. A sample that does not determine its matrix, by
-    :func:`~kornia_learnnorm.linear.has_null_vector` in Hartley's coordinates, is solved with the base normaliser
+    :func:`~kornia_learnnorm.geometry.linear.has_null_vector` in Hartley's coordinates, is solved with the base normaliser
     (``normalizer.base`` where there is one, else Hartley's) and sends no gradient, neither to the points nor to the
     normaliser.
 
@@ -157,7 +157,7 @@ class EightPoint(nn.Module):
         Args:
             keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`.
             keypoints2: pixels in the second view with shape :math:`(B, M_2, 2)`.
-            matches: see :func:`~kornia_learnnorm.matches.correspondences_from_matches`.
+            matches: see :func:`~kornia_learnnorm.estimators.matches.correspondences_from_matches`.
             scores: one for each match, non-negative.
             K1: optional cameras of the first view, as for :meth:`estimate`.
             K2: optional cameras of the second view.

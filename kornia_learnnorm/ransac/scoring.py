@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.objectives import Factor, factor_alone, sampson_factor
-from kornia_learnnorm.transforms import transform_fundamental
+from kornia_learnnorm.estimators.robust_losses import Factor, factor_alone, sampson_factor
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["Hypotheses", "PairScorer", "in_proportion"]
 
@@ -54,8 +54,8 @@ class PairScorer:
         points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, :func:`in_proportion`.
         points2: pixels in the second image with shape :math:`(N, 2)`.
         threshold: largest distance :math:`\tau` of an inlier, pixels.
-        factor: which distance: :func:`~kornia_learnnorm.objectives.sampson_factor` or
-            :func:`~kornia_learnnorm.objectives.symmetric_factor`.
+        factor: which distance: :func:`~kornia_learnnorm.estimators.robust_losses.sampson_factor` or
+            :func:`~kornia_learnnorm.estimators.robust_losses.symmetric_factor`.
         rows: the correspondences that count in scores, those that count in :meth:`shortlist` first; all by default.
 
     Attributes:

@@ -14,7 +14,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import essential_from_fundamental, motion_from_essential
 from torch import Tensor
 
-from kornia_learnnorm.correspondences import solve_dtype
+from kornia_learnnorm.geometry.checks import solve_dtype
 
 __all__ = ["pose_error", "relative_pose", "rotation_error", "translation_error"]
 

@@ -11,8 +11,8 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.correspondences import weighted_mean
-from kornia_learnnorm.linear import design_matrix, null_vector, smallest_right_singular_vector
+from kornia_learnnorm.geometry.checks import weighted_mean
+from kornia_learnnorm.geometry.linear import design_matrix, null_vector, smallest_right_singular_vector
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 

@@ -16,10 +16,10 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.correspondences import solve_dtype, weighted_mean
-from kornia_learnnorm.linear import design_matrix, has_null_vector, null_vector, smallest_right_singular_vector
-from kornia_learnnorm.normalizers import Hartley, Whitening
-from kornia_learnnorm.transforms import transform_fundamental
+from kornia_learnnorm.geometry.checks import solve_dtype, weighted_mean
+from kornia_learnnorm.geometry.linear import design_matrix, has_null_vector, null_vector, smallest_right_singular_vector
+from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["ReweightedWhitening", "adjugate", "line_norms"]
 

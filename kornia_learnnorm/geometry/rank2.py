@@ -13,11 +13,11 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.correspondences import check_correspondences, is_true, solve_dtype
-from kornia_learnnorm.linear import design_matrix, rank2_projection
-from kornia_learnnorm.normalizers import Hartley
-from kornia_learnnorm.reweighting import adjugate, line_norms
-from kornia_learnnorm.transforms import transform_fundamental
+from kornia_learnnorm.geometry.checks import check_correspondences, is_true, solve_dtype
+from kornia_learnnorm.geometry.linear import design_matrix, rank2_projection
+from kornia_learnnorm.normalizers.closed_form import Hartley
+from kornia_learnnorm.normalizers.reweighted import adjugate, line_norms
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["check_fundamental", "optimal_rank2"]
 

@@ -1,7 +1,7 @@
 r"""The linear solver for the fundamental matrix.
 
 A pair of point sets goes from pixels to a fundamental matrix in :func:`find_fundamental`, top to bottom, by the steps
-in :mod:`~kornia_learnnorm.linear`, in float64 where the device has it.
+in :mod:`~kornia_learnnorm.geometry.linear`, in float64 where the device has it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.correspondences import check_correspondences, is_true, solve_dtype
-from kornia_learnnorm.linear import design_matrix, null_vector, rank2_projection
-from kornia_learnnorm.normalizers import Hartley
-from kornia_learnnorm.optimal_rank2 import optimal_rank2
-from kornia_learnnorm.transforms import transform_fundamental
+from kornia_learnnorm.geometry.checks import check_correspondences, is_true, solve_dtype
+from kornia_learnnorm.geometry.linear import design_matrix, null_vector, rank2_projection
+from kornia_learnnorm.normalizers.closed_form import Hartley
+from kornia_learnnorm.geometry.rank2 import optimal_rank2
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["check_rank2", "find_fundamental", "normalizing_transforms"]
 
@@ -37,7 +37,7 @@ def find_fundamental(
     finds :math:`\hat F` with :math:`\hat x_2^\top \hat F \hat x_1 = 0`, the rank-2 constraint is enforced **there**,
     and :math:`F = T_2^\top \hat F T_1`. With eight points the DLT is exact, and the normalisation acts only through the
     metric in which :math:`F` is projected. With ``rank2="optimal"``, :math:`T_2^\top \hat F T_1` is corrected in pixels
-    by :func:`~kornia_learnnorm.optimal_rank2.optimal_rank2` instead; the result of eight points then depends on no
+    by :func:`~kornia_learnnorm.geometry.rank2.optimal_rank2` instead; the result of eight points then depends on no
     normalisation.
 
     Args:

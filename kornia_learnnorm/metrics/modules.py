@@ -15,10 +15,10 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
-from kornia_learnnorm.metrics import comparable
-from kornia_learnnorm.pair_metrics import epipolar_error, f1_score, inlier_share
-from kornia_learnnorm.pose_accuracy import pose_auc
-from kornia_learnnorm.pose_metrics import pose_error
+from kornia_learnnorm.metrics.better_rate import comparable
+from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
+from kornia_learnnorm.metrics.pose_accuracy import pose_auc
+from kornia_learnnorm.metrics.poses import pose_error
 
 __all__ = ["BetterRateMetric", "EpipolarErrorMetric", "F1Metric", "InlierShareMetric", "PoseAUCMetric"]
 
@@ -100,7 +100,7 @@ class _PairMetric(Metric):
 
 
 class InlierShareMetric(_PairMetric):
-    """Mean share of inliers over image pairs; see :func:`kornia_learnnorm.pair_metrics.inlier_share`.
+    """Mean share of inliers over image pairs; see :func:`kornia_learnnorm.metrics.pairs.inlier_share`.
 
     Args:
         threshold: symmetric epipolar distance that an inlier stays below, pixels.
@@ -122,7 +122,7 @@ class InlierShareMetric(_PairMetric):
         self.threshold = threshold
 
     def update(self, points1: Tensor, points2: Tensor, F_mat: Tensor, mask: Tensor | None = None) -> None:
-        """Add image pairs; arguments of :func:`~kornia_learnnorm.pair_metrics.inlier_share`."""
+        """Add image pairs; arguments of :func:`~kornia_learnnorm.metrics.pairs.inlier_share`."""
         self._keep(inlier_share(points1, points2, F_mat, self.threshold, mask))
 
     def compute(self) -> dict[str, Tensor]:
@@ -132,7 +132,7 @@ class InlierShareMetric(_PairMetric):
 
 
 class F1Metric(_PairMetric):
-    """Mean F1 score over image pairs; see :func:`kornia_learnnorm.pair_metrics.f1_score`.
+    """Mean F1 score over image pairs; see :func:`kornia_learnnorm.metrics.pairs.f1_score`.
 
     Args:
         threshold: symmetric epipolar distance that an inlier stays below, pixels.
@@ -156,7 +156,7 @@ class F1Metric(_PairMetric):
     def update(
         self, points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tensor, mask: Tensor | None = None
     ) -> None:
-        """Add image pairs; arguments of :func:`~kornia_learnnorm.pair_metrics.f1_score`."""
+        """Add image pairs; arguments of :func:`~kornia_learnnorm.metrics.pairs.f1_score`."""
         self._keep(f1_score(points1, points2, F_mat, F_true, self.threshold, mask))
 
     def compute(self) -> dict[str, Tensor]:
@@ -166,7 +166,7 @@ class F1Metric(_PairMetric):
 
 
 class EpipolarErrorMetric(_PairMetric):
-    """Mean and median epipolar error over image pairs; see :func:`kornia_learnnorm.pair_metrics.epipolar_error`.
+    """Mean and median epipolar error over image pairs; see :func:`kornia_learnnorm.metrics.pairs.epipolar_error`.
 
     A failed estimate makes the mean infinite. The median of an even number of pairs is the smaller of the middle two.
 
@@ -192,7 +192,7 @@ class EpipolarErrorMetric(_PairMetric):
     def update(
         self, points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tensor, mask: Tensor | None = None
     ) -> None:
-        """Add image pairs; arguments of :func:`~kornia_learnnorm.pair_metrics.epipolar_error`."""
+        """Add image pairs; arguments of :func:`~kornia_learnnorm.metrics.pairs.epipolar_error`."""
         self._keep(epipolar_error(points1, points2, F_mat, F_true, self.threshold, mask))
 
     def compute(self) -> dict[str, Tensor]:
@@ -202,7 +202,7 @@ class EpipolarErrorMetric(_PairMetric):
 
 
 class PoseAUCMetric(_PairMetric):
-    """Area under the recall curve of pose errors; see :func:`kornia_learnnorm.pose_accuracy.pose_auc`.
+    """Area under the recall curve of pose errors; see :func:`kornia_learnnorm.metrics.pose_accuracy.pose_auc`.
 
     Args:
         thresholds: largest errors, degrees.
@@ -224,7 +224,7 @@ class PoseAUCMetric(_PairMetric):
         self.thresholds = tuple(thresholds)
 
     def update(self, R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> None:
-        """Add poses; arguments of :func:`~kornia_learnnorm.pose_metrics.pose_error`."""
+        """Add poses; arguments of :func:`~kornia_learnnorm.metrics.poses.pose_error`."""
         self._keep(pose_error(R, t, R_true, t_true))
 
     def compute(self) -> dict[str, Tensor]:

@@ -13,8 +13,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.correspondences import solve_dtype, weighted_mean
-from kornia_learnnorm.transforms import affine_transform, inverse_sqrt
+from kornia_learnnorm.geometry.checks import solve_dtype, weighted_mean
+from kornia_learnnorm.geometry.transforms import affine_transform, inverse_sqrt
 
 __all__ = ["Hartley", "Identity", "PerView", "Whitening"]
 

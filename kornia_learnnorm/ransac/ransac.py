@@ -13,17 +13,17 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor, nn
 
-from kornia_learnnorm.constrained_fit import constrained_fit
-from kornia_learnnorm.correspondences import solve_dtype
-from kornia_learnnorm.epipolar_cost import EpipolarCost
-from kornia_learnnorm.minimal import are_determined, solve_samples
-from kornia_learnnorm.objectives import Factor, GemanMcClure, Loss, Truncated, sampson_factor
-from kornia_learnnorm.rank2_manifold import Rank2, decompose
-from kornia_learnnorm.refine import minimize
-from kornia_learnnorm.sampling import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
-from kornia_learnnorm.scoring import COARSE, FARTHEST, Hypotheses, PairScorer, in_proportion
-from kornia_learnnorm.solver import Normalizer, check_rank2, find_fundamental
-from kornia_learnnorm.threads import one_thread
+from kornia_learnnorm.ransac.constrained_fit import constrained_fit
+from kornia_learnnorm.geometry.checks import solve_dtype
+from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
+from kornia_learnnorm.estimators.minimal import are_determined, solve_samples
+from kornia_learnnorm.estimators.robust_losses import Factor, GemanMcClure, Loss, Truncated, sampson_factor
+from kornia_learnnorm.geometry.manifold import Rank2, decompose
+from kornia_learnnorm.estimators.refinement import minimize
+from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
+from kornia_learnnorm.ransac.scoring import COARSE, FARTHEST, Hypotheses, PairScorer, in_proportion
+from kornia_learnnorm.estimators.fundamental import Normalizer, check_rank2, find_fundamental
+from kornia_learnnorm.ransac.threads import one_thread
 
 __all__ = ["RANSAC"]
 
@@ -48,7 +48,7 @@ class RANSAC(nn.Module):
     are still needed. In the end the best few are fitted on Geman and McClure's loss, and the one of least cost goes on
     to Levenberg-Marquardt where least squares have not converged.
 
-    PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.threads.one_thread`.
+    PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.ransac.threads.one_thread`.
 
     Its call takes and returns what that of ``kornia.geometry.RANSAC(model_type="fundamental_8pt")`` does. What differs:
     the arguments below, of which ``max_iter`` counts samples; the matrix has unit Frobenius norm; and weights steer the
@@ -65,12 +65,12 @@ class RANSAC(nn.Module):
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
             best matrix so far has found all inliers; 1 draws all ``max_iter`` samples. It is close to 1 by default,
             since a sample must not have much noise either.
-        factor: the distance, :func:`~kornia_learnnorm.objectives.sampson_factor` or
-            :func:`~kornia_learnnorm.objectives.symmetric_factor` (Fan et al., Eq. 7).
+        factor: the distance, :func:`~kornia_learnnorm.estimators.robust_losses.sampson_factor` or
+            :func:`~kornia_learnnorm.estimators.robust_losses.symmetric_factor` (Fan et al., Eq. 7).
         rank2: how the singularity constraint is enforced, see :func:`~kornia_learnnorm.find_fundamental`.
         refine: whether to optimise; otherwise the result is the minimal sample of highest score.
-        sampler: what weights do: :class:`~kornia_learnnorm.sampling.ProsacSampler` or
-            :class:`~kornia_learnnorm.sampling.WeightedSampler`.
+        sampler: what weights do: :class:`~kornia_learnnorm.ransac.samplers.ProsacSampler` or
+            :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
 
     Raises:

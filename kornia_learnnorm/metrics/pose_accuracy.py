@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.correspondences import solve_dtype
+from kornia_learnnorm.geometry.checks import solve_dtype
 
 __all__ = ["mean_average_accuracy", "pose_auc"]
 
@@ -54,7 +54,7 @@ def mean_average_accuracy(errors: Tensor, limit: int = 10) -> float:
     r"""Return the share of image pairs with a pose error below 1, 2, ... degrees, averaged: mAA(10).
 
     :math:`\frac{1}{L} \sum_{k=1}^{L} |\{i : e_i < k\}| / P`, with the larger of rotation and translation error as
-    :math:`e_i`, see :func:`~kornia_learnnorm.pose_metrics.pose_error`.
+    :math:`e_i`, see :func:`~kornia_learnnorm.metrics.poses.pose_error`.
 
     Args:
         errors: one pose error per image pair with shape :math:`(P,)`, degrees; infinite for a failure.

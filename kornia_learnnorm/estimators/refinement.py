@@ -1,6 +1,6 @@
 r"""Non-linear refinement of fundamental matrices: Levenberg-Marquardt on distances in pixels, batched.
 
-Matrices move on the manifold of :mod:`~kornia_learnnorm.rank2_manifold`, in coordinates that are Hartley's up to the
+Matrices move on the manifold of :mod:`~kornia_learnnorm.geometry.manifold`, in coordinates that are Hartley's up to the
 scale of homogeneous vectors: pixels from the centroid, and a third coordinate as large as they are. Distances in them
 are those in pixels.
 """
@@ -13,13 +13,13 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.correspondences import check_correspondences, solve_dtype
-from kornia_learnnorm.epipolar_cost import EpipolarCost
-from kornia_learnnorm.normalizers import Hartley
-from kornia_learnnorm.objectives import Factor, Loss, sampson_factor, squared_loss
-from kornia_learnnorm.optimal_rank2 import check_fundamental
-from kornia_learnnorm.rank2_manifold import Rank2, decompose, retract, tangents
-from kornia_learnnorm.transforms import transform_fundamental
+from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
+from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
+from kornia_learnnorm.normalizers.closed_form import Hartley
+from kornia_learnnorm.estimators.robust_losses import Factor, Loss, sampson_factor, squared_loss
+from kornia_learnnorm.geometry.rank2 import check_fundamental
+from kornia_learnnorm.geometry.manifold import Rank2, decompose, retract, tangents
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["Refinement", "minimize", "refine_fundamental"]
 
@@ -73,12 +73,12 @@ def refine_fundamental(
         weights: optional non-negative weights of the losses, :math:`(B, N)` or :math:`(1, N)` as the points; zero means
             absent.
         factor: :math:`g`, from the algebraic residual to a distance in pixels:
-            :func:`~kornia_learnnorm.objectives.sampson_factor` or
-            :func:`~kornia_learnnorm.objectives.symmetric_factor`.
-        loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.objectives.squared_loss`,
-            :class:`~kornia_learnnorm.objectives.Huber`, :class:`~kornia_learnnorm.objectives.Cauchy`,
-            :class:`~kornia_learnnorm.objectives.GemanMcClure` or
-            :class:`~kornia_learnnorm.objectives.Truncated`.
+            :func:`~kornia_learnnorm.estimators.robust_losses.sampson_factor` or
+            :func:`~kornia_learnnorm.estimators.robust_losses.symmetric_factor`.
+        loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.estimators.robust_losses.squared_loss`,
+            :class:`~kornia_learnnorm.estimators.robust_losses.Huber`, :class:`~kornia_learnnorm.estimators.robust_losses.Cauchy`,
+            :class:`~kornia_learnnorm.estimators.robust_losses.GemanMcClure` or
+            :class:`~kornia_learnnorm.estimators.robust_losses.Truncated`.
         max_iterations: largest number of steps tried.
         tolerance: largest cosine between the distances and their derivatives at which a matrix has converged. 1e-3
             saves half of the steps and more, and leaves the cost within about 0.2 % of the optimum: enough for an

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.linear import design_matrix
+from kornia_learnnorm.geometry.linear import design_matrix
 
 __all__ = ["are_determined", "solve_samples"]
 
@@ -39,7 +39,7 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     A QR factorisation of the transposed design matrix, :math:`A^\top = Q R`, tells which samples determine a matrix
     and gives both the null vector, which is the last column of :math:`Q`, and a factor of its covariance,
     :math:`V_0 = L L^\top` with :math:`L = Q_{:,1:8} R^{-\top} \mathrm{diag}(\sqrt{(u, V_i u)})`, see
-    :func:`~kornia_learnnorm.optimal_rank2`, whose steps these are but that :math:`V_0` stays as it is.
+    :func:`~kornia_learnnorm.geometry.rank2`, whose steps these are but that :math:`V_0` stays as it is.
 
     Args:
         x1: homogeneous points of view 1 with shape :math:`(K, 8, 3)`, pixels and a third coordinate as large.

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.objectives import Factor, Loss, sampson_factor
+from kornia_learnnorm.estimators.robust_losses import Factor, Loss, sampson_factor
 
 __all__ = ["Fit", "constrained_fit"]
 
@@ -63,8 +63,8 @@ def constrained_fit(
         x1: homogeneous points of view 1 with shape :math:`(3, N)`, the first two coordinates in pixels.
         x2: the same of view 2.
         F_mat: where to start, with shape :math:`(K, 3, 3)`, any scale but zero.
-        losses: :math:`\rho` of each step, at least one, see :mod:`kornia_learnnorm.objectives`.
-        factor: :math:`g`, see :mod:`kornia_learnnorm.objectives`.
+        losses: :math:`\rho` of each step, at least one, see :mod:`kornia_learnnorm.estimators.robust_losses`.
+        factor: :math:`g`, see :mod:`kornia_learnnorm.estimators.robust_losses`.
 
     Returns:
         the matrices with their costs. Where a step cannot be computed, as without inliers, the matrix that was given

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.objectives import Factor, Loss
+from kornia_learnnorm.estimators.robust_losses import Factor, Loss
 
 __all__ = ["EpipolarCost"]
 
@@ -19,7 +19,7 @@ class EpipolarCost(NamedTuple):
         x1: homogeneous points of view 1, the first two coordinates in pixels, (B or 1, 3, N).
         x2: the same of view 2.
         weights: weights of the losses, (B or 1, N).
-        factor: from algebraic residuals to distances, see :mod:`kornia_learnnorm.objectives`.
+        factor: from algebraic residuals to distances, see :mod:`kornia_learnnorm.estimators.robust_losses`.
         loss: robust loss of squared distances.
     """
 
