@@ -25,11 +25,11 @@ pytest.importorskip("joblib", reason="joblib is not installed")
 from data.make_sequences import write_image
 
 from kornia_learnnorm.data import collect, feature_cache
-from kornia_learnnorm.data.collect import MatchOptions, collect_matches, match_pair
-from kornia_learnnorm.data.feature_cache import FeatureCache
-from kornia_learnnorm.data.features import Features
-from kornia_learnnorm.data.frames import FramePair, pair_frames
-from kornia_learnnorm.data.sequences import read_folder
+from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches, match_pair
+from kornia_learnnorm.data.matching.cache import FeatureCache
+from kornia_learnnorm.data.matching.features import Features
+from kornia_learnnorm.data.datasets.frames import FramePair, pair_frames
+from kornia_learnnorm.data.datasets.sequences import read_folder
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 
 OPTIONS = MatchOptions(num_features=200, max_matches=30)

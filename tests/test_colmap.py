@@ -13,8 +13,8 @@ Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
 from data.make_sequences import FOCAL, FRAMES, SIZE, STEP, metres, write_colmap  # noqa: E402
 
-from kornia_learnnorm.data.colmap import covisible_pairs, read_colmap  # noqa: E402
-from kornia_learnnorm.data.frames import listed_pairs  # noqa: E402
+from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap  # noqa: E402
+from kornia_learnnorm.data.datasets.frames import listed_pairs  # noqa: E402
 
 NAMES = ["one/0.png", "one/1.png", "two/2.png", "two/3.png"]
 

@@ -11,7 +11,7 @@ from kornia.feature import DISK, LightGlue
 
 from kornia_learnnorm.data import features as module
 from kornia_learnnorm.data import matching
-from kornia_learnnorm.data.features import (
+from kornia_learnnorm.data.matching.features import (
     Features,
     detect_disk,
     detect_keynet,

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.data.frames import Frame, FramePair, listed_pairs, pair_frames, resize_frames
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair, listed_pairs, pair_frames, resize_frames
 
 CAMERA = np.array([[500.0, 0, 310], [0, 510, 250], [0, 0, 1]])
 SEEDS = st.integers(0, 2**32 - 1)

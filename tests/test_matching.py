@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.data.matching import match_images
+from kornia_learnnorm.data.matching.matchers import match_images
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 

@@ -4,7 +4,7 @@ import sys
 import numpy as np
 import pytest
 
-from kornia_learnnorm.data.render import RenderedPair, render_pair, write_pair
+from kornia_learnnorm.data.synthetic.render import RenderedPair, render_pair, write_pair
 
 cv2 = pytest.importorskip("cv2")
 

@@ -22,9 +22,9 @@ from safetensors.torch import save_file
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data import store as stores
-from kornia_learnnorm.data.hloc import export_hloc, import_hloc
+from kornia_learnnorm.data.formats.hloc import export_hloc, import_hloc
 from kornia_learnnorm.data.images import image_size, read_image
-from kornia_learnnorm.data.ngransac import import_ngransac
+from kornia_learnnorm.data.formats.ngransac import import_ngransac
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
 from kornia_learnnorm.data.store import StoreReader, read_store, write_store
 from kornia_learnnorm.data.synthesize import synthetic_store

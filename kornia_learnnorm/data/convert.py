@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from kornia_learnnorm.data.hloc import export_hloc, import_hloc
-from kornia_learnnorm.data.interchange import new_folder
-from kornia_learnnorm.data.kitti_flow import export_kitti_flow, import_kitti_flow
-from kornia_learnnorm.data.ngransac import export_ngransac, import_ngransac
+from kornia_learnnorm.data.formats.hloc import export_hloc, import_hloc
+from kornia_learnnorm.data.formats.interchange import new_folder
+from kornia_learnnorm.data.formats.kitti_flow import export_kitti_flow, import_kitti_flow
+from kornia_learnnorm.data.formats.ngransac import export_ngransac, import_ngransac
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store, write_store
 
 __all__ = ["add_arguments", "run"]

@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 import numpy.typing as npt
 
-from kornia_learnnorm.data.frames import Frame, Size
+from kornia_learnnorm.data.datasets.frames import Frame, Size
 
 __all__ = ["image_size", "import_cv2", "read_frame", "read_image"]
 

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kornia_learnnorm.data.samples import RATIO, Samples, draw_samples, plain_residual
 from kornia_learnnorm.data.store import StoreReader
-from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
+from kornia_learnnorm.data.synthetic.scenes import TwoViewScene, random_scenes
 from kornia_learnnorm.files import replacing
 
 __all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator"]
@@ -168,7 +168,7 @@ class SyntheticSamples:
         max_residual: drop samples whose :func:`~kornia_learnnorm.data.samples.plain_residual` is at least this many
             pixels; None keeps all.
         scenes: makes scenes from their number, the points of each and a generator; one of
-            :mod:`kornia_learnnorm.data.synthetic`.
+            :mod:`kornia_learnnorm.data.synthetic.scenes`.
 
     Raises:
         ValueError: if ``number`` is not positive or ``size`` is below 8.

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.images import import_cv2, read_image
-from kornia_learnnorm.data.matching import match_images
+from kornia_learnnorm.data.matching.matchers import match_images
 from kornia_learnnorm.files import replacing
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.estimators.fundamental import find_fundamental

@@ -6,7 +6,7 @@ scale, CVPR 2019. The file of features has a group for each image, nested where 
 file of matches has a group for each pair, ``NAME0/NAME1`` with the slashes of the names turned to ``-``, or, as older
 versions wrote, ``NAME0_NAME1``, with ``matches0`` (N,), the keypoint of image 1 for each keypoint of image 0 or -1,
 and ``matching_scores0`` (N,). What a store loses on the way is in the table of
-:mod:`kornia_learnnorm.data.interchange`.
+:mod:`kornia_learnnorm.data.formats.interchange`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.interchange import Pair, assemble, best_of_each, natural, split_pairs
+from kornia_learnnorm.data.formats.interchange import Pair, assemble, best_of_each, natural, split_pairs
 from kornia_learnnorm.data.store import CorrespondenceStore, _h5py, check_declared
 from kornia_learnnorm.files import replacing
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from kornia_learnnorm.data.frames import Frame
+from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.images import image_size
-from kornia_learnnorm.data.textfiles import (
+from kornia_learnnorm.data.datasets.textfiles import (
     camera_matrix,
     listed_image,
     parent_name,

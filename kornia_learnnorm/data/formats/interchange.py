@@ -24,8 +24,8 @@ order of the pairs             kept                      by number of the images
 ``detector``, ``provenance``   lost                      lost                     lost
 =============================  ========================  =======================  ========================
 
-The formats are in :mod:`~kornia_learnnorm.data.kitti_flow`, :mod:`~kornia_learnnorm.data.ngransac` and
-:mod:`~kornia_learnnorm.data.hloc`. A ratio of 0 passes every ratio test. An export returns what it left out or
+The formats are in :mod:`~kornia_learnnorm.data.formats.kitti_flow`, :mod:`~kornia_learnnorm.data.formats.ngransac` and
+:mod:`~kornia_learnnorm.data.formats.hloc`. A ratio of 0 passes every ratio test. An export returns what it left out or
 changed, and how often; what begins with "matches" is left out.
 """
 

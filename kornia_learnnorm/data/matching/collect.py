@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 import kornia_learnnorm
-from kornia_learnnorm.data.feature_cache import FeatureCache
-from kornia_learnnorm.data.features import DETECTORS, Features
-from kornia_learnnorm.data.frames import Frame, FramePair
+from kornia_learnnorm.data.matching.cache import FeatureCache
+from kornia_learnnorm.data.matching.features import DETECTORS, Features
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.images import import_cv2, read_frame
-from kornia_learnnorm.data.matching import MATCHERS
+from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.data.workers import Workers, open_workers
+from kornia_learnnorm.data.matching.workers import Workers, open_workers
 from kornia_learnnorm.data.writer import StoreWriter
 
 __all__ = ["MatchOptions", "collect_matches", "match_pair"]
@@ -38,9 +38,9 @@ class MatchOptions:
     """How images are matched.
 
     Attributes:
-        detector: a key of ``kornia_learnnorm.data.features.DETECTORS``.
+        detector: a key of ``kornia_learnnorm.data.matching.features.DETECTORS``.
         num_features: the strongest features of an image that are kept.
-        matcher: a key of ``kornia_learnnorm.data.matching.MATCHERS``.
+        matcher: a key of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
         max_matches: how many matches of a pair pass Lowe's ratio test of 0.8, and how many that do not, are kept, drawn
             at random; None keeps all.
         seed: seed of that draw and of the order of a pair's matches.

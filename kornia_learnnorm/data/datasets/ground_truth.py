@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kornia_learnnorm.data.frames import Frame
-from kornia_learnnorm.data.sequences import _marked_folders
+from kornia_learnnorm.data.datasets.frames import Frame
+from kornia_learnnorm.data.datasets.sequences import _marked_folders
 
 __all__ = ["missing_ground_truth"]
 

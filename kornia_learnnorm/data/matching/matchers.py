@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.features import Features, detect_sift, pretrained
+from kornia_learnnorm.data.matching.features import Features, detect_sift, pretrained
 from kornia_learnnorm.data.images import import_cv2
 
 __all__ = ["MATCHERS", "Matches", "match_images", "match_lightglue", "match_nearest"]
@@ -69,7 +69,7 @@ def match_lightglue(features1: Features, features2: Features) -> Matches:
     usual 0.8 keeps scores above 0.2.
 
     Args:
-        features1: features of image 1, from :func:`~kornia_learnnorm.data.features.detect_disk`.
+        features1: features of image 1, from :func:`~kornia_learnnorm.data.matching.features.detect_disk`.
         features2: features of image 2.
 
     Returns:

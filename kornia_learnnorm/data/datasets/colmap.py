@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.frames import Frame, FramePair
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.images import image_size
 
 __all__ = ["covisible_pairs", "read_colmap"]

@@ -3,7 +3,7 @@
 M. Menze and A. Geiger, Object scene flow for autonomous vehicles, CVPR 2015, and the development kit of KITTI 2015:
 ``000000_10.png``, one for each pair, of 16 bits in three channels with the size of image 1. R and G hold 64 times the
 displacement in x and y plus 2^15, B is not 0 where there is one. What a store loses on the way is in the table of
-:mod:`kornia_learnnorm.data.interchange`.
+:mod:`kornia_learnnorm.data.formats.interchange`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2
-from kornia_learnnorm.data.interchange import Pair, assemble, best_of_each, files_in, new_folder, split_pairs
+from kornia_learnnorm.data.formats.interchange import Pair, assemble, best_of_each, files_in, new_folder, split_pairs
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import replacing
 

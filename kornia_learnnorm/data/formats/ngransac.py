@@ -3,7 +3,7 @@
 E. Brachmann and C. Rother, Neural-guided RANSAC, ICCV 2019: one ``pair_I_J.npy`` for each image pair, I and J the
 numbers of its images, holding an array of nine objects: points of image 1 (1, N, 2) and of image 2, ratios (1, N, 1),
 ``image.shape`` of both images, K of both, R (3, 3) and t (3, 1) of x2 = R x1 + t. What a store loses on the way is in
-the table of :mod:`kornia_learnnorm.data.interchange`.
+the table of :mod:`kornia_learnnorm.data.formats.interchange`.
 
 The objects are a pickle, and a pickle of unknown origin can run anything. Here its arrays are read as the bytes that
 they are; not even NumPy's own code unpickles them, since it trusts what the file says of their layout.
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.interchange import Pair, assemble, files_in, new_folder, split_pairs
+from kornia_learnnorm.data.formats.interchange import Pair, assemble, files_in, new_folder, split_pairs
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import replacing
 
