@@ -16,9 +16,9 @@ from two_view import epipolar_distances
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.metrics.better_rate import bootstrap_interval
-from lightning_modules.cli import main
+from kornia_learnnorm.cli.main import main
 
 FOLDER = Path(__file__).parent.parent / "configs"
 CONFIGS = sorted(FOLDER.glob("*.yaml"))
@@ -228,7 +228,7 @@ def test_interrupted(monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kornia_learnnorm.evaluation.evaluate.run", interrupt)
+    monkeypatch.setattr("kornia_learnnorm.cli.evaluate.run", interrupt)
     assert main(["evaluate", "store.h5"]) == 130
     assert capsys.readouterr().err == "interrupted\n"
 

@@ -34,7 +34,7 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 
 OPTIONS = MatchOptions(num_features=200, max_matches=30)
 ARRAYS = ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t")
-COMMAND = [sys.executable, "-m", "lightning_modules.cli", "match", "folder"]
+COMMAND = [sys.executable, "-m", "kornia_learnnorm.cli.main", "match", "folder"]
 
 
 def frames_of(root: Path, number: int = 6) -> Path:

@@ -15,7 +15,7 @@ import torch
 
 from kornia_learnnorm.evaluation import estimate as command_module
 from kornia_learnnorm.evaluation import pair as module
-from kornia_learnnorm.evaluation.estimate import add_arguments, run
+from kornia_learnnorm.cli.estimate import add_arguments, run
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
 from kornia_learnnorm.files import replacing
 from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening

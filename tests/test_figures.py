@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation.figures import clip_lines, draw_pair
+from kornia_learnnorm.evaluation.drawing import clip_lines, draw_pair
 from kornia_learnnorm.evaluation.pair import PairEstimate
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")

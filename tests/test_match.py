@@ -16,7 +16,7 @@ from data.make_sequences import LAYOUTS
 
 from kornia_learnnorm.data import collect, match
 from kornia_learnnorm.data.store import read_store
-from lightning_modules.cli import main
+from kornia_learnnorm.cli.main import main
 
 FR3 = "rgbd_dataset_freiburg3_long_office_household"
 

@@ -11,16 +11,16 @@ import yaml
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.evaluation import predict_run
-from kornia_learnnorm.evaluation.consensus import THRESHOLDS, consensus
+from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS, consensus
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.report_motion import by_motion
-from kornia_learnnorm.evaluation.report_print import print_tables
-from kornia_learnnorm.evaluation.report_rates import Table, rate_tables
-from kornia_learnnorm.evaluation.run import Cell, Run
+from kornia_learnnorm.evaluation.report.motion import by_motion
+from kornia_learnnorm.evaluation.report.printing import print_tables
+from kornia_learnnorm.evaluation.report.rates import Table, rate_tables
+from kornia_learnnorm.evaluation.runs.run import Cell, Run
 from kornia_learnnorm.evaluation.tables import names_of
-from kornia_learnnorm.evaluation.trained import SHIPPED, saw, trained_on
+from kornia_learnnorm.evaluation.runs.trained import SHIPPED, saw, trained_on
 from kornia_learnnorm.normalizers.learned import WEIGHTS
 from kornia_learnnorm.metrics.pairs import f1_score, inlier_share
 

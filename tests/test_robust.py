@@ -14,24 +14,24 @@ import torch
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.evaluation import example, hypotheses, robust_estimators, robust_peers, robust_record
-from kornia_learnnorm.evaluation.hypotheses import expected_best, hypothesis_quality, picked
-from kornia_learnnorm.evaluation.report import write_report
-from kornia_learnnorm.evaluation.report_hypotheses import hypothesis_tables
-from kornia_learnnorm.evaluation.report_robust import PRINTED, robust_tables
-from kornia_learnnorm.evaluation.robust_budgets import minimal_samples, run_estimator
-from kornia_learnnorm.evaluation.robust_estimators import (
+from kornia_learnnorm.evaluation.robust.hypotheses import expected_best, hypothesis_quality, picked
+from kornia_learnnorm.cli.report import write_report
+from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_tables
+from kornia_learnnorm.evaluation.report.robust import PRINTED, robust_tables
+from kornia_learnnorm.evaluation.robust.budgets import minimal_samples, run_estimator
+from kornia_learnnorm.evaluation.robust.estimators import (
     DEFAULT_ESTIMATORS,
     estimator_names,
     find_estimator,
     find_solver,
     is_slow,
 )
-from kornia_learnnorm.evaluation.robust_matches import draw_matches, measure
-from kornia_learnnorm.evaluation.robust_run import read_robust
+from kornia_learnnorm.evaluation.robust.matches import draw_matches, measure
+from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.metrics.pairs import f1_score
-from lightning_modules.cli import main
+from kornia_learnnorm.cli.main import main
 
 ESTIMATORS = ["kornia-8pt", "count:Hartley", "count:whitening", "time:Hartley", "time:whitening", "RANSAC"]
 SOLVERS = ["Hartley", "whitening", "seven-point"]

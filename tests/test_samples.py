@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from kornia_learnnorm.data.samples import draw_samples, plain_residual
-from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.cli.synthesize import synthetic_store
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import torch
 from kornia_learnnorm.data.samples import draw_samples, plain_residual
 from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
 from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.synthetic.scenes import forward_driving, handheld
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store, write_store
-from kornia_learnnorm.data.synthesize import synthetic_store
+from kornia_learnnorm.cli.synthesize import synthetic_store
 
 
 @pytest.fixture

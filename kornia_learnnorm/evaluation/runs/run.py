@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.manifest import read_about
+from kornia_learnnorm.evaluation.runs.manifest import read_about
 
 __all__ = [
     "Cell",
@@ -73,7 +73,7 @@ class Run:
         cells: stores and protocols.
         pairs: figures of each store's pairs, (P,) each.
         sizes: errors by the number of correspondences, by method.
-        example: the image pair that these errors are of, from :func:`~kornia_learnnorm.evaluation.example.random_pair`;
+        example: the image pair that these errors are of, from :func:`~kornia_learnnorm.evaluation.runs.example.random_pair`;
             nothing where there is none yet.
         missing: what is not there yet.
     """

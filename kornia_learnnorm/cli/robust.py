@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.evaluation.robust_budgets import Estimator
-from kornia_learnnorm.evaluation.robust_estimators import (
+from kornia_learnnorm.evaluation.robust.budgets import Estimator
+from kornia_learnnorm.evaluation.robust.estimators import (
     DEFAULT_ESTIMATORS,
     DEFAULT_SOLVERS,
     estimator_names,
@@ -23,9 +23,9 @@ from kornia_learnnorm.evaluation.robust_estimators import (
     find_solver,
     identify_estimator,
 )
-from kornia_learnnorm.evaluation.robust_peers import PEERS
-from kornia_learnnorm.evaluation.robust_record import record_missing
-from kornia_learnnorm.evaluation.robust_run import begin_run, leave_out
+from kornia_learnnorm.evaluation.robust.peers import PEERS
+from kornia_learnnorm.evaluation.robust.record import record_missing
+from kornia_learnnorm.evaluation.robust.run import begin_run, leave_out
 from kornia_learnnorm.evaluation.tables import names_of
 
 __all__ = ["add_arguments", "record_robust", "run"]
@@ -99,8 +99,8 @@ def record_robust(
     Args:
         folder: the run, made if missing.
         stores: paths of the stores by the names that tables give them.
-        estimators: names for :func:`~kornia_learnnorm.evaluation.robust_estimators.find_estimator`.
-        solvers: names for :func:`~kornia_learnnorm.evaluation.robust_estimators.find_solver`.
+        estimators: names for :func:`~kornia_learnnorm.evaluation.robust.estimators.find_estimator`.
+        solvers: names for :func:`~kornia_learnnorm.evaluation.robust.estimators.find_solver`.
         options: of ``pairs``, ``hypotheses``, ``seeds``, ``slow_seeds`` and ``seed`` those that differ from the
             command's.
         redo: estimators or solvers whose figures are computed again.

@@ -19,12 +19,12 @@ from tqdm import tqdm
 
 from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.evaluation.example import random_pair, sweep
-from kornia_learnnorm.evaluation.manifest import begin_run, leave_out
+from kornia_learnnorm.evaluation.runs.example import random_pair, sweep
+from kornia_learnnorm.evaluation.runs.manifest import begin_run, leave_out
 from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.motion import pair_motions
-from kornia_learnnorm.evaluation.predict_run import describe, draw, predict
-from kornia_learnnorm.evaluation.run import (
+from kornia_learnnorm.evaluation.runs.motion import pair_motions
+from kornia_learnnorm.evaluation.runs.predict import describe, draw, predict
+from kornia_learnnorm.evaluation.runs.run import (
     EXAMPLE,
     PAIRS,
     PREDICTIONS,
@@ -36,7 +36,7 @@ from kornia_learnnorm.evaluation.run import (
     read_arrays,
     within_limit,
 )
-from kornia_learnnorm.evaluation.trained import trained_on
+from kornia_learnnorm.evaluation.runs.trained import trained_on
 from kornia_learnnorm.files import replacing
 
 __all__ = ["PROTOCOLS", "record_run"]

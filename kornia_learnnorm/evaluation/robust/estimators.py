@@ -9,9 +9,9 @@ from typing import Any
 from kornia.geometry.epipolar.fundamental import run_7point
 
 from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.robust_budgets import Estimate, Estimator, Solver, best_of, peer_estimator, ransac
-from kornia_learnnorm.evaluation.robust_matches import Matches
-from kornia_learnnorm.evaluation.robust_peers import PEERS, find_peer, peer_version
+from kornia_learnnorm.evaluation.robust.budgets import Estimate, Estimator, Solver, best_of, peer_estimator, ransac
+from kornia_learnnorm.evaluation.robust.matches import Matches
+from kornia_learnnorm.evaluation.robust.peers import PEERS, find_peer, peer_version
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 
 __all__ = [
@@ -65,7 +65,7 @@ def find_estimator(name: str) -> Estimator:
     """Return a robust estimator by its name.
 
     Args:
-        name: one of those in :mod:`~kornia_learnnorm.evaluation.robust_peers`; ``count:SOLVER``, the best of 1,000
+        name: one of those in :mod:`~kornia_learnnorm.evaluation.robust.peers`; ``count:SOLVER``, the best of 1,000
             minimal samples, the same for all solvers; ``time:METHOD``, the best of those of 50 ms; ``RANSAC``,
             :class:`~kornia_learnnorm.RANSAC` with its defaults; ``RANSAC:METHOD``, with another normaliser and at most
             20,000 samples; ``ground-truth``, the true matrix, which says how far the others' figures can be trusted.

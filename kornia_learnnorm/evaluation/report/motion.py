@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report_rates import BASELINE, Table, rate_text
-from kornia_learnnorm.evaluation.run import Cell, Run
+from kornia_learnnorm.evaluation.report.rates import BASELINE, Table, rate_text
+from kornia_learnnorm.evaluation.runs.run import Cell, Run
 
 __all__ = ["by_motion", "worst_failures"]
 

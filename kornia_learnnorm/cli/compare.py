@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.evaluation.evaluate import beside_closed_forms, evaluation_samples
+from kornia_learnnorm.cli.evaluate import beside_closed_forms, evaluation_samples
 from kornia_learnnorm.evaluation.predict import Normalizer, Residuals, evaluate_normalizers
 from kornia_learnnorm.evaluation.tables import format_table, names_of
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer

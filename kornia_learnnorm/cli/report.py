@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kornia_learnnorm.data.samples import RATIO
-from kornia_learnnorm.evaluation.report_figures import report_figures
-from kornia_learnnorm.evaluation.report_hypotheses import hypothesis_figures, hypothesis_tables
-from kornia_learnnorm.evaluation.report_print import print_tables
-from kornia_learnnorm.evaluation.report_rates import Table, with_baseline
-from kornia_learnnorm.evaluation.report_robust import about_robust, robust_tables
-from kornia_learnnorm.evaluation.report_style import Picture
-from kornia_learnnorm.evaluation.report_tables import report_tables
-from kornia_learnnorm.evaluation.robust_run import read_robust
-from kornia_learnnorm.evaluation.run import Run, read_run
+from kornia_learnnorm.evaluation.report.figures import report_figures
+from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_figures, hypothesis_tables
+from kornia_learnnorm.evaluation.report.printing import print_tables
+from kornia_learnnorm.evaluation.report.rates import Table, with_baseline
+from kornia_learnnorm.evaluation.report.robust import about_robust, robust_tables
+from kornia_learnnorm.evaluation.report.style import Picture
+from kornia_learnnorm.evaluation.report.tables import report_tables
+from kornia_learnnorm.evaluation.robust.run import read_robust
+from kornia_learnnorm.evaluation.runs.run import Run, read_run
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import replacing
 

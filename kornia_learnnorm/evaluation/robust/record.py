@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.evaluation.consensus import THRESHOLDS
-from kornia_learnnorm.evaluation.hypotheses import hypothesis_quality, samples_of
-from kornia_learnnorm.evaluation.record import PROTOCOLS
-from kornia_learnnorm.evaluation.robust_budgets import Estimate, Estimator, Solver, run_estimator
-from kornia_learnnorm.evaluation.robust_estimators import is_slow, is_timed
-from kornia_learnnorm.evaluation.robust_matches import Matches, draw_matches, even_pairs, measure
-from kornia_learnnorm.evaluation.robust_run import estimate_path, hypotheses_path
-from kornia_learnnorm.evaluation.run import read_arrays
+from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
+from kornia_learnnorm.evaluation.robust.hypotheses import hypothesis_quality, samples_of
+from kornia_learnnorm.evaluation.runs.record import PROTOCOLS
+from kornia_learnnorm.evaluation.robust.budgets import Estimate, Estimator, Solver, run_estimator
+from kornia_learnnorm.evaluation.robust.estimators import is_slow, is_timed
+from kornia_learnnorm.evaluation.robust.matches import Matches, draw_matches, even_pairs, measure
+from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path
+from kornia_learnnorm.evaluation.runs.run import read_arrays
 from kornia_learnnorm.files import replacing
 
 __all__ = ["record_missing"]

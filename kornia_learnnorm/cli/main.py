@@ -19,15 +19,15 @@ TRAINING = {
     "predict": "write the predictions of a checkpoint",
 }
 TOOLS = {
-    "estimate": ("kornia_learnnorm.evaluation.estimate", "the fundamental matrix of two images"),
-    "evaluate": ("kornia_learnnorm.evaluation.evaluate", "better rates and errors on stores of correspondences"),
-    "diagnose": ("kornia_learnnorm.evaluation.diagnose", "condition number, rank-2 error and other diagnostics"),
-    "compare": ("kornia_learnnorm.evaluation.compare", "trained weights side by side, with confidence intervals"),
-    "robust": ("kornia_learnnorm.evaluation.robust", "robust estimators and minimal solvers on stores"),
-    "report": ("kornia_learnnorm.evaluation.report", "tables and figures of what evaluate --out and robust wrote"),
-    "match": ("kornia_learnnorm.data.match", "a store of correspondences from folders of images"),
-    "convert": ("kornia_learnnorm.data.convert", "a store from or to the match files of others"),
-    "synthesize": ("kornia_learnnorm.data.synthesize", "a synthetic store and a rendered image pair"),
+    "estimate": ("kornia_learnnorm.cli.estimate", "the fundamental matrix of two images"),
+    "evaluate": ("kornia_learnnorm.cli.evaluate", "better rates and errors on stores of correspondences"),
+    "diagnose": ("kornia_learnnorm.cli.diagnose", "condition number, rank-2 error and other diagnostics"),
+    "compare": ("kornia_learnnorm.cli.compare", "trained weights side by side, with confidence intervals"),
+    "robust": ("kornia_learnnorm.cli.robust", "robust estimators and minimal solvers on stores"),
+    "report": ("kornia_learnnorm.cli.report", "tables and figures of what evaluate --out and robust wrote"),
+    "match": ("kornia_learnnorm.cli.match", "a store of correspondences from folders of images"),
+    "convert": ("kornia_learnnorm.cli.convert", "a store from or to the match files of others"),
+    "synthesize": ("kornia_learnnorm.cli.synthesize", "a synthetic store and a rendered image pair"),
 }
 
 

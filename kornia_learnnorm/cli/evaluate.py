@@ -13,8 +13,8 @@ from kornia_learnnorm.data.samples import RATIO, Samples, draw_samples, plain_re
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import DEFAULT_METHODS
 from kornia_learnnorm.evaluation.predict import Normalizer, evaluate_normalizers
-from kornia_learnnorm.evaluation.record import record_run
-from kornia_learnnorm.evaluation.run import MAX_RESIDUAL
+from kornia_learnnorm.evaluation.runs.record import record_run
+from kornia_learnnorm.evaluation.runs.run import MAX_RESIDUAL
 from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows, names_of
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening

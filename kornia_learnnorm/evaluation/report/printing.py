@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from kornia_learnnorm.evaluation.report_rates import Table
+from kornia_learnnorm.evaluation.report.rates import Table
 
 __all__ = ["print_tables"]
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.evaluation.figures import INLIER, OUTLIER, clip_lines, import_matplotlib
-from kornia_learnnorm.evaluation.report_style import INK, Picture, make_figure, make_picture
-from kornia_learnnorm.evaluation.run import Run
+from kornia_learnnorm.evaluation.drawing import INLIER, OUTLIER, clip_lines, import_matplotlib
+from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture
+from kornia_learnnorm.evaluation.runs.run import Run
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def example_inliers(pair: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """Return which matches of the image pair of a run lie within 1 px of the ground truth, boolean (M,).
 
     Args:
-        pair: from :func:`~kornia_learnnorm.evaluation.example.random_pair`.
+        pair: from :func:`~kornia_learnnorm.evaluation.runs.example.random_pair`.
 
     """
     points1, points2, F_mat = (torch.from_numpy(pair[key]) for key in ("points1", "points2", "F"))

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         picture = None if args.out is None else stack.enter_context(replacing(args.out))
         report = None if args.json is None else stack.enter_context(replacing(args.json))
         if picture is not None:
-            from kornia_learnnorm.evaluation.figures import draw_pair, import_matplotlib
+            from kornia_learnnorm.evaluation.drawing import draw_pair, import_matplotlib
 
             import_matplotlib()
         normalizer = LearnedNormalizer.from_pretrained(*([args.weights] if args.weights else []))

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.consensus import THRESHOLDS
-from kornia_learnnorm.evaluation.manifest import read_object
-from kornia_learnnorm.evaluation.run import file_name, read_arrays
+from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
+from kornia_learnnorm.evaluation.runs.manifest import read_object
+from kornia_learnnorm.evaluation.runs.run import file_name, read_arrays
 from kornia_learnnorm.files import replacing
 
 __all__ = ["RobustCell", "RobustRun", "begin_run", "estimate_path", "hypotheses_path", "leave_out", "read_robust"]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from kornia_learnnorm.evaluation.example import TRIALS
-from kornia_learnnorm.evaluation.report_pair import THRESHOLD, draw_example, example_inliers
-from kornia_learnnorm.evaluation.report_style import COLORS, INK, Picture, make_figure, make_picture
-from kornia_learnnorm.evaluation.run import Cell, Run
+from kornia_learnnorm.evaluation.runs.example import TRIALS
+from kornia_learnnorm.evaluation.report.pair import THRESHOLD, draw_example, example_inliers
+from kornia_learnnorm.evaluation.report.style import COLORS, INK, Picture, make_figure, make_picture
+from kornia_learnnorm.evaluation.runs.run import Cell, Run
 
 __all__ = ["report_figures"]
 

@@ -9,7 +9,7 @@ import io
 import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from kornia_learnnorm.evaluation.figures import import_matplotlib
+from kornia_learnnorm.evaluation.drawing import import_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

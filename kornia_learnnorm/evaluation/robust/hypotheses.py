@@ -10,8 +10,8 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.robust_budgets import Solver, minimal_samples
-from kornia_learnnorm.evaluation.robust_matches import Matches
+from kornia_learnnorm.evaluation.robust.budgets import Solver, minimal_samples
+from kornia_learnnorm.evaluation.robust.matches import Matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["MOST_ERROR", "NUMBERS", "expected_best", "hypothesis_quality", "picked", "samples_of"]

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.predict import Normalizer
-from kornia_learnnorm.evaluation.robust_matches import Matches
-from kornia_learnnorm.evaluation.robust_peers import Peer
+from kornia_learnnorm.evaluation.robust.matches import Matches
+from kornia_learnnorm.evaluation.robust.peers import Peer
 from kornia_learnnorm.estimators.minimal import are_determined
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, draw_distinct
@@ -60,7 +60,7 @@ def run_estimator(estimator: Estimator, matches: Matches, seed: int, thresholds:
     """Run an estimator, or let it fail where there are fewer than eight correspondences.
 
     Args:
-        estimator: from :func:`~kornia_learnnorm.evaluation.robust_estimators.find_estimator`.
+        estimator: from :func:`~kornia_learnnorm.evaluation.robust.estimators.find_estimator`.
         matches: the correspondences.
         seed: seed of its draws.
         thresholds: of inliers, pixels.
@@ -82,7 +82,7 @@ def peer_estimator(peer: Peer) -> Estimator:
     """Return an estimator of another package, timed.
 
     Args:
-        peer: from :func:`~kornia_learnnorm.evaluation.robust_peers.find_peer`.
+        peer: from :func:`~kornia_learnnorm.evaluation.robust.peers.find_peer`.
 
     """
 
