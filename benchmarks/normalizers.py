@@ -13,7 +13,7 @@ import torch
 from kornia.geometry.epipolar import find_fundamental
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic.scenes import random_scenes
+from kornia_learnnorm.data.synthetic import random_scenes
 from kornia_learnnorm.evaluation.tables import format_table
 
 parser = argparse.ArgumentParser(description=__doc__)

@@ -16,7 +16,7 @@ from torch import Generator, Tensor, nn
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.images import read_image
-from kornia_learnnorm.data.synthetic.scenes import orbit
+from kornia_learnnorm.data.synthetic import orbit
 from kornia_learnnorm.estimators.eight_point import TwoViewEstimate
 
 Features = dict[str, Tensor]

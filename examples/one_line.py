@@ -14,7 +14,7 @@ from kornia.geometry import epipolar
 from torch import Generator, Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic.scenes import forward_driving
+from kornia_learnnorm.data.synthetic import forward_driving
 
 
 def relative_pose(

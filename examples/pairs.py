@@ -16,7 +16,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic.scenes import orbit
+from kornia_learnnorm.data.synthetic import orbit
 
 
 class Pairs(NamedTuple):

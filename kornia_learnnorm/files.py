@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["replacing"]
+__all__ = ["atomic_write"]
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def atomic_write(path: str | Path) -> Iterator[Path]:
     """Give a temporary file beside ``path`` to write; it takes the place of ``path`` only if the block succeeds.
 
     Args:
@@ -29,7 +29,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with replacing(Path(folder) / "note.txt") as temporary:
+        ...     with atomic_write(Path(folder) / "note.txt") as temporary:
         ...         _ = temporary.write_text("whole")
         ...     (Path(folder) / "note.txt").read_text()
         'whole'
@@ -44,11 +44,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise PermissionError(f"cannot write {path}: the folder {path.parent} is not writable")
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
+        temporary.touch()  # a new file shows the mode that the process' umask allows
+        mode = temporary.stat().st_mode
         yield temporary
-        # Some writers make files for their owner alone: give them the mode of any other new file.
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
+        temporary.chmod(mode)  # some writers create files that only their owner can read
         temporary.replace(path)
     except OSError as error:
         if error.filename != str(temporary):

@@ -12,7 +12,7 @@ from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import save_file
 from torch import Tensor, distributed
 
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 from lightning_modules.task import NormalizerTask
 
 __all__ = ["Checkpoints", "ExportWeights", "WritePredictions"]
@@ -89,7 +89,7 @@ class WritePredictions(Callback):
         path = Path(trainer.default_root_dir) / self.filename
         path.parent.mkdir(parents=True, exist_ok=True)
         fields = {key: torch.cat([batch[key] for batch in batches]) for key in batches[0]}
-        with replacing(path) as beside:
+        with atomic_write(path) as beside:
             save_file(fields, beside)
         print(f"wrote {path}")
 

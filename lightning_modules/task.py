@@ -13,14 +13,14 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 
-from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.geometry.checks import solve_dtype
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.losses import EpipolarLoss
 from kornia_learnnorm.metrics.better_rate import comparable
 from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 
 __all__ = ["NormalizerTask"]
 

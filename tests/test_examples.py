@@ -13,7 +13,7 @@ from kornia.feature import DISK, LightGlue
 from kornia.geometry import RANSAC
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic.scenes import orbit
+from kornia_learnnorm.data.synthetic import orbit
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

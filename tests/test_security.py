@@ -21,15 +21,15 @@ import torch
 from safetensors.torch import save_file
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data import store as stores
 from kornia_learnnorm.data.formats.hloc import export_hloc, import_hloc
-from kornia_learnnorm.data.images import image_size, read_image
 from kornia_learnnorm.data.formats.ngransac import import_ngransac
+from kornia_learnnorm.data.images import image_size, read_image
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
 from kornia_learnnorm.data.store import StoreReader, read_store, write_store
-from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.evaluation.runs.run import read_arrays
-from kornia_learnnorm.cli.main import main
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import NormalizerTask
 

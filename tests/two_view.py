@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.data.synthetic.scenes import TwoViewScene, forward_driving, handheld, orbit, random_scenes
+from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 

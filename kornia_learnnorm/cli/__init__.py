@@ -1,1 +1,1 @@
-"""cli"""
+"""The command ``learnnorm``: one module a command."""

@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.cli.evaluate import beside_closed_forms, evaluation_samples
 from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.cli.evaluate import beside_closed_forms, evaluation_samples
 from kornia_learnnorm.evaluation.predict import Normalizer, Residuals, evaluate_normalizers
 from kornia_learnnorm.evaluation.tables import format_table, names_of
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.metrics.better_rate import better_rate, bootstrap_interval, comparable
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 
 __all__ = ["add_arguments", "compare", "run"]
 

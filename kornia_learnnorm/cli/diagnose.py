@@ -7,10 +7,10 @@ import argparse
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.cli.evaluate import beside_closed_forms
 from kornia_learnnorm.data.samples import RATIO, draw_samples
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
-from kornia_learnnorm.cli.evaluate import beside_closed_forms
 from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from kornia_learnnorm.data.images import read_image
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 
 __all__ = ["add_arguments", "run"]
@@ -61,8 +61,8 @@ def run(args: argparse.Namespace) -> int:
     """
     _check_outputs(args)
     with ExitStack() as stack:
-        picture = None if args.out is None else stack.enter_context(replacing(args.out))
-        report = None if args.json is None else stack.enter_context(replacing(args.json))
+        picture = None if args.out is None else stack.enter_context(atomic_write(args.out))
+        report = None if args.json is None else stack.enter_context(atomic_write(args.json))
         if picture is not None:
             from kornia_learnnorm.evaluation.drawing import draw_pair, import_matplotlib
 

@@ -15,11 +15,11 @@ from kornia_learnnorm.evaluation.methods import DEFAULT_METHODS
 from kornia_learnnorm.evaluation.predict import Normalizer, evaluate_normalizers
 from kornia_learnnorm.evaluation.runs.record import record_run
 from kornia_learnnorm.evaluation.runs.run import MAX_RESIDUAL
-from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows, names_of
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
-from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
-from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
+from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows, names_of
+from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = ["add_arguments", "beside_closed_forms", "evaluate_store", "evaluation_samples", "run"]
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from kornia_learnnorm.data.datasets.cambridge import read_cambridge
-from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap
-from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair, listed_pairs, pair_frames, resize_frames
 from kornia_learnnorm.data.datasets.ground_truth import missing_ground_truth
-from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.datasets.sequences import read_folder, read_kitti, read_tum, split_sequences
-from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches
+from kornia_learnnorm.data.matching.features import DETECTORS
+from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
+from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.writer import check_target
 
 __all__ = ["add_arguments", "run"]

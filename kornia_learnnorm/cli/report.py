@@ -21,7 +21,7 @@ from kornia_learnnorm.evaluation.report.tables import report_tables
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["Report", "add_arguments", "run", "write_report"]
 
@@ -113,7 +113,7 @@ def write_report(folder: str | Path) -> Report:
 
 
 def _write(path: Path, text: str) -> None:
-    with replacing(path) as beside:
+    with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
 
 

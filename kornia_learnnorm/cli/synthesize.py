@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 from kornia_learnnorm.data.store import CorrespondenceStore, write_store
-from kornia_learnnorm.data.synthetic.scenes import TwoViewScene, forward_driving, handheld, orbit
+from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit
+from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 
 __all__ = ["add_arguments", "run", "synthetic_store"]
 

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from kornia_learnnorm.data.samples import RATIO, Samples, draw_samples, plain_residual
 from kornia_learnnorm.data.store import StoreReader
-from kornia_learnnorm.data.synthetic.scenes import TwoViewScene, random_scenes
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator"]
 
@@ -153,7 +153,7 @@ class StoreSamples:
             return torch.from_numpy(np.load(path))
         kept = plain_residual(samples.points1, samples.points2) < max_residual
         self.cache.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as beside:
+        with atomic_write(path) as beside:
             np.save(beside, kept.numpy())
         return kept
 
@@ -168,7 +168,7 @@ class SyntheticSamples:
         max_residual: drop samples whose :func:`~kornia_learnnorm.data.samples.plain_residual` is at least this many
             pixels; None keeps all.
         scenes: makes scenes from their number, the points of each and a generator; one of
-            :mod:`kornia_learnnorm.data.synthetic.scenes`.
+            :mod:`kornia_learnnorm.data.synthetic`.
 
     Raises:
         ValueError: if ``number`` is not positive or ``size`` is below 8.

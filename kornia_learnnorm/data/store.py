@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 if TYPE_CHECKING:
     import h5py
@@ -328,7 +328,7 @@ def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provena
 
     """
     h5py = _h5py()
-    with replacing(path) as beside:
+    with atomic_write(path) as beside:
         try:
             with h5py.File(beside, "w") as file:
                 _append_all(h5py, file, stores)

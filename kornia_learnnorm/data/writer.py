@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from kornia_learnnorm.data.store import CorrespondenceStore, join_stores, read_store, write_store
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["StoreWriter", "check_target"]
 
@@ -84,7 +84,7 @@ class StoreWriter:
     def _begin(self) -> None:
         try:
             self.folder.mkdir(exist_ok=True)
-            with replacing(self.folder / OPTIONS) as beside:
+            with atomic_write(self.folder / OPTIONS) as beside:
                 beside.write_text(json.dumps(self.options, indent=1), encoding="utf-8")
         except OSError as error:
             self.close()

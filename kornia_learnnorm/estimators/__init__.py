@@ -1,1 +1,1 @@
-"""estimators"""
+"""From correspondences to fundamental matrices: linear, refined, minimal."""

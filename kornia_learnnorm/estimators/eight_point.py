@@ -10,6 +10,8 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from kornia_learnnorm.estimators.fundamental import check_rank2, find_fundamental
+from kornia_learnnorm.estimators.matches import correspondences_from_matches
 from kornia_learnnorm.geometry.checks import (
     check_correspondences,
     check_mask,
@@ -17,10 +19,8 @@ from kornia_learnnorm.geometry.checks import (
     solve_dtype,
 )
 from kornia_learnnorm.geometry.linear import design_matrix, has_null_vector
-from kornia_learnnorm.estimators.matches import correspondences_from_matches
-from kornia_learnnorm.normalizers.closed_form import Hartley
-from kornia_learnnorm.estimators.fundamental import check_rank2, find_fundamental
 from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.normalizers.closed_form import Hartley
 
 __all__ = ["EightPoint", "TwoViewEstimate"]
 
@@ -46,9 +46,9 @@ class EightPoint(nn.Module):
 
     For finite input, the output and all its derivatives are finite. A correspondence that is masked, or of weight zero,
     counts as absent. A sample that does not determine its matrix, by
-    :func:`~kornia_learnnorm.geometry.linear.has_null_vector` in Hartley's coordinates, is solved with the base normaliser
-    (``normalizer.base`` where there is one, else Hartley's) and sends no gradient, neither to the points nor to the
-    normaliser.
+    :func:`~kornia_learnnorm.geometry.linear.has_null_vector` in Hartley's coordinates, is solved with the base
+    normaliser (``normalizer.base`` where there is one, else Hartley's) and sends no gradient, neither to the points nor
+    to the normaliser.
 
     Args:
         normalizer: a module or callable ``(points1, points2, weights) -> (T1, T2)``; Hartley's when not given.

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_correspondences, is_true, solve_dtype
 from kornia_learnnorm.geometry.linear import design_matrix, null_vector, rank2_projection
-from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.geometry.rank2 import optimal_rank2
 from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.normalizers.closed_form import Hartley
 
 __all__ = ["check_rank2", "find_fundamental", "normalizing_transforms"]
 

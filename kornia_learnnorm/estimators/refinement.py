@@ -13,13 +13,13 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
 from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
-from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.estimators.robust_losses import Factor, Loss, sampson_factor, squared_loss
-from kornia_learnnorm.geometry.rank2 import check_fundamental
+from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
 from kornia_learnnorm.geometry.manifold import Rank2, decompose, retract, tangents
+from kornia_learnnorm.geometry.rank2 import check_fundamental
 from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.normalizers.closed_form import Hartley
 
 __all__ = ["Refinement", "minimize", "refine_fundamental"]
 
@@ -76,7 +76,8 @@ def refine_fundamental(
             :func:`~kornia_learnnorm.estimators.robust_losses.sampson_factor` or
             :func:`~kornia_learnnorm.estimators.robust_losses.symmetric_factor`.
         loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.estimators.robust_losses.squared_loss`,
-            :class:`~kornia_learnnorm.estimators.robust_losses.Huber`, :class:`~kornia_learnnorm.estimators.robust_losses.Cauchy`,
+            :class:`~kornia_learnnorm.estimators.robust_losses.Huber`,
+            :class:`~kornia_learnnorm.estimators.robust_losses.Cauchy`,
             :class:`~kornia_learnnorm.estimators.robust_losses.GemanMcClure` or
             :class:`~kornia_learnnorm.estimators.robust_losses.Truncated`.
         max_iterations: largest number of steps tried.

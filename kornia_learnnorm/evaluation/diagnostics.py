@@ -9,10 +9,10 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
-from kornia_learnnorm.geometry.linear import design_matrix, null_vector, rank2_projection
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.estimators.fundamental import Normalizer, normalizing_transforms
+from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.linear import design_matrix, null_vector, rank2_projection
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["Diagnostics", "condition_number", "diagnose", "normalized_distance", "singularity_ratio"]

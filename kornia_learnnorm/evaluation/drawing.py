@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 
 from kornia_learnnorm.evaluation.pair import PairEstimate
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -113,7 +113,7 @@ def draw_pair(
     figure, (axes1, axes2) = _panels(image1, image2)
     _draw_matches(axes1, estimate)
     _draw_lines(axes2, estimate, num_lines, seed)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor=figure.get_facecolor())
 
 

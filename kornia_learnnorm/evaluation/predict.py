@@ -10,8 +10,8 @@ from torch import Tensor
 
 from kornia_learnnorm.data.samples import RATIO, Samples
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["Residuals", "evaluate_normalizers", "ground_truth_inliers"]
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype, weighted_mean
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
-from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = ["SearchedNormalizer"]
 

@@ -15,9 +15,9 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import check_correspondences, is_true, solve_dtype
 from kornia_learnnorm.geometry.linear import design_matrix, rank2_projection
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.reweighted import adjugate, line_norms
-from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["check_fundamental", "optimal_rank2"]
 

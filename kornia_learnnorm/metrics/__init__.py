@@ -1,1 +1,1 @@
-"""metrics"""
+"""Metrics of estimates: better rate, pairs, poses, and their torchmetrics modules."""

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.metrics.better_rate import bootstrap_means, percentile_interval
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.metrics.better_rate import bootstrap_means, percentile_interval
 
 __all__ = ["PairedDifference", "epipolar_error", "f1_score", "inlier_share", "paired_bootstrap"]
 

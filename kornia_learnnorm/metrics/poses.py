@@ -49,7 +49,7 @@ def relative_pose(
         R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2004, section 9.6.
 
     Example:
-        >>> from kornia_learnnorm.data.synthetic.scenes import handheld
+        >>> from kornia_learnnorm.data.synthetic import handheld
         >>> scene = handheld(2, 20, torch.Generator().manual_seed(0))
         >>> R, t = relative_pose(scene.F_mat, scene.K1, scene.K2, scene.points1, scene.points2)
         >>> bool((pose_error(R, t, scene.R, scene.t) < 1e-6).all())

@@ -13,16 +13,18 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from kornia_learnnorm import networks, normalizers, paper_network, reweighting, transforms
+from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.geometry import transforms
 from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
-from kornia_learnnorm.files import replacing
-from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
-from kornia_learnnorm.normalizers.closed_form import Whitening
 from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.normalizers import closed_form, reweighted
+from kornia_learnnorm.normalizers.closed_form import Whitening
+from kornia_learnnorm.normalizers.networks import crossview, paper
+from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 
 __all__ = ["LearnedNormalizer"]
 
-WEIGHTS = Path(__file__).parent / "weights"
+WEIGHTS = Path(__file__).parents[1] / "weights"
 FORMAT = "kornia_learnnorm.normalizer.v1"
 LARGEST = 4096  # of the numbers that a file gives for widths, depths and iterations
 
@@ -103,12 +105,12 @@ class LearnedNormalizer(nn.Module):
         if Path(path).suffix != ".safetensors":
             raise ValueError(f"weights are written to a .safetensors file, got {str(path)!r}")
         architecture = {
-            "base": _describe(self.base, normalizers, reweighting),
-            "network": _describe(self.network, networks, paper_network),
+            "base": _describe(self.base, closed_form, reweighted),
+            "network": _describe(self.network, crossview, paper),
             "transform": _name(self.transform, transforms),
         }
         state = {key: value.detach().cpu().contiguous() for key, value in self.state_dict().items()}
-        with replacing(path) as beside:
+        with atomic_write(path) as beside:
             try:
                 save_file(state, beside, metadata={"format": FORMAT, "architecture": json.dumps(architecture)})
             except SafetensorError as error:
@@ -199,8 +201,8 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
         if large:
             raise ValueError(f"numbers can be at most {LARGEST}, got {large[0]}")
         return {
-            "base": find(base.pop("name"), normalizers, reweighting)(**base),
-            "network": find(network.pop("name"), networks, paper_network)(**network),
+            "base": find(base.pop("name"), closed_form, reweighted)(**base),
+            "network": find(network.pop("name"), crossview, paper)(**network),
             "transform": find(parts["transform"], transforms),
         }
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:

@@ -18,8 +18,8 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import solve_dtype, weighted_mean
 from kornia_learnnorm.geometry.linear import design_matrix, has_null_vector, null_vector, smallest_right_singular_vector
-from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
 from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
 
 __all__ = ["ReweightedWhitening", "adjugate", "line_norms"]
 

@@ -1,1 +1,1 @@
-"""ransac"""
+"""Robust estimation: RANSAC, samplers, scoring, constrained fit, soft RANSAC."""

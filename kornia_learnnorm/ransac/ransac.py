@@ -13,16 +13,16 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor, nn
 
-from kornia_learnnorm.ransac.constrained_fit import constrained_fit
-from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
+from kornia_learnnorm.estimators.fundamental import Normalizer, check_rank2, find_fundamental
 from kornia_learnnorm.estimators.minimal import are_determined, solve_samples
-from kornia_learnnorm.estimators.robust_losses import Factor, GemanMcClure, Loss, Truncated, sampson_factor
-from kornia_learnnorm.geometry.manifold import Rank2, decompose
 from kornia_learnnorm.estimators.refinement import minimize
+from kornia_learnnorm.estimators.robust_losses import Factor, GemanMcClure, Loss, Truncated, sampson_factor
+from kornia_learnnorm.geometry.checks import solve_dtype
+from kornia_learnnorm.geometry.manifold import Rank2, decompose
+from kornia_learnnorm.ransac.constrained_fit import constrained_fit
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.ransac.scoring import COARSE, FARTHEST, Hypotheses, PairScorer, in_proportion
-from kornia_learnnorm.estimators.fundamental import Normalizer, check_rank2, find_fundamental
 from kornia_learnnorm.ransac.threads import one_thread
 
 __all__ = ["RANSAC"]

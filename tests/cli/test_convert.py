@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from kornia_learnnorm.cli.convert import add_arguments, run
-from kornia_learnnorm.data.store import read_store, write_store
 from kornia_learnnorm.cli.synthesize import synthetic_store
+from kornia_learnnorm.data.store import read_store, write_store
 
 
 def convert(*words):

@@ -14,13 +14,13 @@ from safetensors.torch import load_file
 from two_view import epipolar_distances
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.metrics.better_rate import bootstrap_interval
-from kornia_learnnorm.cli.main import main
 
-FOLDER = Path(__file__).parent.parent / "configs"
+FOLDER = Path(__file__).parents[2] / "configs"
 CONFIGS = sorted(FOLDER.glob("*.yaml"))
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 NETWORK = "model.normalizer.init_args.network.init_args"

@@ -12,11 +12,12 @@ pytest.importorskip("cv2", reason="OpenCV is not installed")
 pytest.importorskip("h5py", reason="h5py is not installed")
 pytest.importorskip("joblib", reason="joblib is not installed")
 
-from data.make_sequences import LAYOUTS
+from make_sequences import LAYOUTS
 
-from kornia_learnnorm.data import collect, match
-from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.cli import match
 from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.matching import collect
+from kornia_learnnorm.data.store import read_store
 
 FR3 = "rgbd_dataset_freiburg3_long_office_household"
 

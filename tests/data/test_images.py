@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kornia_learnnorm.data.matching.features import Features
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.images import read_frame, read_image
+from kornia_learnnorm.data.matching.features import Features
 from kornia_learnnorm.data.matching.matchers import match_nearest
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")

@@ -6,8 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store, write_store
 from kornia_learnnorm.cli.synthesize import synthetic_store
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store, write_store
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ from two_view import (
 )
 
 from kornia_learnnorm import find_fundamental, sampson_distance, symmetric_epipolar_distance
+from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import (
     Cauchy,
     GemanMcClure,
@@ -36,7 +37,6 @@ from kornia_learnnorm.estimators.robust_losses import (
     squared_loss,
     symmetric_factor,
 )
-from kornia_learnnorm.estimators.refinement import refine_fundamental
 
 DISTANCES = {
     "sampson": (sampson_factor, sampson_distance),

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation import estimate as command_module
-from kornia_learnnorm.evaluation import pair as module
+from kornia_learnnorm.cli import estimate as command_module
 from kornia_learnnorm.cli.estimate import add_arguments, run
+from kornia_learnnorm.evaluation import pair as module
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
-from kornia_learnnorm.files import replacing
-from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
+from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
@@ -228,7 +228,7 @@ class TestWriting:
 
     @staticmethod
     def stop_halfway(path):
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text("half")
             raise RuntimeError("stop")
 

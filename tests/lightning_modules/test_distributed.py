@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from train_processes import run
 
 CASES = ["plain", "pairs", "filtered", "spoiled", "infinite", "resumed"]
-SCRIPT = Path(__file__).parent / "train_processes.py"
+SCRIPT = Path(__file__).parents[1] / "train_processes.py"
 
 
 def start(folder, processes, *cases):

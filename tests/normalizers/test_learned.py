@@ -29,10 +29,10 @@ from kornia_learnnorm import (
     ReweightedWhitening,
     Whitening,
     find_fundamental,
-    learned,
     spd_transform,
 )
 from kornia_learnnorm.geometry.transforms import affine_transform
+from kornia_learnnorm.normalizers import learned
 
 SHIPPED = ["crossview", "crossview-synthetic"]
 

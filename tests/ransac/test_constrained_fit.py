@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from two_view import epipolar_distances, scenes, uniform, up_to_sign
 
 from kornia_learnnorm import find_fundamental
-from kornia_learnnorm.ransac.constrained_fit import constrained_fit
-from kornia_learnnorm.estimators.robust_losses import Cauchy, Truncated, sampson_factor, squared_loss, symmetric_factor
 from kornia_learnnorm.estimators.refinement import refine_fundamental
+from kornia_learnnorm.estimators.robust_losses import Cauchy, Truncated, sampson_factor, squared_loss, symmetric_factor
+from kornia_learnnorm.ransac.constrained_fit import constrained_fit
 from kornia_learnnorm.ransac.scoring import PairScorer
 
 

@@ -1,1 +1,1 @@
-"""datasets"""
+"""Readers of image datasets: KITTI, TUM RGB-D, Cambridge Landmarks, COLMAP models, folders."""

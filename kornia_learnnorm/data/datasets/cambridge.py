@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.images import image_size
 from kornia_learnnorm.data.datasets.textfiles import (
     camera_matrix,
     listed_image,
@@ -19,6 +18,7 @@ from kornia_learnnorm.data.datasets.textfiles import (
     text_lines,
     without_suffix,
 )
+from kornia_learnnorm.data.images import image_size
 
 __all__ = ["read_cambridge"]
 

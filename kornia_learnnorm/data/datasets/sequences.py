@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.images import image_size
 from kornia_learnnorm.data.datasets.textfiles import (
     camera_matrix,
     listed_image,
@@ -26,6 +25,7 @@ from kornia_learnnorm.data.datasets.textfiles import (
     rotation,
     text_lines,
 )
+from kornia_learnnorm.data.images import image_size
 
 __all__ = ["SPLITS", "read_folder", "read_kitti", "read_tum", "split_sequences"]
 
@@ -38,7 +38,8 @@ SPLITS: dict[str, dict[str, tuple[str, ...] | None]] = {
 }
 """Sequences by dataset and split, as B. Fan et al. (A revisit of the normalized eight-point algorithm and a
 self-supervised deep solution, section 5.1) choose them; None for all that no other split of the dataset names. The
-scene of Cambridge Landmarks splits its images itself, see :func:`~kornia_learnnorm.data.datasets.cambridge.read_cambridge`."""
+scene of Cambridge Landmarks splits its images itself, see
+:func:`~kornia_learnnorm.data.datasets.cambridge.read_cambridge`."""
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 # fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3 of the three Kinects; https://cvg.cit.tum.de/data/datasets/rgbd-dataset,

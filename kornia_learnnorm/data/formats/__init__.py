@@ -1,1 +1,1 @@
-"""formats"""
+"""Stores of correspondences to and from file formats of other packages."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.formats.interchange import Pair, assemble, best_of_each, natural, split_pairs
 from kornia_learnnorm.data.store import CorrespondenceStore, _h5py, check_declared
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["export_hloc", "import_hloc"]
 
@@ -54,7 +54,7 @@ def export_hloc(store: CorrespondenceStore, features: str | Path, matches: str |
     _check_names(pairs)
     images, indices = _keypoints(pairs)
     dropped = 0
-    with replacing(features) as beside, replacing(matches) as beside_too:
+    with atomic_write(features) as beside, atomic_write(matches) as beside_too:
         with h5py.File(beside, "w") as file:
             for name, (keypoints, size) in images.items():
                 file[f"{name}/keypoints"] = keypoints.astype(np.float32)

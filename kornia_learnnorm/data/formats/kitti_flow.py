@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.formats.interchange import Pair, assemble, best_of_each, files_in, new_folder, split_pairs
+from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["export_kitti_flow", "import_kitti_flow"]
 
@@ -53,12 +53,12 @@ def export_kitti_flow(store: CorrespondenceStore, folder: str | Path) -> dict[st
     lines = []
     for i, pair in enumerate(split_pairs(store)):
         encoded = cv2.imencode(".png", _flow_map(pair, notes)[:, :, ::-1])[1]
-        with replacing(folder / f"{i:06d}{_FIRST}") as beside:
+        with atomic_write(folder / f"{i:06d}{_FIRST}") as beside:
             beside.write_bytes(encoded.tobytes())
         names = [re.sub(r"\s", "_", name) or "_" for name in pair.names]
         notes["names with white space or empty, written with _"] += sum(map(str.__ne__, names, pair.names))
         lines.append(" ".join(names) + "\n")
-    with replacing(folder / _NAMES) as beside:
+    with atomic_write(folder / _NAMES) as beside:
         beside.write_text("".join(lines), encoding="utf-8")
     return {what: count for what, count in notes.items() if count}
 

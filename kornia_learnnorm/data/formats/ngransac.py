@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.formats.interchange import Pair, assemble, files_in, new_folder, split_pairs
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["export_ngransac", "import_ngransac"]
 
@@ -60,7 +60,7 @@ def export_ngransac(store: CorrespondenceStore, folder: str | Path) -> dict[str,
     folder = new_folder(folder, "*.npy")
     for file, pair in files.items():
         # np.save appends .npy to a name, not to an open file
-        with replacing(folder / file) as beside, beside.open("wb") as stream:
+        with atomic_write(folder / file) as beside, beside.open("wb") as stream:
             np.save(stream, _objects(pair), allow_pickle=True)
     return {}
 

@@ -11,8 +11,8 @@ from types import TracebackType
 
 import numpy as np
 
-from kornia_learnnorm.data.matching.features import Features
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
+from kornia_learnnorm.data.matching.features import Features
 
 __all__ = ["FeatureCache"]
 

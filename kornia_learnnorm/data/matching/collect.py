@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 import kornia_learnnorm
-from kornia_learnnorm.data.matching.cache import FeatureCache
-from kornia_learnnorm.data.matching.features import DETECTORS, Features
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.images import import_cv2, read_frame
+from kornia_learnnorm.data.matching.cache import FeatureCache
+from kornia_learnnorm.data.matching.features import DETECTORS, Features
 from kornia_learnnorm.data.matching.matchers import MATCHERS
-from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.matching.workers import Workers, open_workers
+from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.writer import StoreWriter
 
 __all__ = ["MatchOptions", "collect_matches", "match_pair"]

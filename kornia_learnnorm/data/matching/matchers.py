@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.matching.features import Features, detect_sift, pretrained
 from kornia_learnnorm.data.images import import_cv2
+from kornia_learnnorm.data.matching.features import Features, detect_sift, pretrained
 
 __all__ = ["MATCHERS", "Matches", "match_images", "match_lightglue", "match_nearest"]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["RenderedPair", "render_pair", "write_pair"]
 
@@ -121,9 +121,9 @@ def write_pair(folder: str | Path, pair: RenderedPair) -> None:
     height, width = pair.image1.shape
     truth = {name: getattr(pair, name).tolist() for name in ("K", "R", "t", "F_mat")}
     for name in ("image1", "image2"):
-        with replacing(folder / f"{name}.png") as temporary:
+        with atomic_write(folder / f"{name}.png") as temporary:
             temporary.write_bytes(cv2.imencode(".png", getattr(pair, name))[1].tobytes())
-    with replacing(folder / "ground_truth.json") as temporary:
+    with atomic_write(folder / "ground_truth.json") as temporary:
         temporary.write_text(json.dumps({"width": width, "height": height, **truth}, indent=2) + "\n")
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from kornia_learnnorm.evaluation.runs.example import TRIALS
 from kornia_learnnorm.evaluation.report.pair import THRESHOLD, draw_example, example_inliers
 from kornia_learnnorm.evaluation.report.style import COLORS, INK, Picture, make_figure, make_picture
+from kornia_learnnorm.evaluation.runs.example import TRIALS
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
 
 __all__ = ["report_figures"]

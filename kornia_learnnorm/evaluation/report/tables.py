@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
 from kornia_learnnorm.evaluation.report.motion import by_motion, worst_failures
 from kornia_learnnorm.evaluation.report.rates import (
     BASELINE,
@@ -19,6 +18,7 @@ from kornia_learnnorm.evaluation.report.rates import (
     rate_tables,
     rate_text,
 )
+from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
 from kornia_learnnorm.metrics.pairs import paired_bootstrap
 from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc

@@ -1,1 +1,1 @@
-"""robust"""
+"""Robust estimators and minimal solvers on stores."""

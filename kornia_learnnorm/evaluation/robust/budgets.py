@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.estimators.minimal import are_determined
 from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.evaluation.robust.matches import Matches
 from kornia_learnnorm.evaluation.robust.peers import Peer
-from kornia_learnnorm.estimators.minimal import are_determined
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, draw_distinct
 from kornia_learnnorm.ransac.scoring import PairScorer

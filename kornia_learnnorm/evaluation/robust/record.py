@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
-from kornia_learnnorm.evaluation.robust.hypotheses import hypothesis_quality, samples_of
-from kornia_learnnorm.evaluation.runs.record import PROTOCOLS
 from kornia_learnnorm.evaluation.robust.budgets import Estimate, Estimator, Solver, run_estimator
 from kornia_learnnorm.evaluation.robust.estimators import is_slow, is_timed
+from kornia_learnnorm.evaluation.robust.hypotheses import hypothesis_quality, samples_of
 from kornia_learnnorm.evaluation.robust.matches import Matches, draw_matches, even_pairs, measure
 from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path
+from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
+from kornia_learnnorm.evaluation.runs.record import PROTOCOLS
 from kornia_learnnorm.evaluation.runs.run import read_arrays
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["record_missing"]
 
@@ -151,5 +151,5 @@ def _record_hypotheses(
 
 def _write(path: Path, arrays: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as beside:
+    with atomic_write(path) as beside:
         np.savez_compressed(beside, **arrays)

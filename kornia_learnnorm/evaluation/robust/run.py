@@ -19,7 +19,7 @@ from torch import Tensor
 from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
 from kornia_learnnorm.evaluation.runs.manifest import read_object
 from kornia_learnnorm.evaluation.runs.run import file_name, read_arrays
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["RobustCell", "RobustRun", "begin_run", "estimate_path", "hypotheses_path", "leave_out", "read_robust"]
 
@@ -137,7 +137,7 @@ def _read_about(folder: Path) -> dict[str, Any]:
 
 
 def _write_about(folder: Path, about: dict[str, Any]) -> None:
-    with replacing(folder / "robust.json") as beside:
+    with atomic_write(folder / "robust.json") as beside:
         beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
 
 

@@ -16,8 +16,8 @@ THRESHOLDS = (0.1, 1.0)  # pixels
 def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
     """Measure share of inliers and F1 of many matrices, each over all correspondences of its image pair.
 
-    What :func:`~kornia_learnnorm.metrics.pairs.inlier_share` and :func:`~kornia_learnnorm.metrics.pairs.f1_score` say of
-    one matrix, with the distances computed once for both and for all of :data:`THRESHOLDS`.
+    What :func:`~kornia_learnnorm.metrics.pairs.inlier_share` and :func:`~kornia_learnnorm.metrics.pairs.f1_score` say
+    of one matrix, with the distances computed once for both and for all of :data:`THRESHOLDS`.
 
     Args:
         F_mat: estimated matrices with shape (S, 3, 3), float64.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["begin_run", "leave_out", "read_about", "read_object"]
 
@@ -126,5 +126,5 @@ def leave_out(folder: Path, methods: Sequence[str]) -> None:
 
 
 def _write(folder: Path, about: About) -> None:
-    with replacing(folder / "run.json") as beside:
+    with atomic_write(folder / "run.json") as beside:
         beside.write_text(json.dumps(about, indent=1), encoding="utf-8")

@@ -19,9 +19,9 @@ from tqdm import tqdm
 
 from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs.example import random_pair, sweep
 from kornia_learnnorm.evaluation.runs.manifest import begin_run, leave_out
-from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs.motion import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import describe, draw, predict
 from kornia_learnnorm.evaluation.runs.run import (
@@ -37,7 +37,7 @@ from kornia_learnnorm.evaluation.runs.run import (
     within_limit,
 )
 from kornia_learnnorm.evaluation.runs.trained import trained_on
-from kornia_learnnorm.files import replacing
+from kornia_learnnorm.files import atomic_write
 
 __all__ = ["PROTOCOLS", "record_run"]
 
@@ -160,7 +160,7 @@ def _attempt(
 
 def _write(path: Path, arrays: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as beside:
+    with atomic_write(path) as beside:
         np.savez_compressed(beside, **arrays)
 
 

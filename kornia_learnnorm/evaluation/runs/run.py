@@ -73,7 +73,8 @@ class Run:
         cells: stores and protocols.
         pairs: figures of each store's pairs, (P,) each.
         sizes: errors by the number of correspondences, by method.
-        example: the image pair that these errors are of, from :func:`~kornia_learnnorm.evaluation.runs.example.random_pair`;
+        example: the image pair that these errors are of, from
+            :func:`~kornia_learnnorm.evaluation.runs.example.random_pair`;
             nothing where there is none yet.
         missing: what is not there yet.
     """

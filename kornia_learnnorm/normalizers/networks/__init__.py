@@ -1,1 +1,1 @@
-"""networks"""
+"""Permutation-invariant networks that predict the parameters of both transforms."""

@@ -11,7 +11,7 @@ import pytest
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
 Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
-from data.make_sequences import FOCAL, FRAMES, SIZE, STEP, metres, write_colmap  # noqa: E402
+from make_sequences import FOCAL, FRAMES, SIZE, STEP, metres, write_colmap  # noqa: E402
 
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap  # noqa: E402
 from kornia_learnnorm.data.datasets.frames import listed_pairs  # noqa: E402

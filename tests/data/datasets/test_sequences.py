@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
-from data.make_sequences import (  # noqa: E402
+from make_sequences import (  # noqa: E402
     FOCAL,
     FRAMES,
     KITTI_BASELINES,
@@ -29,8 +29,8 @@ from data.make_sequences import (  # noqa: E402
 
 from kornia_learnnorm.data.datasets.cambridge import read_cambridge  # noqa: E402
 from kornia_learnnorm.data.datasets.frames import FramePair, pair_frames  # noqa: E402
-from kornia_learnnorm.data.images import image_size  # noqa: E402
 from kornia_learnnorm.data.datasets.sequences import SPLITS, read_folder, read_kitti, read_tum, split_sequences  # noqa: E402
+from kornia_learnnorm.data.images import image_size  # noqa: E402
 
 FR1, FR3 = "rgbd_dataset_freiburg1_wall", "rgbd_dataset_freiburg3_long_office_household"
 

@@ -16,12 +16,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.formats.hloc import export_hloc, import_hloc
-from kornia_learnnorm.data.formats.interchange import Pair, assemble, best_of_each, files_in, natural, new_folder, split_pairs
+from kornia_learnnorm.data.formats.interchange import (
+    Pair,
+    assemble,
+    best_of_each,
+    files_in,
+    natural,
+    new_folder,
+    split_pairs,
+)
 from kornia_learnnorm.data.formats.kitti_flow import export_kitti_flow, import_kitti_flow
 from kornia_learnnorm.data.formats.ngransac import export_ngransac, import_ngransac
 from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.cli.synthesize import synthetic_store
 
 UNKNOWN = {"K": (2, 3, 3), "R": (3, 3), "t": (3,), "F": (3, 3)}
 

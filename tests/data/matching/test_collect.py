@@ -22,14 +22,15 @@ pytest.importorskip("cv2", reason="OpenCV is not installed")
 pytest.importorskip("h5py", reason="h5py is not installed")
 pytest.importorskip("joblib", reason="joblib is not installed")
 
-from data.make_sequences import write_image
+from make_sequences import write_image
 
-from kornia_learnnorm.data import collect, feature_cache
-from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches, match_pair
-from kornia_learnnorm.data.matching.cache import FeatureCache
-from kornia_learnnorm.data.matching.features import Features
 from kornia_learnnorm.data.datasets.frames import FramePair, pair_frames
 from kornia_learnnorm.data.datasets.sequences import read_folder
+from kornia_learnnorm.data.matching import cache as feature_cache
+from kornia_learnnorm.data.matching import collect
+from kornia_learnnorm.data.matching.cache import FeatureCache
+from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches, match_pair
+from kornia_learnnorm.data.matching.features import Features
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 
 OPTIONS = MatchOptions(num_features=200, max_matches=30)

@@ -9,8 +9,8 @@ import pytest
 import torch
 from kornia.feature import DISK, LightGlue
 
-from kornia_learnnorm.data import features as module
-from kornia_learnnorm.data import matching
+from kornia_learnnorm.data.matching import features as module
+from kornia_learnnorm.data.matching import matchers as matching
 from kornia_learnnorm.data.matching.features import (
     Features,
     detect_disk,

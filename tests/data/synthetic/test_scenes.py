@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from kornia_learnnorm.data import synthetic
-from kornia_learnnorm.data.synthetic.scenes import TwoViewScene, forward_driving, handheld, orbit, random_scenes
+from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
 
 NAMED = [forward_driving, handheld, orbit]
 ALL = [random_scenes, *NAMED]

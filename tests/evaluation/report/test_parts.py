@@ -10,21 +10,21 @@ import torch
 import yaml
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.evaluation import predict_run
-from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS, consensus
+from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.evaluation.methods import Method
 from kornia_learnnorm.evaluation.report.motion import by_motion
 from kornia_learnnorm.evaluation.report.printing import print_tables
 from kornia_learnnorm.evaluation.report.rates import Table, rate_tables
+from kornia_learnnorm.evaluation.runs import predict as predict_run
+from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS, consensus
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
-from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.evaluation.runs.trained import SHIPPED, saw, trained_on
-from kornia_learnnorm.normalizers.learned import WEIGHTS
+from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.metrics.pairs import f1_score, inlier_share
+from kornia_learnnorm.normalizers.learned import WEIGHTS
 
-CONFIGS = Path(__file__).parents[1] / "configs"
+CONFIGS = Path(__file__).parents[3] / "configs"
 
 
 def test_predictions_agree_with_the_expectation_under_known_noise():

@@ -15,18 +15,20 @@ import pytest
 import torch
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.cli import evaluate
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.cli.report import write_report
+from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import plain_residual
 from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.evaluation import evaluate, example, predict_run, record
 from kornia_learnnorm.evaluation.methods import find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.runs.motion import pair_motions
-from kornia_learnnorm.cli.report import write_report
 from kornia_learnnorm.evaluation.report.pair import draw_example
 from kornia_learnnorm.evaluation.report.tables import report_tables
+from kornia_learnnorm.evaluation.runs import example, record
+from kornia_learnnorm.evaluation.runs import predict as predict_run
+from kornia_learnnorm.evaluation.runs.motion import pair_motions
 from kornia_learnnorm.evaluation.runs.run import read_run
 from kornia_learnnorm.normalizers.learned import WEIGHTS
-from kornia_learnnorm.cli.main import main
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]

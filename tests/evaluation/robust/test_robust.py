@@ -13,13 +13,16 @@ import pytest
 import torch
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.evaluation import example, hypotheses, robust_estimators, robust_peers, robust_record
-from kornia_learnnorm.evaluation.robust.hypotheses import expected_best, hypothesis_quality, picked
+from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.cli.report import write_report
+from kornia_learnnorm.cli.synthesize import synthetic_store
+from kornia_learnnorm.data.store import read_store, write_store
 from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_tables
 from kornia_learnnorm.evaluation.report.robust import PRINTED, robust_tables
+from kornia_learnnorm.evaluation.robust import estimators as robust_estimators
+from kornia_learnnorm.evaluation.robust import hypotheses
+from kornia_learnnorm.evaluation.robust import peers as robust_peers
+from kornia_learnnorm.evaluation.robust import record as robust_record
 from kornia_learnnorm.evaluation.robust.budgets import minimal_samples, run_estimator
 from kornia_learnnorm.evaluation.robust.estimators import (
     DEFAULT_ESTIMATORS,
@@ -28,10 +31,11 @@ from kornia_learnnorm.evaluation.robust.estimators import (
     find_solver,
     is_slow,
 )
+from kornia_learnnorm.evaluation.robust.hypotheses import expected_best, hypothesis_quality, picked
 from kornia_learnnorm.evaluation.robust.matches import draw_matches, measure
 from kornia_learnnorm.evaluation.robust.run import read_robust
+from kornia_learnnorm.evaluation.runs import example
 from kornia_learnnorm.metrics.pairs import f1_score
-from kornia_learnnorm.cli.main import main
 
 ESTIMATORS = ["kornia-8pt", "count:Hartley", "count:whitening", "time:Hartley", "time:whitening", "RANSAC"]
 SOLVERS = ["Hartley", "whitening", "seven-point"]

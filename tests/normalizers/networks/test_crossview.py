@@ -15,7 +15,8 @@ from safetensors.torch import load_file, save_file
 from torch.autograd import gradcheck
 from two_view import correspondences, numpy_whitening, shaken, uniform
 
-from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer, networks
+from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer
+from kornia_learnnorm.normalizers.networks import crossview as networks
 from kornia_learnnorm.normalizers.networks.crossview import SetNetwork
 
 FEATURES = ["epipolar", "both", "own"]

@@ -1,0 +1,1 @@
+"""Predictions of methods on stores, computed once and kept in a folder."""
