@@ -16,8 +16,8 @@ from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Hube
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.geometry.distances import algebraic_distance, sampson_distance, symmetric_epipolar_distance
-from kornia_learnnorm.geometry.linear import design_matrix, null_vector, rank2_projection
-from kornia_learnnorm.geometry.rank2 import optimal_rank2
+from kornia_learnnorm.geometry.linear import design_matrix, null_vector
+from kornia_learnnorm.geometry.rank2 import optimal_rank2, rank2_projection
 from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
 from kornia_learnnorm.losses import EpipolarLoss
 from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate, bootstrap_interval

@@ -14,9 +14,10 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 
 from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.estimators.fundamental import find_fundamental, solve_in_coordinates
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.losses import EpipolarLoss
 from kornia_learnnorm.metrics.better_rate import comparable
 from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
@@ -159,8 +160,9 @@ class NormalizerTask(pl.LightningModule):
     def predict_step(self, batch: Samples, batch_idx: int) -> dict[str, Tensor]:
         """Return transforms, fundamental matrices and mean residuals of a batch."""
         x1, x2 = batch.points1.double(), batch.points2.double()  # in float32, F itself loses digits of the residual
-        T1, T2 = self.normalizer(x1, x2)
-        F_mat = self(x1, x2)
+        problem = LinearProblem.from_points(x1, x2)
+        T1, T2 = self.normalizer.transforms(problem)
+        F_mat = solve_in_coordinates(problem, T1, T2)
         residual = symmetric_epipolar_distance(x1, x2, F_mat).mean(-1)
         return {"T1": T1, "T2": T2, "F_mat": F_mat, "residual": residual, "pair": batch.pair}
 

@@ -1,7 +1,9 @@
 r"""Set networks that predict the parameters of both views' transforms from correspondences.
 
 The contract is ``(points1, points2, weights) -> (params1, params2)``: points :math:`(B, N, 2)` in the coordinates of
-the base normaliser, parameters :math:`(B, P)` for a transform builder. Zero parameters mean the base itself.
+the base normaliser, parameters :math:`(B, P)` for a transform builder. Zero parameters mean the base itself. A network
+whose attribute ``needs_null_matrix`` is true also gets the null matrix of the DLT in these coordinates, as
+``null_matrix``.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import weighted_mean
-from kornia_learnnorm.geometry.linear import design_matrix, null_vector, smallest_right_singular_vector
+from kornia_learnnorm.geometry.linear import design_matrix, null_vector, smallest_singular_vectors
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 
@@ -58,27 +60,36 @@ class CrossViewNetwork(nn.Module):
         self.features = features
         self.set_network = SetNetwork(_POINT_FEATURES[features], _SET_FEATURES[features], width, depth, num_parameters)
 
-    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    @property
+    def needs_null_matrix(self) -> bool:
+        """Whether :meth:`forward` uses the null matrix."""
+        return self.features == "epipolar"
+
+    def forward(
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, null_matrix: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return the parameters of both views.
 
         Args:
             points1: points of the first view in base coordinates with shape :math:`(B, N, 2)`, :math:`N >= 8`.
             points2: points of the second view in base coordinates with shape :math:`(B, N, 2)`.
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+            null_matrix: the DLT's unit null vectors in base coordinates with shape :math:`(B, 3, 3)`; solved from the
+                points when not given.
 
         Returns:
             parameters with shape :math:`(B, P)` of view 1 and view 2, in the dtype of the points.
 
         """
-        views = self._views(points1, points2, weights)
-        point, whole = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
+        views = self._views(points1, points2, weights, null_matrix)
+        point_features, set_features = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
         doubled = None if weights is None else torch.cat([weights, weights]).to(self.dtype)
-        params = self.set_network(point, whole, doubled).to(points1.dtype)
+        params = self.set_network(point_features, set_features, doubled).to(points1.dtype)
         params1, params2 = (self.bound * torch.tanh(params / self.bound)).chunk(2)
         return params1, params2
 
     def _views(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, null_matrix: Tensor | None
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         """Features of the points and of the set, as either view sees them."""
         if self.features != "epipolar":
@@ -87,9 +98,10 @@ class CrossViewNetwork(nn.Module):
                 return (points1, nothing), (points2, nothing)
             return (torch.cat([points1, points2], -1), nothing), (torch.cat([points2, points1], -1), nothing)
         x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
-        F = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
-        F = F * _sign(F)
-        v, u = smallest_right_singular_vector(F), smallest_right_singular_vector(F.mT)
+        if null_matrix is None:
+            null_matrix = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
+        F = null_matrix * _sign(null_matrix)
+        u, v = smallest_singular_vectors(F)
         return _epipolar_features(x1, x2, F, v, u, weights), _epipolar_features(x2, x1, F.mT, u, v, weights)
 
     @property
@@ -125,7 +137,7 @@ def _epipolar_features(
 
 
 class SetNetwork(nn.Module):
-    """Residual layers over the points of a set, with the set's maximum as context; blind to their order.
+    """Residual layers over the points of a set, with the set's maximum as context; permutation invariant.
 
     Args:
         point_features: features of a point.
@@ -150,16 +162,16 @@ class SetNetwork(nn.Module):
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), last)
 
-    def forward(self, points: Tensor, whole: Tensor, weights: Tensor | None = None) -> Tensor:
+    def forward(self, points: Tensor, set_features: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return the outputs with shape :math:`(B, P)`.
 
         Args:
             points: features of the points with shape :math:`(B, N, C)`.
-            whole: features of the sets with shape :math:`(B, D)`.
+            set_features: features of the sets with shape :math:`(B, D)`.
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
 
         """
-        h = self.point_stem(points) + self.set_stem(whole)[:, None]
+        h = self.point_stem(points) + self.set_stem(set_features)[:, None]
         absent = None if weights is None else (weights <= 0)[..., None]
         for layer in self.layers:
             h = layer(h, absent)
