@@ -51,8 +51,8 @@ def main(args: Sequence[str] | None = None) -> dict[str, tuple[float, float]]:
         "Kornia, dlt, whitening layer": kornia_ransac(kln.Whitening(), samples, seed),
         "Kornia, dlt, learned layer": kornia_ransac(learned, samples, seed),
         "Kornia, lm (its default)": default,
-        "kornia_learnnorm.RANSAC, learned": kln.RANSAC(learned, max_iter=samples, seed=seed),
-        "kornia_learnnorm.RANSAC": kln.RANSAC(max_iter=samples, seed=seed),
+        "kornia_learnnorm.RANSAC, learned": kln.RANSAC(learned, max_samples=samples, seed=seed),
+        "kornia_learnnorm.RANSAC": kln.RANSAC(max_samples=samples, seed=seed),
     }
     results = {}
     for name, estimator in estimators.items():

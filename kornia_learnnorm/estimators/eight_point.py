@@ -203,8 +203,6 @@ class EightPoint(nn.Module):
         found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
         F_mat = problem.x1.new_empty(len(determined), 3, 3)
         F_mat = F_mat.index_copy(0, rest, self._solve_undetermined(problem.select(rest)))
-        if len(found) == 0:
-            return F_mat
         return F_mat.index_copy(0, found, solve_fundamental(problem.select(found), self.normalizer, self.rank2))
 
     def _solve_traced(self, problem: LinearProblem, determined: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ __all__ = [
     "cofactors",
     "design_matrix",
     "has_null_vector",
+    "independence_gap",
     "null_vector",
     "smallest_right_singular_vector",
     "smallest_singular_vectors",
@@ -111,7 +112,7 @@ def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor,
         Q, R = torch.linalg.qr(A.mT, mode="complete")
         h0, pivots = Q[..., -1], R.diagonal(dim1=-2, dim2=-1).abs()
         gap = pivots.amin(-1) / safe_divisor(pivots.amax(-1))
-        independent = gap > 64 * torch.finfo(A.dtype).eps
+        independent = gap > independence_gap(A.dtype)
         scale = torch.where(independent, pivots.amax(-1), 1.0)
     # The linear system [A; h0^T] h = e9, with h0 held fixed, has the solution h0 and gives its derivatives. The
     # substitute enters before the solve and its result is dropped after it: no derivative meets a singular matrix.
@@ -120,6 +121,11 @@ def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor,
     bordered = torch.where(independent[..., None, None], bordered, eye)
     h = torch.linalg.solve_ex(bordered, eye[:, 8].expand(*A.shape[:-2], 9).unsqueeze(-1))[0].squeeze(-1)
     return normalize(torch.where(independent[..., None], h, h0), dim=-1), gap
+
+
+def independence_gap(dtype: torch.dtype) -> float:
+    """Return the relative gap up to which rows are linearly dependent but for rounding."""
+    return 64 * torch.finfo(dtype).eps
 
 
 def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -10,7 +10,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import solve_dtype
-from kornia_learnnorm.geometry.linear import MIN_GAP, design_matrix, null_vector, solve_null_vector
+from kornia_learnnorm.geometry.linear import MIN_GAP, design_matrix, independence_gap, null_vector, solve_null_vector
 from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental
 
 __all__ = ["LinearProblem"]
@@ -105,6 +105,8 @@ class LinearProblem:
         if self.points1.shape[1] == 8:
             R1, R2 = self.T1 @ torch.linalg.inv_ex(T1)[0], self.T2 @ torch.linalg.inv_ex(T2)[0]
             F = transform_fundamental(self.null_matrix, R1, R2)
+            # A null matrix without gradient must not get one by way of Hartley's transforms either.
+            F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
             return F / torch.linalg.matrix_norm(F, keepdim=True)
         x1, x2 = convert_points_to_homogeneous(self.points1), convert_points_to_homogeneous(self.points2)
         return torch.unflatten(null_vector(design_matrix(x1 @ T1.mT, x2 @ T2.mT), self.weights), -1, (3, 3))

@@ -99,7 +99,7 @@ class TestExtremeWeights:
         points = [p.float() for p in correspondences("handheld", 3, 12)]
         weights = uniform(3, 12, low=0.5)
         extreme = (size * weights).float().requires_grad_()
-        estimate = layer.estimate(*points, extreme)
+        estimate = layer.estimate(*points, weights=extreme)
         assert estimate.determined.all() == (size > 1e-30)
         estimate.F_mat.abs().sum().backward()
         assert extreme.grad.isfinite().all()
@@ -132,9 +132,9 @@ class TestDetermined:
         weights = torch.ones(4, 12)
         for k in range(4):
             weights[k, 5 + 2 * k :] = 0
-        assert layer.estimate(*points, weights).determined.tolist() == [False, False, True, True]
-        assert layer.estimate(*points, None, weights > 0).determined.tolist() == [False, False, True, True]
-        assert not layer.estimate(*points, torch.zeros(4, 12)).determined.any()
+        assert layer.estimate(*points, weights=weights).determined.tolist() == [False, False, True, True]
+        assert layer.estimate(*points, mask=weights > 0).determined.tolist() == [False, False, True, True]
+        assert not layer.estimate(*points, weights=torch.zeros(4, 12)).determined.any()
 
     @pytest.mark.parametrize("number", [0, 1])
     def test_few_points_give_a_matrix_of_rank_two(self, layer, number):
@@ -146,12 +146,12 @@ class TestDetermined:
     def test_falls_back_on_the_base(self):
         points1, points2 = correspondences("handheld", 4)
         points2[2] = 0.9 * points1[2] + 20
-        normalizer = shaken()
+        normalizer = shaken().double()  # in float32, the network's rounding depends on the size of the batch
         F_mat = EightPoint(normalizer)(points1, points2).detach()
         base = find_fundamental(points1, points2, normalizer=normalizer.base)
         own = find_fundamental(points1, points2, normalizer=normalizer).detach()
-        assert torch.equal(F_mat[2], base[2])
-        assert torch.equal(F_mat[[0, 1, 3]], own[[0, 1, 3]])
+        assert torch.allclose(F_mat[2], base[2], rtol=1e-9, atol=1e-12)
+        assert torch.allclose(F_mat[[0, 1, 3]], own[[0, 1, 3]], rtol=1e-9, atol=1e-12)
         assert up_to_sign(own, base) > 1e-3
 
     def test_sends_no_gradient(self, layer):
@@ -174,7 +174,7 @@ class TestDetermined:
 class TestCameras:
     def test_essential_matrix(self):
         scene = scenes("handheld", 5, 20, noise=0.0, outliers=0.0)
-        estimate = EightPoint().estimate(scene.points1, scene.points2, None, None, scene.K1, scene.K2)
+        estimate = EightPoint().estimate(scene.points1, scene.points2, K1=scene.K1, K2=scene.K2)
         t = torch.zeros(5, 3, 3, dtype=torch.float64)
         t[:, [2, 0, 1], [1, 2, 0]], t[:, [1, 2, 0], [2, 0, 1]] = scene.t, -scene.t
         assert up_to_sign(estimate.E_mat, t @ scene.R) < 1e-6

@@ -38,7 +38,7 @@ SHIPPED = ["crossview", "crossview-synthetic"]
 
 
 def small(base=None) -> LearnedNormalizer:
-    return LearnedNormalizer(base, CrossViewNetwork(width=16, depth=2))
+    return LearnedNormalizer(base or Whitening(), CrossViewNetwork(width=16, depth=2))
 
 
 @pytest.fixture
@@ -79,9 +79,10 @@ class TestForward:
 
     def test_defaults(self):
         normalizer = LearnedNormalizer()
-        assert isinstance(normalizer.base, Whitening)
+        assert isinstance(normalizer.base, ReweightedWhitening)
         assert isinstance(normalizer.network, CrossViewNetwork)
         assert normalizer.transform is spd_transform
+        normalizer.load_state_dict(LearnedNormalizer.from_pretrained("crossview").state_dict())
 
     def test_composes_builder_and_base(self):
         """With known parameters: T = B(p) T_base."""

@@ -86,9 +86,9 @@ def find_estimator(name: str) -> Estimator:
     if name == DEFAULTS:
         return ransac(None, {})
     if kind == DEFAULTS and method:
-        return _ransac(method, {"max_iter": MOST})
+        return _ransac(method, {"max_samples": MOST})
     if kind == "time" and method:
-        return _ransac(method, {"max_iter": 10**7, "max_seconds": SECONDS, "confidence": 1, "refine": False})
+        return _ransac(method, {"max_samples": 10**7, "max_seconds": SECONDS, "confidence": 1, "refine": False})
     raise ValueError(
         f"no estimator {name!r}: expected {', '.join(PEERS)}, count:SOLVER, time:METHOD, RANSAC, RANSAC:METHOD or "
         f"{TRUTH}"
