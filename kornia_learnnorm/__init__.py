@@ -23,13 +23,14 @@ from kornia_learnnorm.geometry.distances import (
     symmetric_scale,
 )
 from kornia_learnnorm.geometry.linear import design_matrix, null_vector
+from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.rank2 import optimal_rank2, rank2_projection
 from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
 from kornia_learnnorm.losses import EpipolarLoss
-from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate, bootstrap_interval
-from kornia_learnnorm.metrics.pairs import PairedDifference, epipolar_error, f1_score, inlier_share, paired_bootstrap
-from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
-from kornia_learnnorm.metrics.poses import pose_error, relative_pose
+from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate
+from kornia_learnnorm.metrics.bootstrap import PairedDifference, bootstrap_interval, paired_bootstrap
+from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
+from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc, pose_error
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, PerView, Whitening
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork

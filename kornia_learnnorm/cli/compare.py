@@ -13,7 +13,8 @@ from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.predict import Normalizer, Residuals, evaluate_normalizers
 from kornia_learnnorm.evaluation.tables import format_table, names_of
-from kornia_learnnorm.metrics.better_rate import better_rate, bootstrap_interval, comparable
+from kornia_learnnorm.metrics.better_rate import better_rate, comparable
+from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 
 __all__ = ["add_arguments", "compare", "run"]

@@ -18,7 +18,7 @@ from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.metrics.better_rate import bootstrap_interval
+from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
 
 FOLDER = Path(__file__).parents[2] / "configs"
 CONFIGS = sorted(FOLDER.glob("*.yaml"))

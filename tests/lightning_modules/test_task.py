@@ -14,7 +14,7 @@ from lightning_modules.task import NormalizerTask
 
 def make_task(**arguments):
     torch.manual_seed(0)
-    return NormalizerTask(kln.LearnedNormalizer(network=kln.CrossViewNetwork(width=8, depth=1)), **arguments)
+    return NormalizerTask(kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=8, depth=1)), **arguments)
 
 
 class Pairs(SyntheticSamples):
@@ -122,7 +122,7 @@ def test_mixed_precision(tmp_path):
     batch = SyntheticSamples(number=1000).draw(99, 0)
     before, seen = task.compute_loss(batch).item(), []
     task.normalizer.network.set_network.head.register_forward_hook(lambda m, a, out: seen.append(out.dtype))
-    task.normalizer.register_forward_hook(lambda m, a, out: seen.append(out[0].dtype))
+    task.normalizer.network.register_forward_hook(lambda m, a, out: seen.append(out[0].dtype))
     trainer = make_trainer(tmp_path, max_steps=150, enable_checkpointing=False, precision="bf16-mixed")
     trainer.fit(task, data)
     assert set(seen[::2]) == {torch.bfloat16}

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
 
 INF, NAN = float("inf"), float("nan")
 ERRORS = st.lists(st.one_of(st.floats(0, 30), st.integers(0, 12), st.just(INF)), min_size=1, max_size=30)
@@ -54,7 +54,7 @@ class TestPoseAUC:
 
     @pytest.mark.parametrize("thresholds", [(0,), (5, -1), (NAN,)])
     def test_thresholds(self, thresholds):
-        with pytest.raises(ValueError, match=f"a threshold must be positive, got {thresholds[-1]}"):
+        with pytest.raises(ValueError, match="thresholds must be positive, got "):
             pose_auc(torch.ones(3), thresholds)
 
 

@@ -14,7 +14,8 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from two_view import SCENES, homogeneous, scenes
 
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.metrics.poses import pose_error, relative_pose, rotation_error, translation_error
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.metrics.poses import pose_error, rotation_error, translation_error
 
 INF, NAN = float("inf"), float("nan")
 
@@ -148,7 +149,7 @@ class TestRelativePose:
             (
                 lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[0] > 0),
                 ValueError,
-                r"must have shape \[3, 10\], got \[10, 2\]",
+                r"must have shape \[3, 10\] as points1, got \[10, 2\]",
             ),
             (lambda F, K1, K2, a, b: (F, 0 * K1, K2, a, b), torch.linalg.LinAlgError, "singular"),
         ],

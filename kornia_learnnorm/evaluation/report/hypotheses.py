@@ -12,7 +12,7 @@ from kornia_learnnorm.evaluation.report.rates import BASELINE, Table
 from kornia_learnnorm.evaluation.report.style import COLORS, Picture, make_figure, make_picture
 from kornia_learnnorm.evaluation.robust.hypotheses import MOST_ERROR, NUMBERS, expected_best, picked
 from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
-from kornia_learnnorm.metrics.pairs import paired_bootstrap
+from kornia_learnnorm.metrics.bootstrap import paired_bootstrap
 
 __all__ = ["hypothesis_figures", "hypothesis_tables"]
 

@@ -11,7 +11,8 @@ from torch import Tensor
 from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.evaluation.runs.run import MAX_RESIDUAL, Cell, Run
 from kornia_learnnorm.evaluation.runs.trained import saw
-from kornia_learnnorm.metrics.better_rate import better_rate, bootstrap_interval, comparable
+from kornia_learnnorm.metrics.better_rate import better_rate, comparable
+from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
 
 __all__ = ["BASELINE", "RESAMPLES", "Table", "mean_text", "p_text", "rate_tables", "rate_text", "with_baseline"]
 

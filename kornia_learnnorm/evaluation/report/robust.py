@@ -11,8 +11,8 @@ from kornia_learnnorm.evaluation.report.rates import TESTS, Table, p_text
 from kornia_learnnorm.evaluation.robust.hypotheses import MOST_ERROR
 from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
 from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
-from kornia_learnnorm.metrics.pairs import paired_bootstrap
-from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.bootstrap import paired_bootstrap
+from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
 
 __all__ = ["about_robust", "robust_tables"]
 

@@ -20,8 +20,8 @@ from kornia_learnnorm.evaluation.report.rates import (
 )
 from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
-from kornia_learnnorm.metrics.pairs import paired_bootstrap
-from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.bootstrap import paired_bootstrap
+from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
 
 __all__ = ["report_tables"]
 

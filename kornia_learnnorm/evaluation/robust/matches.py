@@ -12,8 +12,9 @@ from torch import Tensor
 from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
-from kornia_learnnorm.metrics.poses import relative_pose, rotation_error, translation_error
+from kornia_learnnorm.metrics.poses import rotation_error, translation_error
 
 __all__ = ["Matches", "draw_matches", "even_pairs", "measure"]
 

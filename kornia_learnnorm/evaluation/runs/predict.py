@@ -19,7 +19,8 @@ from kornia_learnnorm.evaluation.runs.consensus import consensus
 from kornia_learnnorm.evaluation.runs.example import median_distance
 from kornia_learnnorm.evaluation.runs.run import check_limit
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.poses import relative_pose, rotation_error, translation_error
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.metrics.poses import rotation_error, translation_error
 
 __all__ = ["describe", "draw", "predict"]
 
