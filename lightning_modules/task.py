@@ -67,8 +67,8 @@ class NormalizerTask(pl.LightningModule):
         self.optimizer = optimizer
         self.lr_scheduler = lr_scheduler
         self.sample_gradient = sample_gradient
-        self.baselines = nn.ModuleDict({"hartley": Hartley(), "whitening": Whitening()})
-        self.better = nn.ModuleDict({name: BetterRateMetric() for name in self.baselines})
+        self.baselines: dict[str, Normalizer] = {"hartley": Hartley(), "whitening": Whitening()}
+        self.better_than_hartley, self.better_than_whitening = BetterRateMetric(), BetterRateMetric()
         self._log_residuals: list[Tensor] = []  # since the last validation or test
         self._left_out = 0  # since the last validation or test
         self._samples = 0  # of all processes since the last step
@@ -183,7 +183,7 @@ class NormalizerTask(pl.LightningModule):
         learned = self._residuals(problem, self.normalizer)
         self._log_residuals.append((learned + self.loss.floor).log())
         for name, normalizer in self.baselines.items():
-            self.better[name].update(learned, self._residuals(problem, normalizer))
+            getattr(self, f"better_than_{name}").update(learned, self._residuals(problem, normalizer))
 
     def _residuals(self, problem: LinearProblem, normalizer: Normalizer) -> Tensor:
         """Return the mean symmetric epipolar distance of each sample under a normaliser, (B,)."""
@@ -196,7 +196,8 @@ class NormalizerTask(pl.LightningModule):
         total, samples, left_out = self._sum(own.sum(), len(own), self._left_out)
         self._log_residuals, self._left_out = [], 0
         self.log(f"{stage}/log_sed", total / samples, prog_bar=True, sync_dist=True)
-        for name, metric in self.better.items():
+        for name in self.baselines:
+            metric: BetterRateMetric = getattr(self, f"better_than_{name}")
             rate = metric.compute()["better_rate"]
             self.log(f"{stage}/better_than_{name}", rate, prog_bar=True, sync_dist=True)
             metric.reset()

@@ -212,4 +212,5 @@ def cofactors(A: Tensor) -> Tensor:
         tensor([6., 3., 2.])
 
     """
-    return torch.linalg.cross(A.roll(-1, -2), A.roll(-2, -2))
+    rows: Tensor = torch.linalg.cross(A.roll(-1, -2), A.roll(-2, -2))
+    return rows

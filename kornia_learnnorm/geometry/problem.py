@@ -107,7 +107,8 @@ class LinearProblem:
             F = transform_fundamental(self.null_matrix, R1, R2)
             # A null matrix without gradient must not get one by way of Hartley's transforms either.
             F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
-            return F / torch.linalg.matrix_norm(F, keepdim=True)
+            carried: Tensor = F / torch.linalg.matrix_norm(F, keepdim=True)
+            return carried
         x1, x2 = convert_points_to_homogeneous(self.points1), convert_points_to_homogeneous(self.points2)
         return torch.unflatten(null_vector(design_matrix(x1 @ T1.mT, x2 @ T2.mT), self.weights), -1, (3, 3))
 
@@ -130,7 +131,13 @@ class LinearProblem:
         return self._changed(lambda v: torch.where(rows.view(-1, *[1] * (v.ndim - 1)), v.detach(), v))
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> LinearProblem:
-        tensors = map(change, (self.T1, self.T2, self.x1, self.x2))
-        weights = None if self.weights is None else change(self.weights)
-        solution = None if self.solution is None else (change(self.solution[0]), change(self.solution[1]))
-        return LinearProblem(change(self.points1), change(self.points2), weights, *tensors, solution)
+        return LinearProblem(
+            change(self.points1),
+            change(self.points2),
+            None if self.weights is None else change(self.weights),
+            change(self.T1),
+            change(self.T2),
+            change(self.x1),
+            change(self.x2),
+            None if self.solution is None else (change(self.solution[0]), change(self.solution[1])),
+        )

@@ -160,7 +160,7 @@ def _name(part: Any, *modules: Any) -> str:
     return str(name)
 
 
-def _describe(part: nn.Module, *modules: Any) -> dict[str, Any]:
+def _describe(part: object, *modules: Any) -> dict[str, Any]:
     """Name a part of this package and its constructor's arguments, which it keeps as attributes of the same names."""
     name, arguments = _name(type(part), *modules), inspect.signature(type(part)).parameters.values()
     # A part without a constructor of its own shows the `*args, **kwargs` of `nn.Module`.
