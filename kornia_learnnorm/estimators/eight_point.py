@@ -146,7 +146,7 @@ class EightPoint(nn.Module):
         if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
             self.__prepare_scriptable__()
         if (K1 is None) != (K2 is None):
-            raise ValueError("cameras are needed of both views or of none")
+            raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
         if mask is not None:
             check_mask(mask, points1, points2, weights)
             points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
@@ -206,7 +206,7 @@ class EightPoint(nn.Module):
         return F_mat.index_copy(0, found, solve_fundamental(problem.select(found), self.normalizer, self.rank2))
 
     def _solve_traced(self, problem: LinearProblem, determined: Tensor) -> Tensor:
-        """Do the same without data-dependent shapes, for ``torch.compile`` and ``torch.func.vmap``.
+        """Return the matrices of :meth:`_solve` without data-dependent shapes, as ``torch.compile`` and ``vmap`` need.
 
         No derivative meets an undetermined sample: generic points take its place, and their result is dropped.
         """
@@ -226,7 +226,7 @@ class EightPoint(nn.Module):
         return torch.where((values[:, 1] > MIN_RANK2_RATIO * values[:, 0])[:, None, None], F_mat, _sideways(F_mat))
 
     def __prepare_scriptable__(self) -> NoReturn:
-        """Refuse ``torch.jit``.
+        """Raise an error: ``torch.jit`` is not supported.
 
         Raises:
             TypeError: always.
@@ -247,7 +247,7 @@ def _is_concrete(mask: Tensor) -> bool:
 
 
 def _rescale(weights: Tensor) -> Tensor:
-    """Scale weights whose largest would over- or underflow; only their ratios count. All below 1e-30 are zero."""
+    """Return weights scaled where the largest would over- or underflow; sets with none above 1e-30 get zeros."""
     top = weights.detach().amax(-1, keepdim=True)
     weights = torch.where(top < 1e-30, 0.0, weights)
     return weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)

@@ -14,11 +14,11 @@ __all__ = ["EpipolarCost"]
 
 
 class EpipolarCost(NamedTuple):
-    """Sums of losses over one set of correspondences for each matrix, or over one set for all of them.
+    """Sum of losses over the correspondences of each matrix, or over one set that all matrices share.
 
     Attributes:
         x1: homogeneous points of view 1, the first two coordinates in pixels, (B or 1, 3, N).
-        x2: the same of view 2.
+        x2: homogeneous points of view 2, (B or 1, 3, N).
         weights: weights of the losses, (B or 1, N).
         scale: from algebraic residuals to distances, see :mod:`kornia_learnnorm.geometry.distances`.
         loss: robust loss of squared distances.
@@ -37,7 +37,7 @@ class EpipolarCost(NamedTuple):
         return EpipolarCost(self.x1[rows], self.x2[rows], self.weights[rows], self.scale, self.loss)
 
     def rounding(self) -> Tensor:
-        """Return what the weighted sum of squared distances may be without a distance but zero, (B or 1,)."""
+        """Return the weighted sum of squares that rounding alone can cause, (B or 1,)."""
         distance = 4 * torch.finfo(self.x1.dtype).eps * (self.x1[:, 2, 0] + self.x2[:, 2, 0])
         return distance.square() * self.weights.sum(-1)
 
@@ -59,7 +59,7 @@ class EpipolarCost(NamedTuple):
         return J
 
     def _expand(self, F: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Distances and their scales, (B, N), and their derivatives by the lines' normals of both views, (B, 2, N)."""
+        """Return distances and scales, (B, N), and derivatives by the lines' normals of both views, (B, 2, N)."""
         line1, line2 = F.mT[:, :2] @ self.x2, F @ self.x1
         algebraic = (self.x2 * line2).sum(1)
         line2 = line2[:, :2]

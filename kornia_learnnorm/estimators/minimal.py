@@ -34,7 +34,7 @@ def are_determined(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
 
 
 def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-    r"""Solve minimal samples exactly and correct the matrices to rank 2 with their covariances.
+    r"""Return the matrices of minimal samples, solved exactly and corrected to rank 2 with their covariances.
 
     A QR factorisation of the transposed design matrix, :math:`A^\top = Q R`, tells which samples determine a matrix
     and gives both the null vector, which is the last column of :math:`Q`, and a factor of its covariance,

@@ -24,7 +24,7 @@ RANK2 = ("projection", "optimal")
 
 
 def solve_dtype(device: torch.device) -> torch.dtype:
-    """Return the dtype of the small linear algebra: float64, except on MPS, which has none."""
+    """Return the dtype of the small linear algebra: float64, or float32 on MPS, which has no float64."""
     return torch.float32 if device.type == "mps" else torch.float64
 
 

@@ -32,8 +32,8 @@ def relative_pose(
 
     Returns:
         rotations with shape :math:`(B, 3, 3)` and unit translations with shape :math:`(B, 3)`, solved in float64 where
-        the device has it, in the dtype of ``F_mat``. Both are NaN where there is no pose to tell: ``F_mat`` is not
-        finite or of rank below two, or no pose has more votes than each of the others.
+        the device has it, in the dtype of ``F_mat``. Both are NaN where ``F_mat`` is not finite or of rank below two,
+        or where two poses tie for the most votes.
 
     Raises:
         TypeError: if a tensor is not floating-point or the mask is not boolean.
@@ -82,7 +82,7 @@ def _check(F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tens
 
 
 def _rays(points: Tensor, K: Tensor) -> Tensor:
-    """Directions of pixels, ``(B, 1, N, 3)``."""
+    """Return directions of pixels, ``(B, 1, N, 3)``."""
     rays: Tensor = torch.linalg.solve(K, convert_points_to_homogeneous(points).mT)
     return rays.mT[:, None]
 

@@ -64,7 +64,7 @@ def optimal_rank2(
     .. math:: u \leftarrow N\Big[ u - \frac{(u, u^\dagger)}{3\, (u^\dagger, V_0 u^\dagger)} V_0 u^\dagger \Big], \quad
               V_0 \leftarrow P_u V_0 P_u .
 
-    What is left of the determinant goes with a projection in Hartley's coordinates.
+    A projection in Hartley's coordinates removes the rest of the determinant.
 
     Args:
         F_mat: matrices in pixels with shape :math:`(B, 3, 3)`, any scale but zero, such as null vectors of the DLT.
@@ -157,6 +157,6 @@ def _correct(u: Tensor, covariance: Tensor, iterations: int) -> Tensor:
 
 
 def _project(covariance: Tensor, u: Tensor) -> Tensor:
-    """``P_u V P_u``."""
+    """Return ``P_u V P_u``."""
     covariance = covariance - u[..., :, None] * (u[..., None, :] @ covariance)
     return covariance - (covariance @ u[..., None]) * u[..., None, :]

@@ -119,7 +119,7 @@ def paired_bootstrap(
 
     Args:
         values: one number per sample with shape (S,), or per image pair.
-        baseline: the same of the other method with shape (S,).
+        baseline: numbers of the other method for the samples with shape (S,).
         groups: index of each sample's image pair with shape (S,), integers.
         level: share of the draws within the interval.
         draws: number of draws.

@@ -147,7 +147,7 @@ def epipolar_error(
 
 
 def _distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    """Distances in which a matrix of NaN is infinitely far from every point."""
+    """Return the distances, infinite under a matrix of NaN."""
     return symmetric_epipolar_distance(points1, points2, F_mat).nan_to_num(nan=inf, posinf=inf)
 
 

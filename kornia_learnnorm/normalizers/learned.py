@@ -161,9 +161,9 @@ def _name(part: Any, *modules: Any) -> str:
 
 
 def _describe(part: object, *modules: Any) -> dict[str, Any]:
-    """Name a part of this package and its constructor's arguments, which it keeps as attributes of the same names."""
+    """Return the name of a part of this package and its constructor's arguments, kept as attributes of their names."""
     name, arguments = _name(type(part), *modules), inspect.signature(type(part)).parameters.values()
-    # A part without a constructor of its own shows the `*args, **kwargs` of `nn.Module`.
+    # A part without its own constructor shows the `*args, **kwargs` of `nn.Module`.
     keys = [argument.name for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD]
     values = {key: getattr(part, key) for key in keys}
     for key, value in values.items():

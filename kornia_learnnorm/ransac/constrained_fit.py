@@ -25,13 +25,12 @@ STEP_LENGTH = 1.3  # over the least-squares step, which bounded losses make too 
 
 
 class Fit(NamedTuple):
-    """Matrices and how good they are.
+    """Fitted matrices and their costs.
 
     Attributes:
         F_mat: matrices of unit norm, singular up to the square of the last step, (K, 3, 3).
-        cost: what their last losses added up to before the last step, (K,).
-        gain: the share of it that a step of least squares could still take away then, (K,); close to an optimum where
-            small.
+        cost: sum of the last losses before the last step, (K,).
+        gain: share of the cost that a least-squares step could still remove, (K,); small close to an optimum.
     """
 
     F_mat: Tensor
@@ -46,7 +45,7 @@ def constrained_fit(
     losses: Iterable[Loss],
     scale: DistanceScale = sampson_scale,
 ) -> Fit:
-    r"""Fit matrices to correspondences that they share, one step for each loss.
+    r"""Return matrices fitted to correspondences that they share, one step for each loss.
 
     With :math:`u = \mathrm{vec}(F)`, :math:`\|u\| = 1`, :math:`\xi_i = x_{2,i} \otimes x_{1,i}`, the factors
     :math:`g_i(n_{1,i}, n_{2,i})` of the squared norms :math:`n_{v,i} = (u, V_{v,i} u)` of the epipolar lines' normals,
@@ -63,7 +62,7 @@ def constrained_fit(
 
     Args:
         x1: homogeneous points of view 1 with shape :math:`(3, N)`, the first two coordinates in pixels.
-        x2: the same of view 2.
+        x2: homogeneous points of view 2.
         F_mat: where to start, with shape :math:`(K, 3, 3)`, any scale but zero.
         losses: :math:`\rho` of each step, at least one, see :mod:`kornia_learnnorm.estimators.robust_losses`.
         scale: :math:`g`, see :mod:`kornia_learnnorm.geometry.distances`.

@@ -191,8 +191,8 @@ class RANSAC(nn.Module):
             the matrix :math:`(3, 3)`, :math:`x_2^\top F x_1 = 0`, the inliers of the matrix before it is rounded to the
             dtype of the points, the number of samples and the score; no gradients. Zeros and no inliers where no matrix
             of rank 2 was found that has more than eight inliers, and where fewer than eight weights are positive. Where
-            no sample determines a matrix, as of a plane without noise or a camera that does not move, it is one of
-            those that fit.
+            every sample is degenerate, as on a plane without noise or under no motion, the matrix is one of those that
+            fit.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or the weights not floating-point.
@@ -266,7 +266,7 @@ class RANSAC(nn.Module):
         return pool, drawn
 
     def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
-        """Return the matrices of the minimal samples (K, 8) that determine one; of all, if none does."""
+        """Return the matrices of the non-degenerate minimal samples (K, 8), or of all where every one is degenerate."""
         x1, x2 = scorer.samples(rows)
         if self.rank2 == "optimal":
             F_mat = solve_samples(x1, x2, MIN_SAMPLE_SHIFT * self.inl_th)
@@ -279,7 +279,7 @@ class RANSAC(nn.Module):
         return scorer.from_pixels(find_fundamental(points1, points2, None, self.normalizer, self.rank2))
 
     def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
-        """Fit matrices to their inliers, with a normaliser the first by it, and return the best of what comes out."""
+        """Return the best of the matrices fitted to their inliers, the first of them also by the normaliser."""
         if self.rank2 == "projection":
             inliers = scorer.inliers(F_mat[:1]).to(F_mat)
             points1, points2 = (points[None, scorer.rows] for points in scorer.pixels)

@@ -59,9 +59,9 @@ class PairScorer:
 
     Attributes:
         x1: all correspondences in the coordinates of view 1, (3, N).
-        x2: the same of view 2.
+        x2: all correspondences in the coordinates of view 2.
         T1: from pixels of view 1 to its coordinates, (3, 3).
-        T2: the same of view 2.
+        T2: from pixels of view 2 to its coordinates, (3, 3).
 
     """
 
@@ -89,7 +89,7 @@ class PairScorer:
 
     @cached_property
     def pixels(self) -> tuple[Tensor, Tensor]:
-        """All correspondences in pixels, (N, 2) each."""
+        """Correspondences in pixels, (N, 2) for each view."""
         return (self.x1[:2] - self.T1[:2, 2:]).mT, (self.x2[:2] - self.T2[:2, 2:]).mT
 
     def samples(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -145,7 +145,7 @@ class PairScorer:
         return torch.cat([self._gains(block, terms).clamp_(min=0).sum(-1) for block in blocks]).nan_to_num_(nan=0.0)
 
     def _gains(self, F_mat: Tensor, terms: Tensor) -> Tensor:
-        """What each correspondence would add to each score if it were not truncated, (K, M)."""
+        """Return the term of each correspondence in each score before truncation at zero, (K, M)."""
         F = (F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)).float()
         tiny = torch.finfo(F.dtype).tiny
         residuals, products1, products2 = torch.unflatten(terms, 0, (3, 9))

@@ -18,7 +18,7 @@ from kornia_learnnorm.geometry.linear import design_matrix, null_vector, smalles
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 
-# What the network sees of a correspondence and of the set.
+# Numbers of features of a correspondence and of the set.
 _POINT_FEATURES, _SET_FEATURES = {"own": 2, "both": 4, "epipolar": 13}, {"own": 1, "both": 1, "epipolar": 10}
 
 
@@ -40,7 +40,7 @@ class CrossViewNetwork(nn.Module):
             both views, ``"own"`` only its own points.
 
     Raises:
-        ValueError: if ``features`` is none of these.
+        ValueError: if ``features`` is not one of these names.
 
     Example:
         >>> network = CrossViewNetwork(width=16, depth=2)
@@ -91,7 +91,7 @@ class CrossViewNetwork(nn.Module):
     def _views(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, null_matrix: Tensor | None
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Features of the points and of the set, as either view sees them."""
+        """Return the features of the points and of the set as each view sees them."""
         if self.features != "epipolar":
             nothing = torch.ones_like(points1[:, 0, :1])
             if self.features == "own":
@@ -111,7 +111,7 @@ class CrossViewNetwork(nn.Module):
 
 
 def _sign(F: Tensor) -> Tensor:
-    """Sign that makes the largest entry of ``F`` positive: one and the same for ``F`` and its transpose."""
+    """Return the sign that makes the largest entry of ``F`` positive, equal for ``F`` and its transpose."""
     entries = F.detach().flatten(-2)
     return entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
 
@@ -119,10 +119,10 @@ def _sign(F: Tensor) -> Tensor:
 def _epipolar_features(
     own: Tensor, other: Tensor, F: Tensor, v: Tensor, u: Tensor, weights: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Describe the problem as one view sees it, where ``other^T F own = 0``.
+    """Return features of the problem as one view sees it, where ``other^T F own = 0``.
 
     ``v`` and ``u`` are the right and left singular vectors of the smallest singular value of ``F``: projected to rank
-    2, ``F`` loses ``(u^T F v) u v^T``. Returns features of the points ``(B, N, 13)`` and of the set ``(B, 10)``.
+    2, ``F`` loses ``(u^T F v) u v^T``. The features of the points are ``(B, N, 13)``, those of the set ``(B, 10)``.
     """
     line, other_line = (other @ F)[..., :2], (own @ F.mT)[..., :2]
     norm, other_norm = line.norm(dim=-1, keepdim=True), other_line.norm(dim=-1, keepdim=True)
@@ -198,7 +198,7 @@ class ContextLayer(nn.Module):
 
 
 def _maximum(h: Tensor, absent: Tensor | None) -> Tensor:
-    """Maximum over the present points, ``(B, C)``; zero where all are absent."""
+    """Return the maximum over the present points, ``(B, C)``; zero where all are absent."""
     if absent is None:
         return h.amax(1)
     empty = absent.all(1)
@@ -206,7 +206,7 @@ def _maximum(h: Tensor, absent: Tensor | None) -> Tensor:
 
 
 def _average(h: Tensor, weights: Tensor | None) -> Tensor:
-    """Average over the points, ``(B, C)``."""
+    """Return the average over the points, ``(B, C)``."""
     if weights is None:
         return h.mean(1)
     total = weights.sum(1, keepdim=True)
