@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-__all__ = ["INLIER", "OUTLIER", "WIDE", "draw_line", "draw_pair", "import_matplotlib"]
+__all__ = ["INLIER", "OUTLIER", "WIDE", "draw_line", "draw_matches", "draw_pair", "import_matplotlib"]
 
 BACKGROUND = "#11161d"  # dark, to fit light and dark pages
 TEXT = "#e8edf2"
@@ -65,6 +65,25 @@ def draw_line(axes: Axes, line: npt.NDArray[np.float64], **style: Any) -> Line2D
     return axes.axline((-a * c, -b * c), slope=-a / b if b else math.inf, **style)
 
 
+def draw_matches(
+    axes: Axes, points1: npt.NDArray[np.float64], points2: npt.NDArray[np.float64], inliers: npt.NDArray[np.bool_]
+) -> None:
+    """Draw the matches in image 1: inliers as dots with their motion to image 2, outliers as crosses.
+
+    Args:
+        axes: Matplotlib axes.
+        points1: pixels in image 1 with shape (N, 2).
+        points2: pixels in image 2 with shape (N, 2).
+        inliers: mask of the inliers with shape (N,).
+
+    """
+    motion = np.stack([points1, points2], 1)[inliers]
+    lines = import_matplotlib().collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8)
+    axes.add_collection(lines)
+    axes.plot(*points1[inliers].T, "o", color=INLIER, markersize=2, label="inliers and their motion")
+    axes.plot(*points1[~inliers].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8, label="outliers")
+
+
 def draw_pair(
     image1: npt.NDArray[np.uint8],
     image2: npt.NDArray[np.uint8],
@@ -100,7 +119,7 @@ def draw_pair(
     if num_lines < 0:
         raise ValueError(f"num_lines must not be negative, got {num_lines}")
     figure, (axes1, axes2) = _panels(image1, image2)
-    _draw_matches(axes1, estimate)
+    _draw_counts(axes1, estimate)
     _draw_lines(axes2, estimate, num_lines, seed)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor=figure.get_facecolor())
@@ -129,15 +148,9 @@ def _panels(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8]) -> tup
     return figure, axes
 
 
-def _draw_matches(axes: Axes, estimate: PairEstimate) -> None:
-    """Draw inliers as dots with their motion and outliers as crosses; write the counts above."""
-    collections = import_matplotlib().collections
-    start, end = estimate.points1.numpy(), estimate.points2.numpy()
-    inliers = estimate.inliers.numpy()
-    motion = np.stack([start, end], 1)[inliers]
-    axes.add_collection(collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8))
-    axes.plot(*start[~inliers].T, "x", color=OUTLIER, markersize=3, markeredgewidth=0.8)
-    axes.plot(*start[inliers].T, "o", color=INLIER, markersize=1.8)
+def _draw_counts(axes: Axes, estimate: PairEstimate) -> None:
+    """Draw the matches; write the counts of inliers and outliers above."""
+    draw_matches(axes, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
     outliers = estimate.num_matches - estimate.num_inliers
     motion_text = f"{estimate.num_inliers} inliers and their motion"
     _caption(axes, [("image 1", TEXT), (motion_text, INLIER), (f"{outliers} outliers", OUTLIER)])

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.evaluation.drawing import INLIER, OUTLIER, WIDE, draw_line, import_matplotlib
+from kornia_learnnorm.evaluation.drawing import INLIER, WIDE, draw_line, draw_matches
 from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture, report_style
 from kornia_learnnorm.evaluation.runs.run import Run
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
@@ -53,7 +53,8 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
     wide = float((pair["size"][:, 0] / pair["size"][:, 1]).min()) > WIDE
     figure, (first, second) = make_figure(2, 1, 6.2) if wide else make_figure(1, 2)
     near = example_inliers(pair)
-    _draw_matches(first, pair, near)
+    draw_matches(first, pair["points1"], pair["points2"], near)
+    _frame(first, pair["size"][0], "view 1")
     matrices = {name: cell.predictions[name]["F_mat"][middle].numpy() for name in methods} | {TRUTH: pair["F"]}
     _draw_lines(second, pair, near, matrices, {TRUTH: INK, **colors})
     medians = ", ".join(f"{errors[name][middle].item():.2f} px under {name}" for name in methods)
@@ -77,18 +78,6 @@ def example_inliers(pair: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     points1, points2, F_mat = (torch.from_numpy(pair[key]) for key in ("points1", "points2", "F"))
     near: NDArray[np.bool_] = (symmetric_epipolar_distance(points1, points2, F_mat) < INLIER_THRESHOLD).numpy()
     return near
-
-
-def _draw_matches(axes: Axes, pair: dict[str, NDArray[Any]], near: NDArray[np.bool_]) -> None:
-    """Draw inliers with their motion and outliers in the first view."""
-    start, end = pair["points1"], pair["points2"]
-    lines = import_matplotlib().collections.LineCollection(
-        np.stack([start, end], 1)[near], colors=INLIER, linewidths=0.7, alpha=0.8
-    )
-    axes.add_collection(lines)
-    axes.plot(*start[near].T, "o", color=INLIER, markersize=2, label="inliers and their motion")
-    axes.plot(*start[~near].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8, label="outliers")
-    _frame(axes, pair["size"][0], "view 1")
 
 
 def _draw_lines(
