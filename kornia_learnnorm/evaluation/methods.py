@@ -12,11 +12,12 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from kornia_learnnorm.estimators.fundamental import find_fundamental, normalizing_transforms
+from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
+from kornia_learnnorm.normalizers.contract import normalizing_transforms
 from kornia_learnnorm.normalizers.learned import WEIGHTS, LearnedNormalizer
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 

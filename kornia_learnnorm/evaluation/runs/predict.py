@@ -11,7 +11,6 @@ from torch import Tensor
 
 from kornia_learnnorm.data.samples import Samples, draw_samples, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.estimators.fundamental import normalizing_transforms
 from kornia_learnnorm.evaluation.diagnostics import diagnose
 from kornia_learnnorm.evaluation.methods import Method
 from kornia_learnnorm.evaluation.predict import ground_truth_inliers
@@ -21,6 +20,7 @@ from kornia_learnnorm.evaluation.runs.run import check_limit
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import rotation_error, translation_error
+from kornia_learnnorm.normalizers.contract import normalizing_transforms
 
 __all__ = ["describe", "draw", "predict"]
 

@@ -1,13 +1,11 @@
-"""Runs of predictions and the reports made of them."""
+"""Runs of predictions."""
 
 from __future__ import annotations
 
 import importlib
 import json
-import re
 import shutil
 import sys
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +15,10 @@ import torch
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli import evaluate
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.cli.report import write_report
 from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import plain_residual
 from kornia_learnnorm.data.store import read_store, write_store
 from kornia_learnnorm.evaluation.methods import find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.report.pair import draw_example
 from kornia_learnnorm.evaluation.report.tables import report_tables
 from kornia_learnnorm.evaluation.runs import example, record
 from kornia_learnnorm.evaluation.runs import predict as predict_run
@@ -32,28 +28,6 @@ from kornia_learnnorm.normalizers.learned import WEIGHTS
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory):
-    path = tmp_path_factory.mktemp("store") / "scenes.h5"
-    write_store(path, synthetic_store(pairs=3, points=330, seed=1))
-    return path
-
-
-@pytest.fixture(scope="module")
-def run(store, tmp_path_factory):
-    """A run, not to be changed."""
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(example, "TRIALS", 20)
-        assert main(["evaluate", str(store), "--out", str(folder), "--methods", *METHODS]) == 0
-    return folder
-
-
-@pytest.fixture
-def copied(run, tmp_path):
-    return shutil.copytree(run, tmp_path / "run")
 
 
 class TestMethods:
@@ -203,65 +177,7 @@ def test_order_does_not_change_numbers(run, store, tmp_path, monkeypatch):
             np.testing.assert_array_equal(values, second.sizes[name][key])
 
 
-class TestReport:
-    def test_files(self, copied, capsys):
-        assert main(["report", str(copied)]) == 0
-        assert "Better than Hartley" in capsys.readouterr().out
-        text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
-        for name in re.findall(r"\]\(([\w-]+\.svg)\)", text):
-            ElementTree.parse(copied / name)
-        assert page.count("<svg") == text.count(".svg)") == 7
-        assert not re.findall(r'(?:src|href)="(?!#)', page)  # nothing from elsewhere
-        identifiers = re.findall(r'\bid="([^"]+)"', page)
-        assert len(identifiers) == len(set(identifiers))
-        for reference in re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', page):
-            assert "".join(reference) in identifiers
-
-    def test_rates_are_those_of_the_samples(self, run):
-        found = read_run(run)
-        cell = found.cells[0]
-        own = {name: prediction["own"].numpy() for name, prediction in cell.predictions.items()}
-        table = report_tables(found)[0]
-        for row in table.rows:
-            if row[0] in own and row[0] != "Hartley":
-                assert row[2].startswith(f"{100 * np.mean(own[row[0]] < own['Hartley']):.1f} [")
-        assert table.header[2] == f"scenes: {len(cell.pair)} of {cell.drawn}"
-        assert {row[0]: row[1] for row in table.rows}["crossview"] == "kitti_00, kitti_01, kitti_03"
-        raw = np.load(run / "scenes" / "filtered" / "samples.npz")["plain_residual"]
-        assert len(cell.pair) == (raw < 60).sum()
-
-    def test_accuracy_and_tests(self, run):
-        tables = {table.title: table for table in report_tables(read_run(run))}
-        rows = {row[0]: row for row in tables["Fit and accuracy: scenes, filtered"].rows}
-        assert float(rows["Hartley+LM"][1]) < float(rows["Hartley"][1]) < float(rows["none"][1])
-        tests = {row[0]: row for row in tables["Paired tests: scenes, filtered"].rows}
-        assert tests["none"][1].startswith("+")
-        assert tests["Hartley+LM"][1].startswith("-")
-        assert len(tables["By motion: scenes, filtered"].rows) == 8
-        assert 0 < len(tables["Worst failures: scenes, filtered"].rows) <= 10
-
-    def test_without_the_baseline(self, copied, capsys):
-        for protocol in ("filtered", "unfiltered"):
-            (copied / "scenes" / protocol / "Hartley.npz").unlink()
-        assert main(["report", str(copied)]) == 2
-        assert "compares with Hartley, the run has predictions of Hartley+LM, " in capsys.readouterr().err
-
-    def test_not_a_run(self, tmp_path, capsys):
-        assert main(["report", str(tmp_path)]) == 2
-        assert "no run at" in capsys.readouterr().err
-
-    def test_what_is_there_of_a_run(self, copied, capsys):
-        """Of a run that was stopped, with what was left out."""
-        for path in ("scenes/filtered/crossview", "scenes/unfiltered/samples", "sizes/none"):
-            (copied / f"{path}.npz").unlink()
-        assert main(["report", str(copied)]) == 0
-        left = "crossview on scenes, filtered; all methods on scenes, unfiltered; none by the number of correspondences"
-        assert f"not there yet, so left out: {left}" in capsys.readouterr().err
-        assert f"Not there yet, so left out: {left}." in (copied / "report.md").read_text()
-        (copied / "example.npz").unlink()
-        assert write_report(copied).missing[-1] == "the example of a pair"
-        assert "Figure 11" not in (copied / "report.md").read_text()
-
+class TestDamage:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
@@ -410,13 +326,6 @@ def test_a_few_samples(store, tmp_path, monkeypatch, options, most):
     assert json.loads((folder / "run.json").read_text())["max_samples"] == most
     everything = [len(predict_run.draw(read_store(store), ratio, 0, None).pair) for ratio in (0.8, None)]
     assert [cell.drawn for cell in read_run(folder).cells] == ([most, most] if most else everything)
-
-
-def test_without_a_sample_of_the_pair_there_is_no_figure_of_it(copied):
-    found = read_run(copied)
-    assert [picture.name for picture in draw_example(found, dict.fromkeys(METHODS, "red"))] == ["figure-10"]
-    found.example["pair"] = np.array(99)
-    assert draw_example(found, {}) == []
 
 
 def test_motions_by_hand():
