@@ -1,4 +1,4 @@
-"""Write tiny image sequences in the layouts that the readers know: ``python tests/data/make_sequences.py FOLDER``.
+"""Write tiny image sequences in the layouts that the readers know: ``python tests/make_sequences.py FOLDER``.
 
 A camera moves along a textured wall that it faces, so that frame ``n`` is a window of the texture, ``STEP * n`` pixels
 further to the right, and cameras and poses are exact (but for the distortion of TUM's first two Kinects, which is not
@@ -133,6 +133,32 @@ LAYOUTS = {
     "folder": write_folder,
     "colmap": write_colmap,
 }
+
+
+def edit(path: Path, line: int, text: str | None) -> None:
+    """Replace a line, counted from 1, or take it out."""
+    lines = path.read_text().splitlines()
+    lines[line - 1 : line] = [] if text is None else [text]
+    path.write_text("".join(f"{one}\n" for one in lines))
+
+
+def moved(pixels: float, focal: float = FOCAL) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = metres(pixels, focal)
+    return pose
+
+
+def rotated(wxyz: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Rotate vectors (N, 3) by a unit quaternion: q v q*, with Hamilton's product."""
+
+    def product(p, q):
+        w = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdims=True)
+        return np.concatenate(
+            [w, p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])], -1
+        )
+
+    pure = np.column_stack([np.zeros(len(vectors)), vectors])
+    return product(product(np.broadcast_to(wxyz, pure.shape), pure), (wxyz * [1, -1, -1, -1])[None])[:, 1:]
 
 
 def main() -> None:

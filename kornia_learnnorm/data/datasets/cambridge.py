@@ -24,22 +24,23 @@ __all__ = ["read_cambridge"]
 
 
 def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
-    """Read a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015): camera centres, quaternions from the world.
+    """Return the frames of a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015).
 
-    Focal lengths are those of the scene's reconstruction by VisualSFM, ``reconstruction.nvm``, the principal point is
+    Focal lengths are those of the scene's reconstruction by VisualSFM, ``reconstruction.nvm``; the principal point is
     the centre of the image. The reconstruction's radial distortion is not applied.
 
     Args:
-        root: the scene's folder, with ``dataset_train.txt`` and ``dataset_test.txt``, about metres.
+        root: the scene's folder, with ``dataset_train.txt`` and ``dataset_test.txt``: camera centres, approximately in
+            metres, and quaternions from world to camera.
         split: ``train`` or ``test``; None for both.
 
     Returns:
-        the frames by name, each folder a sequence; cameras are NaN where the reconstruction lacks the image or is not
-        there, and where the image cannot be read.
+        the frames by name, each folder a sequence; cameras are NaN if the image cannot be read, or there is no
+        reconstruction or the image is not in it.
 
     Raises:
         FileNotFoundError: if a list is missing, or an image that it lists.
-        ValueError: if the split is unknown, a line malformed, a list without entries or an image listed twice.
+        ValueError: if the split is unknown, a line is malformed, or a list is empty or has an image twice.
 
     """
     root = Path(root)
@@ -68,7 +69,7 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
 
 
 def _nvm_focals(path: Path) -> dict[str, float]:
-    """Read the focal lengths by the images' names without suffix; the points after them are many and not read."""
+    """Return the focal lengths, pixels, by the images' names without suffix; the points after them are not read."""
     lines = text_lines(path, "reconstruction")
     number, line = next(lines, (1, ""))
     if line != "NVM_V3":

@@ -15,8 +15,9 @@ import torch
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.cli.report import write_report
-from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.data.store import read_store, write_store
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_tables
 from kornia_learnnorm.evaluation.report.robust import PRINTED, robust_tables
 from kornia_learnnorm.evaluation.robust import estimators as robust_estimators
