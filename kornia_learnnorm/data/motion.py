@@ -35,4 +35,5 @@ def fundamental_from_motion(K1: Tensor, K2: Tensor, R: Tensor, t: Tensor) -> Ten
 
     """
     F_mat: Tensor = fundamental_from_essential(cross_product_matrix(t) @ R, K1, K2)
-    return F_mat / F_mat.norm(dim=(-2, -1), keepdim=True)
+    scale: Tensor = F_mat.norm(dim=(-2, -1), keepdim=True)
+    return F_mat / scale
