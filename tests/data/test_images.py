@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from make_sequences import blurred_noise as texture
 
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.images import image_size, read_frame, read_image
@@ -22,13 +23,6 @@ Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
 CAMERA = np.array([[250.0, 0, 119.0], [0, 245.0, 92.0], [0, 0, 1]])
 DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # of the benchmark's first Kinect
-
-
-def texture(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
-    """Blurred noise at two scales, with the full range of grey values."""
-    rng = np.random.default_rng(seed)
-    image = sum(cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
-    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def blobs(centres: np.ndarray, width: int = 240, height: int = 180) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -11,12 +11,10 @@ from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.textfiles import (
     camera_matrix,
     listed_image,
-    parent_name,
     parse_numbers,
     rigid_motion,
     rotation,
     text_lines,
-    without_suffix,
 )
 from kornia_learnnorm.data.images import image_size
 
@@ -59,10 +57,12 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
             if name in frames:
                 raise ValueError(f"{path}, line {number}: {name} is listed twice")
             size = image_size(root / listed_image(path, number, name))
-            focal, known = focals.get(without_suffix(name), np.nan), without_suffix(name) in focals and size != (0, 0)
-            K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2) if known else np.full((3, 3), np.nan)
+            focal = focals.get(_without_suffix(name), np.nan) if size != (0, 0) else np.nan
+            K = np.full((3, 3), np.nan)
+            if focal > 0:
+                K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
             pose = rigid_motion(rotation(path, number, row[3:]).T, row[:3])
-            frames[name] = Frame(root / name, name, parent_name(name), size, K, pose)
+            frames[name] = Frame(root / name, name, name.rpartition("/")[0], size, K, pose)
         if len(frames) == before:
             raise ValueError(f"{path} lists no images after the three lines of its header")
     return sorted(frames.values(), key=lambda frame: (frame.sequence, frame.name))
@@ -80,9 +80,15 @@ def _nvm_focals(path: Path) -> dict[str, float]:
     expected, focals = "an image, its focal length, quaternion, centre, radial distortion and 0", {}
     for number, text in islice(lines, int(line)):
         name, *words = text.split()
-        focals[without_suffix(name)] = float(parse_numbers(path, number, words, 10, expected, text)[0])
-        if focals[without_suffix(name)] <= 0:
+        focal = float(parse_numbers(path, number, words, 10, expected, text)[0])
+        focals[_without_suffix(name)] = focal
+        if focal <= 0:
             raise ValueError(f"{path}, line {number}: a positive focal length expected, got {words[0]}")
     if len(focals) < int(line):
         raise ValueError(f"{path} announces {line} images and has {len(focals)}")
     return focals
+
+
+def _without_suffix(name: str) -> str:
+    """Return a name without the suffix, which differs between the lists and the reconstruction."""
+    return str(PurePosixPath(name).with_suffix(""))

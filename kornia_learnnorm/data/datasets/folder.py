@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.datasets.textfiles import parent_name
 from kornia_learnnorm.data.images import image_size
 
 __all__ = ["read_folder"]
@@ -35,5 +34,5 @@ def read_folder(root: str | Path) -> list[Frame]:
     names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
     if not names:
         raise FileNotFoundError(f"no images ({', '.join(sorted(SUFFIXES))}) in {root}")
-    names.sort(key=lambda name: (parent_name(name), name))
-    return [Frame(root / name, name, parent_name(name), image_size(root / name)) for name in names]
+    names.sort(key=lambda name: (name.rpartition("/")[0], name))
+    return [Frame(root / name, name, name.rpartition("/")[0], image_size(root / name)) for name in names]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 __all__ = [
     "camera_matrix",
     "listed_image",
-    "parent_name",
     "parse_numbers",
     "rigid_motion",
     "rotation",
     "text_lines",
-    "without_suffix",
 ]
 
 Array = NDArray[np.float64]
@@ -71,13 +69,3 @@ def rigid_motion(R: Array, t: Array) -> Array:
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
     """Return the camera matrix (3, 3), pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def parent_name(name: str) -> str:
-    """Return the folder in a name with slashes."""
-    return name.rpartition("/")[0]
-
-
-def without_suffix(name: str) -> str:
-    """Return a name without the ending of its file."""
-    return str(PurePosixPath(name).with_suffix(""))
