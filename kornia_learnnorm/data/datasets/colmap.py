@@ -61,7 +61,7 @@ def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int 
 
     Args:
         model: folder with cameras, images and points3D, as ``.bin`` or ``.txt``.
-        frames: frames whose names are those of the model's images.
+        frames: frames named as the images of the model.
         min_points: smallest number of points that both frames of a pair see.
 
     Yields:

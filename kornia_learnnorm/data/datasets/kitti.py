@@ -63,7 +63,7 @@ def _camera(path: Path, key: str) -> tuple[Array, Array]:
             parse_numbers(path, number, rest.split(), 12, f"{key}: and 12 numbers", line).reshape(3, 4), [3], 1
         )
         if min(K[0, 0], K[1, 1]) <= 0 or K[1, 0] or K[2].tolist() != [0, 0, 1]:
-            raise ValueError(f"{path}, line {number}: a camera matrix beside a fourth column expected, got {line!r}")
+            raise ValueError(f"{path}, line {number}: a camera matrix and a fourth column expected, got {line!r}")
         return K, rigid_motion(np.eye(3), np.asarray(-np.linalg.solve(K, b)[:, 0], np.float64))
     raise ValueError(f"{path} has no line '{key}: 12 numbers'")
 

@@ -29,7 +29,7 @@ def choose_pairs(
         min_points: points that the frames of a pair share in ``model``; None for pairs by their order.
 
     Raises:
-        ValueError: if there is no pair, ``min_points`` comes without ``model``, or as those functions say.
+        ValueError: if there is no pair, ``min_points`` comes without ``model``, or as the three functions say.
         FileNotFoundError: if the list or the model is missing.
 
     """

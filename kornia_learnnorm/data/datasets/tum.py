@@ -38,7 +38,7 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
     """Return the frames of the TUM RGB-D benchmark (J. Sturm et al., IROS 2012; conventions of its file formats page).
 
     Args:
-        root: a sequence's folder, with ``rgb.txt`` and ``groundtruth.txt``, metres, or a folder of such folders.
+        root: a sequence's folder, with ``rgb.txt`` and ``groundtruth.txt``, metres, or a folder of sequences.
         sequences: names of folders in the order to read; None for all.
         max_difference: largest difference in time between a frame and its pose, seconds. A frame gets the nearest
             pose, the earlier one of a tie.

@@ -87,7 +87,7 @@ def match_lightglue(features1: Features, features2: Features) -> Matches:
     for features in (features1, features2):
         if features.descriptors.dtype != np.float32 or features.descriptors.shape[1] != 128:
             got = f"{features.descriptors.dtype} with {features.descriptors.shape[1]} columns"
-            raise ValueError(f"LightGlue takes the descriptors of DISK, float32 with 128 columns, got {got}")
+            raise ValueError(f"LightGlue needs the descriptors of DISK, float32 with 128 columns, got {got}")
     data = {f"image{index}": _lightglue_input(features) for index, features in enumerate((features1, features2))}
     with torch.inference_mode():
         found = _lightglue()(data)

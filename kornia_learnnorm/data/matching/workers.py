@@ -94,7 +94,7 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
         import_extra("distributed.comm.addressing", "dask", "matching on a Dask cluster").get_address_host_port(dask)
     except ValueError as error:
         raise ValueError(f"a Dask scheduler needs an address as tcp://host:8786, got {dask!r}: {error}") from error
-    # The finaliser of a client that could not connect takes a lock that the next one holds while it starts.
+    # Collect an earlier client that could not connect: its finaliser would wait for a lock of the new one.
     gc.collect()
     client = distributed.Client(dask)
     try:

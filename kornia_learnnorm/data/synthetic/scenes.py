@@ -37,7 +37,7 @@ def random_scenes(batch_size: int, num_points: int, generator: Generator) -> Two
 
     Images are 400-1,400 px wide and 0.3-0.8 as high, focal lengths 0.5-1.3 widths. Points are uniform, or in half of
     the scenes clustered; depths log-uniform in 3-75, with about 40 % of the points on a ground plane. A third of the
-    motions drives forward and turns by up to 0.06 rad, the others go anywhere and turn by up to 0.24 rad, doubled in a
+    motions drives forward and turns by up to 0.06 rad, the rest go anywhere and turn by up to 0.24 rad, doubled in a
     third of these; the baseline is log-uniform in 1-40 % of the median depth. Noise in both views is Student-t with
     three degrees of freedom, its scale per scene log-uniform in 0.1-1.5 px. Half of the scenes have up to 30 % gross
     outliers, uniform in the second image.
@@ -211,5 +211,5 @@ def _check_arguments(
 
 
 def _num_candidates(num_points: int) -> int:
-    """Return how many points to draw so that, of those that the second view shows, enough are left."""
+    """Return how many candidate points to draw so that the second view shows at least ``num_points``."""
     return 2 * num_points + 16

@@ -94,7 +94,7 @@ def test_calibration(kitti):
     with pytest.raises(ValueError, match=r"calib\.txt, line 2: P1: and 12 numbers expected, got 'P1: 1 2 3'"):
         read_kitti(kitti, ["00"], "image_1")
     edit(path, 2, "P1: " + "0 " * 12)
-    with pytest.raises(ValueError, match=r"calib\.txt, line 2: a camera matrix beside a fourth column expected"):
+    with pytest.raises(ValueError, match=r"calib\.txt, line 2: a camera matrix and a fourth column expected"):
         read_kitti(kitti, ["00"], "image_1")
     edit(path, 2, None)
     with pytest.raises(ValueError, match=r"calib\.txt has no line 'P1: 12 numbers'"):
