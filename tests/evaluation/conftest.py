@@ -8,8 +8,8 @@ import shutil
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.data.store import write_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import estimators, hypotheses
 from kornia_learnnorm.evaluation.runs import example
 

@@ -88,9 +88,9 @@ def find_estimator(name: str) -> Estimator:
     if name == DEFAULTS:
         return ransac(None, {})
     if kind == DEFAULTS and method:
-        return _ransac(method, {"max_iter": MAX_SAMPLES})
+        return _ransac(method, {"max_samples": MAX_SAMPLES})
     if kind == "time" and method:
-        return _ransac(method, {"max_iter": 10**7, "max_seconds": MAX_SECONDS, "confidence": 1, "refine": False})
+        return _ransac(method, {"max_samples": 10**7, "max_seconds": MAX_SECONDS, "confidence": 1, "refine": False})
     raise ValueError(
         f"no estimator {name!r}: expected {', '.join(PEERS)}, count:SOLVER, time:METHOD, RANSAC, RANSAC:METHOD or "
         f"{TRUTH}"

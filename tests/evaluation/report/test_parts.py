@@ -10,8 +10,8 @@ import torch
 import yaml
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import Samples
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.evaluation.methods import Method
 from kornia_learnnorm.evaluation.runs import predict as predict_run
 from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS, consensus

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from kornia_learnnorm.cli.synthesize import synthetic_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.evaluation.robust.matches import draw_matches, measure
 from kornia_learnnorm.metrics.pairs import f1_score
 
