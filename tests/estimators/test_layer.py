@@ -228,6 +228,7 @@ class TestMatches:
         assert estimate.F_mat.isfinite().all()
 
 
+@pytest.mark.long
 class TestGradients:
     @pytest.mark.parametrize("num_points", [8, 12])
     def test_gradcheck(self, layer, num_points):
@@ -311,6 +312,7 @@ def fuzz(kind, nearness, scale, offset, num_points, weighting, single, name, see
 
 
 class TestFiniteEverywhere:
+    @pytest.mark.long
     @given(**FUZZ)
     def test_fuzz(self, **drawn):
         fuzz(size=100, **drawn)
@@ -355,6 +357,7 @@ class TestPrecision:
 
 
 class TestBackEnds:
+    @pytest.mark.long
     @pytest.mark.parametrize("name", ["hartley", "optimal", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
     def test_compile(self, name):
         torch.compiler.reset()
