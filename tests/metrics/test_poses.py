@@ -1,4 +1,4 @@
-"""Relative poses against OpenCV and triangulation in NumPy, angles by construction, areas under recall curves by hand."""
+"""Relative poses against OpenCV and triangulation in NumPy, angles by construction, recall curves by hand."""
 
 from __future__ import annotations
 

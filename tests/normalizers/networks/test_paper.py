@@ -1,6 +1,8 @@
-"""The paper's network: its size, its answers against NumPy, what it is blind to and what it sees."""
+"""The paper's network: its size, its answers against NumPy, what it sees, and the normaliser made of it."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 from torch.autograd import gradcheck
-from two_view import correspondences, in_hartley, numpy_hartley, uniform, up_to_sign
+from two_view import correspondences, in_hartley, numpy_hartley, prepared, uniform, up_to_sign
 
 from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork, find_fundamental, paper_transform
 
@@ -28,11 +30,7 @@ def composed(net: PaperNetwork | None = None) -> LearnedNormalizer:
     return LearnedNormalizer(Hartley(), network() if net is None else net, paper_transform)
 
 
-def normalized(name="handheld", batch_size=6, num_points=12, seed=0):
-    """Correspondences in the coordinates that the network gets."""
-    points = correspondences(name, batch_size, num_points, seed)
-    T = [torch.from_numpy(numpy_hartley(p)) for p in points]
-    return tuple(p @ t[:, :2, :2].mT + t[:, None, :2, 2] for p, t in zip(points, T, strict=True))
+normalized = partial(prepared, numpy_hartley)
 
 
 def numpy_features(net, points, weights=None):
@@ -109,19 +107,6 @@ class TestArchitecture:
 
 
 class TestForward:
-    @pytest.mark.parametrize("batch_size", [0, 1, 3])
-    @pytest.mark.parametrize("num_points", [8, 9, 30])
-    @pytest.mark.parametrize("weighted", [False, True])
-    def test_untrained_answers_zero(self, batch_size, num_points, weighted, device, dtype):
-        net = PaperNetwork(16, 3).to(device)
-        points = [uniform(batch_size, num_points, 2, low=-1, seed=k).to(device, dtype) for k in (0, 1)]
-        weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
-        for params in net(*points, weights):
-            assert params.shape == (batch_size, 3)
-            assert params.dtype == dtype
-            assert params.device.type == device.type
-            assert params.count_nonzero() == 0
-
     @pytest.mark.parametrize("name", ["driving", "handheld"])
     @pytest.mark.parametrize("num_points", [8, 30])
     @pytest.mark.parametrize("weighted", [False, True])
@@ -159,14 +144,6 @@ class TestForward:
         found = net.blocks[0](h.transpose(0, 1), None).transpose(0, 1)
         assert torch.allclose(found, expected, atol=1e-12)
 
-    def test_computes_in_its_own_dtype(self):
-        points, net = normalized(), network()
-        double = net(*points)
-        for single, exact in zip(net.float()(*points), double, strict=True):
-            assert single.dtype == torch.float64  # that of the points
-            assert torch.allclose(single, exact, atol=1e-4)
-            assert not torch.equal(single, exact)
-
     def test_training_and_evaluation_agree(self):
         """The statistics are always the sample's own."""
         net, points = network(), normalized()
@@ -181,16 +158,7 @@ class TestForward:
                 assert torch.allclose(alone[0], params[k], atol=1e-12)
 
 
-class TestBlindness:
-    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.booleans(), st.randoms())
-    def test_order_does_not_matter(self, seed, num_points, weighted, random):
-        net, (points1, points2) = network(), normalized("handheld", 3, num_points, seed)
-        weights = uniform(3, num_points, low=0.1, seed=seed) if weighted else None
-        order = random.sample(range(num_points), num_points)
-        shuffled = net(points1[:, order], points2[:, order], None if weights is None else weights[:, order])
-        for found, expected in zip(shuffled, net(points1, points2, weights), strict=True):
-            assert (found - expected).abs().max() < 1e-10
-
+class TestSight:
     def test_each_view_is_on_its_own(self):
         net, (points1, points2) = network(), normalized()
         params1, params2 = net(points1, points2)
@@ -198,40 +166,6 @@ class TestBlindness:
         assert torch.equal(net(points1.flip(0) ** 2, points2)[1], params2)
         assert not torch.allclose(params1, params2, atol=1e-3)
 
-    def test_swapped_views_swap_the_answers(self):
-        net, (points1, points2), weights = network(), normalized(), uniform(6, 12)
-        for w in (None, weights):
-            (params1, params2), (swapped2, swapped1) = net(points1, points2, w), net(points2, points1, w)
-            assert torch.allclose(swapped1, params1, atol=1e-12)
-            assert torch.allclose(swapped2, params2, atol=1e-12)
-
-    @pytest.mark.parametrize("num_points", [8, 20])
-    @pytest.mark.parametrize("size", [1.0, 1e4])
-    def test_zero_weight_is_absence(self, num_points, size):
-        net, points = network(), normalized("handheld", 6, num_points)
-        weights = uniform(6, num_points, low=0.1)
-        junk = [uniform(6, 5, 2, low=-size, high=size, seed=seed) for seed in (1, 2)]
-        extended = [torch.cat(p, 1) for p in zip((*junk, 0 * weights[:, :5]), (*points, weights), strict=True)]
-        for found, expected in zip(net(*extended), net(*points, weights), strict=True):
-            assert torch.allclose(found, expected, atol=1e-10)
-
-    @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_equal_weights_are_none(self, factor, num_points):
-        net, points = network(), normalized("handheld", 6, num_points)
-        weights = torch.full((6, num_points), factor).double()
-        for found, expected in zip(net(*points, weights), net(*points), strict=True):
-            assert torch.allclose(found, expected, atol=1e-11)
-
-    def test_whole_weights_are_repetitions(self):
-        net, points = network(), normalized("handheld", 6, 9)
-        counts = torch.tensor([1, 2, 3, 1, 2, 1, 1, 4, 1])
-        repeated = [p.repeat_interleave(counts, 1) for p in points]
-        for found, expected in zip(net(*points, counts.double().expand(6, -1)), net(*repeated), strict=True):
-            assert torch.allclose(found, expected, atol=1e-10)
-
-
-class TestSight:
     def test_sees_the_points_and_the_weights(self):
         net, points = network(), normalized()
         (expected, _), weights = net(*points), uniform(6, 12)
@@ -246,12 +180,6 @@ class TestSight:
         blind = {f"blocks.{k}.{layer}.bias" for k in range(3) for layer in ("first", "second")}
         assert {name for name, gradient in largest.items() if gradient < 1e-12} == blind
         assert min(gradient for name, gradient in largest.items() if name not in blind) > 1e-6
-
-    def test_an_untrained_network_can_start_to_learn(self):
-        net = PaperNetwork(8, 2)
-        torch.cat(net(*normalized())).sum().backward()
-        assert net.head[-1].weight.grad.abs().sum() > 0
-        assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters())
 
     @pytest.mark.parametrize("num_points", [8, 10])
     def test_gradcheck(self, num_points):
