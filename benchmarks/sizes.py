@@ -1,8 +1,8 @@
 """Measure how the number of correspondences decides which normalisation is the most accurate.
 
 The matches of each image pair that pass the ratio test are shuffled and cut into samples of N, at most 20 a pair. The
-error of a sample is the median symmetric epipolar distance of the pair's ground-truth inliers; the table has the medians
-over samples, in pixels.
+error of a sample is the median symmetric epipolar distance of the ground-truth inliers of its pair; the table has the
+medians over samples, in pixels.
 
     python benchmarks/sizes.py STORE.h5 [--sizes 8 32 128 512] [--seed 0]
 """
