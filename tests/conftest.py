@@ -9,7 +9,13 @@ import pytest
 import torch
 
 hypothesis.settings.register_profile(
-    "package", max_examples=25, deadline=None, derandomize=True, database=None, print_blob=True
+    "package",
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],  # with the deadline, what a busy machine would decide
+    derandomize=True,
+    database=None,
+    print_blob=True,
 )
 hypothesis.settings.load_profile("package")
 
