@@ -41,6 +41,11 @@ def homogeneous(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.ones_like(points[..., :1])], -1)
 
 
+def mapped(T, points) -> np.ndarray:
+    """Points after an affine transform."""
+    return (homogeneous(np.asarray(points)) @ np.asarray(T).swapaxes(-1, -2))[..., :2]
+
+
 def unit(F: np.ndarray) -> np.ndarray:
     return F / np.linalg.norm(F, axis=(-2, -1), keepdims=True)
 
