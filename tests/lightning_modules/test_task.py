@@ -3,6 +3,7 @@
 import pytest
 import pytorch_lightning as pl
 import torch
+import train_processes
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
@@ -17,18 +18,12 @@ def make_task(**arguments):
     return NormalizerTask(kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=8, depth=1)), **arguments)
 
 
-class Pairs(SyntheticSamples):
+class Pairs(train_processes.Pairs):
     """Ten image pairs, of pair k the samples of k + 1 scenes, mixed."""
 
-    def __init__(self, **arguments):
-        super().__init__(number=55, num_heldout=4, max_residual=None, **arguments)
-
-    def blocks(self, seed):
-        return [Block(55, 10)]
-
     def draw(self, seed, block):
-        pair = torch.repeat_interleave(torch.arange(10), torch.arange(1, 11))
-        return super().draw(seed, block)._replace(pair=pair[torch.arange(55) * 8 % 55])
+        samples = super().draw(seed, block)
+        return samples._replace(pair=samples.pair[torch.arange(55) * 8 % 55])
 
 
 def make_data(source=None, **arguments):
