@@ -49,9 +49,9 @@ test: $(VENV)/.ready
 # Results that depend on the order of rounding differ between processors. OpenBLAS (NumPy), MKL and ATen (PyTorch) choose
 # their kernels by the processor; each line makes them choose older ones. The newest are those of `make test`.
 # Haswell's are also AMD's: OpenBLAS gives the same bits for Haswell and Zen. A test marked long is left out.
-CPUS := OPENBLAS_CORETYPE=Haswell,MKL_CBWR=AVX2,ATEN_CPU_CAPABILITY=avx2
-CPUS += OPENBLAS_CORETYPE=Sandybridge,MKL_CBWR=AVX,ATEN_CPU_CAPABILITY=default
-CPUS += OPENBLAS_CORETYPE=Nehalem,MKL_CBWR=COMPATIBLE,ATEN_CPU_CAPABILITY=default
+CPUS := OPENBLAS_CORETYPE=SkylakeX,ATEN_CPU_CAPABILITY=avx2
+CPUS += OPENBLAS_CORETYPE=Haswell,MKL_CBWR=AVX2,ATEN_CPU_CAPABILITY=avx2
+CPUS += OPENBLAS_CORETYPE=Sandybridge,MKL_CBWR=COMPATIBLE,ATEN_CPU_CAPABILITY=default
 
 test-cpus: $(VENV)/.ready
 	@for cpu in $(CPUS); do \

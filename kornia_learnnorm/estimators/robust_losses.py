@@ -13,7 +13,7 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-__all__ = ["Cauchy", "GemanMcClure", "Huber", "Loss", "Truncated", "squared_loss"]
+__all__ = ["Cauchy", "GemanMcClure", "Huber", "Truncated", "squared_loss"]
 
 Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
 

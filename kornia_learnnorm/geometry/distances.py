@@ -22,7 +22,6 @@ from torch import Tensor
 from kornia_learnnorm.geometry.checks import check_tensor, safe_divisor, weighted_mean
 
 __all__ = [
-    "DistanceScale",
     "algebraic_distance",
     "find_scale",
     "line_norms",

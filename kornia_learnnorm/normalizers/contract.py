@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from kornia_learnnorm.geometry.checks import check_correspondences, is_true
 from kornia_learnnorm.geometry.problem import LinearProblem
 
-__all__ = ["Normalizer", "ProblemNormalizer", "normalizing_transforms", "transforms_of"]
+__all__ = ["ProblemNormalizer", "normalizing_transforms", "transforms_of"]
 
 Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
