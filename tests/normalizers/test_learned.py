@@ -271,9 +271,11 @@ class TestFiles:
     @pytest.mark.parametrize("base", [Identity(), Hartley(), Whitening(), Whitening(1e-4), ReweightedWhitening(3, 0.2)])
     def test_round_trip(self, base, tmp_path):
         normalizer = shaken(LearnedNormalizer(base, CrossViewNetwork(8, 1, bound=2.0)))
+        normalizer.trained_on = ("kitti_00", "tum@0:9")
         normalizer.save_pretrained(tmp_path / "weights.safetensors")
         loaded = LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
         assert not loaded.training
+        assert loaded.trained_on == ("kitti_00", "tum@0:9")
         assert type(loaded.base) is type(base)
         assert {k: v for k, v in vars(loaded.base).items() if k[0] != "_"} == {
             k: v for k, v in vars(base).items() if k[0] != "_"
@@ -394,8 +396,13 @@ class TestStrictness:
         assert file.name in str(caught.value)
 
     def test_control(self, file):
-        self.rewrite(file)
-        LearnedNormalizer.from_pretrained(file)
+        self.rewrite(file, change_metadata=lambda metadata: metadata.pop("trained_on"))
+        assert LearnedNormalizer.from_pretrained(file).trained_on == ()
+
+    @pytest.mark.parametrize("text", ["kitti_00", '"kitti_00"', "[0]"])
+    def test_trained_on_is_not_a_list_of_names(self, file, text):
+        self.rewrite(file, change_metadata=lambda metadata: metadata.update(trained_on=text))
+        self.fails(file, "trained_on must be a JSON list of names, got")
 
     def test_missing_tensor(self, file):
         self.rewrite(file, lambda state: state.pop("network.set_network.head.2.bias"))
