@@ -29,7 +29,7 @@ from kornia_learnnorm.data.formats.ngransac import import_ngransac
 from kornia_learnnorm.data.images import image_size, read_image
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
 from kornia_learnnorm.data.store import StoreReader, read_store, write_store
-from kornia_learnnorm.evaluation.runs.run import read_arrays
+from kornia_learnnorm.evaluation.runs.arrays import read_arrays
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import NormalizerTask
 

@@ -90,9 +90,7 @@ def draw_samples(
         raise ValueError(f"held-out correspondences: a pair has only {few} that pass the ratio test {RATIO}")
     cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
     drawable = passing > size
-    rest[drawable] = points[
-        _draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)
-    ]
+    rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]
     samples = Samples(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)
     if max_residual is None:
         return samples

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.samples import RATIO
-from kornia_learnnorm.evaluation.runs.run import MAX_RESIDUAL, Cell, Run
-from kornia_learnnorm.evaluation.runs.trained import saw
+from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.evaluation.runs.trained import was_trained_on
 from kornia_learnnorm.metrics.better_rate import better_rate, bootstrap_interval, comparable
 
 __all__ = ["BASELINE", "RESAMPLES", "Table", "mean_text", "p_text", "rate_tables", "rate_text", "with_baseline"]
@@ -79,7 +79,7 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     trained, protocol = run.about["trained_on"], cells[0].protocol
     rows = []
     for name in run.about["methods"]:
-        marks = [" *" if saw(trained[name], cell.store) else "" for cell in cells]
+        marks = [" *" if was_trained_on(cell.store, trained[name]) else "" for cell in cells]
         rates = [
             "-" if name == baseline else rate_text(cell, name, baseline, "own") if name in cell.predictions else ""
             for cell in cells
@@ -93,11 +93,12 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     ]
     ties, degenerate = sum(rate.ties for rate in found), sum(rate.degenerate for rate in found)
     text = (
-        "Share of samples of eight correspondences with a smaller mean symmetric epipolar distance than under "
-        f"{baseline}, %, and 95 % bootstrap interval over image pairs. An asterisk: trained on pairs of this store. "
+        f"Share of samples of {run.about['size']} correspondences with a smaller mean symmetric epipolar distance than "
+        f"under {baseline}, %, and 95 % bootstrap interval over image pairs. "
+        "An asterisk: trained on pairs of this store. "
         f"In the whole table {ties} ties count as not better and {degenerate} degenerate comparisons are left out. "
         "The header counts the samples, of all drawn: left out are those whose mean symmetric epipolar "
-        f"distance under the eight-point algorithm without normalisation is not below {MAX_RESIDUAL:g} px."
+        f"distance under the eight-point algorithm without normalisation is not below {run.about['max_residual']:g} px."
     )
     if protocol == "filtered":
         text += (

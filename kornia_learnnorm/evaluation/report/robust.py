@@ -10,9 +10,9 @@ from torch import Tensor
 from kornia_learnnorm.evaluation.report.rates import TESTS, Table, p_text
 from kornia_learnnorm.evaluation.robust.hypotheses import MOST_ERROR
 from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
-from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
 from kornia_learnnorm.metrics.pairs import paired_bootstrap
 from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
+from kornia_learnnorm.protocol import THRESHOLDS
 
 __all__ = ["about_robust", "robust_tables"]
 

@@ -18,10 +18,10 @@ from kornia_learnnorm.evaluation.report.rates import (
     rate_tables,
     rate_text,
 )
-from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
 from kornia_learnnorm.metrics.pairs import paired_bootstrap
 from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
+from kornia_learnnorm.protocol import THRESHOLDS
 
 __all__ = ["report_tables"]
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.estimators.fundamental import Normalizer
 from kornia_learnnorm.estimators.minimal import are_determined
-from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.evaluation.robust.matches import Matches
 from kornia_learnnorm.evaluation.robust.peers import Peer
 from kornia_learnnorm.ransac.ransac import RANSAC

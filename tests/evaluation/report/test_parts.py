@@ -7,49 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 
-import kornia_learnnorm as kln
-from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.evaluation.methods import Method
 from kornia_learnnorm.evaluation.report.motion import by_motion
 from kornia_learnnorm.evaluation.report.printing import print_tables
 from kornia_learnnorm.evaluation.report.rates import Table, rate_tables
-from kornia_learnnorm.evaluation.runs import predict as predict_run
-from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS, consensus
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
-from kornia_learnnorm.evaluation.runs.trained import SHIPPED, saw, trained_on
-from kornia_learnnorm.evaluation.tables import names_of
-from kornia_learnnorm.metrics.pairs import f1_score, inlier_share
-from kornia_learnnorm.normalizers.learned import WEIGHTS
 
 CONFIGS = Path(__file__).parents[3] / "configs"
-
-
-def test_predictions_agree_with_the_expectation_under_known_noise():
-    """Points with noise s in both views, under the true F, whose lines have normals of lengths n1 and n2.
-
-    Their residual is normal with deviation s sqrt(n1^2 + n2^2), their distance |residual| (1 / n1 + 1 / n2): the mean
-    is that of a half-normal variable, s' sqrt(2 / pi), and the share below t is erf(t / (sqrt(2) s')).
-    """
-    store = synthetic_store(pairs=40, points=64, seed=3, noise=0.5, outliers=0.0, scenes=["orbit"])
-    points1, points2 = (torch.from_numpy(p).reshape(40, 64, 2) for p in (store.points1, store.points2))
-    samples = Samples(points1, points2, points1[:, :1], points2[:, :1], torch.arange(40))
-    F_mat = torch.from_numpy(store.F)
-    found = predict_run.predict(Method(kln.Hartley(), lambda *_: F_mat), samples, store, None)
-    x1, x2 = (np.concatenate([p.double().numpy(), np.ones((40, 64, 1))], -1) for p in (points1, points2))
-    n2, n1 = (np.linalg.norm((x @ f)[..., :2], axis=-1) for x, f in ((x1, store.F.swapaxes(1, 2)), (x2, store.F)))
-    deviation = 0.5 * np.hypot(n1, n2) * (1 / n1 + 1 / n2)
-    assert found["own"].mean() == pytest.approx(deviation.mean() * np.sqrt(2 / np.pi), rel=0.03)  # of 2,560 points
-    for place, threshold in enumerate(THRESHOLDS):
-        share = torch.erf(torch.from_numpy(threshold / (np.sqrt(2) * deviation))).numpy()
-        error = 3 * np.sqrt((share * (1 - share)).sum()) / share.size  # three standard deviations of the mean
-        assert found["inliers"][:, place].mean() == pytest.approx(share.mean(), abs=error)
-        assert (found["f1"][:, place][~np.isnan(found["f1"][:, place])] == 1).all()
-    assert found["rotation_error"].max() < 1e-6
-    assert found["translation_error"].max() < 1e-4
-    assert found["distance1"] == pytest.approx(2**0.5)
 
 
 def test_the_rate_of_known_distributions():
@@ -58,7 +22,8 @@ def test_the_rate_of_known_distributions():
     own = {"Hartley": rng.exponential(1.0, 20_000), "crossview": rng.exponential(0.5, 20_000)}
     predictions = {name: {"own": torch.from_numpy(values)} for name, values in own.items()}
     cell = Cell("kitti_06", "filtered", torch.arange(20_000) // 100, 20_000, predictions)
-    about = {"methods": dict.fromkeys(own, ""), "trained_on": {"Hartley": [], "crossview": ["kitti_06@0:3"]}}
+    trained_on = {"Hartley": [], "crossview": ["kitti_06@0:3"]}
+    about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(own, ""), "trained_on": trained_on}
     (table,) = rate_tables(Run(about, [cell], {}, {}, {}))
     rate, interval = table.rows[1][2].split(" ", 1)
     low, high = (float(end) for end in interval.strip("[] *").split(", "))
@@ -73,68 +38,6 @@ def test_the_rate_of_known_distributions():
         ["TUM", "84.22"],
         ["KITTI 00-05 and TUM", "87.05"],
     ]
-
-
-@pytest.mark.parametrize("max_ratio", [0.8, None])
-def test_consensus_is_that_of_the_metrics(max_ratio):
-    store = synthetic_store(pairs=3, points=60, seed=5)
-    store.F[2] = np.nan
-    generator = torch.Generator().manual_seed(0)
-    pair = torch.tensor([0, 2, 1, 0, 1])
-    F_mat = torch.from_numpy(np.nan_to_num(store.F, nan=0.3))[pair]
-    F_mat *= 1 + 1e-4 * torch.randn(5, 3, 3, generator=generator, dtype=torch.float64)
-    F_mat[3] = torch.nan  # a failed estimate
-    found = consensus(F_mat, pair, store, max_ratio)
-    for row, index in enumerate(pair.tolist()):
-        rows = slice(store.offsets[index], store.offsets[index + 1])
-        keep = store.ratio[rows] < (max_ratio or np.inf)
-        x1, x2 = (torch.from_numpy(points[rows][keep]).double() for points in (store.points1, store.points2))
-        true = torch.from_numpy(store.F[index])
-        for place, threshold in enumerate(THRESHOLDS):
-            share, score = inlier_share(x1, x2, F_mat[row], threshold), f1_score(x1, x2, F_mat[row], true, threshold)
-            assert found["inliers"][row, place] == share
-            assert found["f1"][row, place] == pytest.approx(score, nan_ok=True)
-    assert found["inliers"][3].tolist() == found["f1"][3].nan_to_num().tolist() == [0, 0]
-    assert found["f1"][1].isnan().all()
-    assert (found["f1"][0] > 0).any()
-
-
-class TestTrainedOn:
-    @pytest.mark.parametrize(("name", "config"), [("paper", "paper-short"), ("crossview", "crossview")])
-    def test_what_ships_is_as_configured(self, name, config):
-        paths = yaml.safe_load((CONFIGS / f"{config}.yaml").read_text())["data"]["train"]["init_args"]["paths"]
-        assert trained_on(name) == trained_on(f"{name}+LM") == names_of(paths)
-
-    def test_all_that_ship(self):
-        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {*SHIPPED}
-        assert trained_on("crossview-synthetic") == ["synthetic scenes"]
-
-    def test_without_weights(self):
-        assert trained_on("whitening") == trained_on("Hartley+optimal") == []
-        assert trained_on("package.module:Name") == ["not known"]
-
-    @pytest.mark.parametrize(
-        ("train", "expected"),
-        [
-            ({"init_args": {"paths": ["$DATA/tum.h5@0:9", "kitti_00.h5"]}}, ["tum@0:9", "kitti_00"]),
-            ({"class_path": "kornia_learnnorm.data.sources.SyntheticSamples"}, ["synthetic scenes"]),
-            ({"class_path": "mine.Own"}, ["not known"]),
-            (None, ["not known"]),
-        ],
-    )
-    def test_weights_of_ones_own(self, tmp_path, train, expected):
-        assert trained_on(str(tmp_path / "weights.safetensors")) == ["not known"]
-        folder = tmp_path / "lightning_logs" / "version_0"
-        folder.mkdir(parents=True)
-        (folder / "config.yaml").write_text(yaml.safe_dump({"data": {"train": train}}))
-        assert trained_on(f"{tmp_path / 'weights.safetensors'}+LM") == expected
-
-    def test_a_store_of_some_pairs(self):
-        assert saw(["a", "b@3:6"], "b@5:9")
-        assert saw(["a", "b@3:6"], "a@1:2")
-        assert not saw(["a", "b@3:6"], "b@6:9")
-        assert not saw([], "a")
-        assert not saw(["not known"], "a")
 
 
 def test_only_tables_that_fit_are_printed(monkeypatch, capsys):

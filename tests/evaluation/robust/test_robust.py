@@ -297,9 +297,9 @@ class TestRun:
 
     def test_redo(self, copied, command):
         before = times(copied)
-        about = json.loads((copied / "robust.json").read_text())
-        about["estimators"]["RANSAC"] = "RANSAC of old"
-        (copied / "robust.json").write_text(json.dumps(about))
+        about = json.loads((copied / "run.json").read_text())
+        about["robust"]["estimators"]["RANSAC"] = "RANSAC of old"
+        (copied / "run.json").write_text(json.dumps(about))
         assert main([*command, str(copied)]) == 2
         assert main([*command, str(copied), "--redo", "RANSAC"]) == 0
         changed = {path.name for path, time in times(copied).items() if time != before[path]}
@@ -329,7 +329,7 @@ class TestRun:
         monkeypatch.setitem(robust_peers.PEERS, "poselib", (missing, "poselib"))
         options = ["--seeds", "2", "--estimators", "poselib", "--solvers"]
         assert main(["robust", str(store), *options, "--out", str(copied)]) == 0
-        assert json.loads((copied / "robust.json").read_text())["estimators"]["poselib"] is None
+        assert read_robust(copied).about["estimators"]["poselib"] is None
         write_report(copied)
         text = (copied / "report.md").read_text()
         assert "Left out, since not installed: poselib." in text
@@ -354,18 +354,10 @@ class TestRun:
             for again in (["report", str(copied)], [*command, str(copied)]):
                 assert main(again) == 2
                 assert f"{path} is damaged, remove it" in capsys.readouterr().err
-        for text, message in {
-            "{": "is damaged, it is not JSON",
-            "[]": "expected an object of JSON, got list",
-            '{"format": 0}': "is of format 0, expected 1",
-            '{"format": 1, "stores": {}}': "estimators, solvers not as they should be",
-        }.items():
-            (copied / "robust.json").write_text(text)
-            for again in (["report", str(copied)], [*command, str(copied)]):
-                assert main(again) == 2
-                assert f"robust.json {message}" in capsys.readouterr().err.replace(
-                    "robust.json is damaged: ", "robust.json "
-                )
+        (copied / "run.json").write_text('{"format": 3, "robust": {"stores": {}}}')
+        for again in (["report", str(copied)], [*command, str(copied)]):
+            assert main(again) == 2
+            assert "run.json is damaged: estimators, solvers, versions, pairs" in capsys.readouterr().err
 
     def test_what_fails_is_left_out_and_others_go_on(self, store, short, tmp_path, monkeypatch, capsys):
         (tmp_path / "own.py").write_text(
