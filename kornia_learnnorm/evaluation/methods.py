@@ -197,11 +197,11 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
         ValueError: if two methods have the same name.
 
     """
-    short = {}
+    short = []
     for name in names:
         base = base_name(name)
         is_path = Path(base).suffix == ".safetensors"
-        short[name] = names_of([base])[0] + name[len(base) :] if is_path else name
-    if len(set(short.values())) < len(names):
-        raise ValueError(f"two methods have the same name, rename a file or leave one out: {', '.join(names)}")
-    return short
+        short.append(names_of([base])[0] + name[len(base) :] if is_path else name)
+    if twice := {name for name in short if short.count(name) > 1}:
+        raise ValueError(f"two methods have the same name, {', '.join(sorted(twice))}: rename a file or leave one out")
+    return dict(zip(names, short, strict=True))

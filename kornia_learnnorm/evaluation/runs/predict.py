@@ -39,8 +39,8 @@ class SampleOptions:
         size: correspondences in a sample.
         seed: seed of the shuffle.
         max_samples: at most so many samples of each store and protocol, at random; None for all.
-        max_residual: samples with a residual of so many pixels or more under the un-normalised eight-point algorithm are
-            left out.
+        max_residual: samples whose residual under the un-normalised eight-point algorithm is this or larger are left
+            out, pixels.
 
     Raises:
         ValueError: if the size is below 8 or ``max_samples`` is not positive.
