@@ -19,7 +19,7 @@ from kornia_learnnorm.evaluation.report.robust import about_robust, robust_table
 from kornia_learnnorm.evaluation.report.style import Picture
 from kornia_learnnorm.evaluation.report.tables import report_tables
 from kornia_learnnorm.evaluation.robust.run import read_robust
-from kornia_learnnorm.evaluation.runs.manifest import has_section
+from kornia_learnnorm.evaluation.runs.manifest import read_section
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write
@@ -94,7 +94,7 @@ def write_report(folder: str | Path) -> Report:
     missing: list[str] = []
     pictures: list[Picture] = []
     robust = read_robust(folder)
-    if robust is None or has_section(folder, "evaluate"):
+    if robust is None or read_section(folder, "evaluate") is not None:
         found = with_baseline(read_run(folder))
         missing += found.missing
         about.append(_about(found))

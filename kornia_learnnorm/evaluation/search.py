@@ -15,17 +15,17 @@ from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = ["SearchedNormalizer"]
 
-_BOUND = 3.0
+MAX_PARAMETER = 3.0  # absolute value of a parameter; beyond it, rounding errors of F would pass for gains
 
 
 class SearchedNormalizer(nn.Module):
     r"""Search each sample's transforms by gradient descent on its own symmetric epipolar distance.
 
-    :math:`T_i = B(p_i)\, T_i^{base}` with parameters :math:`p_i` of its own for every sample, from zero. Adam lowers
-    the logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters met are kept, so that no sample ends
-    above its base. They stay within plus and minus 3: beyond, rounding errors of :math:`F` would pass for gains.
+    :math:`T_i = B(p_i)\, T_i^{base}` with parameters :math:`p_i` for every sample, which start at zero. Adam lowers the
+    logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters of all steps are kept, so that no sample
+    ends above its base. They stay within plus and minus 3: beyond, rounding errors of :math:`F` would pass for gains.
 
-    It is a limit to compare with, not a method to use: it fits the sample's own points, noise included, costs a
+    Use it as a limit to compare with, not as a method: it fits the sample's own points, noise included, costs a
     hundred solutions and its result carries no gradient. It is a local search, so the true optimum may be lower still.
 
     Args:
@@ -90,13 +90,13 @@ class SearchedNormalizer(nn.Module):
         return T1.to(points1.dtype), T2.to(points2.dtype)
 
     def _search(self, x1: Tensor, x2: Tensor, w: Tensor | None, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best parameters met, ``(B, P)`` of each view."""
+        """Return the parameters of the smallest distance, (B, P) of each view."""
         free = x1.new_zeros(2, len(x1), self.num_parameters, requires_grad=True)
         best, least = torch.zeros_like(free), x1.new_full((len(x1),), torch.inf)
         optimizer = torch.optim.Adam([free], lr=self.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
         for _ in range(self.steps):
-            params = _BOUND * torch.tanh(free / _BOUND)
+            params = MAX_PARAMETER * torch.tanh(free / MAX_PARAMETER)
             transforms = self.transform(params[0]) @ T1, self.transform(params[1]) @ T2
             F_mat = find_fundamental(x1, x2, w, lambda *_, found=transforms: found)
             distance = weighted_mean(symmetric_epipolar_distance(x1, x2, F_mat)[..., None], w)[:, 0]

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.runs.arrays import file_name, read_arrays
-from kornia_learnnorm.evaluation.runs.manifest import begin_section, has_section, read_section
+from kornia_learnnorm.evaluation.runs.manifest import begin_section, read_section
 from kornia_learnnorm.evaluation.runs.manifest import leave_out as remove
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
@@ -120,9 +120,9 @@ def read_robust(folder: str | Path) -> RobustRun | None:
 
     """
     folder = Path(folder)
-    if not has_section(folder, "robust"):
-        return None
     about, missing = read_section(folder, "robust"), list[str]()
+    if about is None:
+        return None
     cells = [_read_cell(folder, about, store, protocol, missing) for store in about["stores"] for protocol in PROTOCOLS]
     return RobustRun(about, cells, missing)
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import atomic_write
 
-__all__ = ["About", "begin_section", "describe_stores", "has_section", "leave_out", "package_versions", "read_section"]
+__all__ = ["About", "begin_section", "describe_stores", "leave_out", "package_versions", "read_section"]
 
 FORMAT = 3  # of the folder; runs of another format are refused
 # Parts of a section that may grow: what each is, by its name.
@@ -28,21 +28,7 @@ OPTIONS = {
 About = dict[str, Any]
 
 
-def has_section(folder: Path, section: str) -> bool:
-    """Return whether a folder holds a run of ``evaluate`` or of ``robust``.
-
-    Args:
-        folder: the run.
-        section: ``evaluate`` or ``robust``.
-
-    Raises:
-        ValueError: if another version of the package made the run, or ``run.json`` is damaged.
-
-    """
-    return section in _read(folder)
-
-
-def read_section(folder: Path, section: str) -> About:
+def read_section(folder: Path, section: str) -> About | None:
     """Return what a run was computed from.
 
     Args:
@@ -50,17 +36,16 @@ def read_section(folder: Path, section: str) -> About:
         section: ``evaluate`` or ``robust``.
 
     Returns:
-        the options by name; by the names in ``JOINED``, what each store, method, estimator and so on is.
+        the options by name, and by the names in ``JOINED`` what each store, method and so on is; None where the folder
+        holds no such run.
 
     Raises:
-        FileNotFoundError: if the folder holds no such run.
         ValueError: if another version of the package made it, or ``run.json`` is damaged.
 
     """
-    sections = _read(folder)
-    if section not in sections:
-        raise FileNotFoundError(f"no run at {folder}: learnnorm {section} STORE --out {folder} makes one")
-    about = sections[section]
+    about = _read(folder).get(section)
+    if about is None:
+        return None
     if not isinstance(about, dict):
         raise ValueError(f"{folder / 'run.json'} is damaged: {section} must be an object, got {about!r}")
     wrong = [key for key in JOINED[section] if not isinstance(about.get(key), dict)]
@@ -70,7 +55,7 @@ def read_section(folder: Path, section: str) -> About:
     return about
 
 
-def begin_section(folder: Path, section: str, about: About, redo: Sequence[str] = ()) -> list[str]:
+def begin_section(folder: Path, section: str, about: About, redo: Collection[str] = ()) -> None:
     """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
 
     Args:
@@ -80,9 +65,6 @@ def begin_section(folder: Path, section: str, about: About, redo: Sequence[str] 
             package is not installed.
         redo: names whose description may change.
 
-    Returns:
-        the names that were not in the run before.
-
     Raises:
         ValueError: if the folder holds a run of other options or of another version of the package.
         OSError: if it cannot be written.
@@ -90,24 +72,16 @@ def begin_section(folder: Path, section: str, about: About, redo: Sequence[str] 
     """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: expected a folder for the run, or a new name")
-    about, joined = {**about}, JOINED[section]
-    had: About = {key: {} for key in joined}
-    if has_section(folder, section):
-        had = read_section(folder, section)
-        differ = [f"{key} {had[key]!r}, now {about[key]!r}" for key in OPTIONS[section] if had[key] != about[key]]
-        differ += [text for key in joined for text in _changes(had[key], about[key], redo)]
-        if differ:
-            raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
-    new = [name for key in joined for name in about[key] if name not in had[key]]
-    for key in joined:
-        known = {name: value for name, value in about[key].items() if value is not None or name not in had[key]}
-        about[key] = {**had[key], **known}
+    joined, had = JOINED[section], read_section(folder, section) or about
+    differ = [f"{key} {had[key]!r}, now {about[key]!r}" for key in OPTIONS[section] if had[key] != about[key]]
+    differ += [text for key in joined for text in _changes(had[key], about[key], redo)]
+    if differ:
+        raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder, section, about)
-    return new
+    _write(folder, section, about | {key: _join(had[key], about[key]) for key in joined})
 
 
-def leave_out(folder: Path, section: str, names: Sequence[str]) -> None:
+def leave_out(folder: Path, section: str, names: Collection[str]) -> None:
     """Remove methods, estimators or solvers from what a run was computed from; their files are the caller's.
 
     Args:
@@ -116,8 +90,8 @@ def leave_out(folder: Path, section: str, names: Sequence[str]) -> None:
         names: what to remove.
 
     """
-    about = read_section(folder, section)
-    for key in set(JOINED[section]) - {"stores", "versions"}:
+    about = read_section(folder, section) or {}
+    for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
         about[key] = {name: value for name, value in about[key].items() if name not in names}
     _write(folder, section, about)
 
@@ -135,13 +109,18 @@ def package_versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")}
 
 
-def _changes(had: About, now: About, redo: Sequence[str]) -> list[str]:
+def _changes(had: About, now: About, redo: Collection[str]) -> list[str]:
     """Return what is described otherwise than before; a package that is or was not installed is no change."""
     return [
         f"{name} {had[name]!r}, now {value!r}"
         for name, value in now.items()
         if name in had and name not in redo and had[name] != value and None not in (had[name], value)
     ]
+
+
+def _join(had: About, now: About) -> About:
+    """Return what was there, then what is new; a package that is not installed now stays as it was."""
+    return had | {name: value for name, value in now.items() if value is not None or name not in had}
 
 
 def _read(folder: Path) -> dict[str, Any]:

@@ -8,7 +8,8 @@ fails is left out of the run, all others go on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +23,13 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
 from kornia_learnnorm.evaluation.runs.example import random_pair, sweep
-from kornia_learnnorm.evaluation.runs.manifest import begin_section, describe_stores, leave_out, package_versions
+from kornia_learnnorm.evaluation.runs.manifest import (
+    begin_section,
+    describe_stores,
+    leave_out,
+    package_versions,
+    read_section,
+)
 from kornia_learnnorm.evaluation.runs.motion import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS, SampleOptions, predict
 from kornia_learnnorm.evaluation.runs.run import (
@@ -95,61 +102,46 @@ def record_run(
 
     """
     options = SampleOptions() if options is None else options
-    names = short_names(methods)
-    recorder = _Recorder(
-        Path(folder),
-        {names[name]: find_method(name) for name in methods},
-        {name: read_store(path) for name, path in stores.items()},
-        options,
-        complete,
-    )
-    new = begin_section(
-        recorder.folder,
-        "evaluate",
-        {
-            **vars(options),
-            "stores": describe_stores(recorder.stores),
-            "methods": {names[name]: identify_method(name) for name in methods},
-            "trained_on": {name: list(method.trained_on) for name, method in recorder.methods.items()},
-            "versions": package_versions(),
-        },
-    )
+    folder, names = Path(folder), short_names(methods)
+    found = {names[name]: find_method(name) for name in methods}
+    recorder = _Recorder(folder, found, {name: read_store(path) for name, path in stores.items()}, options, complete)
+    about = {
+        **vars(options),
+        "stores": describe_stores(recorder.stores),
+        "methods": {names[name]: identify_method(name) for name in methods},
+        "trained_on": {name: list(method.trained_on) for name, method in found.items()},
+        "versions": package_versions(),
+    }
+    before = (read_section(folder, "evaluate") or about | {"methods": {}})["methods"]
+    begin_section(folder, "evaluate", about)
     recorder.record_stores(protocols)
     no_example = recorder.record_sizes() if complete else ""
     if recorder.failed:
-        recorder.forget([name for name in recorder.failed if name in new])
+        recorder.forget(recorder.failed.keys() - before.keys())
         # A normaliser of the user's own is named in its message already.
         texts = [
             text if text.startswith(base_name(name)) else f"{name}: {text}" for name, text in recorder.failed.items()
         ]
-        kept = f". All others are in {folder}" if complete else ""
-        raise ValueError("; ".join(texts) + kept)
+        raise ValueError("; ".join(texts) + (f". All others are in {folder}" if complete else ""))
     return no_example
 
 
+@dataclass
 class _Recorder:
     """What computes the missing files of a run; ``failed`` says why methods failed, by name."""
 
-    def __init__(
-        self,
-        folder: Path,
-        methods: dict[str, Method],
-        stores: dict[str, CorrespondenceStore],
-        options: SampleOptions,
-        complete: bool,
-    ) -> None:
-        self.folder = folder
-        self.methods = methods
-        self.stores = stores
-        self.options = options
-        self.complete = complete
-        self.failed = dict[str, str]()
-        self.tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
+    folder: Path
+    methods: dict[str, Method]
+    stores: dict[str, CorrespondenceStore]
+    options: SampleOptions
+    complete: bool
+    failed: dict[str, str] = field(default_factory=dict)
 
     def record_stores(self, protocols: Sequence[str]) -> None:
         """Compute the missing motions, samples and predictions of all stores."""
+        tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
         steps = len(self.stores) * len(protocols) * len(self.methods)
-        with self.tqdm(total=steps, unit="step", disable=None) as bar:
+        with tqdm(total=steps, unit="step", disable=None) as bar:
             for name, store in self.stores.items():
                 bar.set_postfix_str(name)
                 _once(self.folder / name / "pairs.npz", partial(pair_motions, store), PAIRS, len(store))
@@ -213,7 +205,7 @@ class _Recorder:
             else:
                 write_arrays(path, arrays)
 
-    def forget(self, methods: Sequence[str]) -> None:
+    def forget(self, methods: Collection[str]) -> None:
         """Remove methods from the run, with their files: their code will be another when they come again."""
         leave_out(self.folder, "evaluate", methods)
         for name in methods:

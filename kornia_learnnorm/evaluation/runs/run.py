@@ -99,6 +99,8 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
     """
     folder = Path(folder)
     about, missing = read_section(folder, "evaluate"), list[str]()
+    if about is None:
+        raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
     cells, pairs = [], {}
     for store in about["stores"]:
         for protocol in PROTOCOLS:
