@@ -37,6 +37,7 @@ TABLE1 = {
     path.stem: [FOLDER / ("paper-short.yaml" if path.stem.startswith("paper") else "crossview.yaml"), path]
     for path in sorted((FOLDER / "table1").glob("*.yaml"))
 }
+STORES = ("kitti_00", "kitti_01", "kitti_03", "kitti_06", "tum_fr3_office")
 RUNS = {"base": BASE, "paper-base": PAPER_BASE} | ABLATIONS | TABLE1
 
 
@@ -51,7 +52,7 @@ def data(tmp_path_factory):
     """A folder like LEARNNORM_DATA's, with small synthetic stores under the names that the configs use."""
     folder = tmp_path_factory.mktemp("data")
     (folder / "correspondences").mkdir()
-    for seed, name in enumerate(("kitti_00", "kitti_01", "kitti_03", "kitti_06", "tum_fr3_office")):
+    for seed, name in enumerate(STORES):
         pairs = 3 if name.startswith("tum") else 2  # of each of three scenes
         write_store(folder / f"correspondences/{name}.h5", synthetic_store(pairs, points=120, seed=seed))
     return folder
@@ -60,6 +61,9 @@ def data(tmp_path_factory):
 def assert_trained(weights):
     """The weights load, and two or three steps have moved the transforms off the base's."""
     normalizer, points = kln.LearnedNormalizer.from_pretrained(weights), (torch.rand(5, 8, 2), torch.rand(5, 8, 2))
+    synthetic = normalizer.trained_on == ("synthetic scenes",)
+    assert synthetic or {name.partition("@")[0] for name in normalizer.trained_on} <= {*STORES}
+    assert normalizer.trained_on
     for T, base in zip(normalizer(*points), normalizer.base(*points), strict=True):
         assert torch.isfinite(T).all()
         assert not torch.isclose(T, base, rtol=1e-6).all()
