@@ -33,7 +33,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         "--weights",
         metavar="NAME_OR_PATH",
         nargs="+",
-        help=f"weights beside the methods (default, without --methods: those that ship: {' '.join(SHIPPED)})",
+        help=f"weights beside the methods (default without --methods: {' '.join(SHIPPED)})",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
     parser.add_argument(
@@ -80,8 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="RUN",
-        help="folder to keep the predictions in, for learnnorm report; adds to the default methods"
-        f" {', '.join(DEFAULT_METHODS[len(default_methods()) :])}, and to each method what a report shows",
+        help="folder to keep the predictions in, with everything that learnnorm report shows; the default methods are"
+        f" then also {', '.join(DEFAULT_METHODS[len(default_methods()) :])}",
     )
 
 

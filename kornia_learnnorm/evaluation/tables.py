@@ -106,5 +106,5 @@ def names_of(paths: Sequence[str]) -> list[str]:
     names = [f.resolve().parent.name if f.name == "weights.safetensors" else f.name for f in files]
     names = [name.removesuffix(".safetensors").replace(".h5", "") for name in names]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: {', '.join(paths)}")
+        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: rename one of {', '.join(paths)}")
     return names

@@ -250,15 +250,12 @@ def test_synthesize_evaluate_estimate(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["evaluate", "none.h5"], "no store at none.h5"),
-        (["evaluate", __file__], "not a readable HDF5 file"),
         (["estimate", "none1.png", "none2.png"], "none1.png"),
         (["synthesize", "folder", "--pairs", "0"], "0"),
         (
             ["synthesize", "folder", "--scenes", "moon"],
             "scenes must be among forward driving, hand-held, orbit, got moon",
         ),
-        (["diagnose", "none.h5"], "no store at none.h5"),
     ],
 )
 def test_errors_are_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""What a run keeps and a report shows, against closed forms and functions of one pair."""
+"""What a report shows, against closed forms."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from kornia_learnnorm.evaluation.report.motion import by_motion
 from kornia_learnnorm.evaluation.report.printing import print_tables
 from kornia_learnnorm.evaluation.report.rates import Table, rate_tables
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
-
-CONFIGS = Path(__file__).parents[3] / "configs"
 
 
 def test_the_rate_of_known_distributions():
