@@ -15,7 +15,7 @@ from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = ["SearchedNormalizer"]
 
-MAX_PARAMETER = 3.0  # absolute value of a parameter; beyond it, rounding errors of F would pass for gains
+_BOUND = 3.0
 
 
 class SearchedNormalizer(nn.Module):
@@ -90,13 +90,13 @@ class SearchedNormalizer(nn.Module):
         return T1.to(points1.dtype), T2.to(points2.dtype)
 
     def _search(self, x1: Tensor, x2: Tensor, w: Tensor | None, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the parameters of the smallest distance, (B, P) of each view."""
+        """Return the best parameters met, ``(B, P)`` of each view."""
         free = x1.new_zeros(2, len(x1), self.num_parameters, requires_grad=True)
         best, least = torch.zeros_like(free), x1.new_full((len(x1),), torch.inf)
         optimizer = torch.optim.Adam([free], lr=self.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
         for _ in range(self.steps):
-            params = MAX_PARAMETER * torch.tanh(free / MAX_PARAMETER)
+            params = _BOUND * torch.tanh(free / _BOUND)
             transforms = self.transform(params[0]) @ T1, self.transform(params[1]) @ T2
             F_mat = find_fundamental(x1, x2, w, lambda *_, found=transforms: found)
             distance = weighted_mean(symmetric_epipolar_distance(x1, x2, F_mat)[..., None], w)[:, 0]
