@@ -156,7 +156,7 @@ def test_diagnose(folder, capsys, size):
         (["known.h5", "other/known.h5"], ["tilted"], "two files have the same name, known: "),
         (["known.h5", "none.h5"], ["tilted"], "no store at"),
         (["known.h5", "known.h5@2:9"], ["tilted"], "pairs 2:9 were asked for, the store has 0:3"),
-        (["known.h5", "known.h5@2"], ["tilted"], "some pairs of a store are FILE.h5@FIRST:STOP"),
+        (["known.h5", "known.h5@2"], ["tilted"], "FILE.h5@FIRST:STOP"),
         (["known.h5"], ["tilted", "nothing"], "no weights"),
         (["known.h5"], ["known.h5"], "no weights"),
         (["tilted/weights.safetensors"], ["tilted"], "not a readable HDF5 file"),
