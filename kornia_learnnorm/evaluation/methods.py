@@ -15,7 +15,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.fundamental import Normalizer, find_fundamental, normalizing_transforms
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
-from kornia_learnnorm.files import short_name
+from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
 from kornia_learnnorm.normalizers.learned import WEIGHTS, LearnedNormalizer
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
@@ -201,7 +201,7 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     for name in names:
         base = base_name(name)
         is_path = Path(base).suffix == ".safetensors"
-        short.append(short_name(base) + name[len(base) :] if is_path else name)
+        short.append(names_of([base])[0] + name[len(base) :] if is_path else name)
     if twice := {name for name in short if short.count(name) > 1}:
         raise ValueError(f"two methods have the same name, {', '.join(sorted(twice))}: rename a file or leave one out")
     return dict(zip(names, short, strict=True))
