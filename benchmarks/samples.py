@@ -19,7 +19,8 @@ import torch
 
 from kornia_learnnorm import CrossViewNetwork, EpipolarLoss, LearnedNormalizer, Whitening
 from kornia_learnnorm.data.sources import StoreSamples
-from kornia_learnnorm.data.store import join_stores, read_store
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.writer import join_stores
 from lightning_modules.datamodule import SampleLoader
 from lightning_modules.task import NormalizerTask
 

@@ -26,7 +26,7 @@ def choose(pairs: Pairs, logits: torch.Tensor, generator: torch.Generator, count
 
 def ransac_f1(pairs: Pairs, logits: torch.Tensor, normalizer: torch.nn.Module) -> float:
     """Return the mean F1 at 1 px in percent of the best of 64 minimal samples that are drawn with the logits."""
-    ransac = kln.RANSAC(normalizer, max_iter=64, confidence=1, refine=False, sampler=WeightedSampler, seed=0)
+    ransac = kln.RANSAC(normalizer, max_samples=64, confidence=1, refine=False, sampler=WeightedSampler, seed=0)
     rows = zip(pairs.points1, pairs.points2, logits.softmax(-1), strict=True)
     F_mat = torch.stack([ransac(*row)[0] for row in rows])
     return 100 * kln.f1_score(pairs.points1, pairs.points2, F_mat, pairs.F_mat, threshold=1.0).nanmean().item()

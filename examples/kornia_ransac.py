@@ -15,7 +15,7 @@ from pairs import Pairs, load_pairs
 from torch import Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators.fundamental import Normalizer
+from kornia_learnnorm.normalizers.contract import Normalizer
 
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
@@ -51,8 +51,8 @@ def main(args: Sequence[str] | None = None) -> dict[str, tuple[float, float]]:
         "Kornia, dlt, whitening layer": kornia_ransac(kln.Whitening(), samples, seed),
         "Kornia, dlt, learned layer": kornia_ransac(learned, samples, seed),
         "Kornia, lm (its default)": default,
-        "kornia_learnnorm.RANSAC, learned": kln.RANSAC(learned, max_iter=samples, seed=seed),
-        "kornia_learnnorm.RANSAC": kln.RANSAC(max_iter=samples, seed=seed),
+        "kornia_learnnorm.RANSAC, learned": kln.RANSAC(learned, max_samples=samples, seed=seed),
+        "kornia_learnnorm.RANSAC": kln.RANSAC(max_samples=samples, seed=seed),
     }
     results = {}
     for name, estimator in estimators.items():

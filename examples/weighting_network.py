@@ -3,7 +3,7 @@
 Two stages: the first weighs correspondences by themselves, the second also by their distances under the first result.
 Both end in the weighted eight-point algorithm, a layer, so that the error of the matrices trains everything before it.
 The first steps are with Hartley's normalisation; the last ones, from where these ended and on the same batches, with
-each of those compared. The estimator sees some of a pair's matches; all of them count in the loss and in the figures.
+each of those compared. The estimator sees some of a pair's matches; all of them count in the loss and in the results.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def evaluate(estimator: Estimator, pairs: Pairs, num_points: int) -> tuple[float
 
 
 def main(args: Sequence[str] | None = None) -> dict[str, list[tuple[float, float, float]]]:
-    """Train and evaluate each normaliser with each seed; return the figures by normaliser."""
+    """Train and evaluate each normaliser with each seed; return the results by normaliser."""
     options = parse(args)
     training, held_out = load_pairs("00", "01", "03", num_points=960, num_held_out=1500)
     results: dict[str, list[tuple[float, float, float]]] = {name: [] for name in options.normalizers}

@@ -9,29 +9,36 @@ Example:
 
 """
 
-from kornia_learnnorm.estimators.eight_point import EightPoint
+from kornia_learnnorm.estimators.eight_point import EightPoint, TwoViewEstimate
 from kornia_learnnorm.estimators.fundamental import find_fundamental
-from kornia_learnnorm.estimators.refinement import refine_fundamental
+from kornia_learnnorm.estimators.refinement import Refinement, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
-from kornia_learnnorm.geometry.distances import algebraic_distance, sampson_distance, symmetric_epipolar_distance
-from kornia_learnnorm.geometry.linear import design_matrix, null_vector, rank2_projection
-from kornia_learnnorm.geometry.rank2 import optimal_rank2
+from kornia_learnnorm.geometry.distances import (
+    algebraic_distance,
+    sampson_distance,
+    sampson_scale,
+    symmetric_epipolar_distance,
+    symmetric_scale,
+)
+from kornia_learnnorm.geometry.linear import design_matrix, null_vector
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.geometry.rank2 import optimal_rank2, rank2_projection
 from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
 from kornia_learnnorm.losses import EpipolarLoss
-from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate, bootstrap_interval
-from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share, paired_bootstrap
-from kornia_learnnorm.metrics.pose_accuracy import mean_average_accuracy, pose_auc
-from kornia_learnnorm.metrics.poses import pose_error, relative_pose
+from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate
+from kornia_learnnorm.metrics.bootstrap import PairedDifference, bootstrap_interval, paired_bootstrap
+from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
+from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc, pose_error
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, PerView, Whitening
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 from kornia_learnnorm.normalizers.networks.paper import PaperNetwork
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
-from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
-from kornia_learnnorm.ransac.soft import expected_loss, sample_minimal_sets
+from kornia_learnnorm.ransac.soft import SoftChoice, expected_loss, sample_minimal_sets
 
 __version__ = "0.1.0"
 
@@ -48,12 +55,17 @@ __all__ = [
     "Huber",
     "Identity",
     "LearnedNormalizer",
+    "PairedDifference",
     "PaperNetwork",
     "PerView",
     "ProsacSampler",
+    "RansacResult",
+    "Refinement",
     "ReweightedWhitening",
     "SearchedNormalizer",
+    "SoftChoice",
     "Truncated",
+    "TwoViewEstimate",
     "WeightedSampler",
     "Whitening",
     "algebraic_distance",
@@ -78,6 +90,8 @@ __all__ = [
     "relative_pose",
     "sample_minimal_sets",
     "sampson_distance",
+    "sampson_scale",
     "spd_transform",
     "symmetric_epipolar_distance",
+    "symmetric_scale",
 ]

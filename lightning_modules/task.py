@@ -14,12 +14,14 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 
 from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.estimators.fundamental import find_fundamental, solve_fundamental, solve_in_coordinates
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.losses import EpipolarLoss
-from kornia_learnnorm.metrics.better_rate import comparable
+from kornia_learnnorm.metrics.modules import BetterRateMetric
 from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
+from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 
 __all__ = ["NormalizerTask"]
@@ -65,8 +67,9 @@ class NormalizerTask(pl.LightningModule):
         self.optimizer = optimizer
         self.lr_scheduler = lr_scheduler
         self.sample_gradient = sample_gradient
-        self.hartley, self.whitening = Hartley(), Whitening()
-        self._residuals: dict[str, list[Tensor]] = {}
+        self.baselines: dict[str, Normalizer] = {"hartley": Hartley(), "whitening": Whitening()}
+        self.better_than_hartley, self.better_than_whitening = BetterRateMetric(), BetterRateMetric()
+        self._log_residuals: list[Tensor] = []  # since the last validation or test
         self._left_out = 0  # since the last validation or test
         self._samples = 0  # of all processes since the last step
 
@@ -159,42 +162,45 @@ class NormalizerTask(pl.LightningModule):
     def predict_step(self, batch: Samples, batch_idx: int) -> dict[str, Tensor]:
         """Return transforms, fundamental matrices and mean residuals of a batch."""
         x1, x2 = batch.points1.double(), batch.points2.double()  # in float32, F itself loses digits of the residual
-        T1, T2 = self.normalizer(x1, x2)
-        F_mat = self(x1, x2)
+        problem = LinearProblem.from_points(x1, x2)
+        T1, T2 = self.normalizer.transforms(problem)
+        F_mat = solve_in_coordinates(problem, T1, T2)
         residual = symmetric_epipolar_distance(x1, x2, F_mat).mean(-1)
         return {"T1": T1, "T2": T2, "F_mat": F_mat, "residual": residual, "pair": batch.pair}
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics of the collected residuals."""
-        self._log_residuals("val")
+        self._log_metrics("val")
 
     def on_test_epoch_end(self) -> None:
         """Log the metrics of the collected residuals."""
-        self._log_residuals("test")
+        self._log_metrics("test")
 
     def _collect(self, batch: Samples) -> None:
         batch, left_out = _finite(batch)
         self._left_out += left_out
-        x1, x2 = batch.points1.double(), batch.points2.double()
-        methods = {"learned": self.normalizer, "hartley": self.hartley, "whitening": self.whitening}
-        for name, normalizer in methods.items():
-            F_mat = find_fundamental(x1, x2, normalizer=normalizer)
-            residual = symmetric_epipolar_distance(x1, x2, F_mat).mean(-1)
-            self._residuals.setdefault(name, []).append(residual)
+        problem = LinearProblem.from_points(batch.points1, batch.points2)
+        learned = self._residuals(problem, self.normalizer)
+        self._log_residuals.append((learned + self.loss.floor).log())
+        for name, normalizer in self.baselines.items():
+            getattr(self, f"better_than_{name}").update(learned, self._residuals(problem, normalizer))
 
-    def _log_residuals(self, stage: str) -> None:
-        """Log figures of the samples of all processes; NaN where there are none."""
-        none = torch.zeros(0, dtype=solve_dtype(self.device), device=self.device)
-        learned, hartley, whitening = (
-            torch.cat([none, *self._residuals.pop(name, [])]) for name in ("learned", "hartley", "whitening")
-        )
-        total, samples, left_out = self._sum((learned + self.loss.floor).log().sum(), len(learned), self._left_out)
-        self._left_out = 0
+    def _residuals(self, problem: LinearProblem, normalizer: Normalizer) -> Tensor:
+        """Return the mean symmetric epipolar distance of each sample under a normaliser, (B,)."""
+        F_mat = solve_fundamental(problem, normalizer)
+        return symmetric_epipolar_distance(problem.points1, problem.points2, F_mat).mean(-1)
+
+    def _log_metrics(self, stage: str) -> None:
+        """Log the metrics of the samples of all processes; NaN where there are none."""
+        own = torch.cat([torch.zeros(0, device=self.device), *self._log_residuals])
+        total, samples, left_out = self._sum(own.sum(), len(own), self._left_out)
+        self._log_residuals, self._left_out = [], 0
         self.log(f"{stage}/log_sed", total / samples, prog_bar=True, sync_dist=True)
-        for name, baseline in (("hartley", hartley), ("whitening", whitening)):
-            compared = comparable(learned, baseline)
-            better, number = self._sum((learned < baseline)[compared].sum(), compared.sum())
-            self.log(f"{stage}/better_than_{name}", better / number, prog_bar=True, sync_dist=True)
+        for name in self.baselines:
+            metric: BetterRateMetric = getattr(self, f"better_than_{name}")
+            rate = metric.compute()["better_rate"]
+            self.log(f"{stage}/better_than_{name}", rate, prog_bar=True, sync_dist=True)
+            metric.reset()
         self.log(f"{stage}/left_out", left_out, sync_dist=True)
 
 

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import hypothesis
 import pytest
 import torch
 
 hypothesis.settings.register_profile(
-    "package", max_examples=25, deadline=None, derandomize=True, database=None, print_blob=True
+    "package",
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],  # with the deadline, what a busy machine would decide
+    derandomize=True,
+    database=None,
+    print_blob=True,
 )
 hypothesis.settings.load_profile("package")
 
+TESTS = Path(__file__).parent
+NUMERICAL = {"geometry", "normalizers", "estimators", "ransac", "metrics"}  # folders
+NUMERICAL |= {"test_losses.py", "test_propositions.py", "test_diagnostics.py", "test_search.py"}
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests that compare numbers, by their folder or file."""
+    for item in items:
+        if item.path.is_relative_to(TESTS) and NUMERICAL & {*item.path.relative_to(TESTS).parts}:
+            item.add_marker("numerical")
 
 
 @pytest.fixture(params=DEVICES)

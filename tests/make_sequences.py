@@ -1,4 +1,4 @@
-"""Write tiny image sequences in the layouts that the readers know: ``python tests/data/make_sequences.py FOLDER``.
+"""Images for tests, and tiny image sequences in the layouts that the readers know.
 
 A camera moves along a textured wall that it faces, so that frame ``n`` is a window of the texture, ``STEP * n`` pixels
 further to the right, and cameras and poses are exact (but for the distortion of TUM's first two Kinects, which is not
@@ -7,7 +7,6 @@ drawn).
 
 from __future__ import annotations
 
-import argparse
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -35,6 +34,15 @@ def texture(seed: int = 0, width: int = 900, height: int = 500) -> np.ndarray:
     image = sum(np.fft.irfft2(spectrum * np.exp(-((frequency * scale * 4) ** 2))) * scale for scale in (1.5, 4.0))
     low, high = np.percentile(image, [1, 99])
     return (np.clip((image - low) / (high - low), 0, 1) * 255).astype(np.uint8)
+
+
+def blurred_noise(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
+    """Blurred noise at two scales, with the full range of grey values; its features are stable."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    image = sum(cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
+    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def write_image(path: Path, shift: int, size: tuple[int, int] = SIZE, seed: int = 0) -> None:
@@ -135,14 +143,27 @@ LAYOUTS = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder
-    for name, write in LAYOUTS.items():
-        write(folder / name)
-        print(f"{folder / name}: {sum(path.is_file() for path in (folder / name).rglob('*'))} files")
+def edit(path: Path, line: int, text: str | None) -> None:
+    """Replace a line, counted from 1, or take it out."""
+    lines = path.read_text().splitlines()
+    lines[line - 1 : line] = [] if text is None else [text]
+    path.write_text("".join(f"{one}\n" for one in lines))
 
 
-if __name__ == "__main__":
-    main()
+def moved(pixels: float, focal: float = FOCAL) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = metres(pixels, focal)
+    return pose
+
+
+def rotated(wxyz: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Rotate vectors (N, 3) by a unit quaternion: q v q*, with Hamilton's product."""
+
+    def product(p, q):
+        w = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdims=True)
+        return np.concatenate(
+            [w, p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])], -1
+        )
+
+    pure = np.column_stack([np.zeros(len(vectors)), vectors])
+    return product(product(np.broadcast_to(wxyz, pure.shape), pure), (wxyz * [1, -1, -1, -1])[None])[:, 1:]

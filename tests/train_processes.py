@@ -101,7 +101,8 @@ class Stop(pl.Callback):
 def task_and_data(case):
     torch.manual_seed(0)
     task = NormalizerTask(
-        kln.LearnedNormalizer(network=kln.CrossViewNetwork(width=8, depth=1)).double(),  # so that rounding is small
+        # in float64, so that rounding is small
+        kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=8, depth=1)).double(),
         loss=kln.EpipolarLoss(heldout_weight=0.5),
         sample_gradient=0.1,
     )

@@ -32,13 +32,18 @@ def shaken(normalizer: LearnedNormalizer | None = None, scale: float = 0.3, seed
     torch.manual_seed(seed)
     normalizer = LearnedNormalizer(network=CrossViewNetwork(width=16, depth=2)) if normalizer is None else normalizer
     with torch.no_grad():
-        for value in normalizer.network.set_network.head[-1].parameters():
+        for value in getattr(normalizer.network, "set_network", normalizer.network).head[-1].parameters():
             value.normal_(0, scale)
     return normalizer.eval()
 
 
 def homogeneous(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.ones_like(points[..., :1])], -1)
+
+
+def mapped(T, points) -> np.ndarray:
+    """Points after an affine transform."""
+    return (homogeneous(np.asarray(points)) @ np.asarray(T).swapaxes(-1, -2))[..., :2]
 
 
 def unit(F: np.ndarray) -> np.ndarray:
@@ -77,6 +82,13 @@ def numpy_whitening(points, weights=None) -> np.ndarray:
         M = vectors @ np.diag(values**-0.5) @ vectors.T
         T.append(np.block([[M, -M @ np.average(p, axis=0, weights=w)[:, None]], [np.zeros((1, 2)), np.ones((1, 1))]]))
     return np.array(T)
+
+
+def prepared(transform, name: str = "handheld", batch_size: int = 6, num_points: int = 12, seed: int = 0):
+    """Correspondences in the coordinates of ``numpy_hartley`` or ``numpy_whitening``, as a network gets them."""
+    points = correspondences(name, batch_size, num_points, seed)
+    T = [torch.from_numpy(transform(p)) for p in points]
+    return tuple(p @ t[:, :2, :2].mT + t[:, None, :2, 2] for p, t in zip(points, T, strict=True))
 
 
 def epipolar_distances(points1, points2, F) -> np.ndarray:

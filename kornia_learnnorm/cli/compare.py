@@ -7,7 +7,7 @@ import argparse
 import torch
 
 from kornia_learnnorm.cli.evaluate import add_run_arguments, run_arguments
-from kornia_learnnorm.evaluation.report.rates import rate_text
+from kornia_learnnorm.evaluation.report.formatting import rate_text
 from kornia_learnnorm.evaluation.runs.record import temporary_run
 from kornia_learnnorm.evaluation.runs.run import Cell
 from kornia_learnnorm.evaluation.tables import format_table

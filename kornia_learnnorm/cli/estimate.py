@@ -1,4 +1,4 @@
-"""The command ``learnnorm estimate``: from two image files to a matrix, a picture and a JSON file."""
+"""The command ``learnnorm estimate``: the fundamental matrix of two image files, as text, picture and JSON file."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from kornia_learnnorm.data.images import read_image
-from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
+from kornia_learnnorm.evaluation.pair import estimate_pair, write_json
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
 __all__ = ["add_arguments", "run"]
 
@@ -33,21 +34,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image2", metavar="IMG2", type=Path, help="file of image 2")
     parser.add_argument("--out", metavar="PICTURE", type=Path, help="draw matches and epipolar lines to this file")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write F, counts and errors to this file")
-    parser.add_argument("--ratio", type=float, default=0.8, help="ratio test of the matches (default: %(default)s)")
+    parser.add_argument("--ratio", type=float, default=RATIO, help="ratio test of the matches (default: %(default)s)")
     parser.add_argument(
         "--threshold",
         type=float,
-        default=1.0,
+        default=INLIER_THRESHOLD,
         help="symmetric epipolar distance of an inlier, px (default: %(default)s)",
     )
     parser.add_argument("--weights", metavar="NAME_OR_PATH", help="weights of the normaliser (default: the package's)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm estimate``: print the fundamental matrix and write what was asked for.
+    """Run ``learnnorm estimate``: print the fundamental matrix, write the picture and the JSON file if asked to.
 
     Args:
-        args: what the parser of :func:`add_arguments` returned.
+        args: parsed arguments of :func:`add_arguments`.
 
     Returns:
         the exit code, 0.
@@ -73,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
             draw_pair(read_image(args.image1), read_image(args.image2), estimate, picture)
         if report is not None:
             write_json(report, estimate)
-    print(_summary(estimate))
+    print(estimate.summary())
     for path in (args.out, args.json):
         if path is not None:
             print(f"wrote    {path}")
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_outputs(args: argparse.Namespace) -> None:
-    """Complain about a picture of unknown format and about files that would overwrite an input or each other."""
+    """Raise ValueError for a picture of unknown format and for files that would overwrite an input or each other."""
     if args.out is not None and args.out.suffix.lower() not in PICTURE_SUFFIXES:
         raise ValueError(f"--out {args.out}: expected a name that ends in one of {' '.join(PICTURE_SUFFIXES)}")
     taken = [args.image1.resolve(), args.image2.resolve()]
@@ -89,18 +90,3 @@ def _check_outputs(args: argparse.Namespace) -> None:
         if path is not None and path.resolve() in taken:
             raise ValueError(f"{option} {path}: would overwrite another file of this command")
         taken += [] if path is None else [path.resolve()]
-
-
-def _summary(estimate: PairEstimate) -> str:
-    """Return what the command prints: F, row by row, the counts and the errors."""
-    rows = [" ".join(f"{value: .9e}" for value in row) for row in estimate.F_mat.tolist()]
-    share = estimate.num_inliers / estimate.num_matches
-    return "\n".join(
-        [
-            "F (x2^T F x1 = 0 in pixels, unit Frobenius norm)",
-            *(f"  {row}" for row in rows),
-            f"matches  {estimate.num_matches} (ratio test {estimate.ratio:g})",
-            f"inliers  {estimate.num_inliers} ({share:.1%}, symmetric epipolar distance < {estimate.threshold:g} px)",
-            f"distance of the inliers: mean {estimate.mean_distance:.3f} px, median {estimate.median_distance:.3f} px",
-        ]
-    )

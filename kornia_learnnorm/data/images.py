@@ -1,53 +1,59 @@
-"""Reading images, grey: from a file, or a frame with its undistortion and its size.
+"""Reading images as grey values: from a file, or a frame with its undistortion and resizing.
 
-OpenCV does the work. It comes with the ``images`` extra and is imported only when a function here is called.
+Pillow decodes; OpenCV undistorts and resizes. Both come with the ``images`` extra and are imported on use.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from kornia_learnnorm.data.datasets.frames import Frame, Size
+from kornia_learnnorm.optional import import_extra
 
 __all__ = ["image_size", "import_cv2", "read_frame", "read_image"]
 
-_ORIENTATION, _QUARTER_TURNS = 0x0112, {5, 6, 7, 8}  # EXIF 2.32, section 4.6.4: width and height change places
+# Weights of red, green and blue, and an offset that turns Pillow's rounding into rounding down: the integer arithmetic
+# of libpng, so that a PNG has the grey values that OpenCV reads.
+LUMA = (9797 / 32768, 19234 / 32768, 3737 / 32768, -0.5)
+ORIENTATION = 0x0112  # tag of EXIF 2.32, section 4.6.4
+QUARTER_TURNS = (5, 6, 7, 8)  # orientations that swap width and height
 
 
-def import_cv2() -> ModuleType:
+def import_cv2() -> Any:
     """Return the module ``cv2``.
 
     Raises:
-        ImportError: if OpenCV is not installed; the message names the extra that brings it.
+        ImportError: if OpenCV is not installed; the message names the extra that installs it.
 
     """
-    try:
-        import cv2
-    except ImportError as error:
-        message = "reading and matching images needs OpenCV: pip install 'kornia-learnnorm[images]'"
-        raise ImportError(message) from error
-    return cv2
+    return import_extra("cv2", "images", "matching images")
 
 
 def read_image(path: str | Path) -> npt.NDArray[np.uint8]:
-    """Read an image file as grey values; colours and deeper pixels are converted.
+    """Return the grey values of an image file, turned as its EXIF orientation says.
+
+    Colours become the luma of ITU-R BT.601, rounded down as in libpng; a JPEG gives its own luma channel. These are the
+    grey values of OpenCV's ``IMREAD_GRAYSCALE``, which in other formats can be a level higher (two for CMYK). Of
+    16 bits the upper eight are kept. Alpha is ignored.
 
     Args:
-        path: a file in any format that OpenCV decodes and Pillow knows, which tells the size before it is decoded.
+        path: a file in any format that Pillow decodes.
 
     Returns:
         grey values with shape :math:`(H, W)`, uint8.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is a folder, not an image, a truncated or corrupt image, or one of more pixels than Pillow
-            opens, twice ``PIL.Image.MAX_IMAGE_PIXELS``: a small file can declare any number of them.
-        ImportError: if OpenCV or Pillow is not installed.
+        ValueError: if it is a folder, not an image, a truncated or corrupt image, one of floating-point pixels, or has
+            more than twice ``PIL.Image.MAX_IMAGE_PIXELS`` pixels.
+        ImportError: if Pillow is not installed.
 
     """
     path = Path(path)
@@ -55,63 +61,43 @@ def read_image(path: str | Path) -> npt.NDArray[np.uint8]:
         raise FileNotFoundError(f"image {path} does not exist")
     if path.is_dir():
         raise ValueError(f"image {path} is a folder, expected an image file")
-    data = path.read_bytes()
-    if not data:
-        raise ValueError(f"image {path} is empty (0 bytes)")
-    image = _decode(data) if _size_is_allowed(path) and _jpeg_ends(data) else None
-    if image is None:
-        raise ValueError(f"image {path} cannot be decoded: {len(data)} bytes, not an image or truncated or corrupt")
-    return image
-
-
-def _size_is_allowed(path: Path) -> bool:
-    """Tell whether Pillow knows an image's size, and raise if it is too large."""
+    size = path.stat().st_size
+    if size == 0:
+        raise ValueError(f"image {path} is empty (0 bytes), expected an image file")
     Image = _pillow()
     try:
-        return _header_size(path)[0] > 0
+        with _opened(path) as image:
+            image.verify()  # the checksums of a PNG, which decoding skips
+        with _opened(path) as image:
+            return _grey_values(image)
     except Image.DecompressionBombError as error:
-        most = 2 * (Image.MAX_IMAGE_PIXELS or 0)
-        message = f"image {path} declares more than {most} pixels, the limit, 2 * PIL.Image.MAX_IMAGE_PIXELS"
-        raise ValueError(message) from error
-    except Exception:  # a broken header can end in nearly any error of Pillow's parsers
-        return False
+        limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels, the limit, 2 * PIL.Image.MAX_IMAGE_PIXELS"
+        raise ValueError(f"image {path} declares more than {limit}") from error
+    except Exception as error:  # a broken file can end in nearly any error of Pillow's decoders
+        what = f"{size} bytes, not an image or truncated or corrupt"
+        raise ValueError(f"image {path} cannot be decoded: {what} ({error})") from error
 
 
-def _decode(data: bytes) -> npt.NDArray[np.uint8] | None:
-    """Decode a file's bytes to grey values, None where OpenCV cannot; its log stays quiet meanwhile."""
-    cv2 = import_cv2()
-    log = getattr(cv2.utils, "logging", cv2)  # OpenCV 5 and 4
-    level = log.setLogLevel(0)
-    try:
-        image: npt.NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:
-        return None
-    finally:
-        log.setLogLevel(level)
-    return image
-
-
-def _jpeg_ends(data: bytes) -> bool:
-    """Tell whether a JPEG has its end marker after its pixels; True for other formats.
-
-    OpenCV 4 fills the missing part of a truncated JPEG with grey and says nothing.
-    """
-    if data[:2] != b"\xff\xd8":
-        return True
-    position = 2
-    while data[position : position + 1] == b"\xff" and data[position + 1 : position + 2] != b"\xda":
-        filler = data[position + 1 : position + 2] == b"\xff"
-        position += 1 if filler else 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-    return b"\xff\xd9" in data[position:]
+def _grey_values(image: Any) -> npt.NDArray[np.uint8]:
+    """Decode an open image of Pillow to grey values (H, W)."""
+    image.draft("L", None)  # a JPEG: its luma channel, without a way through RGB
+    if _has_exif(image):
+        image = import_extra("PIL.ImageOps", "images", "reading images").exif_transpose(image)
+    if image.mode == "F":
+        raise ValueError("its pixels are floating-point numbers, expected 8 or 16 bits")
+    if image.mode.startswith("I"):
+        return (np.asarray(image).clip(0, 2**16 - 1) >> 8).astype(np.uint8)
+    colours = image.mode not in ("1", "L", "LA", "La")
+    return np.array(image.convert("RGB").convert("L", LUMA) if colours else image.convert("L"))
 
 
 def read_frame(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Read a frame as it is matched: grey, undistorted, resized.
+    """Return a frame as it is matched: grey, undistorted, resized.
 
-    Undistortion keeps the camera matrix, so what has no pixel in the file turns black.
+    Undistortion keeps the camera matrix; pixels without a source in the file become black.
 
     Args:
-        frame: where the image is and what is known of its camera.
+        frame: the image file and its camera.
 
     Returns:
         grey values of ``frame.matched_size``, (H, W) uint8.
@@ -119,7 +105,7 @@ def read_frame(frame: Frame) -> npt.NDArray[np.uint8]:
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a readable image, not of ``frame.size``, or distorted by an unknown camera.
-        ImportError: if OpenCV is not installed.
+        ImportError: if OpenCV or Pillow is not installed.
 
     """
     cv2 = import_cv2()
@@ -129,7 +115,7 @@ def read_frame(frame: Frame) -> npt.NDArray[np.uint8]:
         raise ValueError(f"image {frame.path} has {got} pixels, its camera {frame.size[0]} x {frame.size[1]}")
     if any(frame.distortion):
         if not np.isfinite(frame.camera).all():
-            raise ValueError(f"image {frame.path} has a distortion, but no camera matrix")
+            raise ValueError(f"image {frame.path} has a distortion, but no camera matrix, which undistortion needs")
         image = cv2.undistort(image, frame.camera, np.array(frame.distortion))
     if frame.matched_size != frame.size:
         image = cv2.resize(image, frame.matched_size, interpolation=cv2.INTER_AREA)
@@ -137,7 +123,7 @@ def read_frame(frame: Frame) -> npt.NDArray[np.uint8]:
 
 
 def image_size(path: str | Path) -> Size:
-    """Return the size of an image as OpenCV decodes it, turned as its EXIF orientation says, from its header alone.
+    """Return the size of an image, turned as its EXIF orientation says, from its header alone.
 
     Args:
         path: an image file.
@@ -147,7 +133,7 @@ def image_size(path: str | Path) -> Size:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ImportError: if Pillow is not installed; the message names the extra that brings it.
+        ImportError: if Pillow is not installed; the message names the extra that installs it.
 
     """
     _pillow()
@@ -155,25 +141,28 @@ def image_size(path: str | Path) -> Size:
     if not path.is_file():
         raise FileNotFoundError(f"no image at {path}")
     try:
-        return _header_size(path)
+        with _opened(path) as image:
+            width, height = image.size
+            turned = _has_exif(image) and image.getexif().get(ORIENTATION) in QUARTER_TURNS
     except Exception:  # a broken header can end in nearly any error of Pillow's parsers
         return 0, 0
-
-
-def _header_size(path: Path) -> Size:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of large images and odd metadata: nothing is decoded here
-        with _pillow().open(path) as image:
-            width, height = image.size
-            # getexif() without the test would decode a whole PNG; of a TIFF, Pillow has turned the size already
-            turned = "exif" in image.info and image.getexif().get(_ORIENTATION) in _QUARTER_TURNS
     return (height, width) if turned else (width, height)
 
 
-def _pillow() -> ModuleType:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        message = "reading images needs Pillow: pip install 'kornia-learnnorm[images]'"
-        raise ImportError(message) from error
-    return Image
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open an image without Pillow's warnings about large images and odd metadata."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # an open file, not the path: Pillow 13 maps an uncompressed TIFF into memory and then turns it wrongly
+        with path.open("rb") as file, _pillow().open(file) as image:
+            yield image
+
+
+def _has_exif(image: Any) -> bool:
+    """Return whether an open image has EXIF data; ``getexif()`` without it would decode a whole PNG."""
+    return "exif" in image.info
+
+
+def _pillow() -> Any:
+    return import_extra("PIL.Image", "images", "reading images")

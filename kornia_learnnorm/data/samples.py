@@ -1,4 +1,4 @@
-r"""Samples: the correspondences of image pairs, shuffled and cut into sets of eight or more."""
+r"""Samples: sets of eight or more correspondences, drawn from image pairs without replacement."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.normalizers.closed_form import Identity
+from kornia_learnnorm.protocol import RATIO
 
 __all__ = ["Samples", "draw_samples", "plain_residual"]
 
-RATIO = 0.8
+BATCH_SIZE = 8192  # samples solved at once, which bounds the memory
 
 
 class Samples(NamedTuple):
@@ -48,15 +49,15 @@ def draw_samples(
     max_residual: float | None = None,
     require_heldout: bool = True,
 ) -> Samples:
-    """Shuffle each pair's correspondences and cut them into samples; what does not fill a sample is left out.
+    """Draw samples: shuffle the correspondences of each pair and split them into sets of ``size``, without the rest.
 
-    Held-out correspondences are the pair's others that pass the ratio test, so they measure the same motion whether or
-    not the samples are filtered.
+    Held-out correspondences come from the same pair, are not in the sample and pass the ratio test of 0.8, whatever
+    ``max_ratio`` is.
 
     Args:
         store: correspondences of image pairs.
-        generator: source of the shuffle; equal states give equal samples.
-        size: correspondences in a sample, at least 8.
+        generator: source of all randomness; equal states give equal samples.
+        size: correspondences per sample, at least 8.
         max_ratio: keep correspondences with Lowe's ratio below this; None keeps all.
         num_heldout: held-out correspondences per sample, drawn with replacement.
         max_residual: drop samples whose :func:`plain_residual` is at least this many pixels; None keeps all.
@@ -82,12 +83,14 @@ def draw_samples(
     place = torch.arange(len(rows)) - (count.cumsum(0) - count)[pair[rows]]
     rows = rows[place < (count // size * size)[pair[rows]]].reshape(-1, size)
     if len(rows) == 0:
-        raise ValueError(f"no pair of the store has {size} correspondences with ratio below {max_ratio}")
+        limit = "" if max_ratio is None else f" with ratio below {max_ratio}"
+        raise ValueError(f"no pair of the store has {size} correspondences{limit}, which a sample needs")
     sample_pair, passes = pair[rows[:, 0]], ratio < RATIO
     passing = torch.bincount(pair[passes], minlength=len(store))[sample_pair]
     if num_heldout and require_heldout and int(passing.min()) <= size:
         few = int(passing.min())
-        raise ValueError(f"held-out correspondences: a pair has only {few} that pass the ratio test {RATIO}")
+        expected = f"expected more than the {size} of a sample"
+        raise ValueError(f"held-out correspondences: a pair has only {few} with ratio below {RATIO}, {expected}")
     cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
     drawable = passing > size
     rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]
@@ -100,7 +103,7 @@ def draw_samples(
 def _draw_heldout(
     rows: Tensor, sample_pair: Tensor, pair: Tensor, passes: Tensor, number: int, generator: torch.Generator
 ) -> Tensor:
-    """Draw ``number`` rows for each sample from its pair, none of them its own."""
+    """Draw ``number`` rows for each sample from its pair that pass the ratio test and are not in the sample."""
     pool = torch.nonzero(passes)[:, 0]
     count = torch.bincount(pair[pool], minlength=int(pair.max()) + 1)
     start = count.cumsum(0) - count
@@ -115,10 +118,10 @@ def _draw_heldout(
     return drawn
 
 
-def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = 8192) -> Tensor:
-    """Return each sample's mean symmetric epipolar distance under the un-normalised eight-point algorithm.
+def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = BATCH_SIZE) -> Tensor:
+    """Return the mean symmetric epipolar distance of each sample under the un-normalised eight-point algorithm.
 
-    The paper drops samples of 60 px and more (Fan et al., section 4, training procedure).
+    Fan et al. drop samples of 60 px and more (section 4, training procedure).
 
     Args:
         points1: pixels in the first view with shape (S, N, 2).

@@ -1,7 +1,7 @@
-r"""Sources of samples for training: stores on disk and synthetic scenes, drawn block by block.
+r"""Sources of samples for training: stores on disk and synthetic scenes.
 
-A draw, of one epoch, is made of blocks, and a block is what has to fit in memory. It depends on nothing but the seed
-and its number, so that blocks can be drawn in any order, by any process.
+The samples of an epoch, a draw, are made in blocks; one block is in memory at once. A block depends only on the seed of
+the draw and its own number, so blocks can be drawn in any order, by any process.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.samples import RATIO, Samples, draw_samples, plain_residual
+from kornia_learnnorm.data.samples import Samples, draw_samples, plain_residual
 from kornia_learnnorm.data.store import StoreReader
 from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.protocol import MAX_RESIDUAL, RATIO
 
 __all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator"]
 
-SCENES = 8192  # in a block
+SCENES_PER_BLOCK = 8192
 
 
 class Block(NamedTuple):
-    """What a block holds before samples are filtered.
+    """The size of a block before samples are filtered.
 
     Attributes:
-        samples: how many samples.
-        pairs: how many image pairs that have samples.
+        samples: number of samples.
+        pairs: number of image pairs with a sample.
     """
 
     samples: int
@@ -42,31 +43,31 @@ class Block(NamedTuple):
 
 
 def block_generator(*key: int) -> torch.Generator:
-    """Return the generator of a key, such as the seed of a draw and the number of a block.
+    """Return a random generator for a key, for example the seed of a draw and the number of a block.
 
     Args:
-        key: numbers from 0 on; other keys give independent generators.
+        key: integers of 0 or more; different keys give independent generators.
 
     """
-    # A generator on the CPU reads 32 bits of its seed.
+    # torch's generator on the CPU uses 32 bits of its seed
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
 
 
 class StoreSamples:
-    """Draw samples from stores of correspondences, each pair once per ratio.
+    """Samples from stores on disk; each image pair is used once per ratio test.
 
-    The stores stay on disk. Where there are more pairs than fit in a block, each draw distributes them anew.
+    Each draw distributes the pairs to blocks at random.
 
     Args:
         paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
             ``$LEARNNORM_DATA`` are filled in.
-        max_ratios: ratio tests; 0.8 gives the filtered samples, None the unfiltered ones, both a mix.
-        size: correspondences in a sample; of a range ``(low, high)`` each block takes one number, ends included.
+        max_ratios: limits of Lowe's ratio; 0.8 gives filtered samples, None unfiltered ones, both a mix.
+        size: correspondences per sample; with a range ``(low, high)`` each block draws one size, ends included.
         num_heldout: held-out correspondences per sample.
         max_residual: drop samples whose :func:`~kornia_learnnorm.data.samples.plain_residual` is at least this many
             pixels; None keeps all.
-        block_pairs: the most image pairs in a block.
-        cache: folder for what the filter keeps, so that the same draw is not filtered twice; None for none.
+        block_pairs: largest number of image pairs in a block.
+        cache: folder for the results of the residual filter, so that a draw is filtered once; None for no cache.
 
     Raises:
         ValueError: if no path is given, an environment variable is not set, a number is out of range, or no pair fills
@@ -80,12 +81,12 @@ class StoreSamples:
         max_ratios: Sequence[float | None] = (RATIO,),
         size: int | tuple[int, int] = 8,
         num_heldout: int = 0,
-        max_residual: float | None = 60.0,
+        max_residual: float | None = MAX_RESIDUAL,
         block_pairs: int = 1024,
         cache: str | None = None,
     ) -> None:
         if not paths or not max_ratios:
-            raise ValueError(f"at least one store and one ratio are needed, got {paths!r} and {max_ratios!r}")
+            raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
         self.sizes = (size, size) if isinstance(size, int) else tuple(size)
         if len(self.sizes) != 2 or not 8 <= self.sizes[0] <= self.sizes[1] or block_pairs < 1:
             got = f"size={size}, block_pairs={block_pairs}"
@@ -104,7 +105,7 @@ class StoreSamples:
             raise ValueError(f"no pair of {stores} has {self.sizes[1]} correspondences that pass the ratio test")
 
     def blocks(self, seed: int) -> list[Block]:
-        """Return what the blocks of a draw hold before the filter."""
+        """Return the size of each block of a draw before the residual filter."""
         found = []
         for number, pairs in enumerate(self._pairs(seed)):
             size = self._size(block_generator(seed, number))
@@ -113,7 +114,7 @@ class StoreSamples:
         return found
 
     def draw(self, seed: int, block: int) -> Samples:
-        """Return the samples of a block; the pairs of later stores count on from those of earlier ones."""
+        """Return the samples of a block; ``pair`` counts the pairs of all stores in their order."""
         generator = block_generator(seed, block)
         size = self._size(generator)
         pairs, parts = self._pairs(seed)[block], []
@@ -133,7 +134,7 @@ class StoreSamples:
         return samples.select(self._kept(samples, self.max_residual, seed, block))
 
     def _pairs(self, seed: int) -> list[NDArray[np.int64]]:
-        """Image pairs of each block, rising; all of them in the first where they fit."""
+        """Return the sorted indices of the image pairs of each block."""
         number = int(self._first[-1])
         blocks = -(-number // self.block_pairs)
         order = np.random.default_rng(seed).permutation(number)
@@ -144,7 +145,7 @@ class StoreSamples:
         return low if low == high else int(torch.randint(low, high + 1, (), generator=generator))
 
     def _kept(self, samples: Samples, max_residual: float, seed: int, block: int) -> Tensor:
-        """Mask (S,) of the samples that the filter keeps."""
+        """Return the mask (S,) of the samples that the residual filter keeps."""
         if self.cache is None:
             return plain_residual(samples.points1, samples.points2) < max_residual
         files = [(str(s.path.resolve()), s.path.stat().st_mtime_ns, s.offsets[[0, -1]].tolist()) for s in self.stores]
@@ -154,21 +155,21 @@ class StoreSamples:
             return torch.from_numpy(np.load(path))
         kept = plain_residual(samples.points1, samples.points2) < max_residual
         self.cache.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as beside:
-            np.save(beside, kept.numpy())
+        with atomic_write(path) as temporary:
+            np.save(temporary, kept.numpy())
         return kept
 
 
 class SyntheticSamples:
-    """Draw samples from synthetic scenes, a scene for each.
+    """Samples from synthetic scenes, one sample per scene.
 
     Args:
-        number: scenes per draw; the residual filter drops some of them.
-        size: correspondences in a sample.
-        num_heldout: held-out correspondences per sample, inliers and outliers alike.
+        number: scenes per draw, before the residual filter.
+        size: correspondences per sample.
+        num_heldout: held-out correspondences per sample, inliers and outliers.
         max_residual: drop samples whose :func:`~kornia_learnnorm.data.samples.plain_residual` is at least this many
             pixels; None keeps all.
-        scenes: makes scenes from their number, the points of each and a generator; one of
+        scenes: function of the number of scenes, the points per scene and a generator, for example one of
             :mod:`kornia_learnnorm.data.synthetic`.
 
     Raises:
@@ -180,7 +181,7 @@ class SyntheticSamples:
         number: int = 262_144,
         size: int = 8,
         num_heldout: int = 0,
-        max_residual: float | None = 60.0,
+        max_residual: float | None = MAX_RESIDUAL,
         scenes: Callable[[int, int, torch.Generator], TwoViewScene] = random_scenes,
     ) -> None:
         if number < 1 or size < 8:
@@ -192,18 +193,18 @@ class SyntheticSamples:
         self.scenes = scenes
 
     def blocks(self, seed: int) -> list[Block]:
-        """Return what the blocks of a draw hold before the filter."""
-        sizes = [min(SCENES, self.number - first) for first in range(0, self.number, SCENES)]
+        """Return the size of each block of a draw before the residual filter."""
+        sizes = [min(SCENES_PER_BLOCK, self.number - first) for first in range(0, self.number, SCENES_PER_BLOCK)]
         return [Block(size, size) for size in sizes]
 
     def draw(self, seed: int, block: int) -> Samples:
-        """Return fresh samples, each a pair of its own."""
+        """Return the samples of a block; each is a pair of its own."""
         number = self.blocks(seed)[block].samples
         scenes = self.scenes(number, self.size + self.num_heldout, block_generator(seed, block))
         sizes = [self.size, self.num_heldout]
         points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
         points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
-        samples = Samples(points1, points2, heldout1, heldout2, block * SCENES + torch.arange(number))
+        samples = Samples(points1, points2, heldout1, heldout2, block * SCENES_PER_BLOCK + torch.arange(number))
         if self.max_residual is None:
             return samples
         return samples.select(plain_residual(points1, points2) < self.max_residual)

@@ -1,32 +1,103 @@
-"""Writing a store pair by pair: what was added survives a crash."""
+"""Writing stores: at once, or pair by pair with the pairs on disk after a crash."""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from kornia_learnnorm.data.store import CorrespondenceStore, join_stores, read_store, write_store
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_learnnorm.data.store import FORMAT, LAYOUT, VERSION, CorrespondenceStore, read_store
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.optional import import_extra
 
-__all__ = ["StoreWriter", "check_target"]
+if TYPE_CHECKING:
+    import h5py
 
-OPTIONS = "options.json"  # in the folder of the parts
-DIGEST = "frames"  # the option that no reader can make sense of
+__all__ = ["StoreWriter", "check_target", "join_stores", "write_store"]
+
+OPTIONS = "options.json"  # file in the folder of the parts
+DIGEST = "frames"  # option that is a hash, which messages do not quote
+ROWS_PER_CHUNK = 2048  # correspondences in a chunk of HDF5
+PAIRS_PER_CHUNK = 16  # pairs in a chunk of HDF5; few, since each part of an unfinished store is a file of one pair
+
+
+def write_store(path: str | Path, store: CorrespondenceStore) -> None:
+    """Write a store to an HDF5 file, completely or not at all.
+
+    Args:
+        path: the file to write; an existing one is replaced.
+        store: the correspondences.
+
+    Raises:
+        OSError: if the folder does not exist or cannot be written, or the disk is full.
+
+    """
+    join_stores(path, [store], store.provenance)
+
+
+def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provenance: dict[str, Any]) -> None:
+    """Write the pairs of several stores to one HDF5 file, completely or not at all; one store is in memory at a time.
+
+    Args:
+        path: the file to write; an existing one is replaced.
+        stores: one store or more; ``dataset``, ``pairs`` and ``detector`` are those of the first.
+        provenance: the provenance of the new store.
+
+    Raises:
+        ValueError: if there is no store.
+        OSError: if the folder does not exist or cannot be written, or the disk is full.
+
+    """
+    h5py = import_extra("h5py", "images", "writing stores")
+    with atomic_write(path) as temporary:
+        try:
+            with h5py.File(temporary, "w") as file:
+                _append_all(h5py, file, stores)
+                if "offsets" not in file:
+                    raise ValueError(f"no pairs to write to {path}: one store or more expected, got none")
+                file.attrs.update({"format": FORMAT, "version": VERSION, "provenance": json.dumps(provenance)})
+        except (OSError, RuntimeError) as error:  # RuntimeError: a disk that fills while a file is closed
+            number = getattr(error, "errno", None)
+            raise OSError(f"cannot write {path}: {os.strerror(number) if number else error}") from error
+
+
+def _append_all(h5py: Any, file: h5py.File, stores: Iterable[CorrespondenceStore]) -> None:
+    for store in stores:
+        if "offsets" not in file:
+            file.attrs.update({key: getattr(store, key) for key in ("dataset", "pairs", "detector")})
+            file.create_dataset("offsets", (1,), np.int64, maxshape=(None,), chunks=(128,))
+            file.create_dataset("names", (0, 2), h5py.string_dtype(), maxshape=(None, 2), chunks=(64, 2))
+            for name, (tail, dtype, axis) in LAYOUT.items():
+                rows = ROWS_PER_CHUNK if axis == "M" else PAIRS_PER_CHUNK
+                file.create_dataset(name, (0, *tail), dtype, maxshape=(None, *tail), chunks=(rows, *tail))
+        _append(file["offsets"], store.offsets[1:] + file["offsets"][-1])
+        _append(file["names"], np.array(store.names, dtype=h5py.string_dtype()))
+        for name in LAYOUT:
+            _append(file[name], getattr(store, name))
+
+
+def _append(dataset: h5py.Dataset, rows: NDArray[Any]) -> None:
+    if len(rows):
+        dataset.resize(len(dataset) + len(rows), axis=0)
+        dataset[-len(rows) :] = rows
 
 
 def check_target(path: str | Path) -> None:
-    """Refuse a path where no store can be written, without touching anything.
+    """Raise an error if no store can be written to a path; nothing is written.
 
     Args:
         path: the store to write.
 
     Raises:
         FileNotFoundError: if its folder does not exist.
-        ValueError: if something else is there than a file, or where its parts have to wait, than a folder.
+        ValueError: if the path is not a regular file, or ``<path>.parts`` is not a folder.
 
     """
     path, folder = Path(path), _folder(path)
@@ -35,30 +106,31 @@ def check_target(path: str | Path) -> None:
     if path.exists() and not path.is_file():
         raise ValueError(f"cannot write {path}: it is not a regular file")
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"cannot write {path}: its parts wait in {folder}, which is not a folder")
+        raise ValueError(f"cannot write {path}: its parts are written to {folder}, which is not a folder")
 
 
 class StoreWriter:
-    """Collect the pairs of a store in any order.
+    """Write the pairs of a store one by one, in any order.
 
-    Each pair waits as a store of its own in the folder ``<path>.parts``. A run that was killed finds there what it had,
-    and what it was: other options are refused. :meth:`finish` joins the parts in their order and removes the folder.
+    Each pair becomes a store of its own, a part, in the folder ``<path>.parts``. A later run finds the parts of a run
+    that was killed, and refuses them if its options differ. :meth:`finish` joins the parts in the order of their places
+    and removes the folder.
 
     Args:
         path: the store to write, an HDF5 file.
-        options: what the store depends on, of JSON's types; a part that other options made must not mix with these.
-            ``frames`` is a digest: a message does not quote it.
+        options: options that the store depends on, values of JSON's types. ``frames`` is a hash, which messages do not
+            quote.
 
     Attributes:
         path: the store to write.
-        folder: where the parts wait.
-        complete: the store is there already, made with the same options.
+        folder: the folder of the parts.
+        complete: whether the store exists, made with the same options.
         skipped: the pairs that a complete store leaves out, and why; empty while it is not complete.
 
     Raises:
         FileNotFoundError: if the folder of the store does not exist.
         OSError: if it cannot be written.
-        ValueError: if the store, or parts of it, are there but were made with other options or by other means, or
+        ValueError: if the store or parts of it exist, but were made with other options or by another program, or
             cannot be read.
     """
 
@@ -84,14 +156,14 @@ class StoreWriter:
     def _begin(self) -> None:
         try:
             self.folder.mkdir(exist_ok=True)
-            with atomic_write(self.folder / OPTIONS) as beside:
-                beside.write_text(json.dumps(self.options, indent=1), encoding="utf-8")
+            with atomic_write(self.folder / OPTIONS) as temporary:
+                temporary.write_text(json.dumps(self.options, indent=1), encoding="utf-8")
         except OSError as error:
             self.close()
             raise type(error)(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def done(self) -> set[int]:
-        """Return the places of the pairs that are there; parts that a power cut made unreadable are removed."""
+        """Return the places of the pairs that were added, after removing unreadable parts (as a power cut leaves)."""
         for part in self._parts():
             try:
                 read_store(part)
@@ -103,23 +175,23 @@ class StoreWriter:
         """Write a pair.
 
         Args:
-            place: its place among the pairs of the store, from 0.
+            place: index of the pair in the finished store, with skipped pairs counted too.
             pair: a store of one pair.
 
         Raises:
-            ValueError: if it is not one pair, or the place is negative.
-            OSError: if it cannot be written, as on a full disk.
+            ValueError: if ``pair`` does not hold one pair, or ``place`` is negative.
+            OSError: if the part cannot be written, as on a full disk.
 
         """
         if len(pair) != 1 or place < 0:
-            raise ValueError(f"one pair and a place from 0 on are expected, got {len(pair)} pairs and place {place}")
+            raise ValueError(f"one pair and a place of 0 or more expected, got {len(pair)} pairs and place {place}")
         write_store(self.folder / f"{place:08d}.h5", pair)
 
     def finish(self, provenance: dict[str, Any]) -> None:
         """Write the store and remove the parts.
 
         Args:
-            provenance: what made the store, of JSON's types; the options are added to it.
+            provenance: versions and skipped pairs, values of JSON's types; the options are added.
 
         Raises:
             ValueError: if no pair was added, or a part is no longer readable.
@@ -130,9 +202,9 @@ class StoreWriter:
         shutil.rmtree(self.folder)
 
     def close(self) -> None:
-        """Remove the folder of the parts if there is none in it, so that a run that failed early leaves nothing."""
+        """Remove the folder of the parts if it holds no part, so that a run that failed early leaves no files."""
         if not any(self._parts()):
-            with suppress(OSError):  # it is gone, or holds what others put there
+            with suppress(OSError):  # the folder is gone, or holds files of others
                 (self.folder / OPTIONS).unlink(missing_ok=True)
                 self.folder.rmdir()
 
@@ -153,11 +225,11 @@ def _read_options(path: Path) -> Any:
 
 def _refuse(path: Path, had: Any, options: dict[str, Any]) -> None:
     if not isinstance(had, dict):
-        raise ValueError(f"{path} is there, but not made by this command: remove it or write elsewhere")
+        raise ValueError(f"{path} exists, but was not made by this command: remove it or write elsewhere")
     other = [key for key in {**had, **options} if had.get(key) != options.get(key)]
     differ = ", ".join(f"{key} was {had.get(key)!r} and is {options.get(key)!r}" for key in other if key != DIGEST)
     if differ:
         raise ValueError(f"{path} was made with other options, remove it or write elsewhere: {differ}")
     if other:
-        changed = "the images, their cameras or poses, or the pairs have changed since"
+        changed = "the images, their cameras, their poses or the pairs have changed since"
         raise ValueError(f"{path} was made from other data, remove it or write elsewhere: {changed}")

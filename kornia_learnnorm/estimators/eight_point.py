@@ -2,60 +2,68 @@ r"""Estimators: modules from correspondences to a fundamental matrix."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple, NoReturn
 
 import torch
-from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.estimators.fundamental import check_rank2, find_fundamental
+from kornia_learnnorm.estimators.fundamental import solve_fundamental
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
 from kornia_learnnorm.geometry.checks import (
     check_correspondences,
     check_mask,
+    check_rank2,
+    check_tensor,
     is_true,
     solve_dtype,
 )
-from kornia_learnnorm.geometry.linear import design_matrix, has_null_vector
-from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
 from kornia_learnnorm.normalizers.closed_form import Hartley
+from kornia_learnnorm.normalizers.contract import Normalizer
 
 __all__ = ["EightPoint", "TwoViewEstimate"]
 
+MIN_RANK2_RATIO = 1e-10  # second over first singular value of a matrix of rank 2
+
 
 class TwoViewEstimate(NamedTuple):
-    r"""What correspondences say of two views.
+    r"""Fundamental matrices of a batch of image pairs, and how well the correspondences determine them.
 
     Attributes:
         F_mat: fundamental matrices of rank 2 and unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, (B, 3, 3).
         E_mat: :math:`K_2^\top F K_1` with unit Frobenius norm, (B, 3, 3), or None without cameras. Its singular values
             are :math:`(\sigma_1, \sigma_2, 0)`, not projected to equal ones.
-        determined: whether the correspondences determine the matrix, (B,) bool. Where they do not (fewer than eight
-            of positive weight, coincident, collinear, coplanar), it is the base normaliser's and carries no gradient.
+        determined: whether the correspondences determine the matrix, ``gap > 1e-6``, (B,) bool. Where they do not
+            (fewer than eight of positive weight, coincident, collinear, coplanar), it is the base normaliser's and
+            carries no gradient. It is a rank test: a plane with 0.01 px of noise passes.
+        gap: relative gap of the design matrix, from 0 to 1, that ``determined`` is decided on, (B,); see
+            :func:`~kornia_learnnorm.geometry.linear.solve_null_vector`. Errors grow as its inverse.
     """
 
     F_mat: Tensor
     E_mat: Tensor | None
     determined: Tensor
+    gap: Tensor
 
 
 class EightPoint(nn.Module):
-    r"""The normalised eight-point algorithm as a layer that other networks can trust.
+    r"""The normalised eight-point algorithm as an nn.Module with finite outputs and gradients for every finite input.
 
-    For finite input, the output and all its derivatives are finite. A correspondence that is masked, or of weight zero,
-    counts as absent. A sample that does not determine its matrix, by
-    :func:`~kornia_learnnorm.geometry.linear.has_null_vector` in Hartley's coordinates, is solved with the base
-    normaliser (``normalizer.base`` where there is one, else Hartley's) and sends no gradient, neither to the points nor
-    to the normaliser.
+    A correspondence that is masked, or of weight zero, counts as absent. A sample that does not determine its matrix is
+    solved with the base normaliser (``normalizer.base`` where there is one, else Hartley's) and sends no gradient,
+    neither to the points nor to the normaliser.
+
+    Do not use it on matches with outliers: it is least squares. :class:`~kornia_learnnorm.RANSAC` rejects them.
 
     Args:
         normalizer: a module or callable ``(points1, points2, weights) -> (T1, T2)``; Hartley's when not given.
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
 
     Raises:
-        ValueError: if ``rank2`` is neither ``None`` nor ``"optimal"``.
+        ValueError: if ``rank2`` is neither ``"projection"`` nor ``"optimal"``.
         TypeError: if it is compiled by ``torch.jit``; ``torch.compile`` and ``torch.export`` take it.
 
     Example:
@@ -69,47 +77,58 @@ class EightPoint(nn.Module):
     """
 
     def __init__(
-        self,
-        normalizer: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]] | None = None,
-        rank2: Literal["optimal"] | None = None,
+        self, normalizer: Normalizer | None = None, rank2: Literal["projection", "optimal"] = "projection"
     ) -> None:
         super().__init__()
         check_rank2(rank2)
         self.normalizer = Hartley() if normalizer is None else normalizer
-        self.rank2: Literal["optimal"] | None = rank2
+        self.rank2: Literal["projection", "optimal"] = rank2
+
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        return f"rank2={self.rank2!r}"
 
     def forward(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
     ) -> Tensor:
-        r"""Return fundamental matrices :math:`(B, 3, 3)`; see :meth:`estimate`.
+        r"""Return the fundamental matrices.
 
         Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`.
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64.
             points2: pixels in the second view with shape :math:`(B, N, 2)`.
             weights: optional non-negative weights with shape :math:`(B, N)`.
             mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`.
 
+        Returns:
+            matrices with shape :math:`(B, 3, 3)`, see :meth:`estimate`.
+
+        Raises:
+            TypeError: as :meth:`estimate`.
+            ShapeError: as :meth:`estimate`.
+            ValueError: as :meth:`estimate`.
+
         """
-        return self.estimate(points1, points2, weights, mask).F_mat
+        return self.estimate(points1, points2, weights=weights, mask=mask).F_mat
 
     def estimate(
         self,
         points1: Tensor,
         points2: Tensor,
+        *,
         weights: Tensor | None = None,
         mask: Tensor | None = None,
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> TwoViewEstimate:
-        r"""Solve for the fundamental matrices and tell which samples determine theirs.
+        r"""Return the fundamental matrices, which samples determine theirs, and essential matrices where asked for.
 
         Args:
             points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64;
                 calibrated coordinates are as good, and give essential matrices.
             points2: pixels in the second view with shape :math:`(B, N, 2)`.
             weights: optional non-negative weights with shape :math:`(B, N)`, of any floating-point dtype.
-            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`; the others
-                may hold anything, NaN too, and get a gradient of zero.
+            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows
+                may hold any value, NaN too, and get a gradient of zero; without a mask NaN is an error.
             K1: optional cameras of the first view with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
             K2: optional cameras of the second view; both or none.
 
@@ -127,21 +146,22 @@ class EightPoint(nn.Module):
         if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
             self.__prepare_scriptable__()
         if (K1 is None) != (K2 is None):
-            raise ValueError("cameras are needed of both views or of none")
+            raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
         if mask is not None:
             check_mask(mask, points1, points2, weights)
             points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
             weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
         check_correspondences(points1, points2, weights)
         _check_cameras(K1, K2, len(points1))
-        weights = None if weights is None else _moderate(weights.to(solve_dtype(points1.device)))
-        with torch.no_grad():
-            determined = _determined(points1, points2, weights)
-        F_mat = self._solve(points1, points2, weights, determined)
+        problem = LinearProblem.from_points(
+            points1, points2, None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
+        )
+        determined, gap = problem.determined, problem.gap
+        F_mat = self._solve(problem, determined).to(points1.dtype)
         if K1 is None or K2 is None:
-            return TwoViewEstimate(F_mat, None, determined)
-        E_mat = transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat))
-        return TwoViewEstimate(F_mat, E_mat / torch.linalg.matrix_norm(E_mat, keepdim=True), determined)
+            return TwoViewEstimate(F_mat, None, determined, gap)
+        E_mat = unit_fundamental(transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat)))
+        return TwoViewEstimate(F_mat, E_mat, determined, gap)
 
     def from_matches(
         self,
@@ -152,7 +172,7 @@ class EightPoint(nn.Module):
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> TwoViewEstimate:
-        r"""Solve for the matches of a matching network; scores are weights, and get gradients.
+        r"""Return the estimate of the matches of a matching network; scores are weights, and get gradients.
 
         Args:
             keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`.
@@ -165,31 +185,48 @@ class EightPoint(nn.Module):
         Returns:
             the matrices; pairs with fewer than eight matches are not determined.
 
-        """
-        return self.estimate(*correspondences_from_matches(keypoints1, keypoints2, matches, scores), K1, K2)
+        Raises:
+            TypeError: if keypoints, matches or scores are not tensors of the right kind.
+            ShapeError: if the keypoints do not have the shape above.
+            ValueError: if the matches do not fit the keypoints, or as :meth:`estimate`.
 
-    def _solve(self, points1: Tensor, points2: Tensor, weights: Tensor | None, determined: Tensor) -> Tensor:
+        """
+        points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
+        return self.estimate(points1, points2, weights=weights, mask=mask, K1=K1, K2=K2)
+
+    def _solve(self, problem: LinearProblem, determined: Tensor) -> Tensor:
+        """Return the matrices: of the normaliser where determined, elsewhere of its base and without gradient."""
         if is_true(determined.all()):
-            return find_fundamental(points1, points2, weights, self.normalizer, self.rank2)
-        with torch.no_grad():
-            base = getattr(self.normalizer, "base", None) or Hartley()
-            fallback = find_fundamental(points1, points2, weights, base, self.rank2)
-            values = torch.linalg.svdvals(fallback)
-            # Of one point or none, all lines are one: there are rows instead.
-            fallback = torch.where((values[:, 1] > 1e-10 * values[:, 0])[:, None, None], fallback, _rows(fallback))
-        # No derivative meets an undetermined sample: a generic one stands in for it, and its result is dropped.
-        rows = determined[:, None]
-        stand_in = _generic_points(points1)
-        points1, points2 = (
-            torch.where(rows[..., None], points, generic)
-            for points, generic in zip((points1, points2), stand_in, strict=True)
-        )
-        weights = None if weights is None else torch.where(rows, weights, 1.0)
-        F_mat = find_fundamental(points1, points2, weights, self.normalizer, self.rank2)
-        return torch.where(rows[..., None], F_mat, fallback)
+            return solve_fundamental(problem, self.normalizer, self.rank2)
+        if not _is_concrete(determined):
+            return self._solve_traced(problem, determined)
+        found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
+        F_mat = problem.x1.new_empty(len(determined), 3, 3)
+        F_mat = F_mat.index_copy(0, rest, self._solve_undetermined(problem.select(rest)))
+        return F_mat.index_copy(0, found, solve_fundamental(problem.select(found), self.normalizer, self.rank2))
+
+    def _solve_traced(self, problem: LinearProblem, determined: Tensor) -> Tensor:
+        """Return the matrices of :meth:`_solve` without data-dependent shapes, as ``torch.compile`` and ``vmap`` need.
+
+        No derivative meets an undetermined sample: generic points take its place, and their result is dropped.
+        """
+        rows, points = determined[:, None], (problem.points1, problem.points2)
+        generic = _generic_points(problem.points1)
+        points1, points2 = (torch.where(rows[..., None], p, g) for p, g in zip(points, generic, strict=True))
+        weights = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
+        replaced = LinearProblem.from_points(points1, points2, weights)
+        F_mat = solve_fundamental(replaced, self.normalizer, self.rank2)
+        return torch.where(rows[..., None], F_mat, self._solve_undetermined(problem))
+
+    @torch.no_grad()
+    def _solve_undetermined(self, problem: LinearProblem) -> Tensor:
+        F_mat = solve_fundamental(problem, getattr(self.normalizer, "base", None) or Hartley(), self.rank2)
+        # With at most one point F has rank 1; use the F of a sideways motion.
+        values = torch.linalg.svdvals(F_mat)
+        return torch.where((values[:, 1] > MIN_RANK2_RATIO * values[:, 0])[:, None, None], F_mat, _sideways(F_mat))
 
     def __prepare_scriptable__(self) -> NoReturn:
-        """Refuse ``torch.jit``.
+        """Raise an error: ``torch.jit`` is not supported.
 
         Raises:
             TypeError: always.
@@ -198,33 +235,34 @@ class EightPoint(nn.Module):
         raise TypeError("EightPoint cannot be compiled by torch.jit, use torch.compile or torch.export")
 
 
-def _determined(points1: Tensor, points2: Tensor, weights: Tensor | None) -> Tensor:
-    dtype = solve_dtype(points1.device)
-    x1, x2, w = points1.to(dtype), points2.to(dtype), None if weights is None else weights.to(dtype)
-    T1, T2 = Hartley()(x1, x2, w)
-    x1, x2 = convert_points_to_homogeneous(x1) @ T1.mT, convert_points_to_homogeneous(x2) @ T2.mT
-    return has_null_vector(design_matrix(x1, x2), w)
+def _is_concrete(mask: Tensor) -> bool:
+    """Return whether values can be read, which they cannot in ``torch.compile`` and ``torch.func.vmap``."""
+    if torch.compiler.is_compiling():
+        return False
+    try:
+        bool(mask.any())
+    except RuntimeError:
+        return False
+    return True
 
 
-def _moderate(weights: Tensor) -> Tensor:
-    """Scale weights whose largest would over- or underflow; only their ratios count. All below 1e-30 are zero."""
+def _rescale(weights: Tensor) -> Tensor:
+    """Return weights scaled where the largest would over- or underflow; sets with none above 1e-30 get zeros."""
     top = weights.detach().amax(-1, keepdim=True)
     weights = torch.where(top < 1e-30, 0.0, weights)
     return weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)
 
 
-def _rows(like: Tensor) -> Tensor:
-    """The fundamental matrix whose epipolar lines are the rows of the image."""
-    return normalize(like.new_tensor([0.0, 0, 0, 0, 0, -1, 0, 1, 0]), dim=-1).view(3, 3)
+def _sideways(like: Tensor) -> Tensor:
+    """Return the fundamental matrix of a sideways motion, whose epipolar lines are the rows of the image."""
+    return normalize(like.new_tensor([0.0, 0, 0, 0, 0, 1, 0, -1, 0]), dim=-1).view(3, 3)
 
 
 def _check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int) -> None:
     for name, K in (("K1", K1), ("K2", K2)):
         if K is None:
             continue
-        if not isinstance(K, Tensor) or not K.is_floating_point():
-            got = K.dtype if isinstance(K, Tensor) else type(K)
-            raise TypeError(f"{name} must be a floating-point tensor, got {got}")
+        check_tensor(name, K)
         if K.shape not in ((3, 3), (batch_size, 3, 3)):
             raise ValueError(f"{name} must have shape [3, 3] or [{batch_size}, 3, 3], got {[*K.shape]}")
         if is_true(~(K.isfinite().all() & (torch.linalg.det(K.detach().to(solve_dtype(K.device))) != 0).all())):
@@ -232,7 +270,7 @@ def _check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int) -> Non
 
 
 def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:
-    """Correspondences of the shape (B, N, 2) that determine a matrix: multiples of irrational numbers, modulo one."""
+    """Return correspondences (B, N, 2) that determine a matrix: multiples of irrational numbers, modulo one."""
     index = torch.arange(1, like.shape[1] + 1, dtype=like.dtype, device=like.device)[:, None]
     roots = torch.tensor([2.0, 3.0, 5.0, 7.0], dtype=like.dtype, device=like.device).sqrt()
     points = (index * roots).frac().expand(len(like), -1, -1)

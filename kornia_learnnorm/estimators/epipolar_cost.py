@@ -7,36 +7,37 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.robust_losses import Factor, Loss
+from kornia_learnnorm.estimators.robust_losses import Loss
+from kornia_learnnorm.geometry.distances import DistanceScale
 
 __all__ = ["EpipolarCost"]
 
 
 class EpipolarCost(NamedTuple):
-    """Sums of losses over one set of correspondences for each matrix, or over one set for all of them.
+    """Sum of losses over the correspondences of each matrix, or over one set that all matrices share.
 
     Attributes:
         x1: homogeneous points of view 1, the first two coordinates in pixels, (B or 1, 3, N).
-        x2: the same of view 2.
+        x2: homogeneous points of view 2, (B or 1, 3, N).
         weights: weights of the losses, (B or 1, N).
-        factor: from algebraic residuals to distances, see :mod:`kornia_learnnorm.estimators.robust_losses`.
+        scale: from algebraic residuals to distances, see :mod:`kornia_learnnorm.geometry.distances`.
         loss: robust loss of squared distances.
     """
 
     x1: Tensor
     x2: Tensor
     weights: Tensor
-    factor: Factor
+    scale: DistanceScale
     loss: Loss
 
     def select(self, rows: Tensor) -> EpipolarCost:
         """Return the cost of some of the matrices."""
         if len(self.x1) == 1:
             return self
-        return EpipolarCost(self.x1[rows], self.x2[rows], self.weights[rows], self.factor, self.loss)
+        return EpipolarCost(self.x1[rows], self.x2[rows], self.weights[rows], self.scale, self.loss)
 
     def rounding(self) -> Tensor:
-        """Return what the weighted sum of squared distances may be without a distance but zero, (B or 1,)."""
+        """Return the weighted sum of squares that rounding alone can cause, (B or 1,)."""
         distance = 4 * torch.finfo(self.x1.dtype).eps * (self.x1[:, 2, 0] + self.x2[:, 2, 0])
         return distance.square() * self.weights.sum(-1)
 
@@ -46,11 +47,11 @@ class EpipolarCost(NamedTuple):
 
     def linearise(self, F: Tensor) -> Tensor:
         """Return derivatives by the entries, column-major, and in the last row the distances themselves, (B, 10, N)."""
-        distance, factor, pull1, pull2 = self._expand(F)
+        distance, scale, pull1, pull2 = self._expand(F)
         J = F.new_empty(len(F), 10, distance.shape[-1])
         J[:, 9] = distance
-        # A change dF changes the distance by (factor x2 + pull2)^T dF x1 + x2^T dF pull1.
-        left = factor[:, None] * self.x2
+        # A change dF changes the distance by (scale x2 + pull2)^T dF x1 + x2^T dF pull1.
+        left = scale[:, None] * self.x2
         left[:, :2] += pull2
         entries = torch.unflatten(J[:, :9], 1, (3, 3))
         torch.mul(self.x1[:, :, None], left[:, None], out=entries)
@@ -58,12 +59,12 @@ class EpipolarCost(NamedTuple):
         return J
 
     def _expand(self, F: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Distances and their factors, (B, N), and their derivatives by the lines' normals of both views, (B, 2, N)."""
+        """Return distances and scales, (B, N), and derivatives by the lines' normals of both views, (B, 2, N)."""
         line1, line2 = F.mT[:, :2] @ self.x2, F @ self.x1
         algebraic = (self.x2 * line2).sum(1)
         line2 = line2[:, :2]
         floor = torch.finfo(F.dtype).eps ** 2  # below it the direction of a line is rounding
-        normal1, normal2 = (line.square().sum(1).clamp(min=floor) for line in (line1, line2))
-        factor, slope1, slope2 = self.factor(normal1, normal2)
+        sq_norm1, sq_norm2 = (line.square().sum(1).clamp(min=floor) for line in (line1, line2))
+        scale, slope1, slope2 = self.scale(sq_norm1, sq_norm2)
         twice = 2 * algebraic
-        return algebraic * factor, factor, (twice * slope1)[:, None] * line1, (twice * slope2)[:, None] * line2
+        return algebraic * scale, scale, (twice * slope1)[:, None] * line1, (twice * slope2)[:, None] * line2

@@ -35,14 +35,14 @@ def correspondences_from_matches(
     matches: Tensor | Sequence[Tensor],
     scores: Tensor | Sequence[Tensor] | None = None,
 ) -> Correspondences:
-    r"""Gather the matched keypoints of a batch, padded to one length of at least eight.
+    r"""Return the matched keypoints of a batch, padded to one length of at least eight.
 
     Args:
         keypoints1: pixels in the first images with shape :math:`(B, M_1, 2)`.
         keypoints2: pixels in the second images with shape :math:`(B, M_2, 2)`.
-        matches: a list of B tensors :math:`(S_i, 2)` of index pairs, as of Kornia's LightGlue; or one tensor
-            :math:`(B, M_1)` that holds for each keypoint of view 1 the index of its match, -1 for none, as of SuperGlue
-            and Transformers (``matches[:, 0]``); other negative numbers are none too.
+        matches: a list of B tensors :math:`(S_i, 2)` of index pairs, as Kornia's LightGlue returns; or one tensor
+            :math:`(B, M_1)` with the index of the match of each keypoint of view 1, negative for no match, as
+            SuperGlue and Transformers (``matches[:, 0]``) return.
         scores: optional, non-negative: a list of B tensors :math:`(S_i,)`, or one tensor :math:`(B, M_1)`.
 
     Returns:
@@ -94,14 +94,14 @@ def correspondences_from_matches(
 
 
 def _at_least_one(keypoints: Tensor) -> Tensor:
-    """Padded rows take the first keypoint, and a view may have none."""
+    """Return the keypoints, or one at the origin for a view without any: padded rows take the first."""
     return keypoints if keypoints.shape[1] else keypoints.new_zeros(len(keypoints), 1, 2)
 
 
 def _pairs_of_matches(
     keypoints1: Tensor, matches: Tensor, scores: Tensor | Sequence[Tensor] | None
 ) -> tuple[list[Tensor], list[Tensor] | None]:
-    """Turn matches by keypoint, (B, M1), into pairs of indices."""
+    """Return matches by keypoint, (B, M1), as pairs of indices."""
     if matches.shape != keypoints1.shape[:2]:
         raise ValueError(f"matches must have shape {[*keypoints1.shape[:2]]} or be a list, got {[*matches.shape]}")
     if scores is not None and (not isinstance(scores, Tensor) or scores.shape != matches.shape):

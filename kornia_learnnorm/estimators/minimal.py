@@ -10,13 +10,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.geometry.linear import design_matrix
+from kornia_learnnorm.geometry.linear import cofactors, design_matrix
 
 __all__ = ["are_determined", "solve_samples"]
 
 
 def are_determined(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-    r"""Tell the minimal samples that determine a matrix from those that do not, as on one line or plane.
+    r"""Return a mask of the non-degenerate minimal samples, which do not lie on one line or plane.
 
     The eight constraints must be independent: each row of the design matrix is farther from the span of the rows before
     it than the least that a shift of the point moves it.
@@ -34,7 +34,7 @@ def are_determined(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
 
 
 def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-    r"""Solve minimal samples exactly and correct the matrices to rank 2 with their covariances.
+    r"""Return the matrices of minimal samples, solved exactly and corrected to rank 2 with their covariances.
 
     A QR factorisation of the transposed design matrix, :math:`A^\top = Q R`, tells which samples determine a matrix
     and gives both the null vector, which is the last column of :math:`Q`, and a factor of its covariance,
@@ -66,9 +66,9 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     L = Q[..., :8] @ torch.linalg.solve_triangular(R[..., :8, :].mT, torch.diag_embed(deviation), upper=False)
     V = L @ L.mT
     for _ in range(3):
-        cofactors = torch.linalg.cross(F.roll(-1, 1), F.roll(-2, 1)).flatten(1)
-        change = (V @ cofactors[..., None])[..., 0]
-        excess = (u * cofactors).sum(-1, keepdim=True) / (3 * (change * cofactors).sum(-1, keepdim=True))
+        gradient = cofactors(F).flatten(1)
+        change = (V @ gradient[..., None])[..., 0]
+        excess = (u * gradient).sum(-1, keepdim=True) / (3 * (change * gradient).sum(-1, keepdim=True))
         u = u - excess * change
         F = torch.unflatten(u, -1, (3, 3))
     F_mat: Tensor = F / torch.linalg.vector_norm(F, dim=(1, 2), keepdim=True)

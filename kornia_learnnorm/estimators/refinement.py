@@ -7,19 +7,18 @@ are those in pixels.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
-from kornia_learnnorm.estimators.robust_losses import Factor, Loss, sampson_factor, squared_loss
-from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
+from kornia_learnnorm.estimators.robust_losses import Loss, squared_loss
+from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, solve_dtype
+from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
 from kornia_learnnorm.geometry.manifold import Rank2, decompose, retract, tangents
-from kornia_learnnorm.geometry.rank2 import check_fundamental
-from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.normalizers.closed_form import Hartley
+from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental, unit_fundamental
 
 __all__ = ["Refinement", "minimize", "refine_fundamental"]
 
@@ -47,7 +46,7 @@ def refine_fundamental(
     points2: Tensor,
     F_mat: Tensor,
     weights: Tensor | None = None,
-    factor: Factor = sampson_factor,
+    distance: Literal["sampson", "symmetric"] | DistanceScale = "sampson",
     loss: Loss = squared_loss,
     max_iterations: int = 50,
     tolerance: float = 1e-7,
@@ -72,14 +71,11 @@ def refine_fundamental(
             Hartley's coordinates.
         weights: optional non-negative weights of the losses, :math:`(B, N)` or :math:`(1, N)` as the points; zero means
             absent.
-        factor: :math:`g`, from the algebraic residual to a distance in pixels:
-            :func:`~kornia_learnnorm.estimators.robust_losses.sampson_factor` or
-            :func:`~kornia_learnnorm.estimators.robust_losses.symmetric_factor`.
+        distance: the distance :math:`d`: ``"sampson"``, ``"symmetric"`` (Fan et al., Eq. 7), or a function that returns
+            :math:`g` and its derivatives such as :func:`~kornia_learnnorm.sampson_scale`.
         loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.estimators.robust_losses.squared_loss`,
-            :class:`~kornia_learnnorm.estimators.robust_losses.Huber`,
-            :class:`~kornia_learnnorm.estimators.robust_losses.Cauchy`,
-            :class:`~kornia_learnnorm.estimators.robust_losses.GemanMcClure` or
-            :class:`~kornia_learnnorm.estimators.robust_losses.Truncated`.
+            :class:`~kornia_learnnorm.Huber`, :class:`~kornia_learnnorm.Cauchy`,
+            :class:`~kornia_learnnorm.GemanMcClure` or :class:`~kornia_learnnorm.Truncated`.
         max_iterations: largest number of steps tried.
         tolerance: largest cosine between the distances and their derivatives at which a matrix has converged. 1e-3
             saves half of the steps and more, and leaves the cost within about 0.2 % of the optimum: enough for an
@@ -93,7 +89,7 @@ def refine_fundamental(
             called or ``max_iterations`` is not a whole number.
         ShapeError: if a shape is wrong.
         ValueError: if there are fewer than eight correspondences, shapes do not pair up, a value is not finite, a
-            matrix is zero, or ``max_iterations`` or ``tolerance`` is negative.
+            matrix is zero, there is no distance of that name, or ``max_iterations`` or ``tolerance`` is negative.
 
     Reference:
         A. Bartoli, P. Sturm, Nonlinear estimation of the fundamental matrix with minimal parameters, TPAMI 2004; R.
@@ -122,17 +118,16 @@ def refine_fundamental(
     w = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)
     with torch.no_grad():
         # The optimum does not depend on the coordinates in which it is sought.
-        T1, T2 = (T / T[:, :1, :1] for T in Hartley()(x1, x2, w))
+        T1, T2 = (T / T[:, :1, :1] for T in (hartley_transform(x1, w), hartley_transform(x2, w)))
         F = transform_fundamental(F_mat.to(dtype), torch.linalg.inv_ex(T1)[0], torch.linalg.inv_ex(T2)[0])
     x1, x2 = T1 @ convert_points_to_homogeneous(x1).mT, T2 @ convert_points_to_homogeneous(x2).mT
-    objective = EpipolarCost(x1, x2, w, factor, loss)
+    objective = EpipolarCost(x1, x2, w, find_scale(distance), loss)
     with torch.no_grad():
         before, best = minimize(objective, decompose(F), max_iterations, tolerance)
     state = best.state
     if torch.is_grad_enabled() and (x1.requires_grad or x2.requires_grad or w.requires_grad):
         state = _attach_gradient(objective, state, best.converged)
-    F = transform_fundamental(state.matrix(), T1, T2)
-    F = F / torch.linalg.matrix_norm(F, keepdim=True)
+    F = unit_fundamental(transform_fundamental(state.matrix(), T1, T2))
     dtype = points1.dtype
     return Refinement(F.to(dtype), before.to(dtype), best.cost.to(dtype), best.iterations, best.converged)
 

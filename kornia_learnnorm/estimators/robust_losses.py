@@ -1,9 +1,7 @@
-r"""What a refinement minimises: the distance that is squared, and the robust loss of its squares.
+r"""Robust losses of squared distances.
 
-A distance of a correspondence to its epipolar lines is the algebraic residual :math:`x_2^\top F x_1` times a factor of
-the squared norms :math:`n_1 = \|(F^\top x_2)_{1:2}\|^2` and :math:`n_2 = \|(F x_1)_{1:2}\|^2` of the lines' normals. A
-factor returns its value and its derivatives by both; a loss returns its value and its derivative by the squared
-distance, which is the weight of iteratively reweighted least squares.
+A loss returns its value and its derivative by the squared distance, which is the weight of iteratively reweighted least
+squares.
 """
 
 from __future__ import annotations
@@ -15,62 +13,9 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-__all__ = [
-    "Cauchy",
-    "GemanMcClure",
-    "Huber",
-    "Truncated",
-    "factor_alone",
-    "sampson_factor",
-    "squared_loss",
-    "symmetric_factor",
-]
+__all__ = ["Cauchy", "GemanMcClure", "Huber", "Truncated", "squared_loss"]
 
-Factor = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
-
-
-def sampson_factor(normal1: Tensor, normal2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Return the factor of the Sampson distance, :math:`(n_1 + n_2)^{-1/2}`.
-
-    Args:
-        normal1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
-        normal2: the same in view 2.
-
-    Returns:
-        the factor and its derivatives by ``normal1`` and by ``normal2``, each with shape :math:`(*, N)`.
-
-    Reference:
-        R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, section 11.4.3.
-
-    Example:
-        >>> sampson_factor(torch.tensor(2.0), torch.tensor(2.0))
-        (tensor(0.5000), tensor(-0.0625), tensor(-0.0625))
-
-    """
-    total = normal1 + normal2
-    factor = total.rsqrt()
-    slope = factor / (-2 * total)
-    return factor, slope, slope
-
-
-def symmetric_factor(normal1: Tensor, normal2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Return the factor of the symmetric epipolar distance (Fan et al., Eq. 7), :math:`n_1^{-1/2} + n_2^{-1/2}`.
-
-    Args:
-        normal1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
-        normal2: the same in view 2.
-
-    Returns:
-        the factor and its derivatives by ``normal1`` and by ``normal2``, each with shape :math:`(*, N)`.
-
-    Example:
-        >>> symmetric_factor(torch.tensor(4.0), torch.tensor(4.0))
-        (tensor(1.), tensor(-0.0625), tensor(-0.0625))
-
-    """
-    first, second = normal1.rsqrt(), normal2.rsqrt()
-    return first + second, -first / (2 * normal1), -second / (2 * normal2)
 
 
 def squared_loss(squares: Tensor) -> tuple[Tensor, Tensor]:
@@ -82,22 +27,6 @@ def squared_loss(squares: Tensor) -> tuple[Tensor, Tensor]:
 
     """
     return squares, torch.ones_like(squares)
-
-
-def factor_alone(factor: Factor, normal1: Tensor, normal2: Tensor) -> Tensor:
-    """Return the factor without its derivatives, which cost more than the factor itself.
-
-    Args:
-        factor: from algebraic residuals to distances.
-        normal1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
-        normal2: the same in view 2.
-
-    Example:
-        >>> factor_alone(sampson_factor, torch.tensor(2.0), torch.tensor(2.0))
-        tensor(0.5000)
-
-    """
-    return (normal1 + normal2).rsqrt() if factor is sampson_factor else factor(normal1, normal2)[0]
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,22 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.estimators.fundamental import Normalizer, normalizing_transforms
-from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
+from kornia_learnnorm.geometry.checks import check_correspondences
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.linear import design_matrix, null_vector, rank2_projection
+from kornia_learnnorm.geometry.linear import design_matrix
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.rank2 import rank2_projection
 from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
 
-__all__ = ["Diagnostics", "condition_number", "diagnose", "normalized_distance", "singularity_ratio"]
+__all__ = [
+    "Diagnostics",
+    "condition_number",
+    "diagnose",
+    "diagnose_in_coordinates",
+    "normalized_distance",
+    "singularity_ratio",
+]
 
 
 class Diagnostics(NamedTuple):
@@ -65,13 +74,16 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
         tensor([1.4142, 1.4142], dtype=torch.float64)
 
     """
-    check_correspondences(points1, points2, None)
-    dtype = solve_dtype(points1.device)
-    points1, points2 = points1.to(dtype), points2.to(dtype)
-    T1, T2 = (T.to(dtype) for T in normalizing_transforms(normalizer, points1, points2, None))
+    check_correspondences(points1, points2)
+    problem = LinearProblem.from_points(points1, points2)
+    return diagnose_in_coordinates(problem, *normalizing_transforms(normalizer, problem))
+
+
+def diagnose_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> Diagnostics:
+    """Return the diagnostics of a problem under known transforms (B, 3, 3); see :func:`diagnose`."""
+    points1, points2 = problem.points1, problem.points2
     x1, x2 = convert_points_to_homogeneous(points1) @ T1.mT, convert_points_to_homogeneous(points2) @ T2.mT
-    A = design_matrix(x1, x2)
-    F_hat = torch.unflatten(null_vector(A), -1, (3, 3))
+    A, F_hat = design_matrix(x1, x2), problem.null_matrix_in(T1, T2)
     before = _distance(points1, points2, transform_fundamental(F_hat, T1, T2))
     after = _distance(points1, points2, transform_fundamental(rank2_projection(F_hat), T1, T2))
     return Diagnostics(

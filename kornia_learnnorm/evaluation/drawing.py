@@ -1,7 +1,9 @@
-"""Pictures of an estimate, drawn with Matplotlib, which comes with the ``report`` extra and is imported when needed."""
+"""Pictures of an estimate, drawn with Matplotlib (extra ``report``), which is imported only when needed."""
 
 from __future__ import annotations
 
+import importlib
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,69 +13,75 @@ import torch
 
 from kornia_learnnorm.evaluation.pair import PairEstimate
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.optional import import_extra
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
-__all__ = ["clip_lines", "draw_pair", "import_matplotlib"]
+__all__ = ["INLIER", "OUTLIER", "WIDE", "draw_line", "draw_matches", "draw_pair", "import_matplotlib"]
 
-BACKGROUND, TEXT = "#11161d", "#e8edf2"  # a dark card: the same on a light and on a dark page
-INLIER, OUTLIER = "#45a1ff", "#ff5c5c"
-WIDTH, DPI = 8.0, 150  # inches and pixels per inch: 1,200 pixels wide
-CAPTION, GAP = 0.26, 0.08  # inches
+BACKGROUND = "#11161d"  # dark, to fit light and dark pages
+TEXT = "#e8edf2"
+INLIER = "#45a1ff"
+OUTLIER = "#ff5c5c"
+WIDTH = 8.0  # inches
+DPI = 150  # pixels per inch: pictures are 1,200 pixels wide
+CAPTION = 0.26  # inches, height
+GAP = 0.08  # inches, between images
+WIDE = 1.8  # width over height from which two images are stacked
 
 
 def import_matplotlib() -> Any:
-    """Return the package ``matplotlib`` with what the pictures here use.
+    """Return the package ``matplotlib`` with its modules ``collections``, ``colors`` and ``figure``.
 
     Raises:
-        ImportError: if Matplotlib is not installed; the message names the extra that brings it.
+        ImportError: if Matplotlib is not installed; the message names the extra that installs it.
 
     """
-    try:
-        import matplotlib
-        import matplotlib.collections
-        import matplotlib.colors
-        import matplotlib.figure
-    except ImportError as error:
-        raise ImportError("drawing pictures needs Matplotlib: pip install 'kornia-learnnorm[report]'") from error
+    matplotlib = import_extra("matplotlib", "report", "drawing pictures")
+    for name in ("collections", "colors", "figure"):
+        importlib.import_module(f"matplotlib.{name}")
     return matplotlib
 
 
-def clip_lines(
-    lines: npt.NDArray[np.float64], width: float, height: float
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    r"""Clip lines :math:`a x + b y + c = 0` to an image whose pixel centres have integer coordinates.
+def draw_line(axes: Axes, line: npt.NDArray[np.float64], **style: Any) -> Line2D | None:
+    r"""Draw the line :math:`a x + b y + c = 0` across axes.
 
     Args:
-        lines: :math:`(a, b, c)` with shape :math:`(N, 3)`, any scale.
-        width: width of the image, pixels.
-        height: height of the image, pixels.
+        axes: Matplotlib axes.
+        line: :math:`(a, b, c)`, any scale.
+        style: options of :meth:`matplotlib.axes.Axes.axline`.
 
     Returns:
-        the end points with shape :math:`(N, 2, 2)`, pixels, NaN where a line misses the image; and which lines meet it,
-        with shape :math:`(N,)`.
-
-    Example:
-        >>> segments, meets = clip_lines(np.array([[0.0, 1.0, -5.0], [0.0, 1.0, 5.0]]), 20, 10)
-        >>> segments[0].tolist(), meets.tolist()
-        ([[-0.5, 5.0], [19.5, 5.0]], [True, False])
+        the line; None for the line at infinity, :math:`a = b = 0`, which is not drawn.
 
     """
-    lower, upper = np.full(2, -0.5), np.array([width, height]) - 0.5
-    with np.errstate(divide="ignore", invalid="ignore"):
-        lines = lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-        direction = np.stack([lines[:, 1], -lines[:, 0]], 1)
-        foot = -lines[:, :2] * lines[:, 2:]
-        steps = np.sort(np.stack([lower - foot, upper - foot]) / direction, axis=0)
-        # A line along an axis is inside all of that axis' slab or outside of it.
-        inside = (foot >= lower) & (foot <= upper)
-        enter = np.where(direction == 0, np.where(inside, -np.inf, np.inf), steps[0]).max(1)
-        leave = np.where(direction == 0, np.inf, steps[1]).min(1)
-        meets = enter < leave
-        segments = foot[:, None] + np.stack([enter, leave], 1)[..., None] * direction[:, None]
-    return np.where(meets[:, None, None], segments, np.nan), meets
+    norm = np.linalg.norm(line[:2])
+    if not norm > 0:
+        return None
+    a, b, c = (line / norm).tolist()
+    return axes.axline((-a * c, -b * c), slope=-a / b if b else math.inf, **style)
+
+
+def draw_matches(
+    axes: Axes, points1: npt.NDArray[np.float64], points2: npt.NDArray[np.float64], inliers: npt.NDArray[np.bool_]
+) -> None:
+    """Draw the matches in image 1: inliers as dots with their motion to image 2, outliers as crosses.
+
+    Args:
+        axes: Matplotlib axes.
+        points1: pixels in image 1 with shape (N, 2).
+        points2: pixels in image 2 with shape (N, 2).
+        inliers: mask of the inliers with shape (N,).
+
+    """
+    motion = np.stack([points1, points2], 1)[inliers]
+    lines = import_matplotlib().collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8)
+    axes.add_collection(lines)
+    axes.plot(*points1[inliers].T, "o", color=INLIER, markersize=2, label="inliers and their motion")
+    axes.plot(*points1[~inliers].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8, label="outliers")
 
 
 def draw_pair(
@@ -86,22 +94,22 @@ def draw_pair(
 ) -> None:
     """Draw the matches in image 1 and epipolar lines in image 2, and write the picture whole or not at all.
 
-    Image 1 carries the inliers in blue, each with its motion to image 2, and the outliers in red; image 2 the epipolar
-    lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10). Wide images are
-    stacked, others stand side by side.
+    Image 1 shows the inliers in blue, each with its motion to image 2, and the outliers in red. Image 2 shows the
+    epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10). Wide
+    images are stacked, other images stand side by side.
 
     Args:
         image1: grey values with shape :math:`(H_1, W_1)`, uint8.
         image2: grey values with shape :math:`(H_2, W_2)`, uint8.
         estimate: the estimate of these images.
         path: the picture to write; its suffix decides the format.
-        num_lines: at most so many epipolar lines.
+        num_lines: number of epipolar lines; fewer if there are fewer inliers.
         seed: seed of the random subset.
 
     Raises:
         OSError: if the folder of ``path`` does not exist or is not writable.
-        ValueError: if the images do not have the sizes in ``estimate``, ``num_lines`` is negative, or Matplotlib does
-            not know the format.
+        ValueError: if the images do not have the sizes in ``estimate``, ``num_lines`` is negative, or the suffix is not
+            a format of Matplotlib.
         ImportError: if Matplotlib is not installed.
 
     """
@@ -111,16 +119,16 @@ def draw_pair(
     if num_lines < 0:
         raise ValueError(f"num_lines must not be negative, got {num_lines}")
     figure, (axes1, axes2) = _panels(image1, image2)
-    _draw_matches(axes1, estimate)
+    _draw_counts(axes1, estimate)
     _draw_lines(axes2, estimate, num_lines, seed)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor=figure.get_facecolor())
 
 
 def _panels(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8]) -> tuple[Figure, list[Axes]]:
-    """Return a figure of the right height and one axes for each image, the images in it."""
+    """Return a figure that shows each image in its own axes, stacked if both images are wide."""
     aspects = [image.shape[1] / image.shape[0] for image in (image1, image2)]
-    stacked = min(aspects) > 1.8
+    stacked = min(aspects) > WIDE
     if stacked:
         heights = [(WIDTH - 2 * GAP) / aspect for aspect in aspects]
         boxes = [(GAP, heights[1] + CAPTION + GAP), (GAP, GAP)]
@@ -140,43 +148,37 @@ def _panels(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8]) -> tup
     return figure, axes
 
 
-def _draw_matches(axes: Axes, estimate: PairEstimate) -> None:
-    """Draw inliers as dots with their motion, outliers as crosses, and the counts above."""
-    collections = import_matplotlib().collections
-    start, end = estimate.points1.numpy(), estimate.points2.numpy()
-    inliers = estimate.inliers.numpy()
-    motion = np.stack([start, end], 1)[inliers]
-    axes.add_collection(collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8))
-    axes.plot(*start[~inliers].T, "x", color=OUTLIER, markersize=3, markeredgewidth=0.8)
-    axes.plot(*start[inliers].T, "o", color=INLIER, markersize=1.8)
+def _draw_counts(axes: Axes, estimate: PairEstimate) -> None:
+    """Draw the matches; write the counts of inliers and outliers above."""
+    draw_matches(axes, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
     outliers = estimate.num_matches - estimate.num_inliers
     motion_text = f"{estimate.num_inliers} inliers and their motion"
     _caption(axes, [("image 1", TEXT), (motion_text, INLIER), (f"{outliers} outliers", OUTLIER)])
 
 
 def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -> None:
-    """Draw the epipolar lines of some inliers, each with its point, and the error above."""
-    colors, collections = import_matplotlib().colors, import_matplotlib().collections
+    """Draw the epipolar lines of some inliers, each with its point; write the error above."""
+    hsv_to_rgb = import_matplotlib().colors.hsv_to_rgb
     chosen = _subset(estimate, num_lines, seed)
     points1, points2 = estimate.points1[chosen].numpy(), estimate.points2[chosen].numpy()
     lines = np.pad(points1, ((0, 0), (0, 1)), constant_values=1.0) @ estimate.F_mat.numpy().T
-    segments, meets = clip_lines(lines, *estimate.size2)
     hues = np.linspace(0, 1, len(chosen), endpoint=False)
-    rgb = colors.hsv_to_rgb(np.stack([hues, np.full_like(hues, 0.6), np.ones_like(hues)], 1))
-    axes.add_collection(collections.LineCollection(segments[meets], colors=rgb[meets], linewidths=1.0))
+    rgb = hsv_to_rgb(np.stack([hues, np.full_like(hues, 0.6), np.ones_like(hues)], 1))
+    for line, color in zip(lines, rgb, strict=True):
+        draw_line(axes, line, color=color, linewidth=1.0)
     axes.scatter(points2[:, 0], points2[:, 1], s=20, c=rgb, edgecolors="black", linewidths=0.7, zorder=3)
     error = f"median error {estimate.median_distance:.2f} px"
     _caption(axes, [("image 2", TEXT), (f"{len(chosen)} epipolar lines", TEXT), (error, TEXT)])
 
 
 def _subset(estimate: PairEstimate, num_lines: int, seed: int) -> npt.NDArray[np.int64]:
-    """Return the rows of a random subset of the inliers."""
+    """Return the indices of a random subset of the inliers."""
     rows = torch.nonzero(estimate.inliers).flatten().numpy()
     return np.random.default_rng(seed).permutation(rows)[:num_lines]
 
 
 def _caption(axes: Axes, parts: list[tuple[str, str]], size: float = 9) -> None:
-    """Write texts, each in its colour, in a row above an image, in smaller letters where the image is narrow."""
+    """Write texts in a row above an image, each in its colour; shrink them to the width of the image."""
     style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "bottom"}
     labels = [axes.annotate(text, (0, 1), (0, 4), color=color, fontsize=size, **style) for text, color in parts]
     widths = [label.get_window_extent().width * 72 / DPI + 12 for label in labels]

@@ -12,11 +12,13 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from kornia_learnnorm.estimators.fundamental import Normalizer, find_fundamental, normalizing_transforms
+from kornia_learnnorm.estimators.fundamental import solve_in_coordinates
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
+from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
 from kornia_learnnorm.normalizers.learned import WEIGHTS, LearnedNormalizer
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
@@ -65,18 +67,26 @@ class Method(NamedTuple):
 
     Attributes:
         normalizer: maps ``(points1, points2, weights)`` to two transforms.
-        solve: maps points in pixels, (B, N, 2) float64 each, and a normaliser to fundamental matrices (B, 3, 3).
+        rank2: how the singularity constraint is enforced.
+        refined: whether Levenberg-Marquardt follows.
         trained_on: the training data, as in :attr:`~kornia_learnnorm.LearnedNormalizer.trained_on`; ``not known`` of
             weights that do not say it and of code that is not this package's.
     """
 
     normalizer: Normalizer
-    solve: Callable[[Tensor, Tensor, Normalizer], Tensor]
+    rank2: Literal["projection", "optimal"] = "projection"
+    refined: bool = False
     trained_on: tuple[str, ...] = ()
 
     def estimate(self, points1: Tensor, points2: Tensor) -> Tensor:
         """Return the fundamental matrices (B, 3, 3) of points in pixels, (B, N, 2) float64 each."""
-        return self.solve(points1, points2, self.normalizer)
+        problem = LinearProblem.from_points(points1, points2)
+        return self.solve(problem, *normalizing_transforms(self.normalizer, problem))
+
+    def solve(self, problem: LinearProblem, T1: Tensor, T2: Tensor) -> Tensor:
+        """Return the fundamental matrices (B, 3, 3) of a problem under the transforms of the normaliser."""
+        F_mat = solve_in_coordinates(problem, T1, T2, self.rank2)
+        return refine_fundamental(problem.points1, problem.points2, F_mat).F_mat if self.refined else F_mat
 
 
 def find_method(name: str) -> Method:
@@ -97,11 +107,8 @@ def find_method(name: str) -> Method:
     base = base_name(name)
     normalizer = _find_normalizer(base)
     trained_on = () if base in CLOSED_FORMS else getattr(normalizer, "trained_on", ()) or (UNKNOWN,)
-    if name.endswith(OPTIMAL):
-        return Method(normalizer, lambda x1, x2, n: _solve(x1, x2, n, "optimal"), trained_on)
-    if name.endswith(REFINED):
-        return Method(normalizer, lambda x1, x2, n: refine_fundamental(x1, x2, _solve(x1, x2, n)).F_mat, trained_on)
-    return Method(normalizer, _solve, trained_on)
+    rank2: Literal["projection", "optimal"] = "optimal" if name.endswith(OPTIMAL) else "projection"
+    return Method(normalizer, rank2, name.endswith(REFINED), trained_on)
 
 
 def base_name(name: str) -> str:
@@ -142,7 +149,7 @@ def _own_normalizer(name: str) -> Normalizer:
 
     def normalize(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         try:
-            return normalizing_transforms(made, points1, points2, weights)
+            return normalizing_transforms(made, LinearProblem.from_points(points1, points2, weights))
         except Exception as error:
             text = f"{type(error).__name__}: {error}"
             raise ValueError(f"{name} failed, called with points1, points2 and weights: {text}") from error
@@ -164,10 +171,6 @@ def _import(name: str) -> Any:
         raise ValueError(f"no normaliser at {name!r}, looked for in {here} too: {text}") from error
     finally:
         sys.path[:] = before
-
-
-def _solve(x1: Tensor, x2: Tensor, normalizer: Normalizer, rank2: Literal["optimal"] | None = None) -> Tensor:
-    return find_fundamental(x1, x2, normalizer=normalizer, rank2=rank2)
 
 
 def identify_method(name: str) -> str:

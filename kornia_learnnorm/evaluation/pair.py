@@ -1,4 +1,4 @@
-"""The fundamental matrix of two image files: matches, robust inliers, the eight-point algorithm on them."""
+"""The fundamental matrix of two image files: matches, robust inliers, and the eight-point algorithm on the inliers."""
 
 from __future__ import annotations
 
@@ -18,12 +18,17 @@ from kornia_learnnorm.data.matching.matchers import match_images
 from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.normalizers.contract import Normalizer
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
 __all__ = ["PairEstimate", "estimate_pair", "write_json"]
 
-MIN_DISPLACEMENT = 0.1  # pixels, median over the matches: below it the camera has not moved
-MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the number of models that random matches would support as well
-MIN_PARALLAX = 0.05  # share of the inliers that no single homography may explain
+MIN_DISPLACEMENT = 0.1  # pixels, median over the matches; with a smaller one the camera has not moved
+MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of models with as many inliers among random matches
+MIN_PARALLAX = 0.05  # share of the inliers that the best homography must leave unexplained
+MAX_FITS = 3  # least-squares fits to the inliers
+MAGSAC_CONFIDENCE = 0.9999
+MAGSAC_MAX_SAMPLES = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +39,14 @@ class PairEstimate:
         F_mat: :math:`(3, 3)`, float64, unit Frobenius norm, :math:`x_2^\top F x_1 = 0` in pixels.
         points1: pixels of the matches in image 1 with shape :math:`(N, 2)`, float64.
         points2: pixels of the matches in image 2 with shape :math:`(N, 2)`, float64.
-        inliers: which matches lie within ``threshold`` of ``F_mat``, with shape :math:`(N,)`, bool.
+        inliers: mask of the matches with a distance to ``F_mat`` below ``threshold``, shape :math:`(N,)`, bool.
         mean_distance: mean symmetric epipolar distance of the inliers, pixels.
         median_distance: median symmetric epipolar distance of the inliers, pixels.
-        path1: the file of image 1.
-        path2: the file of image 2.
+        path1: file of image 1.
+        path2: file of image 2.
         size1: width and height of image 1.
         size2: width and height of image 2.
-        ratio: the ratio test that the matches have passed.
+        ratio: largest ratio of the nearest to the second-nearest descriptor distance of the matches.
         threshold: largest symmetric epipolar distance of an inlier, pixels.
 
     """
@@ -69,20 +74,34 @@ class PairEstimate:
         """Number of matches within the threshold."""
         return int(self.inliers.sum())
 
+    def summary(self) -> str:
+        """Return F row by row, the counts and the errors as text."""
+        rows = [" ".join(f"{value: .9e}" for value in row) for row in self.F_mat.tolist()]
+        share = self.num_inliers / self.num_matches
+        return "\n".join(
+            [
+                "F (x2^T F x1 = 0 in pixels, unit Frobenius norm)",
+                *(f"  {row}" for row in rows),
+                f"matches  {self.num_matches} (ratio test {self.ratio:g})",
+                f"inliers  {self.num_inliers} ({share:.1%}, symmetric epipolar distance < {self.threshold:g} px)",
+                f"distance of the inliers: mean {self.mean_distance:.3f} px, median {self.median_distance:.3f} px",
+            ]
+        )
+
 
 def estimate_pair(
     path1: str | Path,
     path2: str | Path,
-    normalizer: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]],
-    ratio: float = 0.8,
-    threshold: float = 1.0,
+    normalizer: Normalizer,
+    ratio: float = RATIO,
+    threshold: float = INLIER_THRESHOLD,
     seed: int = 0,
 ) -> PairEstimate:
-    """Estimate the fundamental matrix of two image files.
+    """Return the fundamental matrix of two image files with its matches and inliers.
 
-    SIFT matches, the ratio test, a first set of inliers by OpenCV's MAGSAC, then the normalised eight-point algorithm
-    with ``normalizer`` on all inliers. The inliers of that fit are fitted again, at most twice, while they grow in
-    number.
+    SIFT matches pass the ratio test, OpenCV's MAGSAC finds the first inliers, and the normalised eight-point algorithm
+    with ``normalizer`` fits all inliers. The inliers of the fit are fitted again, at most twice, as long as their
+    number grows.
 
     Args:
         path1: file of image 1.
@@ -90,16 +109,16 @@ def estimate_pair(
         normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views.
         ratio: largest ratio of the nearest to the second-nearest descriptor distance.
         threshold: largest symmetric epipolar distance of an inlier, pixels.
-        seed: seed of MAGSAC; the same files and seed give the same estimate.
+        seed: seed of the order in which MAGSAC gets the matches; equal files and seeds give equal estimates.
 
     Returns:
-        the estimate, of which all numbers are finite.
+        the estimate; all its numbers are finite.
 
     Raises:
         FileNotFoundError: if a file does not exist.
         ValueError: if a file is not an image, ``ratio`` or ``threshold`` is out of range, or the images do not
-            determine a fundamental matrix: blank, fewer than eight matches or inliers, no motion, all inliers on one
-            homography, or no more of them than random matches would have.
+            determine a fundamental matrix: a blank image, fewer than eight matches or inliers, no motion, all inliers
+            on one homography, or no more inliers than random matches would have.
         ImportError: if OpenCV is not installed.
 
     """
@@ -134,7 +153,7 @@ def estimate_pair(
 
 
 def _distinct_matches(points1: Tensor, points2: Tensor, ratios: Tensor, ratio: float) -> tuple[Tensor, Tensor]:
-    """Return the matches below the ratio once each, float64; complain about too few of them or no motion."""
+    """Return the distinct matches below the ratio, float64; raise ValueError for too few matches or no motion."""
     kept = torch.from_numpy(np.unique(torch.cat([points1, points2], -1)[ratios < ratio].double().numpy(), axis=0))
     if len(kept) < 8:
         raise ValueError(
@@ -152,21 +171,21 @@ def _distinct_matches(points1: Tensor, points2: Tensor, ratios: Tensor, ratio: f
 def _robust_inliers(points1: Tensor, points2: Tensor, threshold: float, seed: int) -> Tensor:
     """Return MAGSAC's inliers, a mask (N,)."""
     cv2 = import_cv2()
-    # MAGSAC draws its samples from a generator of its own: the order of the matches is what a seed can change.
+    # OpenCV draws the samples of MAGSAC from a generator with a fixed seed: what varies is the order of the matches.
     order = torch.randperm(len(points1), generator=torch.Generator().manual_seed(seed))
-    cv2.setRNGSeed(seed)
     inliers = torch.zeros(len(points1), dtype=torch.bool)
-    inliers[order] = _magsac(cv2.findFundamentalMat, points1[order], points2[order], threshold, 0.9999, 10000)
+    options = threshold, MAGSAC_CONFIDENCE, MAGSAC_MAX_SAMPLES
+    inliers[order] = _magsac(cv2.findFundamentalMat, points1[order], points2[order], *options)
     _check_inliers(inliers, threshold)
     return inliers
 
 
 def _magsac(find: Callable[..., Any], points1: Tensor, points2: Tensor, threshold: float, *options: float) -> Tensor:
-    """Return the inliers (N,) of an OpenCV function that takes MAGSAC as its method; none where it finds no model."""
+    """Return the inliers (N,) that an OpenCV function finds with MAGSAC; none if it finds no model."""
     cv2 = import_cv2()
     try:
         _, mask = find(points1.numpy(), points2.numpy(), cv2.USAC_MAGSAC, threshold, *options)
-    except cv2.error:  # OpenCV 4, where too few points are left to sample from
+    except cv2.error:  # OpenCV 4 raises when too few points are left to sample from
         mask = None
     return torch.zeros(len(points1), dtype=torch.bool) if mask is None else torch.from_numpy(mask.ravel()).bool()
 
@@ -183,12 +202,12 @@ def _fit(
     points1: Tensor,
     points2: Tensor,
     inliers: Tensor,
-    normalizer: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]],
+    normalizer: Normalizer,
     threshold: float,
 ) -> tuple[Tensor, Tensor]:
-    """Fit all inliers, and the inliers of that fit again, at most twice, while their number grows."""
+    """Return F fitted to all inliers and its inliers; refit while the number of inliers grows."""
     F_mat, best = torch.zeros(3, 3, dtype=torch.float64), torch.zeros_like(inliers)
-    for _ in range(3):
+    for _ in range(MAX_FITS):
         with torch.no_grad():
             F_fit = find_fundamental(points1[inliers][None], points2[inliers][None], normalizer=normalizer)[0]
         inliers = symmetric_epipolar_distance(points1, points2, F_fit) < threshold
@@ -202,21 +221,21 @@ def _fit(
 
 
 def _check_parallax(points1: Tensor, points2: Tensor, threshold: float) -> None:
-    """Complain if one homography explains the inliers, as on a plane or when the camera only turns."""
+    """Raise ValueError if one homography explains the inliers: a plane, or a camera that only rotates."""
     explained = int(_magsac(import_cv2().findHomography, points1, points2, threshold).sum())
     if len(points1) - explained < max(2, MIN_PARALLAX * len(points1)):
         raise ValueError(
             f"degenerate: one homography explains {explained} of {len(points1)} inliers within {threshold:g} px (a "
-            "plane, or a camera that only turns): the fundamental matrix is not determined"
+            "plane, or a camera that only rotates): the fundamental matrix is not determined"
         )
 
 
 def _check_chance(matches: int, inliers: int, threshold: float, shape: tuple[int, ...]) -> None:
-    """Complain if so many inliers are to be expected among random matches.
+    """Raise ValueError if random matches are likely to have as many inliers.
 
-    The number of false alarms of Moisan and Stival (A probabilistic criterion to detect rigid point matches between two
-    images and estimate the fundamental matrix, IJCV 2004): models from seven matches, and the chance of a random point
-    to lie within the threshold of a line.
+    The expected number of false alarms is that of Moisan and Stival (A probabilistic criterion to detect rigid point
+    matches between two images and estimate the fundamental matrix, IJCV 2004): models from seven matches, and the
+    probability that a random point lies within the threshold of a line.
     """
     strip = min(1.0, 2 * threshold * math.hypot(*shape) / math.prod(shape))
     tests = (matches - 7) * math.comb(matches, inliers) * math.comb(inliers, 7)
@@ -229,7 +248,7 @@ def _check_chance(matches: int, inliers: int, threshold: float, shape: tuple[int
 
 
 def write_json(path: str | Path, estimate: PairEstimate) -> None:
-    """Write an estimate as JSON, whole or not at all.
+    """Write an estimate as a JSON file, whole or not at all.
 
     Args:
         path: the file to write.

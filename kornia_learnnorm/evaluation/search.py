@@ -7,18 +7,20 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.fundamental import find_fundamental
-from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype, weighted_mean
+from kornia_learnnorm.estimators.fundamental import solve_in_coordinates
+from kornia_learnnorm.geometry.checks import weighted_mean
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.normalizers.contract import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = ["SearchedNormalizer"]
 
-_BOUND = 3.0
+MAX_PARAMETER = 3.0  # beyond it rounding errors of F would pass for gains
 
 
-class SearchedNormalizer(nn.Module):
+class SearchedNormalizer(ProblemNormalizer):
     r"""Search each sample's transforms by gradient descent on its own symmetric epipolar distance.
 
     :math:`T_i = B(p_i)\, T_i^{base}` with parameters :math:`p_i` for every sample, which start at zero. Adam lowers the
@@ -46,6 +48,8 @@ class SearchedNormalizer(nn.Module):
 
     """
 
+    min_points = 8
+
     def __init__(
         self,
         base: nn.Module | None = None,
@@ -57,48 +61,38 @@ class SearchedNormalizer(nn.Module):
         super().__init__()
         if steps < 1 or learning_rate <= 0:
             raise ValueError(f"steps and learning_rate must be positive, got {steps} and {learning_rate}")
-        self.base = ReweightedWhitening() if base is None else base
+        self.base: Normalizer = ReweightedWhitening() if base is None else base
         self.transform = transform
         self.num_parameters = num_parameters
         self.steps = steps
         self.learning_rate = learning_rate
 
-    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        r"""Return the transforms :math:`(B, 3, 3)` of both views, without gradient.
-
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-
-        Raises:
-            TypeError: if the points are not floating-point tensors of one dtype.
-            ShapeError: if a shape is wrong.
-            ValueError: if there are fewer than eight correspondences or a value is not finite.
-
-        """
-        check_correspondences(points1, points2, weights)
-        dtype = solve_dtype(points1.device)
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+        """Return the transforms :math:`(B, 3, 3)` of both views, without gradient."""
         with torch.inference_mode(False):  # a caller's inference mode has no gradients to offer
-            x1, x2 = points1.detach().to(dtype).clone(), points2.detach().to(dtype).clone()
-            w = None if weights is None else weights.detach().to(dtype).clone()
+            weights = None if problem.weights is None else problem.weights.detach().clone()
+            points1, points2 = problem.points1.detach().clone(), problem.points2.detach().clone()
+            problem = LinearProblem.from_points(points1, points2, weights)
             with torch.no_grad():
-                T1, T2 = self.base(x1, x2, w)
+                T1, T2 = (T.to(problem.x1) for T in transforms_of(self.base, problem))
             with torch.enable_grad():
-                params1, params2 = self._search(x1, x2, w, T1, T2)
-        T1, T2 = self.transform(params1) @ T1, self.transform(params2) @ T2
-        return T1.to(points1.dtype), T2.to(points2.dtype)
+                params1, params2 = self._search(problem, T1, T2)
+        return self.transform(params1) @ T1, self.transform(params2) @ T2
 
-    def _search(self, x1: Tensor, x2: Tensor, w: Tensor | None, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        return f"num_parameters={self.num_parameters}, steps={self.steps}, learning_rate={self.learning_rate:g}"
+
+    def _search(self, problem: LinearProblem, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best parameters met, ``(B, P)`` of each view."""
+        x1, x2, w = problem.points1, problem.points2, problem.weights
         free = x1.new_zeros(2, len(x1), self.num_parameters, requires_grad=True)
         best, least = torch.zeros_like(free), x1.new_full((len(x1),), torch.inf)
         optimizer = torch.optim.Adam([free], lr=self.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
         for _ in range(self.steps):
-            params = _BOUND * torch.tanh(free / _BOUND)
-            transforms = self.transform(params[0]) @ T1, self.transform(params[1]) @ T2
-            F_mat = find_fundamental(x1, x2, w, lambda *_, found=transforms: found)
+            params = MAX_PARAMETER * torch.tanh(free / MAX_PARAMETER)
+            F_mat = solve_in_coordinates(problem, self.transform(params[0]) @ T1, self.transform(params[1]) @ T2)
             distance = weighted_mean(symmetric_epipolar_distance(x1, x2, F_mat)[..., None], w)[:, 0]
             better = distance.detach() < least
             least = torch.where(better, distance.detach(), least)

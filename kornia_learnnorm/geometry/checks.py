@@ -1,6 +1,8 @@
-"""What every module asks of correspondences: checks, the dtype to work in, averages."""
+"""Input checks and helpers shared by all modules."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -8,33 +10,66 @@ from torch import Tensor
 
 __all__ = [
     "check_correspondences",
+    "check_fundamental",
     "check_mask",
+    "check_rank2",
+    "check_tensor",
     "is_true",
+    "safe_divisor",
     "solve_dtype",
     "weighted_mean",
 ]
 
+RANK2 = ("projection", "optimal")
+
 
 def solve_dtype(device: torch.device) -> torch.dtype:
-    """Return the dtype of the small linear algebra: float64, except on MPS, which has none."""
+    """Return the dtype of the small linear algebra: float64, or float32 on MPS, which has no float64."""
     return torch.float32 if device.type == "mps" else torch.float64
 
 
-def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> None:
-    """Raise a clear error for anything but finite correspondences ``(B, N, 2)`` x 2 and weights ``(B, N)``.
+def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, precise: bool = False) -> None:
+    """Raise a clear error for anything but a floating-point tensor of a shape.
+
+    Args:
+        name: the argument that the message names.
+        value: what was given.
+        shape: the dimensions as for ``KORNIA_CHECK_SHAPE``; None for any shape.
+        precise: accept float32 and float64 only.
 
     Raises:
-        TypeError: if the points are not floating-point tensors of one dtype, or the weights not floating-point.
+        TypeError: if it is not a floating-point tensor, or with ``precise`` neither float32 nor float64.
+        ShapeError: if the shape is wrong.
+
+    """
+    kind = "a float32 or float64 tensor" if precise else "a floating-point tensor"
+    if not isinstance(value, Tensor):
+        hint = f"; torch.from_numpy({name}) makes it one" if type(value).__module__ == "numpy" else ""
+        raise TypeError(f"{name} must be {kind}, got {type(value)}{hint}")
+    if not (value.dtype in (torch.float32, torch.float64) if precise else value.is_floating_point()):
+        raise TypeError(f"{name} must be {kind}, got {value.dtype}")
+    if shape is not None:
+        KORNIA_CHECK_SHAPE(value, [*shape], f"Argument: {name}")
+
+
+def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | None = None, min_points: int = 8) -> None:
+    """Raise a clear error for anything but finite correspondences ``(B, N, 2)`` x 2 and weights ``(B, N)``.
+
+    Args:
+        points1: points of the first view.
+        points2: points of the second view.
+        weights: optional weights.
+        min_points: smallest number :math:`N` of correspondences.
+
+    Raises:
+        TypeError: if the points are not float32 or float64 tensors of one dtype, or the weights not floating-point.
         ShapeError: if a shape is wrong.
         ValueError: if shapes of the views differ, there are too few correspondences, a value is not finite, or a
             weight is negative.
 
     """
     for name, points in (("points1", points1), ("points2", points2)):
-        if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
-            got = points.dtype if isinstance(points, Tensor) else type(points)
-            raise TypeError(f"{name} must be a float32 or float64 tensor, got {got}")
-        KORNIA_CHECK_SHAPE(points, ["B", "N", "2"])
+        check_tensor(name, points, ["B", "N", "2"], precise=True)
     if points1.dtype != points2.dtype:
         raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
     if points1.shape != points2.shape:
@@ -42,22 +77,25 @@ def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | No
     devices = {str(tensor.device) for tensor in (points1, points2, weights) if isinstance(tensor, Tensor)}
     if len(devices) > 1:
         raise ValueError(f"points and weights must be on one device, got {' and '.join(sorted(devices))}")
-    if points1.shape[1] < 8:
-        raise ValueError(f"at least 8 correspondences are needed, got {points1.shape[1]}")
-    finite = [points1, points2]
+    if points1.shape[1] < min_points:
+        raise ValueError(f"at least {min_points} correspondences are needed, got {points1.shape[1]}")
+    valid = points1.isfinite().all() & points2.isfinite().all()
     if weights is not None:
-        if not isinstance(weights, Tensor) or not weights.is_floating_point():
-            got = weights.dtype if isinstance(weights, Tensor) else type(weights)
-            hint = "; a boolean tensor is a mask" if got == torch.bool else ""
-            raise TypeError(f"weights must be a floating-point tensor, got {got}{hint}")
+        if isinstance(weights, Tensor) and weights.dtype == torch.bool:
+            raise TypeError("weights must be a floating-point tensor, got torch.bool; a boolean tensor is a mask")
+        check_tensor("weights", weights)
         if weights.shape != points1.shape[:2]:
             raise ValueError(f"weights must have shape {[*points1.shape[:2]]}, got {[*weights.shape]}")
-        finite.append(weights)
-    for name, values in zip(("points1", "points2", "weights"), finite, strict=False):
-        if is_true(~values.isfinite().all()):
-            bad = int((~values.isfinite()).sum())
+        valid = valid & ((weights >= 0) & (weights < torch.inf)).all()
+    if is_true(~valid):  # one look at the device for all values
+        _complain_about_values(points1, points2, weights)
+
+
+def _complain_about_values(points1: Tensor, points2: Tensor, weights: Tensor | None) -> None:
+    for name, values in (("points1", points1), ("points2", points2), ("weights", weights)):
+        if values is not None and (bad := int((~values.isfinite()).sum())):
             raise ValueError(f"{name} must be finite, got {bad} NaN or infinite values")
-    if weights is not None and is_true((weights < 0).any()):
+    if weights is not None:
         raise ValueError(f"weights must not be negative, got a minimum of {weights.min().item():g}")
 
 
@@ -78,8 +116,38 @@ def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor |
             raise ValueError(f"mask must have shape {[*shape]} as {name}, got {[*mask.shape]}")
 
 
+def check_fundamental(F_mat: Tensor, points: Tensor) -> None:
+    """Raise a clear error for anything but finite matrices ``(B, 3, 3)`` other than zero, as many as sets of points.
+
+    Raises:
+        TypeError: if it is not a floating-point tensor.
+        ShapeError: if it is not ``(B, 3, 3)``.
+        ValueError: if the batch sizes differ, a value is not finite, or a matrix is zero.
+
+    """
+    check_tensor("F_mat", F_mat, ["B", "3", "3"])
+    if len(F_mat) != len(points):
+        raise ValueError(f"one matrix per set of points is needed, got {len(F_mat)} matrices and {len(points)} sets")
+    if is_true(~F_mat.isfinite().all()):
+        raise ValueError(f"F_mat must be finite, got {int((~F_mat.isfinite()).sum())} NaN or infinite values")
+    zero = (F_mat == 0).all(-1).all(-1)
+    if is_true(zero.any()):
+        raise ValueError(f"F_mat must not be zero, got {int(zero.sum())} zero matrices")
+
+
+def check_rank2(rank2: object) -> None:
+    """Raise a clear error for anything but a way to enforce the singularity constraint.
+
+    Raises:
+        ValueError: if ``rank2`` is neither ``"projection"`` nor ``"optimal"``.
+
+    """
+    if rank2 not in RANK2:
+        raise ValueError(f"rank2 must be 'projection' or 'optimal', got {rank2!r}")
+
+
 def is_true(condition: Tensor) -> bool:
-    """Value of a boolean scalar; false where none can be looked at: in ``torch.compile`` and ``torch.func.vmap``."""
+    """Return a boolean scalar's value; False where it cannot be read: in ``torch.compile`` and ``torch.func.vmap``."""
     if torch.compiler.is_compiling():
         return False
     try:
@@ -96,3 +164,8 @@ def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:
     empty = total <= 0
     weights = torch.where(empty, 1.0, weights)
     return (weights[..., None] * values).sum(-2) / torch.where(empty, weights.shape[-1], total)
+
+
+def safe_divisor(values: Tensor) -> Tensor:
+    """Return the values where they are positive and 1 elsewhere, to divide by."""
+    return torch.where(values > 0, values, 1.0)

@@ -1,12 +1,16 @@
-r"""Residuals of correspondences under a fundamental matrix, one number per correspondence.
+r"""Epipolar distances of correspondences under a fundamental matrix, and the norms of their lines' normals.
 
-All take pixels ``points1, points2`` :math:`(*, N, 2)` and ``F_mat`` :math:`(*, 3, 3)` with :math:`x_2^\top F x_1 = 0`.
+Distances take pixels ``points1, points2`` :math:`(*, N, 2)` and ``F_mat`` :math:`(*, 3, 3)` with
+:math:`x_2^\top F x_1 = 0`. A distance scale is the factor from the algebraic residual :math:`x_2^\top F x_1` to a
+distance in pixels, a function of the squared norms :math:`n_1 = \|(F^\top x_2)_{1:2}\|^2` and
+:math:`n_2 = \|(F x_1)_{1:2}\|^2` of the epipolar lines' normals. It returns its value and its derivatives by both.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import (
     left_to_right_epipolar_distance,
@@ -15,16 +19,26 @@ from kornia.geometry.epipolar import (
 )
 from torch import Tensor
 
-__all__ = ["algebraic_distance", "sampson_distance", "symmetric_epipolar_distance"]
+from kornia_learnnorm.geometry.checks import check_tensor, safe_divisor, weighted_mean
+
+__all__ = [
+    "algebraic_distance",
+    "find_scale",
+    "line_norms",
+    "sampson_distance",
+    "sampson_scale",
+    "scale_value",
+    "symmetric_epipolar_distance",
+    "symmetric_scale",
+]
+
+DistanceScale = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 def _check(points1: Tensor, points2: Tensor, F_mat: Tensor) -> None:
-    for name, value in (("points1", points1), ("points2", points2), ("F_mat", F_mat)):
-        if not isinstance(value, Tensor) or not value.is_floating_point():
-            raise TypeError(f"{name} must be a floating-point tensor, got {getattr(value, 'dtype', type(value))}")
-    KORNIA_CHECK_SHAPE(points1, ["*", "N", "2"])
-    KORNIA_CHECK_SHAPE(points2, ["*", "N", "2"])
-    KORNIA_CHECK_SHAPE(F_mat, ["*", "3", "3"])
+    check_tensor("points1", points1, ["*", "N", "2"])
+    check_tensor("points2", points2, ["*", "N", "2"])
+    check_tensor("F_mat", F_mat, ["*", "3", "3"])
     if not points1.dtype == points2.dtype == F_mat.dtype:
         raise TypeError(f"one dtype is needed, got {points1.dtype}, {points2.dtype} and {F_mat.dtype}")
     if points1.shape[-2] != points2.shape[-2]:
@@ -116,3 +130,102 @@ def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tenso
     F_mat = F_mat / F_mat.norm(dim=(-2, -1), keepdim=True)
     x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
     return torch.einsum("...ni,...ij,...nj->...n", x2, F_mat, x1).abs()
+
+
+def line_norms(
+    x1: Tensor, x2: Tensor, F_mat: Tensor, weights: Tensor | None = None, floor: float = 1e-3
+) -> tuple[Tensor, Tensor]:
+    r"""Return the norms of both epipolar lines' normals, :math:`\|(F^\top x_2)_{1:2}\|` and :math:`\|(F x_1)_{1:2}\|`.
+
+    Args:
+        x1: homogeneous points of the first view with shape :math:`(*, N, 3)`.
+        x2: homogeneous points of the second view with shape :math:`(*, N, 3)`.
+        F_mat: fundamental matrices with shape :math:`(*, 3, 3)`.
+        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
+        floor: share of the set's mean norm added to each, against points on an epipole.
+
+    Returns:
+        two tensors with shape :math:`(*, N)`, positive.
+
+    """
+    norms = (x2 @ F_mat)[..., :2].norm(dim=-1), (x1 @ F_mat.mT)[..., :2].norm(dim=-1)
+    first, second = (n + floor * safe_divisor(weighted_mean(n[..., None], weights)) for n in norms)
+    return first, second
+
+
+def find_scale(distance: object) -> DistanceScale:
+    """Return the distance scale of a name, or the function that was given.
+
+    Args:
+        distance: ``"sampson"``, ``"symmetric"`` (Fan et al., Eq. 7), or a distance scale.
+
+    Raises:
+        ValueError: if there is no distance of that name.
+        TypeError: if it is neither a name nor a function.
+
+    """
+    scales: dict[str, DistanceScale] = {"sampson": sampson_scale, "symmetric": symmetric_scale}
+    if isinstance(distance, str):
+        if distance not in scales:
+            raise ValueError(f"distance must be 'sampson', 'symmetric' or a function, got {distance!r}")
+        return scales[distance]
+    if not callable(distance):
+        raise TypeError(f"distance must be 'sampson', 'symmetric' or a function, got {distance!r}")
+    return distance
+
+
+def sampson_scale(sq_norm1: Tensor, sq_norm2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Return the scale of the Sampson distance, :math:`(n_1 + n_2)^{-1/2}`, and its derivatives.
+
+    Args:
+        sq_norm1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
+        sq_norm2: the same in view 2.
+
+    Returns:
+        the scale and its derivatives by ``sq_norm1`` and by ``sq_norm2``, each with shape :math:`(*, N)`.
+
+    Reference:
+        R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, section 11.4.3.
+
+    Example:
+        >>> sampson_scale(torch.tensor(2.0), torch.tensor(2.0))
+        (tensor(0.5000), tensor(-0.0625), tensor(-0.0625))
+
+    """
+    total = sq_norm1 + sq_norm2
+    scale = total.rsqrt()
+    slope = scale / (-2 * total)
+    return scale, slope, slope
+
+
+def symmetric_scale(sq_norm1: Tensor, sq_norm2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Return the scale of the symmetric epipolar distance, :math:`n_1^{-1/2} + n_2^{-1/2}`, and its derivatives.
+
+    Args:
+        sq_norm1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
+        sq_norm2: the same in view 2.
+
+    Returns:
+        the scale and its derivatives by ``sq_norm1`` and by ``sq_norm2``, each with shape :math:`(*, N)`.
+
+    Reference:
+        Fan et al., Eq. 7.
+
+    Example:
+        >>> symmetric_scale(torch.tensor(4.0), torch.tensor(4.0))
+        (tensor(1.), tensor(-0.0625), tensor(-0.0625))
+
+    """
+    first, second = sq_norm1.rsqrt(), sq_norm2.rsqrt()
+    return first + second, -first / (2 * sq_norm1), -second / (2 * sq_norm2)
+
+
+def scale_value(scale: DistanceScale, sq_norm1: Tensor, sq_norm2: Tensor) -> Tensor:
+    """Return a distance scale without its derivatives, which cost more than the scale itself.
+
+    Example:
+        >>> scale_value(sampson_scale, torch.tensor(2.0), torch.tensor(2.0))
+        tensor(0.5000)
+
+    """
+    return (sq_norm1 + sq_norm2).rsqrt() if scale is sampson_scale else scale(sq_norm1, sq_norm2)[0]

@@ -1,6 +1,6 @@
-r"""The steps of the linear solver: design matrix, null vector, rank-2 projection.
+r"""Linear algebra of the DLT: design matrix, null vector, and small matrices.
 
-Every step is batched and has derivatives that stay finite on degenerate input.
+Every function is batched and has derivatives that stay finite on degenerate input.
 """
 
 from __future__ import annotations
@@ -10,7 +10,22 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import normalize
 
-__all__ = ["design_matrix", "has_null_vector", "null_vector", "rank2_projection", "smallest_right_singular_vector"]
+from kornia_learnnorm.geometry.checks import safe_divisor
+
+__all__ = [
+    "MIN_GAP",
+    "adjugate",
+    "cofactors",
+    "design_matrix",
+    "has_null_vector",
+    "independence_gap",
+    "null_vector",
+    "smallest_right_singular_vector",
+    "smallest_singular_vectors",
+    "solve_null_vector",
+]
+
+MIN_GAP = 1e-6  # relative gap above which a null vector counts as unique; that of float32 pixels
 
 
 def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
@@ -39,9 +54,8 @@ def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
 def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
     r"""Return the unit vector :math:`h` that minimises :math:`\sum_i w_i (A_i h)^2`.
 
-    Eight rows have an exact null vector, whatever the positive weights: it comes from a QR factorisation of
-    :math:`A^\top`, and from the linear system :math:`[A; h_0^\top]\, h = e_9`, in which :math:`h_0` is that vector held
-    fixed, it gets its derivatives. More rows go to :func:`smallest_right_singular_vector`.
+    Eight rows have an exact null vector, whatever the positive weights; more rows go to
+    :func:`smallest_right_singular_vector`.
 
     Args:
         A: design matrix with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
@@ -51,38 +65,16 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
         unit vectors with shape :math:`(*, 9)`, sign arbitrary; without gradient where the rows are linearly dependent.
 
     """
-    if A.shape[-2] > 8:
-        return smallest_right_singular_vector(A, weights)
-    if weights is not None:
-        A = A * (weights > 0).to(A)[..., None]
-    with torch.no_grad():
-        Q, R = torch.linalg.qr(A.mT, mode="complete")
-        h0 = Q[..., -1]
-        pivots = R.diagonal(dim1=-2, dim2=-1).abs()
-        scale = pivots.amax(-1)
-        determined = pivots.amin(-1) > 64 * torch.finfo(A.dtype).eps * scale
-        scale = torch.where(determined, scale, 1.0)
-    bordered = torch.cat([A / scale[..., None, None], h0[..., None, :]], -2)
-    # The substitute enters before the solve and its result is dropped after it: no derivative ever meets a singular
-    # matrix.
-    eye = torch.eye(9, dtype=A.dtype, device=A.device)
-    bordered = torch.where(determined[..., None, None], bordered, eye)
-    h = torch.linalg.solve_ex(bordered, eye[:, 8].expand(*A.shape[:-2], 9).unsqueeze(-1))[0].squeeze(-1)
-    h = torch.where(determined[..., None], h, h0)
-    return normalize(h, dim=-1)
+    return solve_null_vector(A, weights)[0]
 
 
-def has_null_vector(A: Tensor, weights: Tensor | None = None, tolerance: float = 1e-6) -> Tensor:
-    r"""Tell the design matrices that determine their null vector, up to its sign.
-
-    With eight rows, the distance of each from the span of those before it must exceed a share of the largest such
-    distance; with more, the eighth singular value of :math:`\sqrt w A` must exceed that share of the first. Derivatives
-    of the null vector grow as the inverse of what is compared.
+def has_null_vector(A: Tensor, weights: Tensor | None = None, tolerance: float = MIN_GAP) -> Tensor:
+    r"""Return which design matrices have a unique null vector.
 
     Args:
         A: design matrices in normalised coordinates with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
         weights: optional non-negative weights with shape :math:`(*, N)`.
-        tolerance: the share.
+        tolerance: smallest relative gap, see :func:`solve_null_vector`.
 
     Returns:
         booleans with shape :math:`(*)`.
@@ -92,14 +84,48 @@ def has_null_vector(A: Tensor, weights: Tensor | None = None, tolerance: float =
         tensor([ True, False])
 
     """
-    if A.shape[-2] == 8:
-        A = A if weights is None else A * (weights > 0).to(A)[..., None]
-        values = torch.linalg.qr(A.mT, mode="r")[1].diagonal(dim1=-2, dim2=-1).abs()
-    else:
-        A = A if weights is None else A * weights.sqrt()[..., None]
-        values = torch.linalg.svdvals(A)[..., :8]
-    determined: Tensor = values.amin(-1) > tolerance * values.amax(-1)
-    return determined
+    return solve_null_vector(A, weights)[1] > tolerance
+
+
+def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    r"""Return the null vector and the relative gap that tells how well the rows determine it.
+
+    With eight rows, the gap is the smallest distance of a row from the span of the rows before it over the largest such
+    distance, both from the QR factorisation of :math:`A^\top` whose last column is the null vector. With more, it is
+    the eighth singular value of :math:`\sqrt w A` over the first. Derivatives of the null vector grow as its inverse.
+
+    Args:
+        A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
+        weights: optional non-negative weights with shape :math:`(*, N)`.
+
+    Returns:
+        unit vectors with shape :math:`(*, 9)`, sign arbitrary, and gaps in :math:`[0, 1]` with shape :math:`(*)`,
+        without gradient.
+
+    """
+    if A.shape[-2] > 8:
+        s, Vh = _decompose(A, weights)
+        return _attach_derivatives(A, weights, s, Vh), s[..., 7] / safe_divisor(s[..., 0])
+    if weights is not None:
+        A = A * (weights > 0).to(A)[..., None]
+    with torch.no_grad():
+        Q, R = torch.linalg.qr(A.mT, mode="complete")
+        h0, pivots = Q[..., -1], R.diagonal(dim1=-2, dim2=-1).abs()
+        gap = pivots.amin(-1) / safe_divisor(pivots.amax(-1))
+        independent = gap > independence_gap(A.dtype)
+        scale = torch.where(independent, pivots.amax(-1), 1.0)
+    # The linear system [A; h0^T] h = e9, with h0 held fixed, has the solution h0 and gives its derivatives. The
+    # substitute enters before the solve and its result is dropped after it: no derivative meets a singular matrix.
+    bordered = torch.cat([A / scale[..., None, None], h0[..., None, :]], -2)
+    eye = torch.eye(9, dtype=A.dtype, device=A.device)
+    bordered = torch.where(independent[..., None, None], bordered, eye)
+    h = torch.linalg.solve_ex(bordered, eye[:, 8].expand(*A.shape[:-2], 9).unsqueeze(-1))[0].squeeze(-1)
+    return normalize(torch.where(independent[..., None], h, h0), dim=-1), gap
+
+
+def independence_gap(dtype: torch.dtype) -> float:
+    """Return the relative gap up to which rows are linearly dependent but for rounding."""
+    return 64 * torch.finfo(dtype).eps
 
 
 def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -123,9 +149,35 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
         tensor([0., 1., 0.])
 
     """
+    return _attach_derivatives(A, weights, *_decompose(A, weights))
+
+
+def smallest_singular_vectors(A: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return the left and right singular vectors of the smallest singular value, twice differentiable.
+
+    Args:
+        A: square matrices with shape :math:`(*, n, n)`.
+
+    Returns:
+        unit vectors :math:`u` and :math:`v` with shape :math:`(*, n)`, signs arbitrary, of one decomposition.
+
+    """
     with torch.no_grad():
-        weighted = A if weights is None else A * weights.sqrt()[..., None]
-        _, s, Vh = torch.linalg.svd(weighted, full_matrices=False)
+        U, s, Vh = torch.linalg.svd(A)
+    return _attach_derivatives(A.mT, None, s, U.mT), _attach_derivatives(A, None, s, Vh)
+
+
+@torch.no_grad()
+def _decompose(A: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return singular values and right singular vectors of ``sqrt(weights) A``."""
+    weighted = A if weights is None else A * weights.sqrt()[..., None]
+    _, s, Vh = torch.linalg.svd(weighted, full_matrices=False)
+    return s, Vh
+
+
+def _attach_derivatives(A: Tensor, weights: Tensor | None, s: Tensor, Vh: Tensor) -> Tensor:
+    """Return the last row of ``Vh`` with its derivatives by ``A`` and the weights."""
+    with torch.no_grad():
         gap = s[..., :-1].square() - s[..., -1:].square()
         simple = gap > 64 * torch.finfo(A.dtype).eps * s[..., :-1] * s[..., :1]
         inverse_gap = torch.where(simple, gap, torch.inf).reciprocal()
@@ -139,25 +191,26 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
     return normalize(v, dim=-1)
 
 
-def rank2_projection(F_mat: Tensor) -> Tensor:
-    r"""Project matrices on the nearest rank-2 matrices in Frobenius norm.
-
-    :math:`F - F v v^\top`, with :math:`v` the right singular vector of the smallest singular value (the singularity
-    constraint, Fan et al., section 3, step 2b).
-
-    Args:
-        F_mat: matrices with shape :math:`(*, 3, 3)`.
-
-    Returns:
-        matrices of rank 2 with shape :math:`(*, 3, 3)`.
+def adjugate(A: Tensor) -> Tensor:
+    r"""Return the adjugate of matrices :math:`(*, 3, 3)`: :math:`\mathrm{adj}(A)\, A = \det(A)\, I`.
 
     Example:
-        >>> rank2_projection(torch.diag(torch.tensor([3.0, 2.0, 1.0])))
-        tensor([[3., 0., 0.],
-                [0., 2., 0.],
-                [0., 0., 0.]])
+        >>> adjugate(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
+        tensor([[6., 0., 0.],
+                [0., 3., 0.],
+                [0., 0., 2.]])
 
     """
-    KORNIA_CHECK_SHAPE(F_mat, ["*", "3", "3"])
-    v = smallest_right_singular_vector(F_mat)[..., None]
-    return F_mat - (F_mat @ v) @ v.mT
+    return cofactors(A).mT
+
+
+def cofactors(A: Tensor) -> Tensor:
+    r"""Return the cofactors of matrices :math:`(*, 3, 3)`, the gradient of the determinant.
+
+    Example:
+        >>> cofactors(torch.diag(torch.tensor([1.0, 2.0, 3.0]))).diagonal()
+        tensor([6., 3., 2.])
+
+    """
+    rows: Tensor = torch.linalg.cross(A.roll(-1, -2), A.roll(-2, -2))
+    return rows

@@ -1,9 +1,9 @@
 r"""The manifold of matrices of rank 2 and unit norm: its points, steps on it, and its tangents.
 
 A matrix is kept as :math:`F = U_{:,1:2}\, A\, V_{:,1:2}^\top` with rotations :math:`U, V` and a :math:`2 \times 2`
-matrix :math:`A` of unit norm. A step has seven parameters: two tilt the last axis, the epipole, of each rotation, and
-three turn :math:`A` on the unit sphere. Two rotations and the ratio of the singular values are seven as well, but no
-coordinates where those are equal, as under pure forward motion.
+matrix :math:`A` of unit norm. A step has seven parameters: two tilt the last axis of each rotation, the epipole, and
+three turn :math:`A` on the unit sphere. Two rotations and the ratio of the singular values are seven parameters too,
+but are singular where the singular values are equal, as under pure forward motion.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def decompose(F_mat: Tensor) -> Rank2:
 
 
 def retract(state: Rank2, step: Tensor) -> Rank2:
-    """Take a step (B, 7): tilts of view 2 and of view 1, and a turn of the matrix between them."""
+    """Return the state after a step (B, 7): tilts of view 2 and of view 1, and a turn of the matrix between them."""
     a, tilt, turn = state.A.flatten(1), torch.unflatten(step[:, :4], -1, (2, 2)), step[:, None, 4:]
     turned = a + (turn @ torch.unflatten(a @ _TURNS.to(a), -1, (3, 4))).squeeze(1)
     # Cayley's map agrees with the exponential to second order and has no sine.
@@ -66,13 +66,13 @@ def tangents(state: Rank2) -> Tensor:
 
 
 def _turns(a: Tensor) -> Tensor:
-    """Orthonormal directions (*, 3, 4) orthogonal to unit vectors (*, 4): i, j and k times them, as quaternions."""
+    """Return orthonormal directions (*, 3, 4) orthogonal to unit quaternions (*, 4): i, j and k times them."""
     a, b, c, d = a.unbind(-1)
     return torch.unflatten(torch.stack([-b, a, -d, c, -c, d, a, -b, -d, -c, b, a], -1), -1, (3, 4))
 
 
 def _axis_tangents(a: Tensor) -> Tensor:
-    """Derivatives (*, 3, 3, 7) of U^T F V by a step; A is (*, 4)."""
+    """Return derivatives (*, 3, 3, 7) of U^T F V by a step; A is (*, 4)."""
     A, derivatives = torch.unflatten(a, -1, (2, 2)), a.new_zeros(*a.shape[:-1], 3, 3, 7)
     derivatives[..., 2, :2, :2] = A.mT
     derivatives[..., :2, 2, 2:4] = A
@@ -80,7 +80,7 @@ def _axis_tangents(a: Tensor) -> Tensor:
     return derivatives
 
 
-# All three are linear, so that one product with what they make of the unit vectors computes them.
+# All three functions are linear: one product with their values at the unit vectors computes them.
 _TURNS = _turns(torch.eye(4, dtype=torch.float64)).flatten(1)
 _TANGENTS = _axis_tangents(torch.eye(4, dtype=torch.float64)).flatten(1)
 _SKEW = torch.tensor([[0, 0, -1, 0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, -1, 0, 1, 0]], dtype=torch.float64)

@@ -1,29 +1,54 @@
-r"""The singularity constraint imposed where the correspondences allow it: a correction weighted by a covariance.
+r"""The rank-2 (singularity) constraint: projection in Frobenius norm, and optimal correction.
 
-The nearest matrix of rank 2 in Frobenius norm moves every entry of :math:`F` as if all were equally certain. They are
-not: the correspondences fix some combinations well and others hardly at all. This correction moves :math:`F` along the
-uncertain ones, and so needs no normalisation to choose a metric for it.
+The projection moves every entry of :math:`F` as if all were equally certain. They are not: the correspondences fix some
+combinations well and others hardly at all. The optimal correction moves :math:`F` along the uncertain ones, weighted by
+its covariance, so no normalisation has to choose a metric for it.
 """
 
 from __future__ import annotations
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import check_correspondences, is_true, solve_dtype
-from kornia_learnnorm.geometry.linear import design_matrix, rank2_projection
-from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.normalizers.closed_form import Hartley
-from kornia_learnnorm.normalizers.reweighted import adjugate, line_norms
+from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, check_tensor
+from kornia_learnnorm.geometry.distances import line_norms
+from kornia_learnnorm.geometry.linear import cofactors, design_matrix, smallest_right_singular_vector
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
 
-__all__ = ["check_fundamental", "optimal_rank2"]
+__all__ = ["correct_rank2", "optimal_rank2", "rank2_projection"]
+
+ITERATIONS = 3  # steps of the optimal correction
+EPIPOLE_FLOOR = 1e-5  # of the mean norm of a line's normal, added to each in the covariance
+
+
+def rank2_projection(F_mat: Tensor) -> Tensor:
+    r"""Project matrices on the nearest rank-2 matrices in Frobenius norm.
+
+    :math:`F - F v v^\top`, with :math:`v` the right singular vector of the smallest singular value (the singularity
+    constraint, Fan et al., section 3, step 2b).
+
+    Args:
+        F_mat: matrices with shape :math:`(*, 3, 3)`.
+
+    Returns:
+        matrices of rank 2 with shape :math:`(*, 3, 3)`.
+
+    Example:
+        >>> rank2_projection(torch.diag(torch.tensor([3.0, 2.0, 1.0])))
+        tensor([[3., 0., 0.],
+                [0., 2., 0.],
+                [0., 0., 0.]])
+
+    """
+    check_tensor("F_mat", F_mat, ["*", "3", "3"])
+    v = smallest_right_singular_vector(F_mat)[..., None]
+    return F_mat - (F_mat @ v) @ v.mT
 
 
 def optimal_rank2(
-    F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None, iterations: int = 3
+    F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None, iterations: int = ITERATIONS
 ) -> Tensor:
     r"""Correct matrices to rank 2 along the directions that the correspondences leave uncertain.
 
@@ -39,7 +64,7 @@ def optimal_rank2(
     .. math:: u \leftarrow N\Big[ u - \frac{(u, u^\dagger)}{3\, (u^\dagger, V_0 u^\dagger)} V_0 u^\dagger \Big], \quad
               V_0 \leftarrow P_u V_0 P_u .
 
-    What is left of the determinant goes with a projection in Hartley's coordinates.
+    A projection in Hartley's coordinates removes the rest of the determinant.
 
     Args:
         F_mat: matrices in pixels with shape :math:`(B, 3, 3)`, any scale but zero, such as null vectors of the DLT.
@@ -74,47 +99,38 @@ def optimal_rank2(
     check_fundamental(F_mat, points1)
     if iterations < 0:
         raise ValueError(f"iterations must be >= 0, got {iterations}")
-    dtype = solve_dtype(points1.device)
-    x1, x2 = points1.to(dtype), points2.to(dtype)
-    w = None if weights is None else weights.to(dtype)
-    T1, T2 = Hartley()(x1, x2, w)
-    F = transform_fundamental(F_mat.to(dtype), torch.linalg.inv_ex(T1)[0], torch.linalg.inv_ex(T2)[0])
-    u = normalize(F.flatten(-2), dim=-1)
-    if iterations:
-        x1 = convert_points_to_homogeneous(x1) @ T1.mT
-        x2 = convert_points_to_homogeneous(x2) @ T2.mT
-        u = _correct(u, _covariance(u, x1, x2, w, T1[:, 0, 0] / T2[:, 0, 0]), iterations)
-    F = transform_fundamental(rank2_projection(torch.unflatten(u, -1, (3, 3))), T1, T2)
-    F_rank2: Tensor = F / torch.linalg.matrix_norm(F, keepdim=True)
-    return F_rank2.to(points1.dtype)
+    problem = LinearProblem.from_points(points1, points2, weights)
+    inverse1, inverse2 = torch.linalg.inv_ex(problem.T1)[0], torch.linalg.inv_ex(problem.T2)[0]
+    F_hat = transform_fundamental(F_mat.to(problem.x1), inverse1, inverse2)
+    return correct_rank2(problem, F_hat, iterations).to(points1.dtype)
 
 
-def check_fundamental(F_mat: Tensor, points: Tensor) -> None:
-    """Raise a clear error for anything but finite matrices ``(B, 3, 3)`` other than zero, as many as sets of points.
+def correct_rank2(problem: LinearProblem, F_hat: Tensor, iterations: int = ITERATIONS) -> Tensor:
+    """Return the optimal correction of matrices in Hartley's coordinates; see :func:`optimal_rank2`.
 
-    Raises:
-        TypeError: if it is not a floating-point tensor.
-        ShapeError: if it is not ``(B, 3, 3)``.
-        ValueError: if the batch sizes differ, a value is not finite, or a matrix is zero.
+    Args:
+        problem: the correspondences.
+        F_hat: matrices in Hartley's coordinates with shape :math:`(B, 3, 3)`, any scale but zero.
+        iterations: number of steps.
+
+    Returns:
+        fundamental matrices in pixels with shape :math:`(B, 3, 3)`, of rank 2 and unit Frobenius norm.
 
     """
-    if not isinstance(F_mat, Tensor) or not F_mat.is_floating_point():
-        raise TypeError(f"F_mat must be a floating-point tensor, got {getattr(F_mat, 'dtype', type(F_mat))}")
-    KORNIA_CHECK_SHAPE(F_mat, ["B", "3", "3"])
-    if len(F_mat) != len(points):
-        raise ValueError(f"one matrix per set of points is needed, got {len(F_mat)} matrices and {len(points)} sets")
-    if is_true(~F_mat.isfinite().all()):
-        raise ValueError(f"F_mat must be finite, got {int((~F_mat.isfinite()).sum())} NaN or infinite values")
-    zero = (F_mat == 0).all(-1).all(-1)
-    if is_true(zero.any()):
-        raise ValueError(f"F_mat must not be zero, got {int(zero.sum())} zero matrices")
+    u = normalize(F_hat.flatten(-2), dim=-1)
+    if iterations:
+        u = _correct(u, _covariance(u, problem), iterations)
+    F_hat = rank2_projection(torch.unflatten(u, -1, (3, 3)))
+    return unit_fundamental(transform_fundamental(F_hat, problem.T1, problem.T2))
 
 
-def _covariance(u: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor) -> Tensor:
-    """``V_0`` of the unit vectors ``u`` up to scale, ``(B, 9, 9)``; ``scale`` is that of view 1 over that of view 2."""
+def _covariance(u: Tensor, problem: LinearProblem) -> Tensor:
+    """Return ``V_0`` of the unit vectors ``u`` up to scale, ``(B, 9, 9)``."""
+    x1, x2, weights = problem.x1, problem.x2, problem.weights
     # (u, V_i u) is the sum of the squared normals of both epipolar lines; equal noise in pixels is not equal here.
-    n1, n2 = line_norms(x1, x2, torch.unflatten(u, -1, (3, 3)), weights, floor=1e-5)
-    variance = scale[:, None] * n1.square() + n2.square() / scale[:, None]
+    scale = (problem.T1[:, 0, 0] / problem.T2[:, 0, 0])[:, None]
+    n1, n2 = line_norms(x1, x2, torch.unflatten(u, -1, (3, 3)), weights, floor=EPIPOLE_FLOOR)
+    variance = scale * n1.square() + n2.square() / scale
     A = design_matrix(x1, x2)
     A = A - (A @ u[..., None]) * u[..., None, :]
     precision = A.mT @ ((1.0 if weights is None else weights) / variance)[..., None].mul(A)
@@ -131,16 +147,16 @@ def _covariance(u: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale
 
 def _correct(u: Tensor, covariance: Tensor, iterations: int) -> Tensor:
     for _ in range(iterations):
-        cofactors = adjugate(torch.unflatten(u, -1, (3, 3))).mT.flatten(-2)
-        step = (covariance @ cofactors[..., None]).squeeze(-1)
-        slope = (cofactors * step).sum(-1, keepdim=True)
-        residual = (u * cofactors).sum(-1, keepdim=True) / 3
+        gradient = cofactors(torch.unflatten(u, -1, (3, 3))).flatten(-2)
+        step = (covariance @ gradient[..., None]).squeeze(-1)
+        slope = (gradient * step).sum(-1, keepdim=True)
+        residual = (u * gradient).sum(-1, keepdim=True) / 3
         u = normalize(u - residual / torch.where(slope > 0, slope, 1.0) * step, dim=-1)
         covariance = _project(covariance, u)
     return u
 
 
 def _project(covariance: Tensor, u: Tensor) -> Tensor:
-    """``P_u V P_u``."""
+    """Return ``P_u V P_u``."""
     covariance = covariance - u[..., :, None] * (u[..., None, :] @ covariance)
     return covariance - (covariance @ u[..., None]) * u[..., None, :]

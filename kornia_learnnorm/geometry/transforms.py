@@ -1,12 +1,26 @@
-r"""Transforms of the plane: builders of normalising transforms, and how a fundamental matrix follows them."""
+r"""Normalising transforms of the plane, their builders, and how points and fundamental matrices follow them."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-__all__ = ["affine_transform", "inverse_sqrt", "paper_transform", "spd_transform", "transform_fundamental"]
+from kornia_learnnorm.geometry.checks import solve_dtype, weighted_mean
+
+__all__ = [
+    "affine_transform",
+    "hartley_transform",
+    "inverse_sqrt",
+    "paper_transform",
+    "spd_transform",
+    "transform_fundamental",
+    "transform_points",
+    "unit_fundamental",
+    "whitening_transform",
+]
 
 
 def affine_transform(linear: Tensor, origin: Tensor) -> Tensor:
@@ -47,6 +61,96 @@ def transform_fundamental(F_mat: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
 
     """
     return T2.mT @ F_mat @ T1
+
+
+def transform_points(points: Tensor, T: Tensor) -> Tensor:
+    """Return points :math:`(*, N, 2)` after affine transforms :math:`(*, 3, 3)`.
+
+    Example:
+        >>> transform_points(torch.tensor([[1.0, 2.0]]), torch.diag(torch.tensor([2.0, 3.0, 1.0])))
+        tensor([[2., 6.]])
+
+    """
+    return points @ T[..., :2, :2].mT + T[..., None, :2, 2]
+
+
+def unit_fundamental(F_mat: Tensor) -> Tensor:
+    """Return fundamental matrices scaled to unit Frobenius norm, with a canonical sign.
+
+    Of the entries of at least half of the largest magnitude, the first in row-major order is positive. The sign does
+    not depend on rounding, also where two entries are equal up to their signs, as under pure translation.
+
+    Args:
+        F_mat: fundamental matrices with shape :math:`(*, 3, 3)`, any scale but zero.
+
+    Returns:
+        matrices with shape :math:`(*, 3, 3)`.
+
+    Example:
+        >>> unit_fundamental(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -3.0], [0.0, 4.0, 0.0]]))[1:, 1:]
+        tensor([[-0.0000,  0.6000],
+                [-0.8000, -0.0000]])
+
+    """
+    entries = F_mat.detach().flatten(-2)
+    size = entries.abs()
+    first = (size >= size.amax(-1, keepdim=True) / 2).byte().argmax(-1, keepdim=True)
+    sign = torch.where(entries.gather(-1, first) < 0, -1.0, 1.0)[..., None]
+    F: Tensor = F_mat * (sign / torch.linalg.matrix_norm(F_mat, keepdim=True))
+    return F
+
+
+def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:
+    r"""Return the similarity that moves the centroid to the origin and makes the mean distance from it :math:`\sqrt 2`.
+
+    Coincident points keep their scale.
+
+    Args:
+        points: points with shape :math:`(B, N, 2)`.
+        weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+
+    Returns:
+        transforms with shape :math:`(B, 3, 3)`.
+
+    Reference:
+        R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; Fan et al., Eq. 4.
+
+    """
+    origin = weighted_mean(points, weights)
+    radius = weighted_mean((points - origin[:, None]).norm(dim=-1, keepdim=True), weights)[..., 0]
+    scale = math.sqrt(2) / torch.where(radius > _rounding(origin), radius, math.sqrt(2))
+    return affine_transform(scale[:, None, None] * torch.eye(2).to(points), origin)
+
+
+def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: float = 1e-6) -> Tensor:
+    r"""Return the transform that moves the centroid to the origin and makes the covariance the identity.
+
+    :math:`T = [\Sigma^{-1/2}, -\Sigma^{-1/2} o; 0, 1]` with the symmetric root (ZCA), in closed form.
+
+    Args:
+        points: points with shape :math:`(B, N, 2)`.
+        weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+        floor: smallest ratio of the eigenvalues of :math:`\Sigma`.
+
+    Returns:
+        transforms with shape :math:`(B, 3, 3)`.
+
+    """
+    dtype = solve_dtype(points.device)
+    x, w = points.to(dtype), None if weights is None else weights.to(dtype)
+    origin = weighted_mean(x, w)
+    centred = x - origin[:, None]
+    products = (centred[..., :, None] * centred[..., None, :]).flatten(-2)
+    covariance = torch.unflatten(weighted_mean(products, w), -1, (2, 2))
+    spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    covariance = torch.where((spread > _rounding(origin))[:, None, None], covariance, 0.0)
+    return affine_transform(inverse_sqrt(covariance, floor), origin).to(points.dtype)
+
+
+def _rounding(origin: Tensor) -> Tensor:
+    """Return the spread ``(B,)`` about ``origin`` up to which points coincide: a mean is not exact."""
+    size: Tensor = torch.linalg.vector_norm(origin.detach(), dim=-1)
+    return 16 * torch.finfo(origin.dtype).eps * size
 
 
 def paper_transform(params: Tensor, origin: Tensor | None = None) -> Tensor:

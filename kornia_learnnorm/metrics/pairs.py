@@ -1,25 +1,24 @@
-r"""Metrics of an estimated fundamental matrix, one number per image pair, and the comparison of two methods by them.
+r"""Metrics of an estimated fundamental matrix, one number per image pair: share of inliers, F1, epipolar error.
 
 All distances are symmetric epipolar distances in pixels, the sum :math:`d_1 + d_2` of both points' distances to their
-epipolar lines. Others take the larger of the two or their mean, so a threshold of theirs is not one of these.
+epipolar lines. Other packages take the larger of the two or their mean, so their thresholds mean something else.
 
-A failed estimate (NaN or zero matrix) has no inliers and an infinite error. NaN is not a failure: it says that a pair
-cannot be measured, and callers drop and count such pairs. The evaluation of NG-RANSAC drops a pair from all three
+A failed estimate (NaN or zero matrix) has no inliers and an infinite error. NaN is not a failure: the pair cannot be
+measured, and callers drop and count such pairs. The evaluation of NG-RANSAC drops a pair from all three
 metrics when the ground truth has no inliers at the threshold or none below 1 px.
 """
 
 from __future__ import annotations
 
 from math import inf
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.geometry.checks import check_mask
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.better_rate import bootstrap_means, percentile_interval
 
-__all__ = ["PairedDifference", "epipolar_error", "f1_score", "inlier_share", "paired_bootstrap"]
+__all__ = ["epipolar_error", "f1_score", "inlier_share"]
 
 
 def inlier_share(
@@ -148,7 +147,7 @@ def epipolar_error(
 
 
 def _distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    """Distances in which a matrix of NaN is infinitely far from every point."""
+    """Return the distances, infinite under a matrix of NaN."""
     return symmetric_epipolar_distance(points1, points2, F_mat).nan_to_num(nan=inf, posinf=inf)
 
 
@@ -158,69 +157,5 @@ def _inliers(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, 
     inliers = _distance(points1, points2, F_mat) < threshold
     if mask is None:
         return inliers
-    if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
-        raise TypeError(f"mask must be a boolean tensor, got {getattr(mask, 'dtype', type(mask))}")
-    if mask.shape != inliers.shape:
-        raise ValueError(f"mask must have shape {[*inliers.shape]}, got {[*mask.shape]}")
+    check_mask(mask, points1, points2)
     return inliers & mask
-
-
-class PairedDifference(NamedTuple):
-    """How far the mean of one method is above another's on the same samples.
-
-    Attributes:
-        mean: mean of ``values - baseline`` over samples.
-        low: lower end of its bootstrap interval.
-        high: upper end.
-        p_value: two-sided p-value of no difference.
-    """
-
-    mean: float
-    low: float
-    high: float
-    p_value: float
-
-
-def paired_bootstrap(
-    values: Tensor, baseline: Tensor, groups: Tensor, level: float = 0.95, draws: int = 2000, seed: int = 0
-) -> PairedDifference:
-    r"""Compare the means of two methods on the same samples by drawing whole image pairs with replacement.
-
-    The p-value is that of the percentile interval which just reaches zero: with :math:`\bar d^*` the mean difference of
-    a draw, :math:`p = 2 (1 + \min(|\{\bar d^* \le 0\}|, |\{\bar d^* \ge 0\}|)) / (1 + \text{draws})`, at most one. No
-    number of draws makes it smaller than ``2 / (1 + draws)``.
-
-    Args:
-        values: one number per sample with shape (S,), or per image pair.
-        baseline: the same of the other method with shape (S,).
-        groups: index of each sample's image pair with shape (S,), integers.
-        level: share of the draws within the interval.
-        draws: number of draws.
-        seed: seed of the draws.
-
-    Returns:
-        the mean difference, its interval of :func:`~kornia_learnnorm.bootstrap_interval`, and the p-value.
-
-    Raises:
-        ValueError: if the shapes differ, a difference is not finite (drop such samples of both methods and count them),
-            there are fewer than two groups, or ``level`` is not between 0 and 1.
-
-    Reference:
-        A. Davison, D. Hinkley, Bootstrap Methods and their Application, 1997, chapters 4 and 5.
-
-    Example:
-        >>> values, groups = torch.tensor([0.9, 0.8, 0.7, 0.9]), torch.arange(4)
-        >>> paired_bootstrap(values, values - 0.25, groups)
-        PairedDifference(mean=0.25, low=0.25, high=0.25, p_value=0.00099...)
-
-    """
-    if values.shape != baseline.shape or values.ndim != 1:
-        raise ValueError(f"values must be two (S,) tensors, got {[*values.shape]} and {[*baseline.shape]}")
-    difference = values.double() - baseline.double()
-    bad = int((~difference.isfinite()).sum())
-    if bad:
-        raise ValueError(f"differences must be finite, got {bad} NaN or infinite ones of {len(difference)}")
-    means = bootstrap_means(difference, groups, draws, seed)
-    low, high = percentile_interval(means, level)
-    fewest = min(int((means <= 0).sum()), int((means >= 0).sum()))
-    return PairedDifference(difference.mean().item(), low, high, min(1.0, 2 * (1 + fewest) / (1 + draws)))

@@ -1,114 +1,23 @@
-r"""The relative pose that a fundamental matrix gives, and its errors.
+r"""Errors of relative poses and their summaries over image pairs: AUC and mean average accuracy.
 
 A pose is :math:`X_2 = R X_1 + t` for points in space; the length of :math:`t` is unknown. Errors are angles in degrees:
-infinite for a failed estimate, NaN where the ground truth is unknown, and callers drop and count such pairs.
+infinite for a failed estimate, NaN where the ground truth is unknown, and callers drop and count such pairs. In the
+summaries a failure counts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.geometry.conversions import convert_points_to_homogeneous
-from kornia.geometry.epipolar import essential_from_fundamental, motion_from_essential
+from kornia.metrics import auc_from_errors
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import solve_dtype
 
-__all__ = ["pose_error", "relative_pose", "rotation_error", "translation_error"]
-
-
-def relative_pose(
-    F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    r"""Return the pose of the second camera that a fundamental matrix and known cameras give.
-
-    :math:`E = K_2^\top F K_1` has four poses; the one with most correspondences in front of both cameras is taken.
-
-    Args:
-        F_mat: fundamental matrices with shape :math:`(B, 3, 3)`, any scale.
-        K1: cameras of the first images with shape :math:`(B, 3, 3)`.
-        K2: cameras of the second images with shape :math:`(B, 3, 3)`.
-        points1: pixels in the first images with shape :math:`(B, N, 2)`.
-        points2: pixels in the second images with shape :math:`(B, N, 2)`.
-        mask: true for the correspondences that vote, inliers say, boolean with shape :math:`(B, N)`; default: all.
-
-    Returns:
-        rotations with shape :math:`(B, 3, 3)` and unit translations with shape :math:`(B, 3)`, solved in float64 where
-        the device has it, in the dtype of ``F_mat``. Both are NaN where there is no pose to tell: ``F_mat`` is not
-        finite or of rank below two, or no pose has more votes than each of the others.
-
-    Raises:
-        TypeError: if a tensor is not floating-point or the mask is not boolean.
-        ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up, the batches differ, or the mask does not fit the points.
-        torch.linalg.LinAlgError: if a camera is singular.
-
-    Reference:
-        R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2004, section 9.6.
-
-    Example:
-        >>> from kornia_learnnorm.data.synthetic import handheld
-        >>> scene = handheld(2, 20, torch.Generator().manual_seed(0))
-        >>> R, t = relative_pose(scene.F_mat, scene.K1, scene.K2, scene.points1, scene.points2)
-        >>> bool((pose_error(R, t, scene.R, scene.t) < 1e-6).all())
-        True
-
-    """
-    _check(F_mat, K1, K2, points1, points2, mask)
-    dtype, work = F_mat.dtype, solve_dtype(F_mat.device)
-    F_mat, K1, K2, points1, points2 = (value.to(work) for value in (F_mat, K1, K2, points1, points2))
-    E_mat = essential_from_fundamental(F_mat, K1, K2)
-    E_mat = torch.where(E_mat.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), E_mat, 0.0)
-    R, t = motion_from_essential(E_mat)
-    t = t[..., 0]
-    front = _in_front(R, t, _rays(points1, K1), _rays(points2, K2))
-    votes = (front if mask is None else front & mask[:, None]).sum(-1)
-    first, second = votes.topk(2).values.unbind(-1)
-    known = (first > second) & (torch.linalg.matrix_rank(E_mat) >= 2)
-    row, best = torch.arange(len(R), device=R.device), votes.argmax(-1)
-    R = torch.where(known[:, None, None], R[row, best], torch.nan)
-    return R.to(dtype), torch.where(known[:, None], t[row, best], torch.nan).to(dtype)
-
-
-def _check(F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None) -> None:
-    named = {"F_mat": F_mat, "K1": K1, "K2": K2, "points1": points1, "points2": points2}
-    for name, value in named.items():
-        if not isinstance(value, Tensor) or not value.is_floating_point():
-            raise TypeError(f"{name} must be a floating-point tensor, got {getattr(value, 'dtype', type(value))}")
-        KORNIA_CHECK_SHAPE(value, ["B", "N", "2"] if name.startswith("points") else ["B", "3", "3"])
-    if points1.shape != points2.shape:
-        raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
-    sizes = {name: len(value) for name, value in named.items()}
-    if len(set(sizes.values())) > 1:
-        raise ValueError(f"all must be of one batch, got {sizes}")
-    if mask is None:
-        return
-    if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
-        raise TypeError(f"mask must be a boolean tensor, got {getattr(mask, 'dtype', type(mask))}")
-    if mask.shape != points1.shape[:2]:
-        raise ValueError(f"mask must have shape {[*points1.shape[:2]]}, got {[*mask.shape]}")
-
-
-def _rays(points: Tensor, K: Tensor) -> Tensor:
-    """Directions of pixels, ``(B, 1, N, 3)``."""
-    rays: Tensor = torch.linalg.solve(K, convert_points_to_homogeneous(points).mT)
-    return rays.mT[:, None]
-
-
-def _in_front(R: Tensor, t: Tensor, rays1: Tensor, rays2: Tensor) -> Tensor:
-    """Tell whether the depths of z2 x2 = z1 R x1 + t are positive; crossed with one ray, it leaves the other's depth.
-
-    Poses ``(B, 4, 3, 3)`` and ``(B, 4, 3)``, rays ``(B, 1, N, 3)``, booleans ``(B, 4, N)``.
-    """
-    turned = rays1 @ R.mT
-    t = t[..., None, :]
-    normal = torch.linalg.cross(rays2, turned)
-    depth1 = (torch.linalg.cross(t, rays2) * normal).sum(-1)  # times the squared length of the normal
-    depth2 = (torch.linalg.cross(t, turned) * normal).sum(-1)
-    front: Tensor = (depth1 > 0) & (depth2 > 0)
-    return front
+__all__ = ["mean_average_accuracy", "pose_auc", "pose_error", "rotation_error", "translation_error"]
 
 
 def rotation_error(R: Tensor, R_true: Tensor) -> Tensor:
@@ -193,3 +102,75 @@ def pose_error(R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> Tensor:
     error = torch.maximum(rotation_error(R, R_true), translation_error(t, t_true))
     unknown = (rotation_error(R_true, R_true) + translation_error(t_true, t_true)).isnan()
     return torch.where(unknown, torch.nan, error.nan_to_num(nan=inf))
+
+
+def pose_auc(errors: Tensor, thresholds: Sequence[float] = (5, 10, 20)) -> tuple[float, ...]:
+    r"""Return the area under the recall curve of pose errors up to each threshold, as a share.
+
+    The curve joins (0, 0) and :math:`(e_i, i / P)` of the sorted errors below the threshold :math:`\tau` by straight
+    lines and is level from the last to :math:`\tau`. Its trapezoids add up to
+    :math:`(\sum_{e_i < \tau} (\tau - e_i) + \max_{e_i < \tau} e_i / 2) / (P \tau)`.
+
+    Args:
+        errors: one pose error per image pair with shape :math:`(P,)`, degrees; infinite for a failure.
+        thresholds: largest errors, degrees.
+
+    Returns:
+        areas from 0 to 1, one per threshold.
+
+    Raises:
+        ValueError: if there are no errors, one is NaN or negative, or a threshold is not positive.
+
+    Reference:
+        P.-E. Sarlin et al., SuperGlue: Learning Feature Matching with Graph Neural Networks, CVPR 2020.
+
+    Example:
+        >>> pose_auc(torch.tensor([0.0, 2.0, torch.inf]), thresholds=(4, 8))
+        (0.583..., 0.625)
+
+    """
+    if not all(threshold > 0 for threshold in thresholds):
+        raise ValueError(f"thresholds must be positive, got {[*thresholds]}")
+    areas = auc_from_errors(_checked(errors), [*map(float, thresholds)])
+    return tuple(areas[float(threshold)] / 100 for threshold in thresholds)
+
+
+def mean_average_accuracy(errors: Tensor, limit: int = 10) -> float:
+    r"""Return the share of image pairs with a pose error below 1, 2, ... degrees, averaged: mAA(10).
+
+    :math:`\frac{1}{L} \sum_{k=1}^{L} |\{i : e_i < k\}| / P`, with the larger of rotation and translation error as
+    :math:`e_i`, see :func:`pose_error`.
+
+    Args:
+        errors: one pose error per image pair with shape :math:`(P,)`, degrees; infinite for a failure.
+        limit: the last threshold :math:`L`, whole degrees.
+
+    Returns:
+        the average, from 0 to 1.
+
+    Raises:
+        ValueError: if there are no errors, one is NaN or negative, or the limit is below one.
+
+    Reference:
+        Y. Jin et al., Image Matching across Wide Baselines: From Paper to Practice, IJCV 2021. Its histogram also
+        counts an error of exactly 10 degrees.
+
+    Example:
+        >>> mean_average_accuracy(torch.tensor([0.5, 5.5, torch.inf]))
+        0.5
+
+    """
+    errors = _checked(errors)
+    if limit < 1:
+        raise ValueError(f"limit must be one degree or more, got {limit}")
+    degrees = torch.arange(1, limit + 1, device=errors.device)
+    return (errors[:, None] < degrees).to(errors.dtype).mean().item()
+
+
+def _checked(errors: Tensor) -> Tensor:
+    if errors.ndim != 1 or len(errors) == 0:
+        raise ValueError(f"errors must be a (P,) tensor of at least one pair, got shape {[*errors.shape]}")
+    bad = int((~(errors >= 0)).sum())
+    if bad:
+        raise ValueError(f"errors must be zero or more, infinite for a failure, got {bad} NaN or negative ones")
+    return errors.to(solve_dtype(errors.device))

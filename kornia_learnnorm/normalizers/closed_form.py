@@ -1,25 +1,20 @@
-r"""Normalisers: modules that choose the coordinates in which the fundamental matrix is solved and projected.
-
-The one contract of this package is ``(points1, points2, weights=None) -> (T1, T2)``: pixels :math:`(B, N, 2)` of both
-views and optional weights :math:`(B, N)` go in, two affine transforms :math:`(B, 3, 3)` come out. Anything that keeps
-it can be given to :func:`kornia_learnnorm.find_fundamental`.
-"""
+r"""Normalisers in closed form: none, Hartley's, whitening, and an adapter for per-view callables."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.geometry.checks import solve_dtype, weighted_mean
-from kornia_learnnorm.geometry.transforms import affine_transform, inverse_sqrt
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.transforms import whitening_transform
+from kornia_learnnorm.normalizers.contract import ProblemNormalizer
 
 __all__ = ["Hartley", "Identity", "PerView", "Whitening"]
 
 
-class Identity(nn.Module):
+class Identity(ProblemNormalizer):
     """No normalisation: both transforms are the identity (the original eight-point algorithm, in pixels).
 
     Example:
@@ -31,9 +26,9 @@ class Identity(nn.Module):
 
     """
 
-    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return identities with shape :math:`(B, 3, 3)`."""
-        eye = torch.eye(3, dtype=points1.dtype, device=points1.device).expand(points1.shape[0], 3, 3)
+        eye = torch.eye(3, dtype=problem.x1.dtype, device=problem.x1.device).expand(len(problem.x1), 3, 3)
         return eye, eye
 
 
@@ -57,12 +52,22 @@ class PerView(nn.Module):
         self.normalize = normalize
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the callable's transforms of both views."""
+        r"""Return the callable's transforms of both views.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, handed on unchecked.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            weights: optional weights with shape :math:`(B, N)`.
+
+        Returns:
+            two transforms with shape :math:`(B, 3, 3)`.
+
+        """
         kwargs = {} if weights is None else {"weights": weights}
         return self.normalize(points1, **kwargs)[1], self.normalize(points2, **kwargs)[1]
 
 
-class Hartley(nn.Module):
+class Hartley(ProblemNormalizer):
     r"""Hartley's normalisation: centroid to the origin, mean distance from it :math:`\sqrt 2` (Fan et al., Eq. 4).
 
     Coincident points keep their scale.
@@ -76,19 +81,12 @@ class Hartley(nn.Module):
 
     """
 
-    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views."""
-        return self._transform(points1, weights), self._transform(points2, weights)
-
-    @staticmethod
-    def _transform(points: Tensor, weights: Tensor | None) -> Tensor:
-        origin = weighted_mean(points, weights)
-        radius = weighted_mean((points - origin[:, None]).norm(dim=-1, keepdim=True), weights)[..., 0]
-        scale = math.sqrt(2) / torch.where(radius > _rounding(origin), radius, math.sqrt(2))
-        return affine_transform(scale[:, None, None] * torch.eye(2).to(points), origin)
+        return problem.T1, problem.T2
 
 
-class Whitening(nn.Module):
+class Whitening(ProblemNormalizer):
     r"""Symmetric (ZCA) whitening: centroid to the origin, covariance of each view to the identity.
 
     :math:`T = [\Sigma^{-1/2}, -\Sigma^{-1/2} o; 0, 1]`, in closed form. Where the points are nearly collinear, the
@@ -96,6 +94,9 @@ class Whitening(nn.Module):
 
     Args:
         floor: smallest ratio of the eigenvalues of :math:`\Sigma`.
+
+    Raises:
+        ValueError: if the floor is not positive.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0.0], [4.0, 0.0], [0.0, 2.0], [4.0, 2.0]]])
@@ -106,26 +107,17 @@ class Whitening(nn.Module):
 
     def __init__(self, floor: float = 1e-6) -> None:
         super().__init__()
+        if not floor > 0:
+            raise ValueError(f"floor must be positive, got {floor}")
         self.floor = floor
 
-    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views."""
-        return self._transform(points1, weights), self._transform(points2, weights)
-
-    def _transform(self, points: Tensor, weights: Tensor | None) -> Tensor:
-        dtype = solve_dtype(points.device)
-        x, w = points.to(dtype), None if weights is None else weights.to(dtype)
-        origin = weighted_mean(x, w)
-        centred = x - origin[:, None]
-        covariance = torch.unflatten(
-            weighted_mean((centred[..., :, None] * centred[..., None, :]).flatten(-2), w), -1, (2, 2)
+        return (
+            whitening_transform(problem.points1, problem.weights, self.floor),
+            whitening_transform(problem.points2, problem.weights, self.floor),
         )
-        spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-        covariance = torch.where((spread > _rounding(origin))[:, None, None], covariance, 0.0)
-        return affine_transform(inverse_sqrt(covariance, self.floor), origin).to(points.dtype)
 
-
-def _rounding(origin: Tensor) -> Tensor:
-    """Spread ``(B,)`` about ``origin`` up to which points coincide: a mean is not exact."""
-    size: Tensor = torch.linalg.vector_norm(origin.detach(), dim=-1)
-    return 16 * torch.finfo(origin.dtype).eps * size
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        return f"floor={self.floor:g}"

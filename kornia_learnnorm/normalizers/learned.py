@@ -15,21 +15,22 @@ from torch import Tensor, nn
 
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry import transforms
-from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype
-from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.transforms import spd_transform, transform_points
 from kornia_learnnorm.normalizers import closed_form, reweighted
-from kornia_learnnorm.normalizers.closed_form import Whitening
+from kornia_learnnorm.normalizers.contract import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.networks import crossview, paper
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
+from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = ["LearnedNormalizer"]
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
 FORMAT = "kornia_learnnorm.normalizer.v1"
-LARGEST = 4096  # of the numbers that a file gives for widths, depths and iterations
+MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that a file may name
 
 
-class LearnedNormalizer(nn.Module):
+class LearnedNormalizer(ProblemNormalizer):
     r"""Predict the transforms of the normalised eight-point algorithm from the correspondences.
 
     :math:`T_i = B(p_i)\, T_i^{base}`: the base normaliser gives coordinates, the network reads the correspondences
@@ -37,9 +38,10 @@ class LearnedNormalizer(nn.Module):
     the transforms are exactly the base's.
 
     Args:
-        base: normaliser ``(points1, points2, weights) -> (T1, T2)``; whitening when not given.
-        network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates; a fresh
-            :class:`~kornia_learnnorm.normalizers.networks.crossview.CrossViewNetwork` when not given.
+        base: normaliser ``(points1, points2, weights) -> (T1, T2)``; :class:`~kornia_learnnorm.ReweightedWhitening`
+            when not given, as in the shipped weights ``crossview``.
+        network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates; an untrained
+            :class:`~kornia_learnnorm.CrossViewNetwork` of their size when not given.
         transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
 
     Attributes:
@@ -59,6 +61,8 @@ class LearnedNormalizer(nn.Module):
 
     """
 
+    min_points = 8
+
     def __init__(
         self,
         base: nn.Module | None = None,
@@ -66,33 +70,20 @@ class LearnedNormalizer(nn.Module):
         transform: Callable[[Tensor], Tensor] = spd_transform,
     ) -> None:
         super().__init__()
-        self.base = Whitening() if base is None else base
+        self.base: Normalizer = ReweightedWhitening() if base is None else base
         self.network = CrossViewNetwork() if network is None else network
         self.transform = transform
         self.trained_on: tuple[str, ...] = ()
 
-    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        r"""Return the transforms :math:`(B, 3, 3)` of both views, in the dtype of the points.
-
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-
-        Raises:
-            TypeError: if the points are not floating-point tensors of one dtype.
-            ShapeError: if a shape is wrong.
-            ValueError: if there are fewer than eight correspondences or a value is not finite.
-
-        """
-        check_correspondences(points1, points2, weights)
-        dtype = solve_dtype(points1.device)
-        x1, x2 = points1.to(dtype), points2.to(dtype)
-        w = None if weights is None else weights.to(dtype)
-        T1, T2 = self.base(x1, x2, w)
-        params1, params2 = self.network(_apply(T1, x1), _apply(T2, x2), w)
-        T1, T2 = self.transform(params1) @ T1, self.transform(params2) @ T2
-        return T1.to(points1.dtype), T2.to(points2.dtype)
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+        """Return the transforms :math:`(B, 3, 3)` of both views, in the dtype of the problem."""
+        T1, T2 = (T.to(problem.x1) for T in transforms_of(self.base, problem))
+        x1, x2 = transform_points(problem.points1, T1), transform_points(problem.points2, T2)
+        if getattr(self.network, "needs_null_matrix", False):
+            params1, params2 = self.network(x1, x2, problem.weights, null_matrix=problem.null_matrix_in(T1, T2))
+        else:
+            params1, params2 = self.network(x1, x2, problem.weights)
+        return self.transform(params1) @ T1, self.transform(params2) @ T2
 
     def save_pretrained(self, path: str | Path) -> None:
         """Write weights and architecture to one safetensors file, beside the target and then renamed.
@@ -184,10 +175,6 @@ def _read_names(path: Path, text: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _apply(T: Tensor, points: Tensor) -> Tensor:
-    return points @ T[..., :2, :2].mT + T[..., None, :2, 2]
-
-
 def _name(part: Any, *modules: Any) -> str:
     name = getattr(part, "__name__", "")
     if not any(getattr(module, name, None) is part for module in modules):
@@ -195,10 +182,10 @@ def _name(part: Any, *modules: Any) -> str:
     return str(name)
 
 
-def _describe(part: nn.Module, *modules: Any) -> dict[str, Any]:
-    """Name a part of this package and its constructor's arguments, which it keeps as attributes of the same names."""
+def _describe(part: object, *modules: Any) -> dict[str, Any]:
+    """Return the name of a part of this package and its constructor's arguments, kept as attributes of their names."""
     name, arguments = _name(type(part), *modules), inspect.signature(type(part)).parameters.values()
-    # A part without a constructor of its own shows the `*args, **kwargs` of `nn.Module`.
+    # A part without its own constructor shows the `*args, **kwargs` of `nn.Module`.
     keys = [argument.name for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD]
     values = {key: getattr(part, key) for key in keys}
     for key, value in values.items():
@@ -219,9 +206,13 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
     try:
         parts = json.loads(architecture)
         base, network = dict(parts["base"]), dict(parts["network"])
-        large = [value for value in (*base.values(), *network.values()) if isinstance(value, int) and value > LARGEST]
+        large = [
+            value
+            for value in (*base.values(), *network.values())
+            if isinstance(value, int) and value > MAX_ARCHITECTURE_INT
+        ]
         if large:
-            raise ValueError(f"numbers can be at most {LARGEST}, got {large[0]}")
+            raise ValueError(f"numbers can be at most {MAX_ARCHITECTURE_INT}, got {large[0]}")
         return {
             "base": find(base.pop("name"), closed_form, reweighted)(**base),
             "network": find(network.pop("name"), crossview, paper)(**network),

@@ -14,22 +14,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.robust_losses import Factor, Loss, sampson_factor
+from kornia_learnnorm.estimators.robust_losses import Loss
+from kornia_learnnorm.geometry.distances import DistanceScale, sampson_scale
+from kornia_learnnorm.geometry.linear import cofactors
 
 __all__ = ["Fit", "constrained_fit"]
 
-NEAREST = 1e-4  # of the points' size
-LENGTH = 1.3  # of a step: bounded losses make those of least squares too short
+EPIPOLE_FLOOR = 1e-4  # smallest norm of a line's normal, relative to the size of the points
+STEP_LENGTH = 1.3  # over the least-squares step, which bounded losses make too short
 
 
 class Fit(NamedTuple):
-    """Matrices and how good they are.
+    """Fitted matrices and their costs.
 
     Attributes:
         F_mat: matrices of unit norm, singular up to the square of the last step, (K, 3, 3).
-        cost: what their last losses added up to before the last step, (K,).
-        gain: the share of it that a step of least squares could still take away then, (K,); close to an optimum where
-            small.
+        cost: sum of the last losses before the last step, (K,).
+        gain: share of the cost that a least-squares step could still remove, (K,); small close to an optimum.
     """
 
     F_mat: Tensor
@@ -42,9 +43,9 @@ def constrained_fit(
     x2: Tensor,
     F_mat: Tensor,
     losses: Iterable[Loss],
-    factor: Factor = sampson_factor,
+    scale: DistanceScale = sampson_scale,
 ) -> Fit:
-    r"""Fit matrices to correspondences that they share, one step for each loss.
+    r"""Return matrices fitted to correspondences that they share, one step for each loss.
 
     With :math:`u = \mathrm{vec}(F)`, :math:`\|u\| = 1`, :math:`\xi_i = x_{2,i} \otimes x_{1,i}`, the factors
     :math:`g_i(n_{1,i}, n_{2,i})` of the squared norms :math:`n_{v,i} = (u, V_{v,i} u)` of the epipolar lines' normals,
@@ -61,10 +62,10 @@ def constrained_fit(
 
     Args:
         x1: homogeneous points of view 1 with shape :math:`(3, N)`, the first two coordinates in pixels.
-        x2: the same of view 2.
+        x2: homogeneous points of view 2.
         F_mat: where to start, with shape :math:`(K, 3, 3)`, any scale but zero.
         losses: :math:`\rho` of each step, at least one, see :mod:`kornia_learnnorm.estimators.robust_losses`.
-        factor: :math:`g`, see :mod:`kornia_learnnorm.estimators.robust_losses`.
+        scale: :math:`g`, see :mod:`kornia_learnnorm.geometry.distances`.
 
     Returns:
         the matrices with their costs. Where a step cannot be computed, as without inliers, the matrix that was given
@@ -86,17 +87,17 @@ def constrained_fit(
     F, xi = given, (x2[:, None] * x1).flatten(0, 1)
     products, products1, products2 = ((x[:, None] * x).flatten(0, 1).mT for x in (xi, x1, x2))
     # A point this close to the epipole has a line of no certain direction, and must not outweigh all others.
-    floor1, floor2 = (NEAREST**2 * x.square().mean() for x in (x2, x1))
+    floor1, floor2 = (EPIPOLE_FLOOR**2 * x.square().mean() for x in (x2, x1))
     system, right = F.new_zeros(len(F), 11, 11), F.new_zeros(len(F), 11)
     X, constraints, multipliers = system[:, :9, :9], system[:, 9:, :9], system[:, :9, 9:]
     entries = torch.unflatten(torch.unflatten(X, 2, (3, 3)), 1, (3, 3))
     in_view1, in_view2 = entries.diagonal(dim1=2, dim2=4)[..., :2], entries.diagonal(dim1=1, dim2=3)[..., :2]
     right[:, 9] = 1
     for step, loss in enumerate(losses):
-        length = LENGTH if step else 1.0
-        u, cofactors = F.flatten(1), torch.linalg.cross(F.roll(-1, 1), F.roll(-2, 1)).flatten(1)
-        normal1, normal2 = (F.mT[:, :2] @ x2).square_().sum(1), (F[:, :2] @ x1).square_().sum(1)
-        g, slope1, slope2 = factor(normal1.clamp_(min=floor1), normal2.clamp_(min=floor2))
+        length = STEP_LENGTH if step else 1.0
+        u, cofactor = F.flatten(1), cofactors(F).flatten(1)
+        sq_norm1, sq_norm2 = (F.mT[:, :2] @ x2).square_().sum(1), (F[:, :2] @ x1).square_().sum(1)
+        g, slope1, slope2 = scale(sq_norm1.clamp_(min=floor1), sq_norm2.clamp_(min=floor2))
         algebraic, g_squared = (u @ xi).square_(), g.square()
         values, weights = loss(algebraic * g_squared)
         X.copy_(torch.unflatten((weights * g_squared) @ products, 1, (9, 9)))
@@ -104,9 +105,9 @@ def constrained_fit(
             pull = (2 * weights).mul_(algebraic).mul_(g)
             in_view1.add_(torch.unflatten((pull * slope1) @ products2, 1, (3, 3))[..., None])
             in_view2.add_(torch.unflatten((pull * slope2) @ products1, 1, (3, 3))[..., None])
-        torch.stack([u, cofactors], 1, out=constraints)
+        torch.stack([u, cofactor], 1, out=constraints)
         multipliers.copy_(constraints.mT)
-        torch.mul((cofactors * u).sum(-1), 1 - 1 / (3 * length), out=right[:, 10])
+        torch.mul((cofactor * u).sum(-1), 1 - 1 / (3 * length), out=right[:, 10])
         change = torch.linalg.solve_ex(system, right)[0][:, :9] - u
         u = torch.add(u, change, alpha=length)
         F = torch.unflatten(u / torch.linalg.vector_norm(u, dim=-1, keepdim=True), 1, (3, 3))

@@ -5,38 +5,66 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack
 from numbers import Integral, Real
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
-from kornia_learnnorm.estimators.fundamental import Normalizer, check_rank2, find_fundamental
+from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.minimal import are_determined, solve_samples
 from kornia_learnnorm.estimators.refinement import minimize
-from kornia_learnnorm.estimators.robust_losses import Factor, GemanMcClure, Loss, Truncated, sampson_factor
-from kornia_learnnorm.geometry.checks import solve_dtype
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
+from kornia_learnnorm.geometry.checks import check_rank2, check_tensor, solve_dtype
+from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
 from kornia_learnnorm.geometry.manifold import Rank2, decompose
+from kornia_learnnorm.geometry.transforms import unit_fundamental
+from kornia_learnnorm.normalizers.closed_form import Hartley
+from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.ransac.constrained_fit import constrained_fit
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
-from kornia_learnnorm.ransac.scoring import COARSE, FARTHEST, Hypotheses, PairScorer, in_proportion
+from kornia_learnnorm.ransac.scoring import (
+    MAX_MEDIAN_DISTANCES,
+    PRESCORED,
+    Hypotheses,
+    PairScorer,
+    finite_and_bounded,
+)
 from kornia_learnnorm.ransac.threads import one_thread
 
-__all__ = ["RANSAC"]
+__all__ = ["RANSAC", "RansacResult"]
 
-BATCHES = (64, 1024)  # samples in the first batch, and in the largest
-SCORED = 4096  # correspondences, drawn once, that hypotheses are scored on, at most
-POOL = 8  # hypotheses of a batch that are optimised,
-SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the threshold in each step: a noisy sample sees few of its inliers
-FINAL_POOL = 4  # the same in the end, first to their inliers, then
-LOSS_SCALE = 0.7  # on a loss of this times the threshold:
-REWEIGHTINGS = 3  # so many steps of least squares,
-TOLERANCE = 1e-3  # which end close enough to the optimum where they have this share of the cost to gain; elsewhere
-STEPS = 10  # so many of Levenberg-Marquardt, at most,
-COSINE = 1e-3  # until the derivatives are this close to orthogonal
+FIRST_BATCH = 64  # samples in the first batch; each batch is four times as large as the one before
+MAX_BATCH = 1024  # samples in a batch
+MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
+POOL_SIZE = 8  # best hypotheses of a batch, which local optimisation fits
+LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps: a noisy sample has few inliers
+FINAL_POOL_SIZE = 4  # best hypotheses that the final fit starts from
+FINAL_LOSS_SCALE = 0.7  # scale of the final fit's loss, in thresholds
+FINAL_STEPS = 3  # steps of least squares on that loss
+FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
+MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
+LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
+MIN_RANK2_DETERMINANT = 1e-9  # of the 2x2 part of a matrix of rank 2 and unit norm
+MIN_SAMPLE_SHIFT = 0.01  # thresholds; a sample that a shift of a point by less makes degenerate is dropped
+
+
+class RansacResult(NamedTuple):
+    r"""Result of RANSAC on one image pair.
+
+    Attributes:
+        F_mat: fundamental matrix of rank 2 and unit Frobenius norm, (3, 3); zeros where none was found.
+        inliers: which correspondences are inliers, (N,) bool.
+        num_samples: minimal samples drawn.
+        score: MSAC score of ``F_mat``, the sum of :math:`\max(0, 1 - d_i^2 / \tau^2)` over the correspondences.
+    """
+
+    F_mat: Tensor
+    inliers: Tensor
+    num_samples: int
+    score: float
 
 
 class RANSAC(nn.Module):
@@ -48,34 +76,34 @@ class RANSAC(nn.Module):
     are still needed. In the end the best few are fitted on Geman and McClure's loss, and the one of least cost goes on
     to Levenberg-Marquardt where least squares have not converged.
 
-    PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.ransac.threads.one_thread`.
+    On the CPU, PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.ransac.threads.one_thread`.
 
-    Its call takes and returns what that of ``kornia.geometry.RANSAC(model_type="fundamental_8pt")`` does. What differs:
-    the arguments below, of which ``max_iter`` counts samples; the matrix has unit Frobenius norm; and weights steer the
-    sampling.
+    :meth:`forward` takes and returns what that of ``kornia.geometry.RANSAC(model_type="fundamental_8pt")`` does; the
+    constructor's arguments differ, the matrix has unit Frobenius norm, and weights steer the sampling.
 
     Args:
-        normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, in whose coordinates matrices
-            are projected to rank 2. When not given, none is needed, since ``rank2`` is ``"optimal"``: that takes fewer
-            samples than any normalisation, and a fraction of the time.
+        normalizer: maps ``(points1, points2, weights)`` to the transforms of both views; Hartley's when not given.
         inl_th: largest distance of an inlier, pixels.
-        max_iter: largest number of minimal samples.
+        max_samples: largest number of minimal samples (Kornia's ``max_iter`` counts batches of 2,048).
         max_seconds: time after which no further batch of samples, 64 at first and up to 1,024, is drawn; with it the
             result depends on the machine.
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
-            best matrix so far has found all inliers; 1 draws all ``max_iter`` samples. It is close to 1 by default,
+            best matrix so far has found all inliers; 1 draws all ``max_samples`` samples. It is close to 1 by default,
             since a sample must not have much noise either.
-        factor: the distance, :func:`~kornia_learnnorm.estimators.robust_losses.sampson_factor` or
-            :func:`~kornia_learnnorm.estimators.robust_losses.symmetric_factor` (Fan et al., Eq. 7).
-        rank2: how the singularity constraint is enforced, see :func:`~kornia_learnnorm.find_fundamental`.
+        distance: ``"sampson"``, ``"symmetric"`` (Fan et al., Eq. 7), or a function such as
+            :func:`~kornia_learnnorm.sampson_scale`.
+        rank2: how the singularity constraint is enforced on minimal samples: ``"projection"`` in the normaliser's
+            coordinates or ``"optimal"`` correction, which uses no normaliser, takes fewer samples than any and a
+            fraction of the time. When not given, ``"projection"`` with a ``normalizer`` and ``"optimal"`` without.
         refine: whether to optimise; otherwise the result is the minimal sample of highest score.
         sampler: what weights do: :class:`~kornia_learnnorm.ransac.samplers.ProsacSampler` or
             :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
 
     Raises:
-        TypeError: if ``normalizer``, ``factor`` or ``sampler`` cannot be called, or a number is none.
-        ValueError: if a number is out of its range or ``rank2`` is neither of its values.
+        TypeError: if ``normalizer``, ``distance`` or ``sampler`` cannot be called, or an argument that must be a number
+            is not one.
+        ValueError: if a number is out of its range, or there is no such ``distance`` or ``rank2``.
 
     Reference:
         P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM
@@ -98,58 +126,73 @@ class RANSAC(nn.Module):
         self,
         normalizer: Normalizer | None = None,
         inl_th: float = 1.0,
-        max_iter: int = 50_000,
+        max_samples: int = 50_000,
         max_seconds: float | None = None,
         confidence: float = 0.999999,
-        factor: Factor = sampson_factor,
-        rank2: Literal["optimal"] | None = None,
+        distance: Literal["sampson", "symmetric"] | DistanceScale = "sampson",
+        rank2: Literal["projection", "optimal"] | None = None,
         refine: bool = True,
         sampler: Callable[[Tensor], Sampler] = ProsacSampler,
         seed: int | None = None,
     ) -> None:
         super().__init__()
-        for name, value in {"inl_th": inl_th, "confidence": confidence, "max_seconds": max_seconds}.items():
-            if not _is_number(value) and (value is not None or name != "max_seconds"):
-                raise TypeError(f"{name} must be a number, got {value!r}")
-        if not 1e-12 <= inl_th <= 1e12:
-            raise ValueError(f"inl_th must be a positive number of pixels, from 1e-12 to 1e12, got {inl_th}")
-        if not _is_whole(max_iter) or max_iter < 1:
-            raise ValueError(f"max_iter must be a whole number of samples, at least 1, got {max_iter}")
-        if max_seconds is not None and not max_seconds > 0:
-            raise ValueError(f"max_seconds must be positive or None, got {max_seconds}")
-        if seed is not None and not _is_whole(seed):
-            raise TypeError(f"seed must be a whole number or None, got {seed!r}")
-        if seed is not None and not 0 <= seed < 2**63:
-            raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
-        if not 0 < confidence <= 1:
-            raise ValueError(f"confidence must lie in (0, 1], got {confidence}")
+        _check_numbers(inl_th, max_samples, max_seconds, confidence, seed)
         if normalizer is not None and (isinstance(normalizer, type) or not callable(normalizer)):
             raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
+        if not callable(sampler):
+            raise TypeError(f"sampler must be a function or a class, got {sampler!r}")
+        if rank2 is None:
+            rank2 = "optimal" if normalizer is None else "projection"
         check_rank2(rank2)
-        for name, function in (("factor", factor), ("sampler", sampler)):
-            if not callable(function):
-                raise TypeError(f"{name} must be a function or a class, got {function!r}")
-        self.normalizer = normalizer
-        self.rank2: Literal["optimal"] | None = "optimal" if normalizer is None else rank2
-        self.inl_th, self.max_iter, self.max_seconds, self.confidence = inl_th, max_iter, max_seconds, confidence
-        self.factor, self.refine, self.sampler, self.seed = factor, refine, sampler, None if seed is None else int(seed)
+        find_scale(distance)
+        self.normalizer = Hartley() if normalizer is None else normalizer
+        self.rank2: Literal["projection", "optimal"] = rank2
+        self.inl_th, self.max_samples, self.max_seconds, self.confidence = inl_th, max_samples, max_seconds, confidence
+        self.distance, self.refine, self.sampler = distance, refine, sampler
+        self.seed = None if seed is None else int(seed)
+
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        names = ("inl_th", "max_samples", "max_seconds", "confidence", "distance", "rank2", "refine", "sampler", "seed")
+        values = {name: getattr(self, name) for name in names}
+        return ", ".join(f"{name}={getattr(value, '__name__', repr(value))}" for name, value in values.items())
 
     def forward(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        r"""Return the fundamental matrix and the inliers of one image pair, as Kornia's RANSAC.
+
+        Args:
+            kp1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, float32 or float64.
+            kp2: pixels in the second image with shape :math:`(N, 2)`.
+            weights: optional non-negative scores with shape :math:`(N,)`.
+
+        Returns:
+            the matrix :math:`(3, 3)` and the inliers :math:`(N,)`, see :meth:`estimate`.
+
+        Raises:
+            TypeError: as :meth:`estimate`.
+            ShapeError: as :meth:`estimate`.
+            ValueError: as :meth:`estimate`.
+
+        """
+        F_mat, inliers, *_ = self.estimate(kp1, kp2, weights)
+        return F_mat, inliers
+
+    def estimate(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> RansacResult:
         r"""Estimate the fundamental matrix of one image pair.
 
         Args:
-            kp1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, float32 or float64. Rows that are
-                not finite, or a million times as far from the others as these from each other, are no inliers.
-            kp2: pixels in the second image with shape :math:`(N, 2)`.
+            points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, float32 or float64. Rows that
+                are not finite, or more than 1e6 median distances from the other points, are no inliers.
+            points2: pixels in the second image with shape :math:`(N, 2)`.
             weights: optional non-negative scores :math:`(N,)`, higher is better, such as one minus Lowe's ratio. They
-                steer sampling only; zero is never sampled.
+                steer sampling only; a match of weight zero is never sampled.
 
         Returns:
-            the matrix :math:`(3, 3)` of unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, and the inliers :math:`(N,)`,
-            boolean, which are those of the matrix before it is rounded to float32. Neither has a gradient. Zeros and no
-            inliers where no matrix of rank 2 was found that has more than eight of them, and where fewer than eight
-            weights are positive. Where no sample determines a matrix, as of a plane without noise or a camera that does
-            not move, it is one of those that fit.
+            the matrix :math:`(3, 3)`, :math:`x_2^\top F x_1 = 0`, the inliers of the matrix before it is rounded to the
+            dtype of the points, the number of samples and the score; no gradients. Zeros and no inliers where no matrix
+            of rank 2 was found that has more than eight inliers, and where fewer than eight weights are positive. Where
+            every sample is degenerate, as on a plane without noise or under no motion, the matrix is one of those that
+            fit.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or the weights not floating-point.
@@ -158,99 +201,105 @@ class RANSAC(nn.Module):
                 finite.
 
         """
-        _check(kp1, kp2, weights)
-        device = kp1.device.type
-        precision = torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
-        # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
-        no_gradient = torch.inference_mode() if self.normalizer is None else torch.no_grad()
-        with one_thread(), precision, no_gradient:
-            F_mat, inliers = self._estimate(kp1, kp2, weights)
-        return F_mat.clone(), inliers.clone()
+        _check_matches(points1, points2, weights)
+        device = points1.device.type
+        with ExitStack() as stack:
+            if device == "cpu":
+                stack.enter_context(one_thread())
+            if torch.is_autocast_enabled(device):
+                stack.enter_context(torch.autocast(device, enabled=False))
+            # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
+            uses_normalizer = self.rank2 == "projection"
+            stack.enter_context(torch.no_grad() if uses_normalizer else torch.inference_mode())
+            result = self._estimate(points1, points2, weights)
+        return result._replace(F_mat=result.F_mat.clone(), inliers=result.inliers.clone())
 
-    def _estimate(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        if torch.maximum(kp1.abs().max(), kp2.abs().max()) <= FARTHEST * self.inl_th:  # and no NaN
-            return self._estimate_kept(kp1, kp2, weights)
-        kept = in_proportion(kp1, kp2, self.inl_th)
-        F_mat, inliers = self._estimate_kept(kp1[kept], kp2[kept], None if weights is None else weights[kept])
-        return F_mat, torch.zeros_like(kept).masked_scatter(kept, inliers)
+    def _estimate(self, points1: Tensor, points2: Tensor, weights: Tensor | None) -> RansacResult:
+        if torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:  # and no NaN
+            return self._estimate_kept(points1, points2, weights)
+        kept = finite_and_bounded(points1, points2, self.inl_th)
+        result = self._estimate_kept(points1[kept], points2[kept], None if weights is None else weights[kept])
+        return result._replace(inliers=torch.zeros_like(kept).masked_scatter(kept, result.inliers))
 
-    def _estimate_kept(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        if (len(kp1) if weights is None else int((weights > 0).sum())) < SAMPLE_SIZE:
-            return _failure(kp1)
-        x1, x2 = (kp.to(solve_dtype(kp.device)) for kp in (kp1, kp2))
-        generator = torch.Generator(kp1.device)
+    def _estimate_kept(self, points1: Tensor, points2: Tensor, weights: Tensor | None) -> RansacResult:
+        if (len(points1) if weights is None else int((weights > 0).sum())) < SAMPLE_SIZE:
+            return _failure(points1, 0)
+        x1, x2 = (points.to(solve_dtype(points.device)) for points in (points1, points2))
+        generator = torch.Generator(x1.device)
         generator.manual_seed(int(torch.randint(2**62, ())) if self.seed is None else self.seed)
         sampler = UniformSampler(len(x1), x1.device) if weights is None else self.sampler(weights.to(x1))
         scored: Tensor | slice = slice(None)
-        if len(x1) >= 2 * COARSE:
-            scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:SCORED]
-        scorer = PairScorer(x1, x2, self.inl_th, self.factor, scored)
-        pool = self._search(scorer, sampler, generator)
+        if len(x1) >= 2 * PRESCORED:
+            scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:MAX_SCORED]
+        scorer = PairScorer(x1, x2, self.inl_th, find_scale(self.distance), scored)
+        pool, drawn = self._search(scorer, sampler, generator)
         if len(pool.F_mat) == 0:
-            return _failure(kp1)
+            return _failure(points1, drawn)
         state = self._polish(scorer, pool) if self.refine else decompose(pool.F_mat[:1])
-        if state.A.det().abs() < 1e-9:
-            return _failure(kp1)
+        if state.A.det().abs() < MIN_RANK2_DETERMINANT:
+            return _failure(points1, drawn)
         F = state.matrix()
-        inliers = scorer.distances(F[0]) <= self.inl_th
-        F_mat = scorer.to_pixels(F)[0]
-        F_mat = (F_mat / torch.linalg.vector_norm(F_mat)).to(kp1.dtype)
-        return (F_mat, inliers) if int(inliers.sum()) > SAMPLE_SIZE else _failure(kp1)
+        distances = scorer.distances(F[0])
+        inliers = distances <= self.inl_th
+        if int(inliers.sum()) <= SAMPLE_SIZE:
+            return _failure(points1, drawn)
+        score = float((1 - (distances / self.inl_th).square()).clamp(min=0).nansum())
+        return RansacResult(unit_fundamental(scorer.to_pixels(F)[0]).to(points1.dtype), inliers, drawn, score)
 
-    def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> Hypotheses:
-        """Return the best hypotheses that enough minimal samples give, best first."""
+    def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
+        """Return the best hypotheses that enough minimal samples give, best first, and the number of samples."""
         pool = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0))
-        (batch, largest), drawn, needed, start = BATCHES, 0, self.max_iter, time.perf_counter()
+        batch, drawn, needed, start = FIRST_BATCH, 0, self.max_samples, time.perf_counter()
         while drawn < needed:
             if self.max_seconds is not None and drawn and time.perf_counter() - start > self.max_seconds:
                 break
             rows = sampler.draw(min(batch, needed - drawn), generator)
-            drawn, batch = drawn + len(rows), min(4 * batch, largest)
+            drawn, batch = drawn + len(rows), min(4 * batch, MAX_BATCH)
             F_mat = self._solve(scorer, rows)
-            found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL)
-            pool = pool.join(found, POOL)
+            found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL_SIZE)
+            pool = pool.join(found, POOL_SIZE)
             needed = self._samples_needed(pool, scorer, sampler)
             # A pool that ends the search is optimised anyway.
             if self.refine and drawn < needed and len(found.F_mat):
-                pool = pool.join(self._optimize(scorer, found.F_mat), POOL)
+                pool = pool.join(self._optimize(scorer, found.F_mat), POOL_SIZE)
                 needed = self._samples_needed(pool, scorer, sampler)
-        return pool
+        return pool, drawn
 
     def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
-        """Return the matrices of the minimal samples (K, 8) that determine one; of all, if none does."""
+        """Return the matrices of the non-degenerate minimal samples (K, 8), or of all where every one is degenerate."""
         x1, x2 = scorer.samples(rows)
-        if self.normalizer is None:
-            F_mat = solve_samples(x1, x2, 0.01 * self.inl_th)
+        if self.rank2 == "optimal":
+            F_mat = solve_samples(x1, x2, MIN_SAMPLE_SHIFT * self.inl_th)
             if len(F_mat):
                 return F_mat
         else:
-            determined = are_determined(x1, x2, 0.01 * self.inl_th)
+            determined = are_determined(x1, x2, MIN_SAMPLE_SHIFT * self.inl_th)
             rows = rows[determined] if bool(determined.any()) else rows
         points1, points2 = (points[rows] for points in scorer.pixels)
         return scorer.from_pixels(find_fundamental(points1, points2, None, self.normalizer, self.rank2))
 
     def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
-        """Fit matrices to their inliers, and with a normaliser the first by it, and rate what comes out."""
-        if self.normalizer is not None:
+        """Return the best of the matrices fitted to their inliers, the first of them also by the normaliser."""
+        if self.rank2 == "projection":
             inliers = scorer.inliers(F_mat[:1]).to(F_mat)
             points1, points2 = (points[None, scorer.rows] for points in scorer.pixels)
             refit = find_fundamental(points1, points2, inliers, self.normalizer, self.rank2)
             F_mat = torch.cat([scorer.from_pixels(refit), F_mat])
-        losses = [Truncated(scale * self.inl_th) for scale in SCALES]
+        losses = [Truncated(scale * self.inl_th) for scale in LOCAL_SCALES]
         x1, x2 = scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows]
-        return scorer.best(constrained_fit(x1, x2, F_mat, losses, self.factor).F_mat, POOL)
+        return scorer.best(constrained_fit(x1, x2, F_mat, losses, find_scale(self.distance)).F_mat, POOL_SIZE)
 
     def _polish(self, scorer: PairScorer, pool: Hypotheses) -> Rank2:
         """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
-        loss = GemanMcClure(LOSS_SCALE * self.inl_th)
-        losses: list[Loss] = [Truncated(self.inl_th), *REWEIGHTINGS * [loss]]
-        fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL], losses, self.factor)
+        loss = GemanMcClure(FINAL_LOSS_SCALE * self.inl_th)
+        losses: list[Loss] = [Truncated(self.inl_th), *FINAL_STEPS * [loss]]
+        fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL_SIZE], losses, find_scale(self.distance))
         best = int(fit.cost.argmin())
         state, cost = decompose(fit.F_mat[best : best + 1]), float(fit.cost[best])
-        if not float(fit.gain[best]) <= TOLERANCE:
+        if not float(fit.gain[best]) <= FINAL_GAIN:
             ones = torch.ones_like(scorer.x1[:1])
-            objective = EpipolarCost(scorer.x1[None], scorer.x2[None], ones, self.factor, loss)
-            optimum = minimize(objective, state, STEPS, COSINE)[1]
+            objective = EpipolarCost(scorer.x1[None], scorer.x2[None], ones, find_scale(self.distance), loss)
+            optimum = minimize(objective, state, MAX_LM_STEPS, LM_TOLERANCE)[1]
             state, cost = optimum.state, float(optimum.cost[0])
         # The loss is nowhere above that of MSAC, so that the pool's best has no more of it than this but for a margin.
         share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
@@ -260,45 +309,58 @@ class RANSAC(nn.Module):
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
         if len(pool.F_mat) == 0 or self.confidence == 1:
-            return self.max_iter
+            return self.max_samples
         hit_rate = min(sampler.hit_rate(scorer.inliers(pool.F_mat[:1])[0], scorer.rows), 1 - 1e-9)
         if hit_rate == 0:
-            return self.max_iter
-        return math.ceil(min(self.max_iter, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
+            return self.max_samples
+        return math.ceil(min(self.max_samples, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
 
 
-def _failure(kp: Tensor) -> tuple[Tensor, Tensor]:
-    return kp.new_zeros(3, 3), torch.zeros(len(kp), dtype=torch.bool, device=kp.device)
+def _failure(points: Tensor, drawn: int) -> RansacResult:
+    inliers = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    return RansacResult(points.new_zeros(3, 3), inliers, drawn, 0.0)
 
 
-def _is_number(value: object) -> bool:
-    return not isinstance(value, bool) and isinstance(value, Real)
+def _check_numbers(
+    inl_th: float, max_samples: int, max_seconds: float | None, confidence: float, seed: int | None
+) -> None:
+    for name, value in {"inl_th": inl_th, "confidence": confidence, "max_seconds": max_seconds}.items():
+        if (isinstance(value, bool) or not isinstance(value, Real)) and (value is not None or name != "max_seconds"):
+            raise TypeError(f"{name} must be a number, got {value!r}")
+    if not 1e-12 <= inl_th <= 1e12:
+        raise ValueError(f"inl_th must be a positive number of pixels, from 1e-12 to 1e12, got {inl_th}")
+    if not _is_whole(max_samples) or max_samples < 1:
+        raise ValueError(f"max_samples must be a whole number of samples, at least 1, got {max_samples}")
+    if max_seconds is not None and not max_seconds > 0:
+        raise ValueError(f"max_seconds must be positive or None, got {max_seconds}")
+    if not 0 < confidence <= 1:
+        raise ValueError(f"confidence must lie in (0, 1], got {confidence}")
+    if seed is not None and not _is_whole(seed):
+        raise TypeError(f"seed must be a whole number or None, got {seed!r}")
+    if seed is not None and not 0 <= seed < 2**63:
+        raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
 
 
 def _is_whole(value: object) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
-def _check(kp1: Tensor, kp2: Tensor, weights: Tensor | None) -> None:
-    for name, points in (("kp1", kp1), ("kp2", kp2)):
-        if not isinstance(points, Tensor) or points.dtype not in (torch.float32, torch.float64):
-            got = points.dtype if isinstance(points, Tensor) else type(points)
-            raise TypeError(f"{name} must be a float32 or float64 tensor, got {got}")
-        KORNIA_CHECK_SHAPE(points, ["N", "2"])
-    if kp1.dtype != kp2.dtype:
-        raise TypeError(f"kp1 and kp2 must have one dtype, got {kp1.dtype} and {kp2.dtype}")
-    if kp1.shape != kp2.shape:
-        raise ValueError(f"kp1 and kp2 must pair up, got shapes {[*kp1.shape]} and {[*kp2.shape]}")
-    if len(kp1) < SAMPLE_SIZE:
-        raise ValueError(f"at least {SAMPLE_SIZE} correspondences are needed, got {len(kp1)}")
+def _check_matches(points1: Tensor, points2: Tensor, weights: Tensor | None) -> None:
+    for name, points in (("points1", points1), ("points2", points2)):
+        check_tensor(name, points, ["N", "2"], precise=True)
+    if points1.dtype != points2.dtype:
+        raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
+    if points1.shape != points2.shape:
+        raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
+    if len(points1) < SAMPLE_SIZE:
+        raise ValueError(f"at least {SAMPLE_SIZE} correspondences are needed, got {len(points1)}")
     if weights is None:
         return
-    if not isinstance(weights, Tensor) or not weights.is_floating_point():
-        got = weights.dtype if isinstance(weights, Tensor) else type(weights)
-        hint = "; of a boolean mask, take the rows" if got == torch.bool else ""
-        raise TypeError(f"weights must be a floating-point tensor, got {got}{hint}")
-    if weights.shape != kp1.shape[:1]:
-        raise ValueError(f"weights must have shape {[*kp1.shape[:1]]}, got {[*weights.shape]}")
-    known = weights[(kp1.isfinite() & kp2.isfinite()).all(-1)]
+    if isinstance(weights, Tensor) and weights.dtype == torch.bool:
+        raise TypeError("weights must be a floating-point tensor, got torch.bool; select the rows of a boolean mask")
+    check_tensor("weights", weights)
+    if weights.shape != points1.shape[:1]:
+        raise ValueError(f"weights must have shape {[*points1.shape[:1]]}, got {[*weights.shape]}")
+    known = weights[(points1.isfinite() & points2.isfinite()).all(-1)]
     if not bool(known.isfinite().all()) or bool((known < 0).any()):
         raise ValueError("weights must be finite and not negative where the points are finite")

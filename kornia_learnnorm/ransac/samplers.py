@@ -10,12 +10,12 @@ from torch import Tensor
 __all__ = ["ProsacSampler", "Sampler", "UniformSampler", "WeightedSampler", "draw_distinct"]
 
 SAMPLE_SIZE = 8
-BLOCK = 1 << 22  # random numbers in memory at once
-SMALLEST = 1e-30  # a weight, of the largest
+MAX_RANDOM_NUMBERS = 1 << 22  # random numbers in memory at once
+MIN_WEIGHT = 1e-30  # smallest positive weight, relative to the largest
 
 
 class Sampler(Protocol):
-    """What RANSAC asks of a way to sample."""
+    """Protocol of a sampler for RANSAC."""
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return the indices of the next ``count`` minimal samples, (count, 8) int64."""
@@ -62,7 +62,7 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
 
 
 class UniformSampler:
-    """All correspondences alike.
+    """Uniform samples.
 
     Args:
         total: number of correspondences, at least eight.
@@ -91,11 +91,11 @@ class UniformSampler:
 
 
 class ProsacSampler:
-    r"""The correspondences of largest weight first, and from ever more.
+    r"""PROSAC: samples from a growing set of the best-weighted correspondences.
 
     The :math:`t`-th sample holds the :math:`n(t)`-th best correspondence and seven of the better ones, where
     :math:`n(t)` grows as if 200,000 uniform samples were ordered by their worst member. Only the order of the weights
-    counts; those of zero are never drawn.
+    counts; correspondences of weight zero are never drawn.
 
     Args:
         weights: scores, higher is better, (N,), at least eight of them positive.
@@ -105,8 +105,8 @@ class ProsacSampler:
 
     """
 
-    GROWTH = 200_000
-    LEAST = 0.25  # share of the best that may stop the sampling: a cluster of few must not
+    MAX_SAMPLES = 200_000  # uniform samples whose order PROSAC follows
+    MIN_SHARE = 0.25  # smallest share of the best correspondences whose inliers may stop the sampling
 
     def __init__(self, weights: Tensor) -> None:
         self.weights = weights
@@ -115,7 +115,7 @@ class ProsacSampler:
         total = len(self.order)
         sizes = torch.arange(SAMPLE_SIZE, total + 1, dtype=torch.float64)
         taken = torch.arange(SAMPLE_SIZE, dtype=torch.float64)
-        expected = self.GROWTH * ((sizes[:, None] - taken) / (total - taken)).prod(-1)
+        expected = self.MAX_SAMPLES * ((sizes[:, None] - taken) / (total - taken)).prod(-1)
         until = torch.cat([expected.new_ones(1), 1 + expected.diff().ceil().cumsum(-1)])
         self.until, self.drawn = until.long().to(weights.device), 0  # samples among the best 8, 9, ...
 
@@ -138,11 +138,11 @@ class ProsacSampler:
             return 0.0
         ranked = inliers[order].cpu().double()
         shares = ranked.cumsum(-1) / torch.arange(1, len(ranked) + 1)
-        return float(shares[int(self.LEAST * len(shares)) :].max() ** SAMPLE_SIZE)
+        return float(shares[int(self.MIN_SHARE * len(shares)) :].max() ** SAMPLE_SIZE)
 
 
 class WeightedSampler:
-    """Correspondences in proportion to weights, without replacement; those of zero are never drawn.
+    """Samples with probability in proportion to weights, without replacement; weight zero is never drawn.
 
     Args:
         weights: non-negative weights, (N,), at least eight of them positive.
@@ -154,18 +154,18 @@ class WeightedSampler:
 
     def __init__(self, weights: Tensor) -> None:
         share = weights.double() / weights.max().double()
-        self.weights = torch.where(share > 0, share.clamp(min=SMALLEST), 0.0).float()
+        self.weights = torch.where(share > 0, share.clamp(min=MIN_WEIGHT), 0.0).float()
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return the indices of the next samples."""
-        blocks = torch.split(torch.arange(count), max(1, BLOCK // len(self.weights)))
+        blocks = torch.split(torch.arange(count), max(1, MAX_RANDOM_NUMBERS // len(self.weights)))
         return torch.cat([self._draw_block(len(block), generator) for block in blocks])
 
     def _draw_block(self, count: int, generator: torch.Generator) -> Tensor:
         uniform = torch.rand(
             count, len(self.weights), generator=generator, device=self.weights.device, dtype=torch.float32
         )
-        return (uniform.clamp_(min=SMALLEST).log() / self.weights).topk(SAMPLE_SIZE).indices
+        return (uniform.clamp_(min=MIN_WEIGHT).log() / self.weights).topk(SAMPLE_SIZE).indices
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
         """Return the share of the weights that inliers have to the power of eight."""

@@ -8,15 +8,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.robust_losses import Factor, factor_alone, sampson_factor
+from kornia_learnnorm.geometry.distances import DistanceScale, sampson_scale, scale_value
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 
-__all__ = ["Hypotheses", "PairScorer", "in_proportion"]
+__all__ = ["Hypotheses", "PairScorer", "finite_and_bounded"]
 
-FARTHEST = 1e6  # times the median distance from the median point, or the threshold
-BLOCK = 1 << 16  # distances of a block, which stay in a core's cache
-SHORTLIST = 64  # matrices, by their scores on
-COARSE = 512  # correspondences
+MAX_MEDIAN_DISTANCES = 1e6  # largest distance from the median point, in median distances or thresholds
+BLOCK = 1 << 16  # distances computed at once, which stay in a core's cache
+SHORTLIST = 64  # hypotheses that are scored on all correspondences
+PRESCORED = 512  # correspondences on which hypotheses are scored first
 
 
 class Hypotheses(NamedTuple):
@@ -51,18 +51,17 @@ class PairScorer:
     whatever the outliers, and distances in them are those in pixels.
 
     Args:
-        points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, :func:`in_proportion`.
+        points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, :func:`finite_and_bounded`.
         points2: pixels in the second image with shape :math:`(N, 2)`.
         threshold: largest distance :math:`\tau` of an inlier, pixels.
-        factor: which distance: :func:`~kornia_learnnorm.estimators.robust_losses.sampson_factor` or
-            :func:`~kornia_learnnorm.estimators.robust_losses.symmetric_factor`.
+        scale: the distance: :func:`~kornia_learnnorm.sampson_scale` or :func:`~kornia_learnnorm.symmetric_scale`.
         rows: the correspondences that count in scores, those that count in :meth:`shortlist` first; all by default.
 
     Attributes:
         x1: all correspondences in the coordinates of view 1, (3, N).
-        x2: the same of view 2.
+        x2: all correspondences in the coordinates of view 2.
         T1: from pixels of view 1 to its coordinates, (3, 3).
-        T2: the same of view 2.
+        T2: from pixels of view 2 to its coordinates, (3, 3).
 
     """
 
@@ -71,10 +70,10 @@ class PairScorer:
         points1: Tensor,
         points2: Tensor,
         threshold: float,
-        factor: Factor = sampson_factor,
+        scale: DistanceScale = sampson_scale,
         rows: Tensor | slice = slice(None),
     ) -> None:
-        self.threshold, self.factor, self.rows = threshold, factor, rows
+        self.threshold, self.scale, self.rows = threshold, scale, rows
         both = torch.stack([points1.mT, points2.mT])
         origin = both.median(-1, keepdim=True).values
         centred = both - origin
@@ -90,7 +89,7 @@ class PairScorer:
 
     @cached_property
     def pixels(self) -> tuple[Tensor, Tensor]:
-        """All correspondences in pixels, (N, 2) each."""
+        """Correspondences in pixels, (N, 2) for each view."""
         return (self.x1[:2] - self.T1[:2, 2:]).mT, (self.x2[:2] - self.T2[:2, 2:]).mT
 
     def samples(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,19 +124,19 @@ class PairScorer:
             F_mat: matrices, any scale, with shape :math:`(K, 3, 3)`.
 
         """
-        if self.terms.shape[-1] < 2 * COARSE or len(F_mat) <= SHORTLIST:
+        if self.terms.shape[-1] < 2 * PRESCORED or len(F_mat) <= SHORTLIST:
             return F_mat
-        return F_mat[self._scores(F_mat, self.terms[:, :COARSE]).topk(SHORTLIST).indices]
+        return F_mat[self._scores(F_mat, self.terms[:, :PRESCORED]).topk(SHORTLIST).indices]
 
     def inliers(self, F_mat: Tensor) -> Tensor:
-        """Tell the inliers (K, M) of matrices (K, 3, 3) among the correspondences that count."""
+        """Return a mask (K, M) of the inliers of matrices (K, 3, 3) among the correspondences that count."""
         return self._gains(F_mat, self.terms) >= 0
 
     def distances(self, F_mat: Tensor) -> Tensor:
         """Return the distances of all correspondences from one matrix (3, 3), pixels, (N,); NaN on an epipole."""
         line1, line2 = F_mat.mT[:2] @ self.x2, F_mat @ self.x1
-        normal1, normal2 = line1.square_().sum(0), line2[:2].square().sum(0)
-        distances: Tensor = (self.x2 * line2).sum(0).abs_() * factor_alone(self.factor, normal1, normal2)
+        sq_norm1, sq_norm2 = line1.square_().sum(0), line2[:2].square().sum(0)
+        distances: Tensor = (self.x2 * line2).sum(0).abs_() * scale_value(self.scale, sq_norm1, sq_norm2)
         return distances
 
     def _scores(self, F_mat: Tensor, terms: Tensor) -> Tensor:
@@ -146,19 +145,19 @@ class PairScorer:
         return torch.cat([self._gains(block, terms).clamp_(min=0).sum(-1) for block in blocks]).nan_to_num_(nan=0.0)
 
     def _gains(self, F_mat: Tensor, terms: Tensor) -> Tensor:
-        """What each correspondence would add to each score if it were not truncated, (K, M)."""
+        """Return the term of each correspondence in each score before truncation at zero, (K, M)."""
         F = (F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)).float()
         tiny = torch.finfo(F.dtype).tiny
         residuals, products1, products2 = torch.unflatten(terms, 0, (3, 9))
-        normal1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ products2).clamp_(min=tiny)
-        normal2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ products1).clamp_(min=tiny)
-        ratio = ((F / self.threshold).flatten(1) @ residuals).mul_(factor_alone(self.factor, normal1, normal2))
+        sq_norm1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ products2).clamp_(min=tiny)
+        sq_norm2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ products1).clamp_(min=tiny)
+        ratio = ((F / self.threshold).flatten(1) @ residuals).mul_(scale_value(self.scale, sq_norm1, sq_norm2))
         gains: Tensor = 1 - ratio.square_()
         return gains
 
 
-def in_proportion(points1: Tensor, points2: Tensor, threshold: float) -> Tensor:
-    r"""Tell the correspondences that are finite and not so far from all others that powers of them would overflow.
+def finite_and_bounded(points1: Tensor, points2: Tensor, threshold: float) -> Tensor:
+    r"""Return which correspondences are finite and not so far from all others that powers of them would overflow.
 
     Args:
         points1: pixels in the first image with shape :math:`(N, 2)`.
@@ -174,5 +173,5 @@ def in_proportion(points1: Tensor, points2: Tensor, threshold: float) -> Tensor:
         return kept
     for points in (points1.double(), points2.double()):
         offset = (points - points[kept].median(0).values).abs()
-        kept = kept & (offset <= FARTHEST * offset[kept].median().clamp(min=threshold)).all(-1)
+        kept = kept & (offset <= MAX_MEDIAN_DISTANCES * offset[kept].median().clamp(min=threshold)).all(-1)
     return kept

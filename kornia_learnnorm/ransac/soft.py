@@ -13,9 +13,10 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Generator, Tensor
 
-from kornia_learnnorm.estimators.fundamental import Normalizer, find_fundamental
+from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.geometry.checks import check_correspondences
 from kornia_learnnorm.geometry.distances import sampson_distance
+from kornia_learnnorm.normalizers.contract import Normalizer
 
 __all__ = ["SoftChoice", "expected_loss", "sample_minimal_sets"]
 
@@ -71,7 +72,7 @@ def sample_minimal_sets(logits: Tensor, count: int, generator: Generator | None 
 
 
 class SoftChoice(NamedTuple):
-    """Hypotheses and what is expected of the one that is chosen.
+    """Expected loss of the chosen hypothesis, with all hypotheses and their probabilities.
 
     Attributes:
         loss: expected loss, (B,).
@@ -165,7 +166,7 @@ def expected_loss(
 
 
 def _without_each(scores: Tensor, losses: Tensor) -> Tensor:
-    """Expected losses (B, K) where one sample is left out."""
+    """Return expected losses (B, K) where one sample is left out."""
     left_out = torch.eye(scores.shape[1], dtype=torch.bool, device=scores.device)
     return (scores[:, None].masked_fill(left_out, -torch.inf).softmax(-1) * losses[:, None]).sum(-1)
 

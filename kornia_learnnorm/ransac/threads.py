@@ -21,10 +21,10 @@ class _Held:
 def one_thread() -> Iterator[None]:
     """Hold PyTorch's operations on the CPU to one thread.
 
-    To wake others costs more than they save where matrices are small, and on a busy machine many times what the work
-    itself does. The number of threads belongs to the process: others that run meanwhile are held too, and the number
-    that the first one found returns with each that leaves. A thread that uses PyTorch for the first time meanwhile
-    keeps to one, until it sets the number itself.
+    Where matrices are small, waking further threads costs more than they save, and on a busy machine many times more
+    than the work itself. The number of threads belongs to the process: other threads that run meanwhile are held to one
+    too, and the last caller that leaves restores the number. A thread that uses PyTorch for the first time meanwhile
+    keeps to one thread until it sets the number itself.
 
     Example:
         >>> before = torch.get_num_threads()

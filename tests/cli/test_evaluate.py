@@ -12,10 +12,11 @@ from two_view import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import draw_samples
-from kornia_learnnorm.data.store import read_store, write_store
-from kornia_learnnorm.metrics.better_rate import bootstrap_interval
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
 
 METHODS = ["none", "Hartley", "whitening", "reweighted", "tilted", "crossview", "searched"]
 

@@ -13,8 +13,8 @@ from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.data.store import write_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 
 FOLDER = Path(__file__).parents[2] / "configs"
 CONFIGS = sorted(FOLDER.glob("*.yaml"))

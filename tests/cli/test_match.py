@@ -70,7 +70,7 @@ def test_resized_images_and_cameras_agree(roots, tmp_path):
 
 
 def test_skipped_pairs_are_listed_up_to_a_number(roots, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(match, "LISTED", 1)
+    monkeypatch.setattr(match, "MAX_LISTED", 1)
     root = tmp_path / "kitti"
     LAYOUTS["kitti"](root)
     (root / "sequences/06/image_0/000001.png").write_bytes(b"")
@@ -84,16 +84,17 @@ def test_skipped_pairs_are_listed_up_to_a_number(roots, tmp_path, capsys, monkey
 @pytest.mark.parametrize(
     ("reader", "args", "message"),
     [
-        ("folder", ["--sequences", "06"], "--sequences is for kitti and tum, got folder"),
-        ("tum", ["--camera", "image_1"], "--camera is for kitti, got tum"),
-        ("kitti", ["--max-difference", "1"], "--max-difference is for tum, got kitti"),
+        ("folder", ["--sequences", "06"], "sequences is for kitti and tum, got folder"),
+        ("tum", ["--camera", "image_1"], "camera is for kitti, got tum"),
+        ("kitti", ["--max-difference", "1"], "max_difference is for tum, got kitti"),
         ("kitti", ["--sequences", "06", "--split", "test"], "exclude each other"),
         ("kitti", ["--sequences", "99"], "no sequence '99'"),
         ("kitti", ["--gap", "9"], "no pairs of frames to match (frames 9 apart) among 12 frames"),
         ("kitti", ["--gap", "0"], "must be at least 1, got 0"),
-        ("kitti", ["--matcher", "lightglue"], "lightglue takes features of the detector disk, got sift"),
+        ("kitti", ["--matcher", "lightglue"], "lightglue needs features of the detector disk, got sift"),
         ("kitti", ["--max-matches", "3"], "max_matches must be at least 8, or None (a command's 0) for all, got 3"),
-        ("colmap", [], "colmap needs --model"),
+        ("kitti", ["--min-points", "5"], "min_points 5 needs a COLMAP model, got none"),
+        ("colmap", [], "colmap needs a model"),
     ],
 )
 def test_errors_are_one_line(roots, tmp_path, capsys, reader, args, message):
@@ -104,27 +105,14 @@ def test_errors_are_one_line(roots, tmp_path, capsys, reader, args, message):
     assert not (tmp_path / "s.h5").exists()
 
 
-def test_pose_that_is_missing_or_short(tmp_path, capsys):
-    root = tmp_path / "kitti"
-    LAYOUTS["kitti"](root)
-    poses = root / "poses" / "06.txt"
-    lines = poses.read_text().splitlines()
-    poses.write_text("\n".join(lines[:-1]))
-    assert run("kitti", root, tmp_path / "s.h5", "--sequences", "06") == 2
-    assert "has no line 4, the pose of" in capsys.readouterr().err
-    poses.write_text("1 0 0")
-    assert run("kitti", root, tmp_path / "s.h5", "--sequences", "06") == 2
-    assert "line 1: the 12 numbers of a pose expected, got '1 0 0'" in capsys.readouterr().err
-
-
-def test_rerun_says_that_the_store_is_there(roots, tmp_path, capsys):
+def test_rerun_says_that_the_store_exists(roots, tmp_path, capsys):
     args = ("kitti", roots / "kitti", tmp_path / "s.h5", "--sequences", "06")
     assert run(*args) == 0
     assert capsys.readouterr().out.startswith(f"wrote {tmp_path / 's.h5'}: 3 pairs, ")
     assert run(*args) == 0
     captured = capsys.readouterr()
     assert captured.out.startswith(f"{tmp_path / 's.h5'}: 3 pairs, ")
-    assert "is there already" in captured.err
+    assert "exists already" in captured.err
 
 
 def test_other_pairs_than_the_store_has(roots, tmp_path, capsys):
@@ -164,7 +152,7 @@ def test_missing_ground_truth_is_named(tmp_path, capsys, reader, args, lost, exp
     ],
 )
 def test_options_are_checked_before_images_are_read(roots, tmp_path, capsys, monkeypatch, args, message):
-    monkeypatch.setattr(match, "_read", None)
+    monkeypatch.setattr(match, "read_dataset", None)
     assert run("kitti", roots / "kitti", tmp_path / "s.h5", *args) == 2
     assert message in capsys.readouterr().err
 

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from make_sequences import blurred_noise as texture
 
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
-from kornia_learnnorm.data.images import read_frame, read_image
+from kornia_learnnorm.data.images import image_size, read_frame, read_image
 from kornia_learnnorm.data.matching.features import Features
 from kornia_learnnorm.data.matching.matchers import match_nearest
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
 CAMERA = np.array([[250.0, 0, 119.0], [0, 245.0, 92.0], [0, 0, 1]])
 DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # of the benchmark's first Kinect
-
-
-def texture(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
-    """Blurred noise at two scales, with the full range of grey values."""
-    rng = np.random.default_rng(seed)
-    image = sum(cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
-    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def blobs(centres: np.ndarray, width: int = 240, height: int = 180) -> np.ndarray:
@@ -71,12 +69,6 @@ class TestReadImage:
         assert image.shape == (4, 5)
         assert abs(int(image[0, 0]) - 0.299 * 200) <= 1  # luma of ITU-R BT.601
 
-    def test_sixteen_bits_become_eight(self, tmp_path):
-        cv2.imwrite(str(tmp_path / "deep.png"), np.full((4, 5), 0x8000, np.uint16))
-        image = read_image(tmp_path / "deep.png")
-        assert image.dtype == np.uint8
-        assert abs(int(image[0, 0]) - 0x80) <= 1
-
     def test_missing_file(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"nothing\.png does not exist"):
             read_image(tmp_path / "nothing.png")
@@ -121,11 +113,91 @@ class TestReadImage:
         with pytest.raises(ValueError, match="not an image"):
             read_image(tmp_path / "text.png")
 
-    def test_without_opencv(self, tmp_path, monkeypatch):
+    @pytest.mark.parametrize("mode", ["RGB", "RGBA", "P", "LA", "1"])
+    def test_modes_as_opencv_converts_them(self, tmp_path, mode):
+        colour = np.stack([texture(seed) for seed in range(3)], -1)
+        for suffix, limit in ((".png", 0), (".tif", 1)):
+            path = tmp_path / f"a{suffix}"
+            Image.fromarray(colour).convert(mode).save(path)
+            image, expected = read_image(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            assert image.dtype == np.uint8
+            assert np.abs(image.astype(int) - expected).max() <= limit
+
+    def test_a_colour_jpeg_gives_its_luma_channel(self, tmp_path):
+        Image.fromarray(np.stack([texture(seed) for seed in range(3)], -1)).save(tmp_path / "a.jpg")
+        expected = cv2.imread(str(tmp_path / "a.jpg"), cv2.IMREAD_GRAYSCALE)
+        assert np.array_equal(read_image(tmp_path / "a.jpg"), expected)
+
+    @pytest.mark.parametrize("suffix", [".png", ".tif", ".pgm"])
+    def test_sixteen_bits_keep_the_upper_eight(self, tmp_path, suffix):
+        deep = np.array([[0, 0xFF, 0x100, 0x80FF, 0xFFFF]], np.uint16)
+        cv2.imwrite(str(tmp_path / f"deep{suffix}"), deep)
+        assert read_image(tmp_path / f"deep{suffix}").tolist() == [[0, 0, 1, 0x80, 0xFF]]
+
+    def test_floating_point(self, tmp_path):
+        Image.fromarray(np.zeros((3, 4), np.float32)).save(tmp_path / "float.tif")
+        with pytest.raises(ValueError, match=r"float\.tif .*floating-point numbers, expected 8 or 16 bits"):
+            read_image(tmp_path / "float.tif")
+
+    def test_without_pillow(self, tmp_path, monkeypatch):
         cv2.imwrite(str(tmp_path / "image.png"), texture())
-        monkeypatch.setitem(sys.modules, "cv2", None)
-        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[images\]'"):
-            read_image(tmp_path / "image.png")
+        monkeypatch.setitem(sys.modules, "PIL.Image", None)
+        for read in (read_image, image_size):
+            with pytest.raises(ImportError, match=r"pip install '\.\[images\]'"):
+                read(tmp_path / "image.png")
+
+    @pytest.mark.parametrize("folder", ["kitti/sequences/06/image_0", "tum"])
+    def test_real_images_as_opencv_reads_them(self, folder):
+        data = os.environ.get("LEARNNORM_DATA")
+        if data is None:
+            pytest.skip("LEARNNORM_DATA does not name a folder of real data")
+        for path in sorted((Path(data) / folder).rglob("*.png"))[:3]:
+            assert np.array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+
+
+class TestImageSize:
+    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".webp", ".pgm"])
+    def test_formats(self, tmp_path, suffix):
+        Image.new("L", (31, 17)).save(tmp_path / f"a{suffix}")
+        assert image_size(tmp_path / f"a{suffix}") == image_size(str(tmp_path / f"a{suffix}")) == (31, 17)
+
+    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp"])
+    @pytest.mark.parametrize("orientation", range(1, 9))
+    def test_orientation_as_opencv_decodes_it(self, tmp_path, suffix, orientation):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        path = tmp_path / f"turned{suffix}"
+        Image.fromarray(texture(width=48, height=32)).save(path, exif=exif)
+        expected = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert image_size(path) == expected.shape[::-1] == ((32, 48) if orientation > 4 else (48, 32))
+        assert np.abs(read_image(path).astype(int) - expected).max() <= (suffix == ".webp")
+
+    @pytest.mark.parametrize(
+        "data", [b"", b"hello", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0", b"P5\n-1 x", b"II*\0" + b"\xff" * 9]
+    )
+    def test_unreadable(self, tmp_path, data):
+        (tmp_path / "broken.png").write_bytes(data)
+        assert image_size(tmp_path / "broken.png") == (0, 0)
+
+    @given(keep=st.integers(0, 60), where=st.integers(0, 59), value=st.integers(0, 255))
+    def test_no_broken_header_raises(self, tmp_path_factory, keep, where, value):
+        path = tmp_path_factory.getbasetemp() / "header.png"
+        Image.new("L", (31, 17)).save(path)
+        data = bytearray(path.read_bytes()[:keep])
+        data[where : where + 1] = bytes([value])
+        path.write_bytes(data)
+        assert len(image_size(path)) == 2
+
+    def test_large_image_is_no_reason_to_warn(self, tmp_path):
+        path = tmp_path / "large.pgm"
+        path.write_bytes(b"P5\n10000 10000\n255\n")
+        assert image_size(path) == (10000, 10000)
+
+    def test_missing(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"no image at .*a\.png"):
+            image_size(tmp_path / "a.png")
+        with pytest.raises(FileNotFoundError):
+            image_size(tmp_path)
 
 
 class TestReadFrame:

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import draw_samples, plain_residual
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
 
 
 @pytest.fixture(scope="module")

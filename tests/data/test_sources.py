@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import draw_samples, plain_residual
 from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
-from kornia_learnnorm.data.store import read_store, write_store
+from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic import forward_driving, handheld
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 
 
 @pytest.fixture(scope="module")

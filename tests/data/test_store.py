@@ -6,8 +6,9 @@ import h5py
 import numpy as np
 import pytest
 
-from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store, write_store
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 
 
 @pytest.fixture
@@ -77,8 +78,9 @@ def _change(path, name, value):
         ("ratio", None, "lacks the datasets ratio"),
         ("F", np.zeros((5, 3, 3)), r"F must have shape \(6, 3, 3\), got \(5, 3, 3\)"),
         ("points2", np.zeros((10, 2)), r"points2 must have shape \(180, 2\)"),
-        ("offsets", np.array([0, 9, 3, 4, 5, 6, 180]), "offsets must rise"),
-        ("offsets", np.array([0]), "offsets must rise"),
+        ("offsets", np.array([0, 9, 3, 4, 5, 6, 180]), "offsets must start at 0 and not decrease"),
+        ("offsets", np.array([0, 9, 10, 40, 50, 60, 2**62]), r"points1 must have shape \(4611686018427387904, 2\)"),
+        ("offsets", np.array([0]), "offsets must start at 0 and not decrease"),
         ("points1", np.full((180, 2), np.nan), "points1 holds NaN or infinite"),
         ("ratio", np.full(180, np.nan), "ratio holds NaN or infinite"),
         ("points1", np.zeros((180, 2), int), "points1 must be float32, got int64"),
@@ -93,13 +95,40 @@ def test_inconsistent_arrays(store, tmp_path, name, value, message):
         read_store(path)
 
 
-def test_a_group_in_place_of_a_dataset(store, tmp_path):
+def virtual(path):
+    layout = h5py.VirtualLayout((180,), "float32")
+    layout[:] = h5py.VirtualSource(path, "ratio", (180,))
+    return layout
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda file, other: file.create_group("ratio"),
+        lambda file, other: file.update(ratio=h5py.ExternalLink(other, "ratio")),
+        lambda file, other: file.update(ratio=h5py.SoftLink("/offsets")),
+        lambda file, other: file.create_dataset("ratio", (180,), "float32", external=[(str(other), 0, 720)]),
+        lambda file, other: file.create_virtual_dataset("ratio", virtual(other)),
+    ],
+)
+def test_a_group_or_a_link_in_place_of_a_dataset(store, tmp_path, change):
+    path, other = tmp_path / "store.h5", tmp_path / "other.h5"
+    write_store(path, store)
+    other.write_bytes(path.read_bytes())
+    with h5py.File(path, "r+") as file:
+        del file["ratio"]
+        change(file, other)
+    with pytest.raises(ValueError, match=r"lacks the datasets ratio \(links"):
+        read_store(path)
+
+
+def test_names_that_are_not_strings(store, tmp_path):
     path = tmp_path / "store.h5"
     write_store(path, store)
     with h5py.File(path, "r+") as file:
-        del file["ratio"]
-        file.create_group("ratio")
-    with pytest.raises(ValueError, match="lacks the datasets ratio"):
+        del file["names"]
+        file.create_dataset("names", (6, 2), h5py.vlen_dtype(np.int32))
+    with pytest.raises(ValueError, match="names must be strings"):
         read_store(path)
 
 
@@ -163,12 +192,22 @@ def test_select(ragged, first, stop):
     assert (part.dataset, part.pairs, part.detector) == (ragged.dataset, ragged.pairs, ragged.detector)
     for new, old in enumerate(range(first, stop)):
         for name in ("points1", "points2", "ratio"):
-            rows = getattr(part, name)[part.offsets[new] : part.offsets[new + 1]]
-            np.testing.assert_array_equal(rows, getattr(ragged, name)[ragged.offsets[old] : ragged.offsets[old + 1]])
+            np.testing.assert_array_equal(getattr(part, name)[part.rows(new)], getattr(ragged, name)[ragged.rows(old)])
         for name in ("image_size", "F", "K", "R", "t"):
             np.testing.assert_array_equal(getattr(part, name)[new], getattr(ragged, name)[old])
     assert len(part.points1) == len(part.points2) == len(part.ratio) == part.offsets[-1]
     same(part.select(0, len(part)), part)
+
+
+def test_matches_of_a_pair(ragged):
+    assert ragged.rows(2).tolist() == list(range(10, 50))
+    assert [len(ragged.rows(pair)) for pair in range(6)] == [10, 0, 40, 40, 60, 30]
+    rows = ragged.rows(2, 0.8)
+    assert rows.tolist() == [row for row in range(10, 50) if ragged.ratio[row] < 0.8]
+    for limit in (None, 0.8):
+        for part, name in zip(ragged.matches(2, limit), ("points1", "points2", "ratio"), strict=True):
+            np.testing.assert_array_equal(part, getattr(ragged, name)[ragged.rows(2, limit)])
+    assert [len(part) for part in ragged.matches(1)] == [0, 0, 0]
 
 
 def test_select_everything(ragged):

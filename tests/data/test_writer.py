@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kornia_learnnorm.data import writer as module
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store, write_store
-from kornia_learnnorm.data.writer import StoreWriter
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.data.writer import StoreWriter, write_store
 
 pytest.importorskip("h5py", reason="h5py is not installed")
 
@@ -91,7 +91,7 @@ class TestParts:
         writer.add(0, pair(0))
         about = writer.folder / "options.json"
         about.unlink() if text is None else about.write_text(text)
-        with pytest.raises(ValueError, match=r"store\.h5\.parts is there, but not made by this command"):
+        with pytest.raises(ValueError, match=r"store\.h5\.parts exists, but was not made by this command"):
             StoreWriter(tmp_path / "store.h5", OPTIONS)
 
     def test_wrong_arguments(self, tmp_path):
@@ -112,7 +112,7 @@ class TestStoreThatIsThere:
 
     def test_of_another_tool(self, tmp_path):
         write_store(tmp_path / "store.h5", pair(0))
-        with pytest.raises(ValueError, match=r"store\.h5 is there, but not made by this command"):
+        with pytest.raises(ValueError, match=r"store\.h5 exists, but was not made by this command"):
             StoreWriter(tmp_path / "store.h5", OPTIONS)
 
     def test_folder(self, tmp_path):

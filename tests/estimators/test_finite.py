@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from two_view import shaken, uniform
 
 from kornia_learnnorm import (
     CrossViewNetwork,
+    EightPoint,
     EpipolarLoss,
     Hartley,
     LearnedNormalizer,
@@ -81,10 +82,10 @@ WEIGHTS = {
 }
 
 
-def check(points1, points2, weights, normalizer):
+def check(solve, parameters, points1, points2, weights=None):
     """Everything is finite: F, the loss, and the gradients of both in the points, weights and parameters."""
     values = [v.detach().clone().requires_grad_() for v in (points1, points2, weights) if v is not None]
-    F_mat = find_fundamental(*values, normalizer=normalizer)
+    F_mat = solve(*values)
     assert torch.isfinite(F_mat).all()
     norms = np.linalg.norm(F_mat.detach().double().numpy(), axis=(1, 2))
     np.testing.assert_allclose(norms, 1, rtol=1e-6)
@@ -92,10 +93,14 @@ def check(points1, points2, weights, normalizer):
     direction = torch.randn(F_mat.shape, generator=torch.Generator().manual_seed(1)).to(F_mat)
     loss = EpipolarLoss()(values[0], values[1], F_mat)
     assert torch.isfinite(loss)
-    parameters = list(normalizer.parameters())
     total = (F_mat * direction).sum() + loss
     for gradient in torch.autograd.grad(total, [*values, *parameters], allow_unused=True):
         assert gradient is None or torch.isfinite(gradient).all()
+
+
+def check_function(name, points1, points2, weights=None):
+    normalizer = normalizers()[name]
+    check(partial(find_fundamental, normalizer=normalizer), normalizer.parameters(), points1, points2, weights)
 
 
 @pytest.mark.parametrize("num_points", [8, 12])
@@ -103,7 +108,7 @@ def check(points1, points2, weights, normalizer):
 @pytest.mark.parametrize("name", NAMES)
 def test_degenerate_and_extreme_samples(name, sample, num_points, dtype):
     points1, points2 = (points.to(dtype) for points in SAMPLES[sample](num_points))
-    check(points1, points2, None, normalizers()[name])
+    check_function(name, points1, points2)
 
 
 @pytest.mark.parametrize("weights", ["random", "zeros", "all zero", "extreme"])
@@ -112,12 +117,12 @@ def test_degenerate_and_extreme_samples(name, sample, num_points, dtype):
 def test_with_weights(name, sample, weights, dtype):
     for num_points in (8, 12):
         points1, points2 = (points.to(dtype) for points in SAMPLES[sample](num_points))
-        check(points1, points2, WEIGHTS[weights](num_points).to(dtype), normalizers()[name])
+        check_function(name, points1, points2, WEIGHTS[weights](num_points).to(dtype))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_many_correspondences(name, dtype):
-    check(base(5000, 0, 2).to(dtype), base(5000, 1, 2).to(dtype), None, normalizers()[name])
+    check_function(name, base(5000, 0, 2).to(dtype), base(5000, 1, 2).to(dtype))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -125,4 +130,75 @@ def test_many_correspondences(name, dtype):
 def test_small_whole_coordinates(name, num_points, coordinates):
     """Coordinates of which many coincide, so that every kind of degeneracy turns up."""
     points = torch.tensor(coordinates, dtype=torch.float64).view(2, 1, 9, 2)[:, :, :num_points]
-    check(points[0], points[1], None, normalizers()[name])
+    check_function(name, points[0], points[1])
+
+
+LAYERS = {
+    "hartley": lambda: EightPoint(),
+    "optimal": lambda: EightPoint(rank2="optimal"),
+    "reweighted": lambda: EightPoint(ReweightedWhitening()),
+    "learned": lambda: EightPoint(shaken()),
+    "shipped": lambda: EightPoint(LearnedNormalizer.from_pretrained()),
+}
+NEAR = ["coincident", "collinear", "plane", "identical", "repeated", "pure rotation", "far"]
+
+
+def fuzzed(kind: str, nearness: float, num_points: int, size: int, seed: int):
+    """A batch that is a share of ``nearness`` of its extent away from a degenerate one."""
+    a, b = (uniform(size, num_points, 2, low=-1, seed=seed + k) for k in (0, 1))
+    if kind == "coincident":
+        points = a[:, :1].expand_as(a), b[:, :1].expand_as(b)
+    elif kind == "collinear":
+        points = a[..., :1] * b[:, :1], a[..., :1] * b[:, 1:2] + 0.3
+    elif kind == "plane":
+        x = torch.cat([a, torch.ones_like(a[..., :1])], -1) @ torch.eye(3).double().add(
+            uniform(3, 3, high=0.2, seed=seed)
+        )
+        points = a, x[..., :2] / x[..., 2:]
+    elif kind == "repeated":
+        index = torch.arange(num_points) % (1 + seed % 8)
+        points = a[:, index], b[:, index]
+    elif kind == "far":
+        points = a, torch.cat([b[:, 1:], 1e8 * b[:, :1]], 1)
+    else:
+        points = a, a if kind == "identical" else a @ torch.tensor([[0.6, 0.8], [-0.8, 0.6]]).double()
+    noise = (uniform(size, num_points, 2, low=-nearness, high=nearness, seed=seed + k) for k in (2, 3))
+    return [p + n for p, n in zip(points, noise, strict=True)]
+
+
+FUZZ = {
+    "kind": st.sampled_from(NEAR),
+    "nearness": st.floats(-12, 0).map(lambda x: 10**x),
+    "scale": st.floats(-6, 6).map(lambda x: 10**x),
+    "offset": st.sampled_from([0.0, 1.0, 1e3, 1e6]),
+    "num_points": st.sampled_from([8, 8, 9, 16]),
+    "weighting": st.sampled_from([None, "random", "zeros", "extreme"]),
+    "single": st.booleans(),
+    "name": st.sampled_from(["hartley", "reweighted", "learned", "optimal", "shipped"]),
+    "seed": st.integers(0, 2**20),
+}
+
+
+def fuzz(kind, nearness, scale, offset, num_points, weighting, single, name, seed, size) -> None:
+    points = [scale * p + offset for p in fuzzed(kind, nearness, num_points, size, seed)]
+    weights = None
+    if weighting is not None:
+        weights = uniform(size, num_points, seed=seed)
+        weights = weights.round() * weights if weighting == "zeros" else weights
+        weights = 10 ** (12 * weights - 6) if weighting == "extreme" else weights
+    dtype = torch.float32 if single else torch.float64
+    layer = LAYERS[name]()
+    check(layer, layer.parameters(), *(None if value is None else value.to(dtype) for value in (*points, weights)))
+
+
+class TestFiniteEverywhere:
+    @pytest.mark.long
+    @given(**FUZZ)
+    def test_fuzz(self, **drawn):
+        fuzz(size=100, **drawn)
+
+    @pytest.mark.slow
+    @settings(max_examples=500, derandomize=True)
+    @given(**FUZZ)
+    def test_hundred_thousand(self, **drawn):
+        fuzz(size=200, **drawn)

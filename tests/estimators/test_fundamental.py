@@ -71,10 +71,10 @@ class TestFindFundamental:
         normalizer, transform = REFERENCES[reference]
         F_mat = find_fundamental(points1.to(device), points2.to(device), normalizer=normalizer).cpu()
         expected = eight_point(points1, points2, transform(points1), transform(points2))
-        assert up_to_sign(F_mat, expected) < 1e-9
         # In pixels the design matrix has a condition number of 1e10, and either computation loses as many digits.
-        allowed = 1e-7 if reference == "identity" else 1e-9
-        assert up_to_sign(in_hartley(F_mat, points1, points2), in_hartley(expected, points1, points2)) < allowed
+        pixels, hartley = (1e-8, 1e-7) if reference == "identity" else (1e-9, 1e-9)
+        assert up_to_sign(F_mat, expected) < pixels
+        assert up_to_sign(in_hartley(F_mat, points1, points2), in_hartley(expected, points1, points2)) < hartley
 
     @pytest.mark.parametrize("name", ["driving", "handheld", "random"])
     @pytest.mark.parametrize("reference", REFERENCES)
@@ -102,7 +102,7 @@ class TestFindFundamental:
         points1, points2 = correspondences()
         expected = find_fundamental(points1, points2)
         assert up_to_sign(find_fundamental(points1, points2, normalizer=PerView(normalize_points)), expected) < 1e-9
-        assert up_to_sign(find_fundamental(points1, points2, None, lambda *args: Hartley()(*args)), expected) == 0
+        assert up_to_sign(find_fundamental(points1, points2, None, lambda *args: Hartley()(*args)), expected) < 1e-12
         single = find_fundamental(points1, points2, normalizer=lambda *args: [T.float() for T in Identity()(*args)])
         assert single.dtype == torch.float64
 
@@ -320,9 +320,9 @@ class TestExceptions:
         with pytest.raises(error, match=message):
             find_fundamental(torch.rand(2, 8, 2), torch.rand(2, 8, 2), weights)
 
-    @pytest.mark.parametrize("rank2", ["projection", True, rank2_projection])
+    @pytest.mark.parametrize("rank2", [None, True, rank2_projection])
     def test_rank2(self, rank2):
-        with pytest.raises(ValueError, match="rank2 must be None or 'optimal', got "):
+        with pytest.raises(ValueError, match="rank2 must be 'projection' or 'optimal', got "):
             find_fundamental(torch.rand(2, 8, 2), torch.rand(2, 8, 2), rank2=rank2)
 
     def test_parts(self):

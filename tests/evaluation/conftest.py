@@ -1,15 +1,20 @@
-"""A store and a run that the tests of runs and reports share."""
+"""Runs of predictions and of robust estimators that the tests of reports and runs share."""
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.cli.synthesize import synthetic_store
-from kornia_learnnorm.data.store import write_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.evaluation.robust import estimators, hypotheses
 from kornia_learnnorm.evaluation.runs import example
+
+ESTIMATORS = ["kornia-8pt", "count:Hartley", "count:whitening", "time:Hartley", "time:whitening", "RANSAC"]
+SOLVERS = ["Hartley", "whitening", "seven-point"]
 
 
 @pytest.fixture(scope="session")
@@ -43,6 +48,48 @@ def run(command, tmp_path_factory):
 @pytest.fixture
 def copied(run, tmp_path):
     return shutil.copytree(run, tmp_path / "run")
+
+
+@pytest.fixture(scope="session")
+def small_budgets():
+    """Return a context manager under which robust estimators and minimal solvers get few samples and little time."""
+
+    @contextlib.contextmanager
+    def small():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(estimators, "NUM_SAMPLES", 50)
+            patch.setattr(estimators, "MAX_SECONDS", 0.005)
+            patch.setattr(hypotheses, "NUMBERS", (1, 3, 10, 30))
+            yield
+
+    return small
+
+
+@pytest.fixture(scope="session")
+def robust_store(tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "kitti_06.h5"
+    write_store(path, synthetic_store(pairs=1, points=330, seed=1))
+    return path
+
+
+@pytest.fixture(scope="session")
+def robust_command(robust_store):
+    """The command of a run, without its folder."""
+    return ["robust", str(robust_store), "--seeds", "2", "--estimators", *ESTIMATORS, "--solvers", *SOLVERS, "--out"]
+
+
+@pytest.fixture(scope="session")
+def robust_run(robust_command, small_budgets, tmp_path_factory):
+    """A run of robust estimators, not to be changed."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    with small_budgets():
+        assert main([*robust_command, str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def robust_copied(robust_run, tmp_path):
+    return shutil.copytree(robust_run, tmp_path / "run")
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation.drawing import clip_lines, draw_pair
+from kornia_learnnorm.evaluation.drawing import draw_line, draw_pair, import_matplotlib
 from kornia_learnnorm.evaluation.pair import PairEstimate
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
@@ -33,37 +33,25 @@ def make_pair(width: int = 160, height: int = 120, points: int = 30) -> tuple[np
     return image1, image2, estimate
 
 
-class TestClipLines:
-    def test_axis_parallel_and_diagonal(self):
-        lines = np.array([[0, 1, -5], [1, 0, -3], [1, -1, 0]], float)  # y = 5, x = 3, y = x
-        segments, meets = clip_lines(lines, 20, 10)
-        assert meets.all()
-        ends = [sorted(map(tuple, segment.tolist())) for segment in segments]
-        expected = [[(-0.5, 5), (19.5, 5)], [(3, -0.5), (3, 9.5)], [(-0.5, -0.5), (9.5, 9.5)]]
-        assert np.allclose(ends, expected)
+@pytest.mark.parametrize(
+    ("line", "ends"),
+    [
+        ((0, 1, -5), [(-0.5, 5), (19.5, 5)]),  # y = 5
+        ((1e-9, 0, -3e-9), [(3, -0.5), (3, 9.5)]),  # x = 3
+        ((-2, 2, 0), [(-0.5, -0.5), (9.5, 9.5)]),  # y = x
+    ],
+)
+def test_draw_line_from_border_to_border(line, ends):
+    axes = import_matplotlib().figure.Figure().add_subplot(xlim=(-0.5, 19.5), ylim=(9.5, -0.5))
+    drawn = draw_line(axes, np.array(line, float))
+    found = (drawn.get_transform() - axes.transData).transform([(0, 0), (1, 1)])
+    assert np.allclose(sorted(map(tuple, found)), ends)
 
-    def test_lines_that_miss(self):
-        lines = np.array([[0, 1, 5], [1, 0, -30], [1, 1, 5], [0, 0, 1]], float)  # the last one is at infinity
-        segments, meets = clip_lines(lines, 20, 10)
-        assert not meets.any()
-        assert np.isnan(segments).all()
 
-    def test_ends_lie_on_the_line_and_on_the_border(self):
-        lines = np.random.default_rng(0).normal(size=(500, 3)) * [1, 1, 30]
-        segments, meets = clip_lines(lines, 64, 48)
-        assert 50 < meets.sum() < 500
-        x, y = segments[meets].reshape(-1, 2).T
-        a, b, c = np.repeat(lines[meets], 2, axis=0).T
-        assert np.allclose(a * x + b * y + c, 0, atol=1e-9)
-        border = np.stack([x + 0.5, x - 63.5, y + 0.5, y - 47.5])
-        assert np.allclose(np.abs(border).min(0), 0, atol=1e-9)
-        assert (np.minimum(x, y) >= -0.5 - 1e-9).all()
-        assert (x <= 63.5 + 1e-9).all()
-        assert (y <= 47.5 + 1e-9).all()
-
-    def test_scale_does_not_matter(self):
-        lines = np.random.default_rng(1).normal(size=(20, 3)) * [1, 1, 30]
-        assert np.allclose(clip_lines(lines, 64, 48)[0], clip_lines(lines * 1e-9, 64, 48)[0], equal_nan=True)
+def test_draw_line_at_infinity():
+    axes = import_matplotlib().figure.Figure().add_subplot()
+    assert draw_line(axes, np.array([0.0, 0.0, 1.0])) is None
+    assert not axes.lines
 
 
 class TestDrawPair:
@@ -125,5 +113,5 @@ class TestDrawPair:
 
     def test_without_matplotlib(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
-        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[report\]'"):
+        with pytest.raises(ImportError, match=r"pip install '\.\[report\]'"):
             draw_pair(*make_pair(), tmp_path / "pair.png")

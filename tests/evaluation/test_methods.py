@@ -10,7 +10,7 @@ import torch
 import yaml
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.cli.synthesize import synthetic_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.evaluation.methods import SHIPPED, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs.trained import was_trained_on
 from kornia_learnnorm.evaluation.tables import names_of

@@ -53,13 +53,13 @@ class Scene:
         image, near = texture(0), np.zeros((HEIGHT, WIDTH), np.uint8)
         near[:, : WIDTH // 2] = 255
         moved = np.where(warp(near, R, t, 4.0) > 127, warp(image, R, t, 4.0), warp(image, R, t, 9.0))
-        self.folder, self.left, self.right = folder, folder / "left.png", folder / "right.png"
-        self.blank, self.plane, self.noisy = folder / "blank.png", folder / "plane.png", folder / "noisy.png"
         noisy = np.clip(image + np.random.default_rng(1).normal(0, 1, image.shape), 0, 255).astype(np.uint8)
-        plane, blank = warp(image, R, t, 4.0), np.zeros_like(image)
-        for name in ("left", "right", "blank", "plane", "noisy"):
-            pixels = {"left": image, "right": moved, "blank": blank, "plane": plane, "noisy": noisy}[name]
-            cv2.imwrite(str(getattr(self, name)), pixels)
+        images = {"left": image, "right": moved, "blank": np.zeros_like(image), "noisy": noisy}
+        for name, pixels in {**images, "plane": warp(image, R, t, 4.0)}.items():
+            cv2.imwrite(str(folder / f"{name}.png"), pixels)
+        self.folder = folder
+        self.left, self.right, self.blank = (folder / f"{name}.png" for name in ("left", "right", "blank"))
+        (folder / "half.png").write_bytes(self.left.read_bytes()[:5000])
 
 
 @pytest.fixture(scope="module")
@@ -160,44 +160,29 @@ class TestEstimatePair:
 
 
 class TestErrors:
-    def fails(self, first, second, message, error=ValueError, **options):
-        with pytest.raises(error, match=message) as caught:
-            estimate_pair(first, second, Hartley(), **options)
+    @pytest.mark.parametrize(
+        ("first", "second", "message", "options"),
+        [
+            ("left", "half", r"half\.png.*truncated or corrupt", {}),
+            ("blank", "right", r"blank\.png and .*right\.png: image 1 is blank", {}),
+            ("left", "blank", "image 2 is blank", {}),
+            ("left", "right", r"\d distinct matches of \d+ pass the ratio test 0\.001", {"ratio": 0.001}),
+            ("left", "left", "no motion", {}),
+            ("left", "noisy", "no motion", {}),
+            ("left", "right", r"of \d+ matches agree .* within 1e-09 px", {"threshold": 1e-9}),
+            ("left", "plane", "degenerate: one homography explains", {}),
+            *(("left", "right", "ratio must be above 0", {"ratio": ratio}) for ratio in (0.0, -1.0, 1.5, np.nan)),
+            *(("left", "right", "threshold must be positive", {"threshold": t}) for t in (0.0, -1.0, np.inf, np.nan)),
+        ],
+    )
+    def test_images_or_options(self, scene, first, second, message, options):
+        with pytest.raises(ValueError, match=message) as caught:
+            estimate_pair(scene.folder / f"{first}.png", scene.folder / f"{second}.png", Hartley(), **options)
         assert "\n" not in str(caught.value)
 
     def test_missing_file(self, scene):
-        self.fails(scene.left, scene.folder / "no.png", r"no\.png does not exist", FileNotFoundError)
-
-    def test_corrupt_file(self, scene, tmp_path):
-        (tmp_path / "half.png").write_bytes(scene.left.read_bytes()[:5000])
-        self.fails(tmp_path / "half.png", scene.right, "truncated or corrupt")
-
-    def test_blank(self, scene):
-        self.fails(scene.blank, scene.right, r"blank\.png and .*right\.png: image 1 is blank")
-        self.fails(scene.left, scene.blank, "image 2 is blank")
-
-    def test_few_matches(self, scene):
-        self.fails(scene.left, scene.right, r"\d distinct matches of \d+ pass the ratio test 0\.001", ratio=0.001)
-
-    def test_same_image(self, scene):
-        self.fails(scene.left, scene.left, "no motion")
-
-    def test_same_view_with_noise(self, scene):
-        self.fails(scene.left, scene.noisy, "no motion")
-
-    def test_few_inliers(self, scene):
-        self.fails(scene.left, scene.right, r"of \d+ matches agree .* within 1e-09 px", threshold=1e-9)
-
-    def test_plane(self, scene):
-        self.fails(scene.left, scene.plane, "degenerate: one homography explains")
-
-    @pytest.mark.parametrize("ratio", [0.0, -1.0, 1.5, float("nan")])
-    def test_ratio(self, scene, ratio):
-        self.fails(scene.left, scene.right, "ratio must be above 0", ratio=ratio)
-
-    @pytest.mark.parametrize("threshold", [0.0, -1.0, float("inf"), float("nan")])
-    def test_threshold(self, scene, threshold):
-        self.fails(scene.left, scene.right, "threshold must be positive", threshold=threshold)
+        with pytest.raises(FileNotFoundError, match=r"no\.png does not exist"):
+            estimate_pair(scene.left, scene.folder / "no.png", Hartley())
 
 
 class TestWriting:
@@ -335,7 +320,7 @@ class TestCommand:
     def test_picture_without_matplotlib(self, command, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setattr(command_module, "estimate_pair", lambda *_: pytest.fail("the work was begun"))
-        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[report\]'"):
+        with pytest.raises(ImportError, match=r"pip install '\.\[report\]'"):
             command("--out", "pair.png")
 
 

@@ -155,7 +155,7 @@ class TestSearch:
         path = torch.stack(seen[:-2:2])  # view 1, without the transforms returned
         lengths = path.diff(dim=0).abs().amax((1, 2))
         assert path[0].count_nonzero() == 0
-        np.testing.assert_allclose((path[1] - path[0]).abs(), 0.05, rtol=1e-4)
+        np.testing.assert_allclose((path[1] - path[0]).abs(), 3 * np.tanh(0.05 / 3), rtol=1e-5)  # bounded by 3
         cosine = 0.05 * (1 + np.cos(np.pi * np.arange(39) / 40)) / 2
         assert (lengths.numpy() < 3 * cosine).all()
 

@@ -11,7 +11,14 @@ from kornia.core.exceptions import ShapeError
 from torch.autograd import gradcheck
 from two_view import SCENES, epipolar_distances, homogeneous, scenes, uniform
 
-from kornia_learnnorm import algebraic_distance, sampson_distance, symmetric_epipolar_distance
+from kornia_learnnorm import (
+    algebraic_distance,
+    sampson_distance,
+    sampson_scale,
+    symmetric_epipolar_distance,
+    symmetric_scale,
+)
+from kornia_learnnorm.geometry.distances import find_scale, scale_value
 
 ALL = [symmetric_epipolar_distance, sampson_distance, algebraic_distance]
 ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x2^T F x1 = y1 - y2
@@ -106,7 +113,7 @@ class TestAll:
         points, F_mat = torch.rand(2, 8, 2), torch.rand(2, 3, 3)
         for wrong, message in [
             ((points.long(), points, F_mat), "points1 must be a floating-point tensor, got torch.int64"),
-            ((points, points.numpy(), F_mat), "points2 must be a floating-point tensor, got float32"),
+            ((points, points.numpy(), F_mat), "points2 must be a floating-point tensor, got .*numpy"),
             ((points, points, None), "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
         ]:
             with pytest.raises(TypeError, match=message):
@@ -170,3 +177,31 @@ class TestAlgebraicDistance:
     def test_by_hand(self):
         found = algebraic_distance(torch.tensor([[[1.0, 5.0]]]), torch.tensor([[[2.0, 8.0]]]), 10 * ROWS[None])
         assert found.item() == pytest.approx(3 / 2**0.5)  # y1 - y2 over the norm of (1, -1)
+
+
+class TestDistanceScales:
+    @pytest.mark.parametrize("scale", [sampson_scale, symmetric_scale])
+    def test_derivatives(self, scale):
+        norms = [uniform(5, low=0.5, seed=k).requires_grad_() for k in (0, 1)]
+        value, *slopes = scale(*norms)
+        for got, want in zip(slopes, torch.autograd.grad(value.sum(), norms), strict=True):
+            torch.testing.assert_close(got.detach(), want)
+        assert torch.equal(scale_value(scale, *norms), value)
+
+    @pytest.mark.parametrize(
+        ("name", "distance"), [("sampson", sampson_distance), ("symmetric", symmetric_epipolar_distance)]
+    )
+    def test_scales_the_algebraic_residual(self, name, distance):
+        scene = scenes("handheld", 3, 12)
+        F_mat = scene.F_mat / torch.linalg.matrix_norm(scene.F_mat, keepdim=True)
+        x1, x2 = (torch.from_numpy(homogeneous(x.numpy())) for x in (scene.points1, scene.points2))
+        sq_norms = [(x2 @ F_mat)[..., :2].square().sum(-1), (x1 @ F_mat.mT)[..., :2].square().sum(-1)]
+        expected = algebraic_distance(scene.points1, scene.points2, F_mat) * find_scale(name)(*sq_norms)[0]
+        torch.testing.assert_close(distance(scene.points1, scene.points2, F_mat), expected)
+
+    def test_unknown(self):
+        assert find_scale(sampson_scale) is sampson_scale
+        with pytest.raises(ValueError, match="'sampson', 'symmetric' or a function, got 'huber'"):
+            find_scale("huber")
+        with pytest.raises(TypeError, match="'sampson', 'symmetric' or a function, got 3"):
+            find_scale(3)

@@ -58,7 +58,7 @@ def reference(F, points1, points2, iterations: int = 3) -> np.ndarray:
         V = (vectors[:, 1:] / values[1:]) @ vectors[:, 1:].T
         for _ in range(iterations):
             G = u.reshape(3, 3)
-            cofactors = np.linalg.det(G) * np.linalg.inv(G).T.reshape(9)
+            cofactors = np.cross(G[[1, 2, 0]], G[[2, 0, 1]]).reshape(9)  # an inverse does not exist in the last round
             u = u - (u @ cofactors) / 3 / (cofactors @ V @ cofactors) * V @ cofactors
             u = u / np.linalg.norm(u)
             P = np.eye(9) - np.outer(u, u)

@@ -9,15 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from torch.autograd import gradcheck, gradgradcheck
-from two_view import homogeneous, uniform
+from two_view import mapped, uniform
 
 from kornia_learnnorm import paper_transform, spd_transform
 from kornia_learnnorm.geometry.transforms import affine_transform, transform_fundamental
-
-
-def mapped(T, points) -> np.ndarray:
-    """Points after an affine transform."""
-    return (homogeneous(np.asarray(points)) @ np.asarray(T).swapaxes(-1, -2))[..., :2]
 
 
 class TestAffineTransform:

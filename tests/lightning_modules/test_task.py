@@ -3,6 +3,7 @@
 import pytest
 import pytorch_lightning as pl
 import torch
+import train_processes
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
@@ -14,21 +15,15 @@ from lightning_modules.task import NormalizerTask
 
 def make_task(**arguments):
     torch.manual_seed(0)
-    return NormalizerTask(kln.LearnedNormalizer(network=kln.CrossViewNetwork(width=8, depth=1)), **arguments)
+    return NormalizerTask(kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=8, depth=1)), **arguments)
 
 
-class Pairs(SyntheticSamples):
+class Pairs(train_processes.Pairs):
     """Ten image pairs, of pair k the samples of k + 1 scenes, mixed."""
 
-    def __init__(self, **arguments):
-        super().__init__(number=55, num_heldout=4, max_residual=None, **arguments)
-
-    def blocks(self, seed):
-        return [Block(55, 10)]
-
     def draw(self, seed, block):
-        pair = torch.repeat_interleave(torch.arange(10), torch.arange(1, 11))
-        return super().draw(seed, block)._replace(pair=pair[torch.arange(55) * 8 % 55])
+        samples = super().draw(seed, block)
+        return samples._replace(pair=samples.pair[torch.arange(55) * 8 % 55])
 
 
 def make_data(source=None, **arguments):
@@ -122,7 +117,7 @@ def test_mixed_precision(tmp_path):
     batch = SyntheticSamples(number=1000).draw(99, 0)
     before, seen = task.compute_loss(batch).item(), []
     task.normalizer.network.set_network.head.register_forward_hook(lambda m, a, out: seen.append(out.dtype))
-    task.normalizer.register_forward_hook(lambda m, a, out: seen.append(out[0].dtype))
+    task.normalizer.network.register_forward_hook(lambda m, a, out: seen.append(out[0].dtype))
     trainer = make_trainer(tmp_path, max_steps=150, enable_checkpointing=False, precision="bf16-mixed")
     trainer.fit(task, data)
     assert set(seen[::2]) == {torch.bfloat16}

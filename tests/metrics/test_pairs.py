@@ -14,7 +14,8 @@ from two_view import scenes
 
 from kornia_learnnorm import bootstrap_interval
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share, paired_bootstrap
+from kornia_learnnorm.metrics.bootstrap import paired_bootstrap
+from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
 
 INF, NAN = float("inf"), float("nan")
 ROWS = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]], dtype=torch.float64)  # y1 - y2
@@ -148,7 +149,7 @@ class TestAll:
         [
             (torch.ones(6, 40), TypeError, "mask must be a boolean tensor, got torch.float32"),
             ([True], TypeError, "mask must be a boolean tensor, got <class 'list'>"),
-            (torch.ones(6, 39).bool(), ValueError, r"mask must have shape \[6, 40\], got \[6, 39\]"),
+            (torch.ones(6, 39).bool(), ValueError, r"mask must have shape \[6, 40\] as points1, got \[6, 39\]"),
         ],
     )
     def test_mask(self, name, mask, error, message):

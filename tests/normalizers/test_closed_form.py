@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.geometry.epipolar import normalize_points
 from torch.autograd import gradcheck, gradgradcheck
-from two_view import SCENES, correspondences, homogeneous, numpy_hartley, numpy_whitening, uniform
+from two_view import SCENES, correspondences, mapped, numpy_hartley, numpy_whitening, uniform
 
 from kornia_learnnorm import Hartley, Identity, PerView, ReweightedWhitening, Whitening
 from kornia_learnnorm.geometry.transforms import inverse_sqrt
@@ -23,11 +23,6 @@ ALL = {
     "kornia": PerView(normalize_points),
     "reweighted": ReweightedWhitening(),
 }
-
-
-def mapped(T, points) -> np.ndarray:
-    """Points after an affine transform."""
-    return (homogeneous(np.asarray(points)) @ np.asarray(T).swapaxes(-1, -2))[..., :2]
 
 
 class TestContract:

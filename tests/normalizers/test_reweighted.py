@@ -22,7 +22,8 @@ from two_view import (
 )
 
 from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening, find_fundamental, symmetric_epipolar_distance
-from kornia_learnnorm.normalizers.reweighted import adjugate, line_norms
+from kornia_learnnorm.geometry.distances import line_norms
+from kornia_learnnorm.geometry.linear import adjugate
 
 
 def numpy_factor(x1, x2, F):

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from two_view import epipolar_distances, scenes, uniform, up_to_sign
 
-from kornia_learnnorm import find_fundamental
+from kornia_learnnorm import find_fundamental, sampson_scale, symmetric_scale
 from kornia_learnnorm.estimators.refinement import refine_fundamental
-from kornia_learnnorm.estimators.robust_losses import Cauchy, Truncated, sampson_factor, squared_loss, symmetric_factor
+from kornia_learnnorm.estimators.robust_losses import Cauchy, Truncated, squared_loss
 from kornia_learnnorm.ransac.constrained_fit import constrained_fit
 from kornia_learnnorm.ransac.scoring import PairScorer
 
@@ -61,7 +61,7 @@ def reference(x1, x2, F_mat, losses, factor) -> np.ndarray:
     return np.stack(fitted)
 
 
-@pytest.mark.parametrize("factor", [sampson_factor, symmetric_factor])
+@pytest.mark.parametrize("factor", [sampson_scale, symmetric_scale])
 class TestSteps:
     @pytest.mark.parametrize("losses", [[squared_loss], [Truncated(3.0), Truncated(1.0)], 3 * [Cauchy(0.5)]])
     def test_against_null_spaces_in_numpy(self, scene, factor, losses):
@@ -116,7 +116,7 @@ class TestResults:
         for F in scorer.to_pixels(fitted):
             assert epipolar_distances(scene.points1, scene.points2, F[None]).max() < 1e-6
 
-    @pytest.mark.parametrize("factor", [sampson_factor, symmetric_factor])
+    @pytest.mark.parametrize("factor", [sampson_scale, symmetric_scale])
     def test_a_point_on_the_epipole_does_not_outweigh_the_others(self, factor):
         epipole = torch.full((2,), 300.0, dtype=torch.float64)
         points1 = uniform(200, 2, high=600)

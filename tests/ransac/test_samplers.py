@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from kornia_learnnorm.ransac.samplers import ProsacSampler, UniformSampler, WeightedSampler, draw_distinct
 
-GROWTH = ProsacSampler.GROWTH
+GROWTH = ProsacSampler.MAX_SAMPLES
 
 CPU = torch.device("cpu")
 
@@ -103,7 +103,7 @@ class TestWeighted:
         assert np.abs(drawn.numpy() - reference).max() < 0.02
 
     def test_in_blocks(self, monkeypatch, generator):
-        monkeypatch.setattr("kornia_learnnorm.ransac.samplers.BLOCK", 100)
+        monkeypatch.setattr("kornia_learnnorm.ransac.samplers.MAX_RANDOM_NUMBERS", 100)
         rows = WeightedSampler(torch.ones(30)).draw(50, generator)
         assert rows.shape == (50, 8)
         assert all(len(set(row)) == 8 for row in rows.tolist())

@@ -209,6 +209,7 @@ class TestExpectedLoss:
             assert second.count_nonzero() > 0
             torch.testing.assert_close(total, first + second, rtol=1e-3, atol=1e-5 * total.abs().max().item())
 
+    @pytest.mark.long
     def test_gradients_of_the_sampling_are_unbiased(self, generator):
         """Nine points have nine sets of eight: the exact expectation over two hypotheses is a sum of 81 terms."""
         points = [p[:1] for p in unit_square(9)]

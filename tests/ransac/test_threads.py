@@ -58,5 +58,5 @@ def test_callers_that_overlap():
 
 
 def test_ransac_gives_the_threads_back():
-    RANSAC(seed=0, max_iter=64)(torch.rand(20, 2), torch.rand(20, 2))
+    RANSAC(seed=0, max_samples=64)(torch.rand(20, 2), torch.rand(20, 2))
     assert torch.get_num_threads() == 3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -11,12 +11,10 @@ from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.textfiles import (
     camera_matrix,
     listed_image,
-    parent_name,
     parse_numbers,
     rigid_motion,
     rotation,
     text_lines,
-    without_suffix,
 )
 from kornia_learnnorm.data.images import image_size
 
@@ -24,22 +22,23 @@ __all__ = ["read_cambridge"]
 
 
 def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
-    """Read a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015): camera centres, quaternions from the world.
+    """Return the frames of a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015).
 
-    Focal lengths are those of the scene's reconstruction by VisualSFM, ``reconstruction.nvm``, the principal point is
+    Focal lengths are those of the scene's reconstruction by VisualSFM, ``reconstruction.nvm``; the principal point is
     the centre of the image. The reconstruction's radial distortion is not applied.
 
     Args:
-        root: the scene's folder, with ``dataset_train.txt`` and ``dataset_test.txt``, about metres.
+        root: the scene's folder, with ``dataset_train.txt`` and ``dataset_test.txt``: camera centres, approximately in
+            metres, and quaternions from world to camera.
         split: ``train`` or ``test``; None for both.
 
     Returns:
-        the frames by name, each folder a sequence; cameras are NaN where the reconstruction lacks the image or is not
-        there, and where the image cannot be read.
+        the frames by name, each folder a sequence; cameras are NaN if the image cannot be read, or there is no
+        reconstruction or the image is not in it.
 
     Raises:
         FileNotFoundError: if a list is missing, or an image that it lists.
-        ValueError: if the split is unknown, a line malformed, a list without entries or an image listed twice.
+        ValueError: if the split is unknown, a line is malformed, or a list is empty or has an image twice.
 
     """
     root = Path(root)
@@ -58,17 +57,19 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
             if name in frames:
                 raise ValueError(f"{path}, line {number}: {name} is listed twice")
             size = image_size(root / listed_image(path, number, name))
-            focal, known = focals.get(without_suffix(name), np.nan), without_suffix(name) in focals and size != (0, 0)
-            K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2) if known else np.full((3, 3), np.nan)
+            focal = focals.get(_without_suffix(name), np.nan) if size != (0, 0) else np.nan
+            K = np.full((3, 3), np.nan)
+            if focal > 0:
+                K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
             pose = rigid_motion(rotation(path, number, row[3:]).T, row[:3])
-            frames[name] = Frame(root / name, name, parent_name(name), size, K, pose)
+            frames[name] = Frame(root / name, name, name.rpartition("/")[0], size, K, pose)
         if len(frames) == before:
             raise ValueError(f"{path} lists no images after the three lines of its header")
     return sorted(frames.values(), key=lambda frame: (frame.sequence, frame.name))
 
 
 def _nvm_focals(path: Path) -> dict[str, float]:
-    """Read the focal lengths by the images' names without suffix; the points after them are many and not read."""
+    """Return the focal lengths, pixels, by the images' names without suffix; the points after them are not read."""
     lines = text_lines(path, "reconstruction")
     number, line = next(lines, (1, ""))
     if line != "NVM_V3":
@@ -79,9 +80,15 @@ def _nvm_focals(path: Path) -> dict[str, float]:
     expected, focals = "an image, its focal length, quaternion, centre, radial distortion and 0", {}
     for number, text in islice(lines, int(line)):
         name, *words = text.split()
-        focals[without_suffix(name)] = float(parse_numbers(path, number, words, 10, expected, text)[0])
-        if focals[without_suffix(name)] <= 0:
+        focal = float(parse_numbers(path, number, words, 10, expected, text)[0])
+        focals[_without_suffix(name)] = focal
+        if focal <= 0:
             raise ValueError(f"{path}, line {number}: a positive focal length expected, got {words[0]}")
     if len(focals) < int(line):
         raise ValueError(f"{path} announces {line} images and has {len(focals)}")
     return focals
+
+
+def _without_suffix(name: str) -> str:
+    """Return a name without the suffix, which differs between the lists and the reconstruction."""
+    return str(PurePosixPath(name).with_suffix(""))

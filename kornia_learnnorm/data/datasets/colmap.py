@@ -16,19 +16,21 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.images import image_size
+from kornia_learnnorm.optional import import_extra
 
 __all__ = ["covisible_pairs", "read_colmap"]
 
-# Where the distortion starts among a model's parameters; COLMAP's source, sensor/models.h. Its terms are the first of
-# OpenCV's k1, k2, p1, p2 in this order.
-_DISTORTION = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4}
+# Index of the first distortion parameter of a camera model (COLMAP's source, sensor/models.h). These parameters are the
+# first of OpenCV's k1, k2, p1, p2.
+FIRST_DISTORTION = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4}
 
 
 def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
-    """Read the frames of a COLMAP model (https://colmap.github.io/format.html).
+    """Return the frames of a COLMAP model (https://colmap.github.io/format.html).
 
-    COLMAP puts the centre of the top left pixel at (0.5, 0.5), a frame has it at (0, 0). Each folder of images is a
-    sequence. COLMAP ignores the orientation in an image's EXIF.
+    Each folder of images is a sequence. The centre of the top left pixel is (0.5, 0.5) in COLMAP and (0, 0) in a frame.
+    COLMAP ignores the EXIF orientation of an image, so an image that EXIF turns by a quarter does not have its camera's
+    size and is refused.
 
     Args:
         model: folder with cameras, images and points3D, as ``.bin`` or ``.txt``; its unit of length is arbitrary.
@@ -55,12 +57,12 @@ def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
 
 
 def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int = 30) -> Iterator[FramePair]:
-    """Pair the frames that see enough of the same 3D points of a COLMAP model.
+    """Yield the pairs of frames that see enough of the same 3D points of a COLMAP model.
 
     Args:
         model: folder with cameras, images and points3D, as ``.bin`` or ``.txt``.
-        frames: frames whose names are those of the model's images.
-        min_points: how many points both frames of a pair see at least.
+        frames: frames named as the images of the model.
+        min_points: smallest number of points that both frames of a pair see.
 
     Yields:
         the pairs by the name of the first frame, then of the second.
@@ -91,30 +93,27 @@ def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int 
 
 
 def _reconstruction(model: Path) -> Any:
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ImportError("COLMAP models need pycolmap: pip install 'kornia-learnnorm[colmap]'") from error
+    pycolmap = import_extra("pycolmap", "colmap", "reading COLMAP models")
     for name in ("cameras", "images", "points3D"):
         if not any((model / f"{name}.{suffix}").is_file() for suffix in ("bin", "txt")):
             raise FileNotFoundError(f"no COLMAP model at {model}: it lacks {name}.bin or {name}.txt")
     try:
         return pycolmap.Reconstruction(str(model))
-    except (ValueError, IndexError, RuntimeError) as error:  # IndexError of references to nothing
+    except (ValueError, IndexError, RuntimeError) as error:  # IndexError: a reference to a missing camera or point
         raise ValueError(f"the COLMAP model {model} cannot be read: {error}") from error
 
 
 def _frame(image: Any, path: Path) -> Frame:
     camera, size = image.camera, image_size(path)
-    if camera.model_name not in _DISTORTION:
-        known = ", ".join(_DISTORTION)
+    if camera.model_name not in FIRST_DISTORTION:
+        known = ", ".join(FIRST_DISTORTION)
         raise ValueError(f"camera model of {image.name} must be one of {known}, got {camera.model_name}")
     if size not in ((0, 0), (camera.width, camera.height)):
         expected, got = f"{camera.width} x {camera.height}", f"{size[0]} x {size[1]}"
         raise ValueError(f"image {path} must have its camera's size, {expected} pixels, got {got}")
     K: NDArray[np.float64] = np.array(camera.calibration_matrix(), np.float64)
     K[:2, 2] -= 0.5
-    terms = [float(term) for term in camera.params[_DISTORTION[camera.model_name] :]]
+    terms = [float(term) for term in camera.params[FIRST_DISTORTION[camera.model_name] :]]
     distortion = (*terms, 0.0, 0.0, 0.0)[:4] if terms else ()
     pose = np.full((4, 4), np.nan)
     if image.has_pose:

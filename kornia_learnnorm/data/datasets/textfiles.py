@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
+import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from numpy.typing import NDArray
 
 __all__ = [
     "camera_matrix",
     "listed_image",
-    "parent_name",
     "parse_numbers",
     "rigid_motion",
     "rotation",
     "text_lines",
-    "without_suffix",
 ]
 
 Array = NDArray[np.float64]
 
 
 def text_lines(path: Path, what: str) -> Iterator[tuple[int, str]]:
-    """Yield number, from 1, and text of each line that is neither empty nor a comment."""
+    """Yield the number, from 1, and the text of each line that is neither empty nor a comment."""
     if not path.is_file():
         raise FileNotFoundError(f"no {what} at {path}")
     with path.open(encoding="utf-8") as file:
@@ -36,7 +36,7 @@ def text_lines(path: Path, what: str) -> Iterator[tuple[int, str]]:
 
 
 def parse_numbers(path: Path, number: int, words: list[str], count: int, expected: str, line: str = "") -> Array:
-    """Return ``count`` finite numbers; the error says what was ``expected`` and quotes the line."""
+    """Return ``count`` finite numbers, (count,); the error says what was ``expected`` and quotes the line."""
     try:
         values = np.array([float(word) for word in words])
     except ValueError:
@@ -54,13 +54,11 @@ def listed_image(path: Path, number: int, name: str) -> str:
 
 
 def rotation(path: Path, number: int, wxyz: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a quaternion of any norm but zero."""
+    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z) of any norm but zero."""
     norm = np.linalg.norm(wxyz)
     if norm == 0:
-        raise ValueError(f"{path}, line {number}: a quaternion must not be zero")
-    w, x, y, z = wxyz / norm
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + 2 * (w * cross + cross @ cross))
+        raise ValueError(f"{path}, line {number}: a quaternion other than zero expected, got {wxyz}")
+    return np.asarray(quaternion_to_rotation_matrix(torch.from_numpy(wxyz / norm)))
 
 
 def rigid_motion(R: Array, t: Array) -> Array:
@@ -71,13 +69,3 @@ def rigid_motion(R: Array, t: Array) -> Array:
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
     """Return the camera matrix (3, 3), pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def parent_name(name: str) -> str:
-    """Return the folder in a name with slashes."""
-    return name.rpartition("/")[0]
-
-
-def without_suffix(name: str) -> str:
-    """Return a name without the ending of its file."""
-    return str(PurePosixPath(name).with_suffix(""))

@@ -1,36 +1,56 @@
 """Stores of correspondences to and from the feature and match files of hloc.
 
 P.-E. Sarlin, C. Cadena, R. Siegwart and M. Dymczyk, From coarse to fine: robust hierarchical localization at large
-scale, CVPR 2019. The file of features has a group for each image, nested where its name has slashes, with
+scale, CVPR 2019. The file of features has a group for each image, nested where the image's name has slashes, with
 ``keypoints`` (N, 2), pixels with the centre of the top left one at (0, 0), and ``image_size``, (width, height). The
-file of matches has a group for each pair, ``NAME0/NAME1`` with the slashes of the names turned to ``-``, or, as older
-versions wrote, ``NAME0_NAME1``, with ``matches0`` (N,), the keypoint of image 1 for each keypoint of image 0 or -1,
-and ``matching_scores0`` (N,). What a store loses on the way is in the table of
-:mod:`kornia_learnnorm.data.formats.interchange`.
+file of matches has a group for each pair, ``NAME0/NAME1`` with the slashes of the names replaced by ``-``, or
+``NAME0_NAME1`` in older versions of hloc, with ``matches0`` (N,), the keypoint of image 1 for each keypoint of image 0
+or -1, and ``matching_scores0`` (N,).
+
+The files keep points, names, image sizes and, as the score 1 - ratio, ratios. They hold one match for each keypoint of
+image 0, so of several matches of one point the one with the smallest ratio is kept. They have no place for the order of
+matches and pairs, for ground truth, and for the texts of a store.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.formats.interchange import Pair, assemble, best_of_each, natural, split_pairs
-from kornia_learnnorm.data.store import CorrespondenceStore, _h5py, check_declared
+from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.optional import import_extra
 
 __all__ = ["export_hloc", "import_hloc"]
 
-# keypoints and (width, height) of an image
-_Image = tuple[NDArray[Any], NDArray[Any]]
+PURPOSE = "converting hloc's files"
 
 
-def export_hloc(store: CorrespondenceStore, features: str | Path, matches: str | Path) -> dict[str, int]:
-    """Write a file of features and one of matches; an image's keypoints are its points in all its pairs, each once.
+class _Image(NamedTuple):
+    """An image's keypoints (N, 2), pixels, and its (width, height) (2,)."""
+
+    keypoints: NDArray[Any]
+    size: NDArray[Any]
+
+
+class _Pair(NamedTuple):
+    """A pair of images: names, points in both (N, 2), Lowe's ratio (N,) and both sizes (2, 2)."""
+
+    names: tuple[str, str]
+    points1: NDArray[Any]
+    points2: NDArray[Any]
+    ratio: NDArray[np.float64]
+    image_size: NDArray[Any]
+
+
+def export_hloc(store: CorrespondenceStore, features: str | Path, matches: str | Path) -> int:
+    """Write a file of features and a file of matches; the keypoints of an image are its distinct points in all pairs.
 
     Args:
         store: the correspondences.
@@ -38,39 +58,39 @@ def export_hloc(store: CorrespondenceStore, features: str | Path, matches: str |
         matches: the HDF5 file of matches to write; an existing one is replaced.
 
     Returns:
-        what was left out, and how often; nothing else was.
+        how many matches were left out, because another match of the same keypoint of image 0 has a smaller ratio.
 
     Raises:
         FileNotFoundError: if a folder does not exist.
-        ValueError: if the files are the same, a name is not that of a file, two images or two pairs have the same
+        ValueError: if both files are the same, a name cannot name a file, two images or two pairs have the same
             name, or an image has two sizes.
 
     """
-    h5py = _h5py()
+    h5py = import_extra("h5py", "images", PURPOSE)
     features, matches = Path(features), Path(matches)
     if features.resolve() == matches.resolve():
         raise ValueError(f"features and matches must be two files, got {features} for both")
-    pairs = list(split_pairs(store))
-    _check_names(pairs)
-    images, indices = _keypoints(pairs)
+    _check_names(store.names)
+    images, indices = _keypoints(store)
     dropped = 0
-    with atomic_write(features) as beside, atomic_write(matches) as beside_too:
-        with h5py.File(beside, "w") as file:
-            for name, (keypoints, size) in images.items():
-                file[f"{name}/keypoints"] = keypoints.astype(np.float32)
-                file[f"{name}/image_size"] = size.astype(np.int64)
-        with h5py.File(beside_too, "w") as file:
-            for pair, (index1, index2) in zip(pairs, indices, strict=True):
-                best = best_of_each(index1, pair.ratio)
-                target = np.full(len(images[pair.names[0]][0]), -1, np.int32)
-                # float64: 1 - (1 - ratio) is then the ratio again
-                scores = np.zeros(len(target))
+    with atomic_write(features) as features_file, atomic_write(matches) as matches_file:
+        with h5py.File(features_file, "w") as file:
+            for name, image in images.items():
+                file[f"{name}/keypoints"] = image.keypoints.astype(np.float32)
+                file[f"{name}/image_size"] = image.size.astype(np.int64)
+        with h5py.File(matches_file, "w") as file:
+            for i, (index1, index2) in enumerate(indices):
+                ratio = store.matches(i)[2]
+                order = np.argsort(ratio, kind="stable")
+                best = order[np.unique(index1[order], return_index=True)[1]]
+                target = np.full(len(images[store.names[i][0]].keypoints), -1, np.int32)
+                scores = np.zeros(len(target))  # float64, so that 1 - (1 - ratio) is the ratio
                 target[index1[best]] = index2[best]
-                scores[index1[best]] = 1 - pair.ratio[best].astype(np.float64)
-                group = file.create_group(_key(pair.names))
+                scores[index1[best]] = 1 - ratio[best].astype(np.float64)
+                group = file.create_group(_key(store.names[i]))
                 group["matches0"], group["matching_scores0"] = target, scores
                 dropped += len(index1) - len(best)
-    return {"matches of a keypoint that has a better one": dropped} if dropped else {}
+    return dropped
 
 
 def _dashed(name: str) -> str:
@@ -81,35 +101,35 @@ def _key(names: tuple[str, str]) -> str:
     return "/".join(map(_dashed, names))
 
 
-def _check_names(pairs: list[Pair]) -> None:
+def _check_names(pairs: list[tuple[str, str]]) -> None:
     dashed: dict[str, str] = {}
     keys: set[str] = set()
-    for pair in pairs:
-        for name in pair.names:
+    for names in pairs:
+        for name in names:
             if {"", "."} & set(name.split("/")):
                 raise ValueError(f"{name!r} cannot name an image of hloc: expected a path below the images' folder")
             if dashed.setdefault(_dashed(name), name) != name:
                 raise ValueError(f"hloc cannot tell the images {name!r} and {dashed[_dashed(name)]!r} apart")
-        if _key(pair.names) in keys:
-            raise ValueError(f"two pairs are of the images {pair.names}, hloc has one for each pair of images")
-        keys.add(_key(pair.names))
+        if _key(names) in keys:
+            raise ValueError(f"two pairs are of the images {names}, hloc has one for each pair of images")
+        keys.add(_key(names))
 
 
-def _keypoints(pairs: list[Pair]) -> tuple[dict[str, _Image], list[list[NDArray[np.intp]]]]:
-    """Return the images, and for each pair and side the keypoint that each match has."""
+def _keypoints(store: CorrespondenceStore) -> tuple[dict[str, _Image], list[list[NDArray[np.intp]]]]:
+    """Return the images, and for each pair and side the keypoint of each match."""
     places: dict[str, list[tuple[int, int]]] = {}
-    for i, pair in enumerate(pairs):
-        for side, name in enumerate(pair.names):
+    for i, names in enumerate(store.names):
+        for side, name in enumerate(names):
             places.setdefault(name, []).append((i, side))
     images: dict[str, _Image] = {}
-    indices = [[np.empty(0, np.intp)] * 2 for _ in pairs]
+    indices = [[np.empty(0, np.intp)] * 2 for _ in store.names]
     for name, found in places.items():
-        sizes = np.array([pairs[i].image_size[side] for i, side in found])
+        sizes = np.array([store.image_size[place] for place in found])
         if (sizes != sizes[0]).any():
             raise ValueError(f"the image {name!r} has several sizes: {np.unique(sizes, axis=0).tolist()}")
-        points = [(pairs[i].points1, pairs[i].points2)[side] for i, side in found]
+        points = [store.matches(i)[side] for i, side in found]
         unique, index = np.unique(np.concatenate(points), axis=0, return_inverse=True)
-        images[name] = unique, sizes[0]
+        images[name] = _Image(unique, sizes[0])
         ends = np.cumsum([len(part) for part in points])
         for (i, side), part in zip(found, np.split(index.reshape(-1), ends[:-1]), strict=True):
             indices[i][side] = part
@@ -117,15 +137,15 @@ def _keypoints(pairs: list[Pair]) -> tuple[dict[str, _Image], list[list[NDArray[
 
 
 def import_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
-    """Read the pairs of a file of matches, with the keypoints of a file of features.
+    """Return a store of the pairs in a file of matches, with the keypoints of a file of features.
 
     Args:
-        features: HDF5 file of features; other datasets than keypoints and sizes, as descriptors, are passed over.
+        features: HDF5 file of features; datasets other than keypoints and sizes are ignored.
         matches: HDF5 file of matches.
 
     Returns:
-        the store, pairs in the order of their names; ``ratio`` is 1 - score, 0 where there are no scores; K, R, t and
-        F are NaN. hloc rounds keypoints to float16 unless told otherwise: at 1000 px that is half a pixel.
+        the store, pairs sorted by name with numbers in names by value; ``ratio`` is 1 - score, 0 where there are no
+        scores; K, R, t and F are NaN. hloc rounds keypoints to float16 by default: at 1000 px that is half a pixel.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -145,9 +165,33 @@ def import_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStor
             except ValueError as error:
                 raise ValueError(f"{matches}, {key}: {error}") from error
     if not pairs:
-        raise ValueError(f"{matches} holds no pair of images")
-    pairs.sort(key=lambda pair: tuple(map(natural, pair.names)))
-    return assemble(pairs, f"hloc's {features.name} and {matches.name}")
+        raise ValueError(f"{matches} holds no pair of images, expected one group for each pair")
+    pairs.sort(key=lambda pair: [_sort_key(name) for name in pair.names])
+    return _store(pairs, f"hloc's {features.name} and {matches.name}")
+
+
+def _sort_key(name: str) -> list[str | int]:
+    """Split a name so that its numbers sort by value: ``a_9`` before ``a_10``."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
+
+
+def _store(pairs: list[_Pair], dataset: str) -> CorrespondenceStore:
+    number = len(pairs)
+    return CorrespondenceStore(
+        points1=np.concatenate([pair.points1 for pair in pairs]).astype(np.float32),
+        points2=np.concatenate([pair.points2 for pair in pairs]).astype(np.float32),
+        ratio=np.concatenate([pair.ratio for pair in pairs]).astype(np.float32),
+        offsets=np.cumsum([0, *(len(pair.ratio) for pair in pairs)], dtype=np.int64),
+        image_size=np.stack([pair.image_size for pair in pairs]).astype(np.int32),
+        names=[pair.names for pair in pairs],
+        F=np.full((number, 3, 3), np.nan),
+        K=np.full((number, 2, 3, 3), np.nan),
+        R=np.full((number, 3, 3), np.nan),
+        t=np.full((number, 3), np.nan),
+        dataset=dataset,
+        pairs="not known",
+        detector="not known",
+    )
 
 
 @contextmanager
@@ -155,7 +199,7 @@ def _opened(path: Path) -> Iterator[Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no file of hloc at {path}")
     try:
-        with _h5py().File(path, "r") as file:
+        with import_extra("h5py", "images", PURPOSE).File(path, "r") as file:
             yield file
     except (OSError, RuntimeError, KeyError) as error:
         raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
@@ -181,29 +225,26 @@ def _read_features(path: Path) -> dict[str, _Image]:
             if keypoints is None or size is None:
                 held = ", ".join(sorted(file[name or "/"]))
                 raise ValueError(f"{path}: the image {name!r} must have keypoints and image_size, got {held}")
-            if (
-                keypoints.shape[1:] != (2,)
-                or size.shape != (2,)
-                or {keypoints.dtype.kind, size.dtype.kind} - set("fiu")
-            ):
+            kinds = {keypoints.dtype.kind, size.dtype.kind}
+            if keypoints.shape[1:] != (2,) or size.shape != (2,) or kinds - set("fiu"):
                 got = f"{keypoints.dtype} {keypoints.shape} and {size.dtype} {size.shape}"
                 raise ValueError(f"{path}, {name}: keypoints and image_size must be numbers (N, 2) and (2,), got {got}")
             if not np.isfinite(keypoints).all() or not ((size >= 0) & (size < 2**31)).all():
                 raise ValueError(f"{path}, {name}: keypoints are NaN or infinite, or image_size is not a size: {size}")
-            images[name] = keypoints, size
+            images[name] = _Image(keypoints, size)
     return images
 
 
 def _dataset(group: Any, key: str) -> NDArray[Any] | None:
-    data = group.get(key)
-    if not hasattr(data, "dtype"):
+    """Return a dataset of a group; None where there is none, or a link to another file."""
+    h5py = import_extra("h5py", "images", PURPOSE)
+    if group.get(key, getclass=True, getlink=True) is not h5py.HardLink or not hasattr(group[key], "dtype"):
         return None
-    check_declared(Path(group.file.filename), [data])
-    return np.asarray(data[()])
+    return np.asarray(group[key][()])
 
 
 def _names(key: str, dashed: Mapping[str, list[str]]) -> tuple[str, str]:
-    """Find the images that the group of a pair names."""
+    """Return the names of the two images that the group of a pair names."""
     if "/" in key:
         splits = [key.partition("/")[::2]]
     else:
@@ -216,7 +257,7 @@ def _names(key: str, dashed: Mapping[str, list[str]]) -> tuple[str, str]:
     return found[0]
 
 
-def _read_pair(group: Any, names: tuple[str, str], images: Mapping[str, _Image]) -> Pair:
+def _read_pair(group: Any, names: tuple[str, str], images: Mapping[str, _Image]) -> _Pair:
     (keypoints1, size1), (keypoints2, size2) = (images[name] for name in names)
     target, scores = _dataset(group, "matches0"), _dataset(group, "matching_scores0")
     if target is None:
@@ -233,4 +274,4 @@ def _read_pair(group: Any, names: tuple[str, str], images: Mapping[str, _Image])
     index1 = np.flatnonzero(target >= 0)
     index2 = target[index1]
     ratio = 1 - scores[index1].astype(np.float64)
-    return Pair(keypoints1[index1], keypoints2[index2], ratio, np.stack([size1, size2]), names)
+    return _Pair(names, keypoints1[index1], keypoints2[index2], ratio, np.stack([size1, size2]))

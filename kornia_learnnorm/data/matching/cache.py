@@ -1,4 +1,4 @@
-"""Features of frames on disk, each for as long as pairs need it."""
+"""A cache on disk for the features of frames."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["FeatureCache"]
 
 
 class FeatureCache:
-    """Keep the features of frames in a folder, each until the last pair that needs it is released.
+    """Keep the features of frames in a folder, each until the last pair of the frame is released.
 
-    As a context it starts with an empty folder and removes it at the end, whatever happened.
+    The context manager starts with an empty folder and removes it at the end, also after an error.
 
     Args:
-        folder: where the files lie; what a killed run left there is removed.
+        folder: the folder of the files; files that a killed run left there are removed.
         pairs: all pairs that will ask for features.
     """
 
@@ -43,15 +43,15 @@ class FeatureCache:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def missing(self, pairs: Sequence[FramePair]) -> list[Frame]:
-        """Return the frames of the pairs that were not put yet, each once."""
+        """Return the frames of the pairs that have not been put, each once."""
         frames = {frame.name: frame for pair in pairs for frame in (pair.frame1, pair.frame2)}
         return [frame for name, frame in frames.items() if name not in self.held]
 
     def put(self, frame: Frame, features: Features | str) -> None:
-        """Keep the features of a frame, or why it has none.
+        """Keep the features of a frame, or the reason why it has none.
 
         Raises:
-            OSError: if they cannot be written, as on a full disk.
+            OSError: if the features cannot be written, as on a full disk.
 
         """
         if isinstance(features, str):
@@ -60,14 +60,14 @@ class FeatureCache:
         path = self.folder / f"{sha256(frame.name.encode()).hexdigest()}.npz"
         try:
             np.savez(path, points=features.points, descriptors=features.descriptors, size=features.size)
-        except OSError as error:  # NumPy's own names neither the file nor, at times, the cause
+        except OSError as error:  # NumPy's message does not name the file
             raise OSError(
                 f"cannot write the features of {frame.name} to {self.folder}, is the disk full? {error}"
             ) from error
         self.held[frame.name] = path
 
     def get(self, pair: FramePair) -> tuple[Features | str, Features | str]:
-        """Return what was put for the frames of a pair."""
+        """Return the features of both frames of a pair, or the reason why there are none."""
         return self._get(pair.frame1), self._get(pair.frame2)
 
     def _get(self, frame: Frame) -> Features | str:
@@ -79,7 +79,7 @@ class FeatureCache:
             return Features(data["points"], data["descriptors"], (width, height))
 
     def release(self, pair: FramePair) -> None:
-        """Take note that a pair is done; what no other pair needs is deleted."""
+        """Mark a pair as done and delete features that no other pair needs."""
         for frame in (pair.frame1, pair.frame2):
             self.uses[frame.name] -= 1
             if self.uses[frame.name] == 0:

@@ -1,7 +1,7 @@
 """Matching all pairs of frames into a store, on all cores or on many machines.
 
-The features of a frame wait on disk from when they are computed until its last pair is matched: none is computed twice,
-and memory does not grow with the number of pairs.
+The features of a frame are computed once and stay on disk until the frame's last pair is matched, so memory does not
+grow with the number of pairs.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import kornia_learnnorm
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.images import import_cv2, read_frame
 from kornia_learnnorm.data.matching.cache import FeatureCache
@@ -25,12 +25,14 @@ from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import Workers, open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.writer import StoreWriter
+from kornia_learnnorm.optional import import_extra
+from kornia_learnnorm.protocol import MAX_FILTERED, RATIO
 
 __all__ = ["MatchOptions", "collect_matches", "match_pair"]
 
-RATIO = 0.8  # Lowe's
-WINDOW = 8  # pairs for each process between looks at which features are needed no more
-RESTARTS = 3  # in a row and without a pair done, after that something kills every process
+WINDOW = 8  # pairs per process that are matched before unneeded features are deleted
+MAX_RESTARTS = 3  # consecutive worker crashes without progress
+LOG_INTERVAL = 30.0  # seconds between lines of progress where stderr is not a terminal
 
 
 @dataclass(frozen=True)
@@ -39,20 +41,20 @@ class MatchOptions:
 
     Attributes:
         detector: a key of ``kornia_learnnorm.data.matching.features.DETECTORS``.
-        num_features: the strongest features of an image that are kept.
+        num_features: largest number of features kept of an image, the strongest ones.
         matcher: a key of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
-        max_matches: how many matches of a pair pass Lowe's ratio test of 0.8, and how many that do not, are kept, drawn
-            at random; None keeps all.
-        seed: seed of that draw and of the order of a pair's matches.
+        max_matches: largest number of matches kept of a pair, drawn at random: so many that pass Lowe's ratio test of
+            0.8, and so many that fail it; None keeps all.
+        seed: seed of this draw and of the order of a pair's matches.
 
     Raises:
-        ValueError: if there is no such detector or matcher, they do not go together, or a number is out of range.
+        ValueError: if the detector or matcher is unknown, they do not fit together, or a number is out of range.
     """
 
     detector: str = "sift"
     num_features: int = 4000
     matcher: str = "nearest"
-    max_matches: int | None = 1000
+    max_matches: int | None = MAX_FILTERED
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -66,7 +68,7 @@ class MatchOptions:
         if self.seed < 0:
             raise ValueError(f"seed must be 0 or more, got {self.seed}")
         if self.matcher == "lightglue" and self.detector != "disk":
-            raise ValueError(f"the matcher lightglue takes features of the detector disk, got {self.detector}")
+            raise ValueError(f"the matcher lightglue needs features of the detector disk, got {self.detector}")
 
 
 def match_pair(
@@ -77,14 +79,14 @@ def match_pair(
     options: MatchOptions | None = None,
     about: dict[str, str] | None = None,
 ) -> CorrespondenceStore:
-    """Match two frames, in random order.
+    """Match two frames and return their matches in random order.
 
     Args:
-        pair: the frames, for what a store says of them.
+        pair: the frames, for names, cameras and motion.
         features1: features of the first frame.
         features2: features of the second frame.
-        place: the pair's place in the store; with the seed it decides the order.
-        options: how to match.
+        place: index of the pair in the store; with the seed it determines the order of the matches.
+        options: options of matching; None for the default ones.
         about: ``dataset`` and ``pairs`` of the store.
 
     Returns:
@@ -127,44 +129,44 @@ def collect_matches(
     jobs: int = 1,
     dask: str | None = None,
 ) -> dict[str, str]:
-    """Match all pairs into a store, with a progress bar; a run that was stopped goes on where it was.
+    """Match all pairs into a store, with a progress bar; a run that was stopped continues where it was.
 
     Args:
         pairs: pairs of frames, in the order of the store.
-        path: the store to write. Until it is whole, its pairs wait in ``<path>.parts``.
-        options: how to match.
+        path: the store to write. Until it is complete, its pairs are in ``<path>.parts``.
+        options: options of matching; None for the default ones.
         about: ``dataset`` and ``pairs`` of the store.
         jobs: processes on this machine; -1 for as many as it has cores.
-        dask: address of a Dask scheduler whose workers match instead; they see the images under the same paths.
+        dask: address of a Dask scheduler whose workers match instead; they need the images under the same paths.
 
     Returns:
         the pairs that could not be matched, ``"name1 name2"``, and why; the store leaves them out and lists them.
 
     Raises:
-        ValueError: if there are no pairs, none of them could be matched, or ``path`` holds something else.
-        OSError: if something cannot be written, or processes die again and again.
+        ValueError: if there are no pairs, none of them could be matched, or ``path`` holds another store.
+        OSError: if a file cannot be written, or workers crash repeatedly without progress.
         ImportError: if OpenCV, h5py, joblib or, for ``dask``, Dask is not installed.
 
     """
     options, about = options or MatchOptions(), about or {}
     if not pairs:
-        raise ValueError("no pairs of frames to match")
+        raise ValueError("no pairs of frames to match: one pair or more expected, got none")
     writer = StoreWriter(path, {**about, **asdict(options), "frames": _digest(pairs)})
     if writer.complete:
-        print(f"{path} is there already, made with these options; remove it to match anew", file=sys.stderr)
+        print(f"{path} exists already, made with these options; remove it to match again", file=sys.stderr)
         return writer.skipped
     with closing(writer):
         with open_workers(jobs, dask) as workers:
             skipped = _match_all(pairs, writer, options, about, workers)
         if not writer.done():
             first = next(iter(skipped.values()))
-            raise ValueError(f"none of the {len(pairs)} pairs could be matched; the first: {first}")
+            raise ValueError(f"none of the {len(pairs)} pairs could be matched; reason for the first: {first}")
         writer.finish({"versions": _versions(), "skipped": skipped})
     return skipped
 
 
 def _digest(pairs: Sequence[FramePair]) -> str:
-    """Return what tells these pairs, their cameras and their poses from others."""
+    """Return a hash of the pairs: names, sizes, cameras and poses."""
     digest = sha256()
     for pair in pairs:
         for frame in (pair.frame1, pair.frame2):
@@ -175,16 +177,15 @@ def _digest(pairs: Sequence[FramePair]) -> str:
 
 
 def _versions() -> dict[str, str]:
-    import h5py
-
-    versions = {"kornia_learnnorm": kornia_learnnorm.__version__, "numpy": np.__version__, "h5py": h5py.__version__}
-    return {**versions, "opencv": import_cv2().__version__}
+    packages = {"kornia_learnnorm": "kornia-learnnorm", "numpy": "numpy", "h5py": "h5py"}
+    versions = {name: version(package) for name, package in packages.items()}
+    return {**versions, "opencv": str(import_cv2().__version__)}
 
 
 def _match_all(
     pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: dict[str, str], workers: Workers
 ) -> dict[str, str]:
-    """Match what is not done; go on after a process was killed."""
+    """Match the pairs that are not done; continue after a worker was killed. Return the skipped pairs and why."""
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
     done = writer.done()
@@ -204,17 +205,16 @@ def _match_all(
                         bar.update()
             except BrokenProcessPool as error:
                 restarts = restarts + 1 if len(done) == before else 1
-                if restarts > RESTARTS:
-                    raise OSError(f"the processes that match were killed {restarts} times in a row: {error}") from error
-                bar.write("a process was killed; going on with the others", file=sys.stderr)
+                if restarts > MAX_RESTARTS:
+                    raise OSError(f"the worker processes were killed {restarts} times in a row: {error}") from error
+                bar.write("a worker process was killed; continuing with new ones", file=sys.stderr)
     return skipped
 
 
 def _progress(total: int, done: int) -> Any:
-    """Return a progress bar on stderr; a log file gets a line of it now and then."""
-    from tqdm import tqdm
-
-    often = {} if sys.stderr.isatty() else {"mininterval": 30.0, "maxinterval": 30.0}
+    """Return a progress bar on stderr, which writes a line now and then to a log file."""
+    tqdm = import_extra("tqdm", "images", "matching many pairs").tqdm
+    often = {} if sys.stderr.isatty() else {"mininterval": LOG_INTERVAL, "maxinterval": LOG_INTERVAL}
     return tqdm(total=total, initial=done, unit="pair", **often)
 
 
@@ -226,7 +226,7 @@ def _match_some(
     about: dict[str, str],
     workers: Workers,
 ) -> Generator[tuple[int, CorrespondenceStore | str], None, None]:
-    """Yield each place of ``todo`` with its pair's store, or why there is none."""
+    """Yield each place of ``todo`` with the store of its pair, or the reason why there is none."""
     window = WINDOW * workers.number
     with FeatureCache(folder / "features", [pairs[place] for place in todo]) as cache:
         for first in range(0, len(todo), window):
@@ -243,7 +243,7 @@ def _match_some(
 
 
 def _detect(frame: Frame, options: MatchOptions) -> Features | str:
-    """Return a frame's features, or why it cannot be read."""
+    """Return the features of a frame, or the reason why it cannot be read."""
     import_cv2().setNumThreads(1)
     try:
         image = read_frame(frame)
@@ -259,7 +259,7 @@ def _match(
     options: MatchOptions,
     about: dict[str, str],
 ) -> CorrespondenceStore | str:
-    """Return a pair's store, or why there is none."""
+    """Return the store of a pair, or the reason why there is none."""
     features1, features2 = features
     if isinstance(features1, str):
         return features1

@@ -1,7 +1,7 @@
-"""Features of an image: where they are and how their surroundings look.
+"""Local features of an image: keypoints and descriptors.
 
 SIFT is OpenCV's (extra ``images``). The learned detectors are Kornia's; they load their weights through
-:mod:`torch.hub`, from its cache or from where Kornia's authors put them.
+:mod:`torch.hub`, from its cache or from the internet.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ class Features(NamedTuple):
 def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
     """Find the strongest SIFT features.
 
-    A place with several orientations gives several features at the same pixel.
+    A keypoint with several orientations gives several features at the same pixel.
 
     Args:
         image: grey values with shape :math:`(H, W)`, uint8.
-        num_features: how many to keep.
+        num_features: largest number of features to keep.
 
     Returns:
-        up to ``num_features`` features, and those that are as strong as the last; descriptors uint8 with 128 columns.
+        up to ``num_features`` features, and ties with the weakest of them; descriptors uint8 with 128 columns.
 
     Raises:
         TypeError: if the image is not an array of uint8.
-        ValueError: if it is not of two dimensions, or ``num_features`` is below 2.
+        ValueError: if the image does not have two dimensions, or ``num_features`` is below 2.
         ImportError: if OpenCV is not installed.
 
     References:
@@ -65,13 +65,13 @@ def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
 
 
 def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Find SIFT features and take the square root of each descriptor of unit sum.
+    """Find SIFT features with square roots of descriptors of unit sum (RootSIFT).
 
-    The Euclidean distance of these is the Hellinger distance of SIFT's histograms.
+    Their Euclidean distance is the Hellinger distance of SIFT's histograms.
 
     Args:
         image: as for :func:`detect_sift`.
-        num_features: how many to keep.
+        num_features: largest number of features to keep.
 
     Returns:
         as :func:`detect_sift`, descriptors float32.
@@ -90,14 +90,14 @@ def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
 
     Args:
         image: as for :func:`detect_sift`.
-        num_features: how many to keep.
+        num_features: largest number of features to keep.
 
     Returns:
         up to ``num_features`` features, descriptors float32 with 128 columns.
 
     Raises:
         TypeError: if the image is not an array of uint8.
-        ValueError: if it is not of two dimensions, or ``num_features`` is below 2.
+        ValueError: if the image does not have two dimensions, or ``num_features`` is below 2.
         OSError: if the weights cannot be loaded.
 
     References:
@@ -115,14 +115,14 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
 
     Args:
         image: as for :func:`detect_sift`.
-        num_features: how many to keep.
+        num_features: largest number of features to keep.
 
     Returns:
         up to ``num_features`` features, descriptors float32 with 128 columns.
 
     Raises:
         TypeError: if the image is not an array of uint8.
-        ValueError: if it is not of two dimensions, or ``num_features`` is below 2.
+        ValueError: if the image does not have two dimensions, or ``num_features`` is below 2.
         OSError: if the weights cannot be loaded.
 
     References:
@@ -133,12 +133,12 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
     _check(image, num_features)
     with torch.inference_mode():
         frames, _, descriptors = _keynet(num_features)(_tensor(image))
-    found = frames[0].flatten(1).any(1)  # where it finds fewer than it was asked for, Kornia fills up with zeros
+    found = frames[0].flatten(1).any(1)  # Kornia pads with zeros
     points, rows = frames[0, found, :, 2].float(), descriptors[0, found].float()
     return Features(points.numpy(), rows.numpy(), (image.shape[1], image.shape[0]))
 
 
-# What a command line may call them.
+# names on the command line
 DETECTORS: dict[str, Callable[[NDArray[np.uint8], int], Features]] = {
     "sift": detect_sift,
     "rootsift": detect_rootsift,
@@ -148,19 +148,19 @@ DETECTORS: dict[str, Callable[[NDArray[np.uint8], int], Features]] = {
 
 
 def pretrained(name: str, load: Callable[[], Any]) -> Any:
-    """Return what ``load`` makes; say so where its weights are not at hand.
+    """Return the network that ``load`` makes, with a clear error if its weights cannot be loaded.
 
     Args:
-        name: what the message calls it.
-        load: makes a network of Kornia with its weights.
+        name: name of the network in the error.
+        load: function that returns a network of Kornia with its weights.
 
     Raises:
-        OSError: if the weights are neither in the cache of :mod:`torch.hub` nor to be downloaded.
+        OSError: if the weights are not in the cache of :mod:`torch.hub` and cannot be downloaded.
 
     """
     try:
         return load()
-    except (OSError, RuntimeError, EOFError, UnpicklingError) as error:  # the last two: a cached file that is cut
+    except (OSError, RuntimeError, EOFError, UnpicklingError) as error:  # the last two: a truncated file in the cache
         folder = f"{torch.hub.get_dir()}/checkpoints"
         raise OSError(f"the weights of {name} are not in {folder} and could not be loaded: {error}") from error
 
@@ -180,7 +180,7 @@ def _keynet(num_features: int) -> Any:
 
 
 def _tensor(image: NDArray[np.uint8]) -> torch.Tensor:
-    """Grey values in [0, 1], (1, 1, H, W)."""
+    """Return grey values in [0, 1], (1, 1, H, W)."""
     return torch.from_numpy(image)[None, None].float() / 255.0
 
 

@@ -24,8 +24,8 @@ class Matches(NamedTuple):
         points1: pixels ``(x, y)`` in image 1 with shape :math:`(N, 2)`, float32.
         points2: pixels of their matches in image 2 with shape :math:`(N, 2)`, float32.
         ratio: distance of the nearest over that of the second-nearest descriptor with shape :math:`(N,)`, float32, in
-            :math:`[0, 1]`; small is distinctive (D. Lowe, Distinctive image features from scale-invariant keypoints,
-            IJCV 2004, section 7.1).
+            :math:`[0, 1]`; a small ratio is a distinctive match (D. Lowe, Distinctive image features from
+            scale-invariant keypoints, IJCV 2004, section 7.1).
 
     """
 
@@ -37,8 +37,8 @@ class Matches(NamedTuple):
 def match_nearest(features1: Features, features2: Features) -> Matches:
     """Match each feature of image 1 to its nearest neighbour in image 2, by brute force.
 
-    No match is dropped: keep ``ratio < 0.8`` for Lowe's ratio test. Several features of image 1 may share one of
-    image 2.
+    All matches are returned: keep ``ratio < 0.8`` for Lowe's ratio test. Several features of image 1 may share one
+    feature of image 2.
 
     Args:
         features1: features of image 1.
@@ -48,7 +48,7 @@ def match_nearest(features1: Features, features2: Features) -> Matches:
         as many matches as image 1 has features.
 
     Raises:
-        ValueError: if an image has fewer than two features, as a blank one, or the descriptors differ in length.
+        ValueError: if an image has fewer than two features, as a blank image, or the descriptors differ in length.
         ImportError: if OpenCV is not installed.
 
     """
@@ -57,7 +57,7 @@ def match_nearest(features1: Features, features2: Features) -> Matches:
     pairs = import_cv2().BFMatcher().knnMatch(descriptors1, descriptors2, k=2)
     index1, index2 = np.array([(nearest.queryIdx, nearest.trainIdx) for nearest, _ in pairs]).T
     distances = torch.tensor([[nearest.distance, second.distance] for nearest, second in pairs])
-    # Two equal neighbours are a tie, a ratio of one, at distance zero too.
+    # two neighbours at distance zero are a tie, ratio 1
     ratio = torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
     return Matches(torch.from_numpy(features1.points[index1]), torch.from_numpy(features2.points[index2]), ratio)
 
@@ -65,15 +65,15 @@ def match_nearest(features1: Features, features2: Features) -> Matches:
 def match_lightglue(features1: Features, features2: Features) -> Matches:
     """Match DISK features with Kornia's LightGlue.
 
-    LightGlue gives a match a score instead of a ratio; ``ratio`` is one minus the score, so that small is sure and the
-    usual 0.8 keeps scores above 0.2.
+    LightGlue gives each match a score instead of a ratio. Here ``ratio`` is 1 - score, so a small one is a confident
+    match and the usual limit of 0.8 keeps scores above 0.2.
 
     Args:
         features1: features of image 1, from :func:`~kornia_learnnorm.data.matching.features.detect_disk`.
         features2: features of image 2.
 
     Returns:
-        the matches that LightGlue makes, none of them twice.
+        the matches of LightGlue; each feature has one at most.
 
     Raises:
         ValueError: if an image has fewer than two features, or the descriptors are not of 128 columns of float32.
@@ -87,7 +87,7 @@ def match_lightglue(features1: Features, features2: Features) -> Matches:
     for features in (features1, features2):
         if features.descriptors.dtype != np.float32 or features.descriptors.shape[1] != 128:
             got = f"{features.descriptors.dtype} with {features.descriptors.shape[1]} columns"
-            raise ValueError(f"LightGlue takes the descriptors of DISK, float32 with 128 columns, got {got}")
+            raise ValueError(f"LightGlue needs the descriptors of DISK, float32 with 128 columns, got {got}")
     data = {f"image{index}": _lightglue_input(features) for index, features in enumerate((features1, features2))}
     with torch.inference_mode():
         found = _lightglue()(data)
@@ -96,7 +96,7 @@ def match_lightglue(features1: Features, features2: Features) -> Matches:
     return Matches(points1, points2, (1.0 - found["scores"][0]).clamp(0.0, 1.0).float().clone())
 
 
-# What a command line may call them.
+# names on the command line
 MATCHERS: dict[str, Callable[[Features, Features], Matches]] = {"nearest": match_nearest, "lightglue": match_lightglue}
 
 
@@ -113,8 +113,8 @@ def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_featu
 
     Raises:
         TypeError: if an image is not an array of uint8.
-        ValueError: if an image is not of two dimensions, has no features, as a blank one, or ``num_features`` is
-            below 2.
+        ValueError: if an image does not have two dimensions or has no features, as a blank one, or ``num_features``
+            is below 2.
         ImportError: if OpenCV is not installed.
 
     """
@@ -125,7 +125,9 @@ def _check(features1: Features, features2: Features) -> None:
     for number, features in enumerate((features1, features2), 1):
         if len(features.points) < 2:
             size = f"{features.size[0]} x {features.size[1]} pixels"
-            raise ValueError(f"image {number} is blank or nearly so: {len(features.points)} features in it ({size})")
+            raise ValueError(
+                f"image {number} is blank or nearly so: {len(features.points)} features ({size}), expected 2 or more"
+            )
     columns1, columns2 = (features.descriptors.shape[1] for features in (features1, features2))
     if columns1 != columns2:
         raise ValueError(f"descriptors of the same length expected, got {columns1} and {columns2} columns")

@@ -1,4 +1,4 @@
-"""Processes that work on lists of tasks: on this machine, or those of a Dask cluster."""
+"""Worker processes on this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from kornia_learnnorm.optional import import_extra
+
 __all__ = ["Workers", "check_jobs", "open_workers"]
 
 
 class Workers:
-    """Processes that call a function on many arguments.
+    """Worker processes that call a function with many arguments.
 
     Args:
         options: arguments of joblib's ``Parallel``.
@@ -27,41 +29,41 @@ class Workers:
 
     @property
     def number(self) -> int:
-        """How many there are."""
+        """Return the number of processes."""
         from joblib import effective_n_jobs
 
         return int(effective_n_jobs(self.options["n_jobs"]))
 
     @contextmanager
     def results(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Iterator[Any]]:
-        """Give the results, in order and one at a time; leaving the context cancels what is not done.
+        """Yield the results in order, one at a time; leaving the context cancels the remaining calls.
 
         Args:
-            function: of a module, so that a process can find it.
-            arguments: of one call each; they are taken as processes become free.
+            function: a function of a module, so that a process can import it.
+            arguments: the arguments of each call; they are consumed as processes become free.
 
         Yields:
-            an iterator over the results; a call's errors are raised there.
+            an iterator over the results; it raises the errors of the calls.
 
         """
         from joblib import Parallel, delayed
 
-        # A new Parallel each time: one whose process was killed gives late results of that call to the next.
+        # A new Parallel for each list: after a killed process, an old one mixes late results into the next list.
         parallel = Parallel(return_as="generator", batch_size=1, max_nbytes=None, **self.options)
         results = parallel(delayed(function)(*some) for some in arguments)
         try:
             yield results
         finally:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # that tasks were cancelled: it is meant so
+                warnings.simplefilter("ignore", UserWarning)  # about cancelled tasks
                 results.close()
 
 
 def check_jobs(jobs: int) -> None:
-    """Refuse a number of processes that is none.
+    """Raise an error unless ``jobs`` is a number of processes.
 
     Raises:
-        ValueError: unless ``jobs`` is positive, or -1.
+        ValueError: if ``jobs`` is neither positive nor -1.
 
     """
     if jobs < 1 and jobs != -1:
@@ -70,49 +72,42 @@ def check_jobs(jobs: int) -> None:
 
 @contextmanager
 def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
-    """Give processes here or, with ``dask``, those of a cluster.
+    """Yield worker processes on this machine or, with ``dask``, those of a cluster.
 
     Args:
         jobs: processes on this machine; -1 for as many as it has cores.
-        dask: address of a Dask scheduler whose workers are taken instead.
+        dask: address of a Dask scheduler whose workers are used instead.
 
     Raises:
-        ValueError: if ``jobs`` is neither positive nor -1, or ``dask`` is no address.
-        OSError: if the scheduler or its workers cannot be reached, or a task kills one worker of Dask after another.
+        ValueError: if ``jobs`` is neither positive nor -1, or ``dask`` is not an address.
+        OSError: if the scheduler or its workers cannot be reached, or Dask gives up a task that killed several workers.
         ImportError: if joblib or, for ``dask``, Dask is not installed.
 
     """
-    try:
-        import joblib
-    except ImportError as error:
-        raise ImportError("matching many pairs needs joblib: pip install 'kornia-learnnorm[images]'") from error
+    joblib = import_extra("joblib", "images", "matching many pairs")
     check_jobs(jobs)
     if dask is None:
         yield Workers(n_jobs=jobs, backend="loky", initializer=_end_with, initargs=(os.getpid(),))
         return
+    distributed = import_extra("distributed", "dask", "matching on a Dask cluster")
     try:
-        from distributed import Client, KilledWorker
-        from distributed.comm.addressing import get_address_host_port
-    except ImportError as error:
-        raise ImportError("a Dask scheduler needs Dask: pip install 'kornia-learnnorm[dask]'") from error
-    try:
-        get_address_host_port(dask)
+        import_extra("distributed.comm.addressing", "dask", "matching on a Dask cluster").get_address_host_port(dask)
     except ValueError as error:
-        raise ValueError(f"a Dask scheduler has an address as tcp://host:8786, got {dask!r}: {error}") from error
-    # The finaliser of a client that could not connect takes a lock that the next one holds while it starts.
+        raise ValueError(f"a Dask scheduler needs an address as tcp://host:8786, got {dask!r}: {error}") from error
+    # Collect an earlier client that could not connect: its finaliser would wait for a lock of the new one.
     gc.collect()
-    client = Client(dask)  # type: ignore[no-untyped-call]
+    client = distributed.Client(dask)
     try:
         with client, joblib.parallel_config("dask", client=client):
             yield Workers(n_jobs=-1)
-    except KilledWorker as error:
+    except distributed.KilledWorker as error:
         raise OSError(f"one worker after another of {dask} was killed: {error}") from error
 
 
 def _end_with(parent: int) -> None:
-    """End this process when ``parent`` was killed: it would wait for ever to write to a pipe that nobody reads.
+    """End this process when ``parent`` has been killed; otherwise it would wait forever to write to a pipe.
 
-    An interrupt from the keyboard reaches all processes at once. It is for the parent, which ends the others.
+    An interrupt from the keyboard reaches all processes; the workers ignore it, and the parent ends them.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

@@ -1,7 +1,8 @@
-r"""A small renderer: two views of a furnished room made of textured planes, with the exact fundamental matrix.
+r"""Rendered image pairs with an exact fundamental matrix: two views of a room made of textured planes.
 
-For a first run without any data set. A back wall, a floor and slanted boards are each warped into each view by the
-homography of their plane and painted from back to front. The scene is far from planar, so :math:`F` is well determined.
+For a first run without a data set; use real images to compare methods. A back wall, a floor and slanted boards are
+warped into each view by the homographies of their planes, from back to front. The scene is far from planar, so
+:math:`F` is well determined.
 Images need OpenCV (the extra ``kornia-learnnorm[images]``), which is imported on use.
 """
 
@@ -13,9 +14,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2
+from kornia_learnnorm.data.motion import fundamental_from_motion
 from kornia_learnnorm.files import atomic_write
 
 __all__ = ["RenderedPair", "render_pair", "write_pair"]
@@ -25,7 +28,7 @@ Texture = NDArray[np.float32]
 
 Painter = Callable[[np.random.Generator, Any, Texture], None]
 
-SUPERSAMPLING = 3  # pixels are averages of 3 x 3 samples
+SUPERSAMPLING = 3  # samples per pixel and axis
 
 
 class RenderedPair(NamedTuple):
@@ -59,13 +62,13 @@ class _Plane(NamedTuple):
 
 
 def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedPair:
-    r"""Render two views of a room with pictures on stands: the same seed gives the same images.
+    r"""Render two views of a room with pictures on stands; equal seeds give equal images.
 
     The second camera is about half a metre to the side of and ahead of the first one and turned a little. The ground
     truth is :math:`F = K^{-\top} [t]_\times R K^{-1}`.
 
     Args:
-        seed: seed of the textures, of the boards' places and of the motion; not negative.
+        seed: seed of textures, boards and motion, 0 or more.
         width: width of the images in pixels.
         height: height of the images in pixels.
 
@@ -74,7 +77,7 @@ def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedP
 
     Raises:
         ImportError: if OpenCV is not installed.
-        ValueError: if the seed is negative, the height under 64 pixels or above the width.
+        ValueError: if the seed is negative, or the height is below 64 pixels or above the width.
 
     Example:
         >>> pair = render_pair(seed=0, width=320, height=240)
@@ -95,15 +98,16 @@ def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedP
     planes = _room(rng, cv2, texels=SUPERSAMPLING * width / 640)
     image1 = _expose(_render(cv2, planes, K, np.eye(3), np.zeros(3), (width, height)), rng)
     image2 = _expose(_render(cv2, planes, K, R, t, (width, height)), rng)
-    return RenderedPair(image1, image2, K, R, t, _fundamental(K, R, t))
+    F_mat = fundamental_from_motion(*map(torch.from_numpy, (K, K, R, t)))
+    return RenderedPair(image1, image2, K, R, t, F_mat.numpy())
 
 
 def write_pair(folder: str | Path, pair: RenderedPair) -> None:
     """Write ``image1.png``, ``image2.png`` and ``ground_truth.json``, each complete or not at all.
 
     Args:
-        folder: where to write; made if absent. Files of these names in it are replaced.
-        pair: what to write. The ground truth holds ``K``, ``R``, ``t``, ``F_mat``, ``width`` and ``height``.
+        folder: folder to write to; created if missing. Existing files of these names are replaced.
+        pair: the rendered pair. The ground truth holds ``K``, ``R``, ``t``, ``F_mat``, ``width`` and ``height``.
 
     Raises:
         ImportError: if OpenCV is not installed.
@@ -136,14 +140,8 @@ def _rotation(yaw: float, pitch: float, roll: float) -> Array:
     return np.asarray(Rz @ Rx @ Ry)
 
 
-def _fundamental(K: Array, R: Array, t: Array) -> Array:
-    x, y, z = t
-    F_mat = np.linalg.inv(K).T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R @ np.linalg.inv(K)
-    return np.asarray(F_mat / np.linalg.norm(F_mat))
-
-
 def _room(rng: np.random.Generator, cv2: Any, texels: float) -> list[_Plane]:
-    """Furnish the room, from back to front; ``texels`` is the number of texels per pixel of a 640 pixel wide image."""
+    """Return the planes of the room from back to front, with ``texels`` per pixel of an image 640 pixels wide."""
     wall_z, floor_y = 7.0, 1.35
     wall = _masonry(rng, cv2, (15.0, 6.0), 85 * texels, brick=(0.62, 0.27), shift=0.5)
     floor = _masonry(rng, cv2, (15.0, 5.8), 110 * texels, brick=(0.45, 0.45), shift=0.0)
@@ -199,7 +197,7 @@ def _masonry(
     brick: tuple[float, float],
     shift: float,
 ) -> Texture:
-    """Lay bricks or tiles, each of its own tone; every other row is shifted by a share of a brick."""
+    """Return bricks or tiles of random tones; every other row is shifted by a share of a brick."""
     rows, columns = (np.arange(int(metres * density)) / density for metres in size[::-1])
     row = rows / brick[1]
     column = columns / brick[0] + shift * (row.astype(int)[:, None] % 2)
@@ -212,7 +210,7 @@ def _masonry(
 
 
 def _framed(rng: np.random.Generator, cv2: Any, paint: Painter, size: tuple[float, float], density: float) -> Texture:
-    """Hang a painting in a dark frame with a pale mount."""
+    """Return a painting in a dark frame with a pale mount."""
     width, height = (int(metres * density) for metres in size)
     texture = 0.55 + 0.12 * _noise(rng, cv2, (height, width), finest=4)
     paint(rng, cv2, texture)
@@ -258,7 +256,7 @@ def _letters(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
 
 
 def _render(cv2: Any, planes: list[_Plane], K: Array, R: Array, t: Array, size: tuple[int, int]) -> Texture:
-    """Paint the planes from back to front on a finer grid and average it down."""
+    """Render the planes from back to front on a finer grid and average it."""
     fine = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
     centre = (SUPERSAMPLING - 1) / 2
     K_fine = np.array([[SUPERSAMPLING, 0, centre], [0, SUPERSAMPLING, centre], [0, 0, 1]]) @ K
@@ -276,6 +274,6 @@ def _render(cv2: Any, planes: list[_Plane], K: Array, R: Array, t: Array, size: 
 
 
 def _expose(image: Texture, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Turn brightness into grey levels, with a sensor's noise of one level."""
+    """Return the grey levels of brightness in 0-1, with noise of one level."""
     levels = 235 * image + 8 + rng.standard_normal(image.shape)
     return levels.round().clip(0, 255).astype(np.uint8)

@@ -1,24 +1,35 @@
-"""The figures of a report, from the predictions of a run."""
+"""Pictures of a run of predictions."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from kornia_learnnorm.evaluation.report.pair import THRESHOLD, draw_example, example_inliers
-from kornia_learnnorm.evaluation.report.style import COLORS, INK, Picture, make_figure, make_picture
+from kornia_learnnorm.evaluation.report.pair import draw_example, example_inliers
+from kornia_learnnorm.evaluation.report.style import (
+    INK,
+    Picture,
+    line_style,
+    make_figure,
+    make_picture,
+    method_colors,
+    report_style,
+)
 from kornia_learnnorm.evaluation.runs.example import TRIALS
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.protocol import INLIER_THRESHOLD
 
 __all__ = ["report_figures"]
 
-FRAMES = 20
-CONSECUTIVE = 100
+MAX_FRAMES = 20  # image pairs on the axis of Figure 4a
+RHO_WINDOW = 100  # successive samples in a mean of Figure 13
 NORMALISATIONS = ("none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched")
+BUILT_IN = {*NORMALISATIONS, "crossview-synthetic"}
 DASHES = "Dashed: learned."
 
 
+@report_style()
 def report_figures(run: Run) -> list[Picture]:
-    """Draw all figures of a run; those of samples for the filtered samples of its first store.
+    """Draw all pictures of a run; those of samples use the first store with filtered samples.
 
     Args:
         run: predictions.
@@ -28,7 +39,7 @@ def report_figures(run: Run) -> list[Picture]:
 
     """
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
-    colors = dict(zip(run.about["methods"], COLORS * 10, strict=False))
+    colors = method_colors(run.about["methods"])
     return [
         _per_frame(cell, colors),
         _distribution(cell, colors),
@@ -44,7 +55,7 @@ def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
     chosen = _present(cell, "Hartley", "paper", "crossview", "Hartley+LM", "crossview+LM")
     figure, (axes,) = make_figure(1, 1)
     pair = cell.pair.numpy()
-    frames = np.unique(pair)[:FRAMES]
+    frames = np.unique(pair)[:MAX_FRAMES]
     for name in chosen:
         own = cell.predictions[name]["own"].numpy()
         means = [own[(pair == frame) & np.isfinite(own)].mean() for frame in frames]
@@ -63,7 +74,7 @@ def _distribution(cell: Cell, colors: dict[str, str]) -> Picture:
     figure, (axes,) = make_figure(1, 1)
     for name in _present(cell, *NORMALISATIONS, "Hartley+optimal"):
         own = np.sort(cell.predictions[name]["own"].numpy())
-        axes.plot(own, np.arange(1, len(own) + 1) / len(own), _line(name), color=colors[name], label=name)
+        axes.plot(own, np.arange(1, len(own) + 1) / len(own), line_style(name), color=colors[name], label=name)
     axes.set(xlabel="symmetric epipolar distance of a sample, px", ylabel="share of samples below", xscale="log")
     axes.set(xlim=(0.01, 60), ylim=(0, 1))
     text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}. {DASHES}"
@@ -101,11 +112,11 @@ def _by_size(run: Run, colors: dict[str, str]) -> Picture:
     outliers = 1 - float(example_inliers(pair).mean())
     text = (
         f"Median of {TRIALS:,} random samples of one random image pair, {' and '.join(pair['names'])} of "
-        f"{pair['store']}, by the number of correspondences, which are drawn from the {len(pair['points1'])} matches "
-        f"that pass the ratio test. {100 * outliers:.0f} % of these are farther than {THRESHOLD:g} px from the "
-        "ground truth. The larger a sample, the more of them it is sure to hold, and least squares does not reject "
-        "them: that is where errors of ground-truth inliers that grow with the number come from. Those of the sample's "
-        "own points also grow because the fewer they are, the closer they can be fitted."
+        f"{pair['store']}, against the number of correspondences in a sample. They are drawn from the "
+        f"{len(pair['points1'])} matches that pass the ratio test, of which {100 * outliers:.0f} % are outliers, "
+        f"farther than {INLIER_THRESHOLD:g} px from the ground truth. Larger samples contain more outliers, and least "
+        "squares does not reject them: so errors of ground-truth inliers can grow with the size of the sample. Errors "
+        "of the sample's own points grow too, because fewer points can be fitted more closely."
     )
     return make_picture(figure, "figure-11", "Number of correspondences (Figure 11)", text)
 
@@ -122,8 +133,8 @@ def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
     axes.set(xscale="log", xlabel="condition number of the design matrix (no unit)")
     axes.set_ylim(-0.6, len(names) - 0.2)
     text = (
-        "Condition number of the design matrix, its largest over its eighth singular value, by normalisation: median "
-        f"(dot) and quartiles (bar) over samples, {cell.title}."
+        "Condition number of the design matrix, its largest over its eighth singular value, by normalisation. Dot: "
+        f"median over samples; bar: quartiles. {cell.title}."
     )
     return make_picture(figure, "figure-12", "Condition numbers (Figure 12)", text, legend=False)
 
@@ -132,24 +143,18 @@ def _rho(cell: Cell, colors: dict[str, str]) -> Picture:
     figure, (axes,) = make_figure(1, 1)
     for name in _present(cell, "Hartley", "whitening", "paper", "crossview"):
         rho = cell.predictions[name]["rho"].numpy()
-        means = [np.mean(rho[i : i + CONSECUTIVE]) for i in range(0, len(rho) - CONSECUTIVE + 1, CONSECUTIVE)]
-        axes.plot(np.arange(len(means)) * CONSECUTIVE, means, _line(name), color=colors[name], label=name)
-    axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {CONSECUTIVE} samples (no unit)")
+        means = [np.mean(rho[i : i + RHO_WINDOW]) for i in range(0, len(rho) - RHO_WINDOW + 1, RHO_WINDOW)]
+        axes.plot(np.arange(len(means)) * RHO_WINDOW, means, line_style(name), color=colors[name], label=name)
+    axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {RHO_WINDOW} samples (no unit)")
     text = (
-        "Singularity ratio rho before the projection to rank 2, the second over the third singular value of the "
-        f"normalised matrix: the larger, the less the projection takes away. Means of {CONSECUTIVE} successive "
+        "Singularity ratio rho before the projection to rank 2: the second over the third singular value of the "
+        f"normalised matrix. The larger it is, the less the projection changes. Means of {RHO_WINDOW} successive "
         f"samples, {cell.title}. {DASHES}"
     )
     return make_picture(figure, "figure-13", "Singularity ratio (Figure 13)", text)
 
 
-def _line(name: str) -> str:
-    """Dashes for what was learned, which often lies on a closed form."""
-    return "--" if name in ("paper", "crossview") else "-"
-
-
 def _present(cell: Cell, *names: str) -> list[str]:
-    """Methods of the run among ``names``; all that have none of these names, such as one's own weights, come too."""
-    known = {"none", "Hartley", "whitening", "reweighted", "paper", "crossview", "crossview-synthetic", "searched"}
-    own = [name for name in cell.predictions if name.split("+")[0] not in known and "+" not in name]
+    """Return the methods of the run among ``names``, and all methods that are not built in, such as own weights."""
+    own = [name for name in cell.predictions if "+" not in name and name not in BUILT_IN]
     return [name for name in names if name in cell.predictions] + own

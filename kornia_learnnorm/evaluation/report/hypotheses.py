@@ -1,118 +1,127 @@
-"""The hypotheses of minimal solvers in a report: tables and a figure."""
+"""Tables and pictures of the hypotheses of minimal solvers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import product
+from math import nan
 
-import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.rates import BASELINE, Table
-from kornia_learnnorm.evaluation.report.style import COLORS, Picture, make_figure, make_picture
-from kornia_learnnorm.evaluation.robust.hypotheses import MOST_ERROR, NUMBERS, expected_best, picked
+from kornia_learnnorm.evaluation.report.formatting import BASELINE, Table, number_text, paired_text
+from kornia_learnnorm.evaluation.report.style import (
+    Picture,
+    line_style,
+    make_figure,
+    make_picture,
+    method_colors,
+    report_style,
+)
+from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR, NUMBERS, expected_best, picked
 from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
-from kornia_learnnorm.metrics.pairs import paired_bootstrap
 
 __all__ = ["hypothesis_figures", "hypothesis_tables"]
 
-TESTED = (1, 3, 10, 30, 100, 1000)
+TESTED = (1, 3, 10, 30, 100, 1000)  # numbers of samples in the table of paired tests
 TITLES = {"best": "Best of k hypotheses", "picked": "Hypothesis that MSAC picks among k"}
 TEXTS = {
-    "best": "Expected smallest error of k minimal samples, exact for those drawn. ",
+    "best": "Expected smallest error of k minimal samples, computed exactly from the samples drawn. ",
     "picked": "Error of the hypothesis of highest MSAC score (1 px, all matches), mean over disjoint groups of k. ",
 }
 
 
-def _at(figure: str, hypotheses: dict[str, Tensor], number: int, most: int | None = None) -> Tensor:
-    """Return a figure of each pair at k, (P,), from the first ``most`` samples."""
-    known = ~hypotheses["error"].isnan().any(-1)
-    error, score = (hypotheses[key][known, :most] for key in ("error", "score"))
-    return expected_best(error, number) if figure == "best" else picked(error, score, number)
-
-
 def hypothesis_tables(run: RobustRun) -> list[Table]:
-    """Make the tables of hypotheses of a run.
+    """Return all tables of the hypotheses of minimal solvers.
 
     Args:
-        run: its figures.
+        run: results of minimal solvers.
 
     """
     cells = [cell for cell in run.cells if cell.hypotheses]
     return [table for cell in cells for table in (_values(cell, "best"), _values(cell, "picked"), *_tests(cell))]
 
 
-def _curve(figure: str, hypotheses: dict[str, Tensor]) -> Iterator[tuple[int, float]]:
-    for number in NUMBERS:
-        if number <= hypotheses["error"].shape[1]:
-            yield number, _at(figure, hypotheses, number).mean().item()
+def _errors(kind: str, hypotheses: dict[str, Tensor], number: int, num_samples: int | None = None) -> Tensor:
+    """Return the error of each pair with ground truth at k = ``number``, (P,), from the first ``num_samples``."""
+    known = ~hypotheses["error"].isnan().any(-1)
+    error, score = (hypotheses[key][known, :num_samples] for key in ("error", "score"))
+    return expected_best(error, number) if kind == "best" else picked(error, score, number)
 
 
-def _values(cell: RobustCell, figure: str) -> Table:
+def _curve(kind: str, hypotheses: dict[str, Tensor], num_samples: int | None = None) -> dict[int, float]:
+    """Return the mean error by k, for each k that the samples allow; NaN if no pair has ground truth."""
+    available = num_samples or hypotheses["error"].shape[1]
+    numbers = [number for number in NUMBERS if number <= available]
+    return {number: _errors(kind, hypotheses, number, num_samples).mean().item() for number in numbers}
+
+
+def _shared(cell: RobustCell, solver: str) -> int:
+    """Return the number of samples that a solver and the baseline have both solved."""
+    return min(cell.hypotheses[name]["error"].shape[1] for name in (solver, BASELINE))
+
+
+def _values(cell: RobustCell, kind: str) -> Table:
+    """Return the table of mean errors by solver and k."""
     rows = []
     for name, hypotheses in cell.hypotheses.items():
-        found = dict(_curve(figure, hypotheses))
-        rows.append([name, *(f"{found[number]:.3f}" if number in found else "" for number in NUMBERS)])
+        found = _curve(kind, hypotheses)
+        rows.append([name, *(number_text(found.get(number, nan)) for number in NUMBERS)])
     error = next(iter(cell.hypotheses.values()))["error"]
     left_out = int(error.isnan().any(-1).sum())
     text = (
-        f"{TEXTS[figure]}A hypothesis' error is the mean symmetric epipolar distance of the pair's ground-truth "
-        f"inliers (1 px) under it, at most {MOST_ERROR:g} px; mean over {len(error) - left_out} image pairs, px. All "
-        "solvers get the same samples, the slow ones the first of them; the seven-point solver the first seven points "
-        "of each, and the one of its candidates with the highest score counts."
+        f"{TEXTS[kind]}The error of a hypothesis is the mean symmetric epipolar distance of the pair's ground-truth "
+        f"inliers (1 px), at most {MAX_ERROR:g} px. Mean over {len(error) - left_out} image pairs, px. All solvers get "
+        "the same samples, the slow solvers only the first ones. The seven-point solver gets the first seven points of "
+        "each sample; of its candidates the one with the highest score counts."
     )
     text += f" Pairs with too few ground-truth inliers are left out: {left_out}." if left_out else ""
-    return Table(f"{TITLES[figure]}: {cell.title}", text, ["solver", *(f"k = {k}" for k in NUMBERS)], rows)
+    return Table(f"{TITLES[kind]}: {cell.title}", text, ["solver", *(f"k = {k}" for k in NUMBERS)], rows)
 
 
 def _tests(cell: RobustCell) -> list[Table]:
+    """Return the table of paired tests against the baseline, if the run has it."""
     if BASELINE not in cell.hypotheses:
         return []
+    solvers = [name for name in cell.hypotheses if name != BASELINE]
     rows = [
-        [name, TITLES[figure], *(_test(cell, name, figure, number) for number in TESTED)]
-        for name in cell.hypotheses
-        if name != BASELINE
-        for figure in TITLES
+        [name, TITLES[kind], *(_test(cell, name, kind, number) for number in TESTED)]
+        for name, kind in product(solvers, TITLES)
     ]
     text = (
-        f"Difference of the two errors from those of {BASELINE}'s normalisation, on the samples that both solved, px, "
-        "with the 95 % interval of a paired bootstrap over image pairs. Negative is better."
+        f"Difference of both errors from those of {BASELINE}'s normalisation, on the samples that both have solved, "
+        "px, with the 95 % interval of a paired bootstrap over image pairs. Negative is better."
     )
-    header = ["solver", "figure", *(f"k = {number}" for number in TESTED)]
+    header = ["solver", "error", *(f"k = {number}" for number in TESTED)]
     return [Table(f"Hypotheses against {BASELINE}'s: {cell.title}", text, header, rows)]
 
 
-def _test(cell: RobustCell, name: str, figure: str, number: int) -> str:
-    both = cell.hypotheses[name], cell.hypotheses[BASELINE]
-    most = min(hypotheses["error"].shape[1] for hypotheses in both)
-    if number > most:
+def _test(cell: RobustCell, name: str, kind: str, number: int) -> str:
+    shared = _shared(cell, name)
+    if number > shared:
         return ""
-    values, baseline = (_at(figure, hypotheses, number, most) for hypotheses in both)
-    if len(values) < 2:
-        return ""
-    found = paired_bootstrap(values, baseline, torch.arange(len(values)))
-    return f"{found.mean:+.3f} [{found.low:+.3f}, {found.high:+.3f}]"
+    errors = (_errors(kind, cell.hypotheses[solver], number, shared) for solver in (name, BASELINE))
+    return paired_text(*errors, with_p_value=False)
 
 
+@report_style()
 def hypothesis_figures(run: RobustRun) -> list[Picture]:
-    """Draw the errors of each store's hypotheses by their number.
+    """Draw the errors of each store's hypotheses against their number.
 
     Args:
-        run: its figures.
+        run: results of minimal solvers.
 
     Raises:
         ImportError: if Matplotlib is not installed.
 
     """
-    colors = dict(zip(run.about["solvers"], COLORS * 10, strict=False))
+    colors = method_colors(run.about["solvers"])
     pictures = []
     for place, store in enumerate(run.about["stores"], 1):
         cells = [cell for cell in run.cells if cell.store == store and cell.hypotheses]
-        based = [cell for cell in cells if BASELINE in cell.hypotheses]
+        with_baseline = [cell for cell in cells if BASELINE in cell.hypotheses]
         if cells:
             pictures.append(_draw(cells, f"hypotheses-{place}", colors, relative=False))
-        if based:
-            pictures.append(_draw(based, f"hypotheses-{place}-relative", colors, relative=True))
+        if with_baseline:
+            pictures.append(_draw(with_baseline, f"hypotheses-{place}-relative", colors, relative=True))
     return pictures
 
 
@@ -121,23 +130,21 @@ def _draw(cells: list[RobustCell], name: str, colors: dict[str, str], relative: 
     unit = f" over {BASELINE}'s" if relative else ", px"
     for axes, (cell, kind) in zip(panels, product(cells, TITLES), strict=True):
         for solver, hypotheses in cell.hypotheses.items():
-            x, y = _relative(kind, cell, solver) if relative else zip(*_curve(kind, hypotheses), strict=True)
-            axes.plot(x, y, "--" if solver in ("paper", "crossview") else "-", color=colors[solver], label=solver)
+            curve = _relative(kind, cell, solver) if relative else _curve(kind, hypotheses)
+            axes.plot([*curve], [*curve.values()], line_style(solver), color=colors[solver], label=solver)
         axes.set(xscale="log", xlabel="k, minimal samples", yscale="linear" if relative else "log")
         axes.set_ylabel(f"{cell.protocol}, {kind}: error{unit}")
     text = (
         f"{cells[0].store}: expected smallest error of k minimal samples (left) and error of the one that MSAC picks "
         "(right), mean over image pairs"
     )
-    text += f", over that of {BASELINE}'s normalisation on the same samples." if relative else "."
+    text += f", divided by the error of {BASELINE}'s normalisation on the same samples." if relative else "."
     title = f"Hypotheses{f' against {BASELINE}' if relative else ''}: {cells[0].store}"
     return make_picture(figure, name, title, text)
 
 
-def _relative(figure: str, cell: RobustCell, solver: str) -> tuple[list[int], list[float]]:
-    """Return k, and the mean error over that of the baseline on the samples that both solved."""
-    both = cell.hypotheses[solver], cell.hypotheses[BASELINE]
-    most = min(hypotheses["error"].shape[1] for hypotheses in both)
-    numbers = [number for number in NUMBERS if number <= most]
-    means = ([_at(figure, hypotheses, k, most).mean().item() for k in numbers] for hypotheses in both)
-    return numbers, [value / other for value, other in zip(*means, strict=True)]
+def _relative(kind: str, cell: RobustCell, solver: str) -> dict[int, float]:
+    """Return the mean error over the baseline's by k, on the samples that both have solved."""
+    shared = _shared(cell, solver)
+    values, baseline = (_curve(kind, cell.hypotheses[name], shared) for name in (solver, BASELINE))
+    return {number: value / baseline[number] if baseline[number] else nan for number, value in values.items()}

@@ -1,4 +1,4 @@
-"""The figure of an image pair: its inliers and outliers, and epipolar lines of one of its samples."""
+"""Picture of an image pair: its inliers and outliers, and the epipolar lines of one of its samples."""
 
 from __future__ import annotations
 
@@ -8,31 +8,32 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.evaluation.drawing import INLIER, OUTLIER, clip_lines, import_matplotlib
-from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture
+from kornia_learnnorm.evaluation.drawing import INLIER, WIDE, draw_line, draw_matches
+from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture, report_style
 from kornia_learnnorm.evaluation.runs.run import Run
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.protocol import INLIER_THRESHOLD
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["draw_example", "example_inliers"]
 
-THRESHOLD = 1.0  # pixels, of an inlier
-LINES = 5
+NUM_LINES = 5  # epipolar lines of each matrix
 METHODS = ("Hartley", "crossview")
 TRUTH = "ground truth"
 
 
+@report_style()
 def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
-    """Draw the image pair that a run keeps, without the images, which no store has.
+    """Draw the example image pair of a run. The images are not drawn: stores do not contain them.
 
     Args:
         run: predictions.
         colors: colours by method.
 
     Returns:
-        the picture; nothing where the run has no pair yet or no sample of it.
+        the picture; an empty list if the run has no example yet or no sample of it.
 
     Raises:
         ImportError: if Matplotlib is not installed.
@@ -49,45 +50,34 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
         return []
     errors = {name: cell.predictions[name]["truth"] for name in methods}
     middle = rows[errors[methods[0]][rows].argsort()[(len(rows) - 1) // 2]]
-    wide = float((pair["size"][:, 0] / pair["size"][:, 1]).min()) > 1.8
+    wide = float((pair["size"][:, 0] / pair["size"][:, 1]).min()) > WIDE
     figure, (first, second) = make_figure(2, 1, 6.2) if wide else make_figure(1, 2)
     near = example_inliers(pair)
-    _draw_matches(first, pair, near)
+    draw_matches(first, pair["points1"], pair["points2"], near)
+    _frame(first, pair["size"][0], "view 1")
     matrices = {name: cell.predictions[name]["F_mat"][middle].numpy() for name in methods} | {TRUTH: pair["F"]}
     _draw_lines(second, pair, near, matrices, {TRUTH: INK, **colors})
     medians = ", ".join(f"{errors[name][middle].item():.2f} px under {name}" for name in methods)
     text = (
         f"{' and '.join(pair['names'])} of {cell.store}, a random pair. View 1: the {len(near)} matches that pass the "
-        f"ratio test; {int(near.sum())} are inliers, within {THRESHOLD:g} px of the ground truth (symmetric epipolar "
-        f"distance). View 2: some of these, and their epipolar lines under the ground truth and under matrices of one "
-        f"sample of eight, that of the pair's median error for {methods[0]}: median distance of ground-truth inliers "
-        f"{medians}."
+        f"ratio test; {int(near.sum())} are inliers, with a symmetric epipolar distance to the ground truth below "
+        f"{INLIER_THRESHOLD:g} px. View 2: some inliers with their epipolar lines under the ground truth and under the "
+        f"matrices of one sample of eight, the sample with the pair's median error for {methods[0]}. Median distance "
+        f"of the ground-truth inliers: {medians}."
     )
     return [make_picture(figure, "figure-10", "Inliers, outliers and epipolar lines (Figure 10)", text)]
 
 
 def example_inliers(pair: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return which matches of the image pair of a run lie within 1 px of the ground truth, boolean (M,).
+    """Return a mask of the matches of the example image pair within 1 px of the ground truth, boolean (M,).
 
     Args:
         pair: from :func:`~kornia_learnnorm.evaluation.runs.example.random_pair`.
 
     """
     points1, points2, F_mat = (torch.from_numpy(pair[key]) for key in ("points1", "points2", "F"))
-    near: NDArray[np.bool_] = (symmetric_epipolar_distance(points1, points2, F_mat) < THRESHOLD).numpy()
+    near: NDArray[np.bool_] = (symmetric_epipolar_distance(points1, points2, F_mat) < INLIER_THRESHOLD).numpy()
     return near
-
-
-def _draw_matches(axes: Axes, pair: dict[str, NDArray[Any]], near: NDArray[np.bool_]) -> None:
-    """Draw inliers with their motion and outliers in the first view."""
-    start, end = pair["points1"], pair["points2"]
-    lines = import_matplotlib().collections.LineCollection(
-        np.stack([start, end], 1)[near], colors=INLIER, linewidths=0.7, alpha=0.8
-    )
-    axes.add_collection(lines)
-    axes.plot(*start[near].T, "o", color=INLIER, markersize=2, label="inliers and their motion")
-    axes.plot(*start[~near].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8, label="outliers")
-    _frame(axes, pair["size"][0], "view 1")
 
 
 def _draw_lines(
@@ -98,23 +88,22 @@ def _draw_lines(
     colors: dict[str, str],
 ) -> None:
     """Draw the epipolar lines of some inliers, and the inliers, in the second view."""
-    chosen = np.flatnonzero(near)[_spread(pair["points2"][near])]
+    chosen = np.flatnonzero(near)[_far_apart(pair["points2"][near])]
     points = np.pad(pair["points1"][chosen], ((0, 0), (0, 1)), constant_values=1.0)
     for order, (name, F_mat) in enumerate(matrices.items()):
-        segments, meets = clip_lines(points @ F_mat.T, *pair["size"][1].tolist())
-        # Thinner and thinner, so that lines which coincide show each other.
-        line, width = "--" if name == TRUTH else "-", 3.2 / (1 + order)
-        for place, segment in enumerate(segments[meets]):
-            axes.plot(*segment.T, line, color=colors[name], linewidth=width, label=name if place == 0 else None)
+        # Ever thinner lines, so that lines that coincide remain visible.
+        style = {"linestyle": "--" if name == TRUTH else "-", "color": colors[name], "linewidth": 3.2 / (1 + order)}
+        for place, line in enumerate(points @ F_mat.T):
+            draw_line(axes, line, label=name if place == 0 else None, **style)
     axes.plot(*pair["points2"][chosen].T, "o", color=INLIER, markersize=5, markeredgecolor=INK)
     _frame(axes, pair["size"][1], "view 2")
 
 
-def _spread(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Choose points far from each other: from the first one on, each the farthest from those before."""
+def _far_apart(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the indices of points far from each other: the first one, then always the farthest from all chosen."""
     chosen = [0]
     distance = np.full(len(points), np.inf)
-    while len(chosen) < min(LINES, len(points)):
+    while len(chosen) < min(NUM_LINES, len(points)):
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
         chosen.append(int(distance.argmax()))
     return np.array(chosen)

@@ -1,75 +1,51 @@
-"""The tables of a report in a terminal, those that fit."""
+"""Printing the tables of a report that fit a terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from kornia_learnnorm.evaluation.report.rates import Table
+from kornia_learnnorm.evaluation.report.formatting import Table
+from kornia_learnnorm.optional import import_extra
 
 __all__ = ["print_tables"]
 
-FRAME = 3  # columns of the terminal that each column of a table takes for its line and margins
-
 
 def print_tables(tables: Sequence[Table], elsewhere: Path) -> None:
-    """Print the tables that the terminal is wide enough for, and name the others.
+    """Print the tables that fit the width of the terminal, and the titles of the tables that do not.
 
     Args:
         tables: the tables.
-        elsewhere: the file that has them all.
+        elsewhere: the file that has all tables.
 
     Raises:
         ImportError: if rich is not installed.
 
     """
-    try:
-        from rich.console import Console
-        from rich.table import Table as RichTable
-    except ImportError as error:
-        raise ImportError("printing tables needs rich: pip install 'kornia-learnnorm[report]'") from error
-    console, wide = Console(), []
+    console, wide = import_extra("rich.console", "report", "printing tables").Console(), []
+    unlimited = console.options.update_width(10**6)
     for table in tables:
-        widths = column_widths(table, console.width)
-        if widths is None:
+        grids = (_grid(table, narrow) for narrow in (False, True))
+        grid = next((g for g in grids if console.measure(g, options=unlimited).maximum <= console.width), None)
+        if grid is None:
             wide.append(table.title)
-            continue
-        shown = RichTable(title=table.title, title_justify="left", caption=table.text, caption_justify="left")
-        for place, (name, width) in enumerate(zip(table.header, widths, strict=True)):
-            shown.add_column(name, justify="left" if place == 0 else "right", width=width)
-        for row in table.rows:
-            shown.add_row(*row)
-        console.print(shown)
+        else:
+            console.print(grid)
     if wide:
-        names = "\n".join(f"  {title}" for title in wide)
-        print(f"wider than the {console.width} columns here, in {elsewhere}:\n{names}")
+        titles = "\n".join(f"  {title}" for title in wide)
+        print(f"wider than the {console.width} columns of this terminal, see {elsewhere}:\n{titles}")
 
 
-def column_widths(table: Table, width: int) -> list[int] | None:
-    """Return how wide the columns of a table are in a terminal; nothing where it does not fit.
-
-    Text may break between words, a figure with its interval may not.
-
-    Args:
-        table: the table.
-        width: columns of the terminal.
-
-    Example:
-        >>> column_widths(Table("", "", ["method", "rate of it"], [["mine", "1.0 [0.5, 1.5]"]]), 30)
-        [6, 14]
-
-    """
-    columns = [[name, *(row[place] for row in table.rows)] for place, name in enumerate(table.header)]
-    least = [max(map(_unbroken, column)) for column in columns]
-    spare = width - 1 - sum(least) - FRAME * len(least)
-    if spare < 0:
-        return None
-    for place, column in enumerate(columns):
-        more = min(spare, max(map(len, column)) - least[place])
-        least[place] += more
-        spare -= more
-    return least
-
-
-def _unbroken(cell: str) -> int:
-    return len(cell) if "[" in cell else max(map(len, cell.split()), default=0)
+def _grid(table: Table, narrow: bool) -> Any:
+    """Return a table of rich; a narrow one breaks text between words, but no number from its interval."""
+    grid = import_extra("rich.table", "report", "printing tables").Table(
+        title=table.title, title_justify="left", caption=table.text, caption_justify="left"
+    )
+    for place, cells in enumerate(zip(table.header, *table.rows, strict=True)):
+        words = [word for cell in cells for word in ([cell] if "[" in cell else cell.split())]
+        width = max(map(len, words)) if narrow else None
+        grid.add_column(cells[0], justify="right" if place else "left", width=width)
+    for row in table.rows:
+        grid.add_row(*row)
+    return grid

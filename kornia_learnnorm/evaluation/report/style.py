@@ -1,12 +1,14 @@
-"""How the figures of a report are drawn, with Matplotlib (extra ``report``).
+"""Layout and colours of the pictures of a report, drawn with Matplotlib (extra ``report``).
 
-Lines and letters have the colour of the text around them, so that the pictures fit light and dark pages.
+Lines and letters take the colour of the text around them, so that the pictures fit light and dark pages.
 """
 
 from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kornia_learnnorm.evaluation.drawing import import_matplotlib
@@ -15,22 +17,29 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLORS", "INK", "Picture", "make_figure", "make_picture"]
+__all__ = ["INK", "Picture", "line_style", "make_figure", "make_picture", "method_colors", "report_style"]
 
-INK = "#010203"  # replaced by the page's colour
+INK = "#010203"  # placeholder that make_picture replaces by the text colour of the page
 # Legible on white and on black; after P. Tol's and Okabe and Ito's palettes for colour blindness.
-_HUES = "8b8b8b e69f00 2b9fd9 18a57a d55e00 cc79a7 a0714f 7a6ff0 b8a400 c2443f 5f8f2f"
-COLORS = tuple(f"#{hue}" for hue in _HUES.split())
+HUES = "8b8b8b e69f00 2b9fd9 18a57a d55e00 cc79a7 a0714f 7a6ff0 b8a400 c2443f 5f8f2f"
+LEARNED = ("paper", "crossview")
+WIDTH = 8.0  # inches
+SETTINGS: dict[str, Any] = {
+    "svg.fonttype": "none",
+    "font.size": 10,
+    "font.family": "sans-serif",
+    "svg.hashsalt": "report",
+}
 
 
 class Picture(NamedTuple):
-    """A figure of a report.
+    """A picture of a report.
 
     Attributes:
         name: file name without suffix.
         title: heading.
-        text: what it shows.
-        svg: the picture.
+        text: what the picture shows.
+        svg: the picture as SVG.
     """
 
     name: str
@@ -39,27 +48,48 @@ class Picture(NamedTuple):
     svg: str
 
 
-def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, list[Axes]]:
-    """Return a figure with axes in rows and columns, row by row.
-
-    Args:
-        rows: number of rows.
-        columns: number of columns.
-        height: height in inches; the width is eight.
+@contextmanager
+def report_style() -> Iterator[None]:
+    """Apply the Matplotlib settings of a report to the figures that are made and saved inside, and restore them.
 
     Raises:
         ImportError: if Matplotlib is not installed.
 
     """
-    matplotlib = import_matplotlib()
-    style: dict[str, Any] = {
-        "svg.fonttype": "none",
-        "font.size": 10,
-        "font.family": "sans-serif",
-        "svg.hashsalt": "report",
-    }
-    matplotlib.rcParams.update(style)
-    figure = matplotlib.figure.Figure(figsize=(8.0, height), layout="constrained", facecolor="none")
+    with import_matplotlib().rc_context(SETTINGS):
+        yield
+
+
+def method_colors(names: Iterable[str]) -> dict[str, str]:
+    """Return a colour for each method; they repeat after eleven methods.
+
+    Example:
+        >>> method_colors(["none", "Hartley"])
+        {'none': '#8b8b8b', 'Hartley': '#e69f00'}
+
+    """
+    hues = HUES.split()
+    return {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(names)}
+
+
+def line_style(name: str) -> str:
+    """Return the Matplotlib line style of a method: dashed for a learned one, which often lies on a closed form."""
+    return "--" if name in LEARNED else "-"
+
+
+def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, list[Axes]]:
+    """Return a figure with axes in rows and columns, row by row; call it inside :func:`report_style`.
+
+    Args:
+        rows: number of rows.
+        columns: number of columns.
+        height: height in inches; the width is eight inches.
+
+    Raises:
+        ImportError: if Matplotlib is not installed.
+
+    """
+    figure = import_matplotlib().figure.Figure(figsize=(WIDTH, height), layout="constrained", facecolor="none")
     axes = [figure.add_subplot(rows, columns, place + 1, facecolor="none") for place in range(rows * columns)]
     for one in axes:
         one.grid(color=INK, alpha=0.15, linewidth=0.6)
@@ -72,14 +102,14 @@ def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, l
 
 
 def make_picture(figure: Figure, name: str, title: str, text: str, legend: bool = True) -> Picture:
-    """Return a figure as SVG, with one legend of all its axes above.
+    """Return a figure as SVG, with one legend of all axes above it; call it inside :func:`report_style`.
 
     Args:
         figure: from :func:`make_figure`.
         name: file name without suffix.
         title: heading.
-        text: what it shows.
-        legend: whether there is one.
+        text: what the picture shows.
+        legend: whether to draw the legend.
 
     """
     if legend:
@@ -93,7 +123,7 @@ def make_picture(figure: Figure, name: str, title: str, text: str, legend: bool 
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
-    # Several pictures share a page: their identifiers must differ.
+    # The pictures share a page, so their identifiers must differ.
     svg = re.sub(r'id="([^"]+)"', rf'id="{name}-\1"', svg)
     svg = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)
     return Picture(name, title, text, svg)

@@ -1,4 +1,4 @@
-"""Robust estimators under equal budgets: the best of so many minimal samples, and RANSAC with a normaliser."""
+"""Robust estimators on equal budgets: the best of a number of minimal samples, and RANSAC with a normaliser."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.fundamental import Normalizer
 from kornia_learnnorm.estimators.minimal import are_determined
 from kornia_learnnorm.evaluation.robust.matches import Matches
 from kornia_learnnorm.evaluation.robust.peers import Peer
+from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, draw_distinct
 from kornia_learnnorm.ransac.scoring import PairScorer
@@ -23,12 +23,12 @@ __all__ = ["Estimate", "Estimator", "Solver", "best_of", "minimal_samples", "pee
 
 
 class Estimate(NamedTuple):
-    """A matrix and what it took.
+    """A fundamental matrix, its time and its number of samples.
 
     Attributes:
         F_mat: (3, 3) float64; NaN for a failure.
-        seconds: wall clock.
-        samples: how many minimal samples were solved; NaN where that is not known.
+        seconds: wall-clock time.
+        samples: number of minimal samples solved; NaN if unknown.
     """
 
     F_mat: Tensor
@@ -40,33 +40,33 @@ class Solver(NamedTuple):
     """A minimal solver.
 
     Attributes:
-        size: correspondences of a sample.
-        solve: maps points in pixels, (K, size, 2) float64 each, to candidate matrices (K, C, 3, 3).
+        size: correspondences in a sample.
+        solve: maps points1 and points2 in pixels, (K, size, 2) float64, to candidate matrices (K, C, 3, 3).
     """
 
     size: int
     solve: Callable[[Tensor, Tensor], Tensor]
 
 
-Estimator = Callable[[Matches, int, Sequence[float]], list[Estimate]]  # by seed, for each threshold
+Estimator = Callable[[Matches, int, Sequence[float]], list[Estimate]]  # matches, seed, thresholds in pixels
 
 
 def minimal_samples(total: int, number: int, seed: int) -> Tensor:
-    """Return the minimal samples that all solvers get, (number, 8) indices of ``total`` correspondences."""
+    """Return the minimal samples that all solvers share, (number, 8) indices of ``total`` correspondences."""
     return draw_distinct(torch.full((number,), total), SAMPLE_SIZE, torch.Generator().manual_seed(seed))
 
 
 def run_estimator(estimator: Estimator, matches: Matches, seed: int, thresholds: Sequence[float]) -> list[Estimate]:
-    """Run an estimator, or let it fail where there are fewer than eight correspondences.
+    """Return the estimates of an estimator; failures if there are fewer than eight correspondences.
 
     Args:
         estimator: from :func:`~kornia_learnnorm.evaluation.robust.estimators.find_estimator`.
         matches: the correspondences.
-        seed: seed of its draws.
-        thresholds: of inliers, pixels.
+        seed: seed of the samples.
+        thresholds: inlier thresholds, pixels.
 
     Returns:
-        a matrix for each threshold.
+        one estimate per threshold.
 
     """
     if len(matches.points1) < SAMPLE_SIZE:
@@ -79,7 +79,7 @@ def _failure() -> Tensor:
 
 
 def peer_estimator(peer: Peer) -> Estimator:
-    """Return an estimator of another package, timed.
+    """Return an estimator of another package that measures its time.
 
     Args:
         peer: from :func:`~kornia_learnnorm.evaluation.robust.peers.find_peer`.
@@ -92,7 +92,7 @@ def peer_estimator(peer: Peer) -> Estimator:
             start = time.perf_counter()
             F_mat = peer(matches.points1.numpy(), matches.points2.numpy(), matches.size, seed, threshold)
             seconds = time.perf_counter() - start
-            # OpenCV stacks several matrices where seven points are all there is.
+            # OpenCV stacks up to three matrices if there are only seven points.
             good = F_mat is not None and F_mat.shape == (3, 3)
             F_mat = torch.tensor(np.array(F_mat, float)) if good else _failure()
             found.append(Estimate(F_mat, seconds, math.nan))
@@ -102,13 +102,13 @@ def peer_estimator(peer: Peer) -> Estimator:
 
 
 def best_of(number: int, solver: Solver) -> Estimator:
-    """Return what takes the matrix of highest MSAC score of so many minimal samples, the same for all solvers.
+    """Return an estimator that picks the matrix of highest MSAC score among a number of minimal samples.
 
-    The matrices do not depend on the threshold, only which of them is taken: they are computed once for all.
+    Only the score depends on the threshold: the matrices are computed once for all thresholds.
 
     Args:
-        number: of minimal samples.
-        solver: what solves them.
+        number: number of minimal samples, which all solvers share.
+        solver: minimal solver.
 
     """
 
@@ -133,34 +133,24 @@ def best_of(number: int, solver: Solver) -> Estimator:
     return estimate
 
 
-class _Counted(RANSAC):
-    """RANSAC that counts the samples it draws."""
-
-    samples = 0
-
-    def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
-        self.samples += len(rows)
-        return super()._solve(scorer, rows)
-
-
 def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
     """Return :class:`~kornia_learnnorm.RANSAC` as an estimator.
 
     Args:
-        normalizer: its normaliser; None for its own.
-        options: further arguments of it.
+        normalizer: normaliser; None for the default of RANSAC.
+        options: further arguments of RANSAC.
 
     """
 
     def estimate(matches: Matches, seed: int, thresholds: Sequence[float]) -> list[Estimate]:
         found = []
         for threshold in thresholds:
-            estimator = _Counted(normalizer, inl_th=threshold, seed=seed, **options)
+            estimator = RANSAC(normalizer, inl_th=threshold, seed=seed, **options)
             start = time.perf_counter()
-            F_mat = estimator(matches.points1, matches.points2)[0]
+            result = estimator.estimate(matches.points1, matches.points2)
             seconds = time.perf_counter() - start
-            F_mat = F_mat if bool(F_mat.any()) else _failure()
-            found.append(Estimate(F_mat, seconds, estimator.samples))
+            F_mat = result.F_mat if bool(result.F_mat.any()) else _failure()
+            found.append(Estimate(F_mat, seconds, result.num_samples))
         return found
 
     return estimate

@@ -1,4 +1,4 @@
-"""The robust estimators that ``learnnorm robust`` compares, by name."""
+"""Robust estimators and minimal solvers by name, as ``learnnorm robust`` takes them."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ __all__ = [
 
 SEVEN_POINT = "seven-point"
 TRUTH = "ground-truth"
-COUNT = 1000  # samples of a run of equal hypotheses
-SECONDS = 0.05  # of a run of equal time
-MOST = 20_000  # samples of RANSAC with a normaliser, which can be a network
-DEFAULTS = "RANSAC"
+NUM_SAMPLES = 1000  # minimal samples of count:
+MAX_SECONDS = 0.05  # of a run of time:
+MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network
+DEFAULTS = "RANSAC"  # RANSAC with its default options
 KINDS = ("count:", "time:", f"{DEFAULTS}:")
 _SOLVERS = ("Hartley", "whitening", "paper", "crossview", "Hartley+optimal")
 DEFAULT_SOLVERS = ("none", "Hartley", "whitening", "reweighted", *_SOLVERS[2:], SEVEN_POINT, "searched")
@@ -48,11 +48,12 @@ def find_solver(name: str) -> Solver:
     """Return a minimal solver by its name.
 
     Args:
-        name: ``seven-point``, Kornia's, or as for :func:`~kornia_learnnorm.evaluation.methods.find_method`.
+        name: ``seven-point``, which is Kornia's, or a name for
+            :func:`~kornia_learnnorm.evaluation.methods.find_method`.
 
     Raises:
-        ValueError: if there is no such method.
-        FileNotFoundError: if there are no such weights.
+        ValueError: if there is no method of this name.
+        FileNotFoundError: if there are no weights of this name.
 
     """
     if name == SEVEN_POINT:
@@ -65,15 +66,16 @@ def find_estimator(name: str) -> Estimator:
     """Return a robust estimator by its name.
 
     Args:
-        name: one of those in :mod:`~kornia_learnnorm.evaluation.robust.peers`; ``count:SOLVER``, the best of 1,000
-            minimal samples, the same for all solvers; ``time:METHOD``, the best of those of 50 ms; ``RANSAC``,
-            :class:`~kornia_learnnorm.RANSAC` with its defaults; ``RANSAC:METHOD``, with another normaliser and at most
-            20,000 samples; ``ground-truth``, the true matrix, which says how far the others' figures can be trusted.
+        name: a name in :data:`~kornia_learnnorm.evaluation.robust.peers.PEERS`; ``count:SOLVER``, the best of 1,000
+            minimal samples, which all solvers share; ``time:METHOD``, the best of the samples drawn in 50 ms;
+            ``RANSAC``, :class:`~kornia_learnnorm.RANSAC` with its defaults; ``RANSAC:METHOD``, RANSAC with another
+            normaliser and at most 20,000 samples; ``ground-truth``, the true matrix, which shows how far the metrics
+            can be trusted.
 
     Raises:
-        ValueError: if there is no such estimator.
-        FileNotFoundError: if there are no such weights.
-        ImportError: if its package is not installed.
+        ValueError: if there is no estimator of this name.
+        FileNotFoundError: if there are no weights of this name.
+        ImportError: if the package of the estimator is not installed.
 
     """
     if name in PEERS:
@@ -82,13 +84,13 @@ def find_estimator(name: str) -> Estimator:
         return _truth
     kind, _, method = name.partition(":")
     if kind == "count" and method:
-        return best_of(COUNT, find_solver(method))
+        return best_of(NUM_SAMPLES, find_solver(method))
     if name == DEFAULTS:
         return ransac(None, {})
     if kind == DEFAULTS and method:
-        return _ransac(method, {"max_iter": MOST})
+        return _ransac(method, {"max_samples": MAX_SAMPLES})
     if kind == "time" and method:
-        return _ransac(method, {"max_iter": 10**7, "max_seconds": SECONDS, "confidence": 1, "refine": False})
+        return _ransac(method, {"max_samples": 10**7, "max_seconds": MAX_SECONDS, "confidence": 1, "refine": False})
     raise ValueError(
         f"no estimator {name!r}: expected {', '.join(PEERS)}, count:SOLVER, time:METHOD, RANSAC, RANSAC:METHOD or "
         f"{TRUTH}"
@@ -96,17 +98,17 @@ def find_estimator(name: str) -> Estimator:
 
 
 def is_slow(name: str) -> bool:
-    """Return whether an estimator can take a second and more where inliers are few."""
+    """Return whether an estimator can take more than a second on pairs with few inliers."""
     return not name.startswith(("opencv", TRUTH, *KINDS[:2]))
 
 
 def is_timed(name: str) -> bool:
-    """Return whether an estimator gets a time and not a number of samples."""
+    """Return whether the budget of an estimator is a time instead of a number of samples."""
     return name.startswith("time:")
 
 
 def identify_estimator(name: str) -> str:
-    """Return what an estimator's or solver's figures depend on: a package's version, or the digest of weights."""
+    """Return what the results of an estimator or solver depend on: a package's version, or the digest of weights."""
     if name in PEERS:
         return peer_version(name)
     kind, colon, method = _split(name)
@@ -114,13 +116,13 @@ def identify_estimator(name: str) -> str:
 
 
 def estimator_names(names: Sequence[str]) -> dict[str, str]:
-    """Return the names of estimators or solvers for tables and files: of weights, the run's folder or the file's name.
+    """Return short names of estimators or solvers for tables and files, with the folder or file name of own weights.
 
     Args:
-        names: as for :func:`find_estimator` or :func:`find_solver`.
+        names: names for :func:`find_estimator` or :func:`find_solver`.
 
     Raises:
-        ValueError: if two are the same.
+        ValueError: if two short names are equal.
 
     """
     short = {}
@@ -142,8 +144,8 @@ def _truth(matches: Matches, _: int, thresholds: Sequence[float]) -> list[Estima
 
 
 def _ransac(name: str, options: dict[str, Any]) -> Estimator:
-    """RANSAC with the normaliser of a method."""
+    """Return RANSAC with the normaliser of a method."""
     if name.endswith(REFINED):
-        raise ValueError(f"RANSAC refines by itself: {base_name(name)!r} without {REFINED}, got {name!r}")
+        raise ValueError(f"RANSAC refines by itself: expected {base_name(name)!r} without {REFINED}, got {name!r}")
     optimal = {"rank2": "optimal"} if name.endswith(OPTIMAL) else {}
     return ransac(find_method(name).normalizer, {**options, **optimal})

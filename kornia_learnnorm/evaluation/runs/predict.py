@@ -9,14 +9,16 @@ from torch import Tensor
 
 from kornia_learnnorm.data.samples import Samples, draw_samples
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.estimators.fundamental import normalizing_transforms
-from kornia_learnnorm.evaluation.diagnostics import diagnose
+from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method
 from kornia_learnnorm.evaluation.runs.arrays import Arrays
 from kornia_learnnorm.evaluation.runs.consensus import consensus
 from kornia_learnnorm.evaluation.runs.pairs import ground_truth_inliers, median_distance
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.poses import relative_pose, rotation_error, translation_error
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.metrics.poses import rotation_error, translation_error
+from kornia_learnnorm.normalizers.contract import normalizing_transforms
 from kornia_learnnorm.protocol import MAX_RESIDUAL
 
 __all__ = ["AGREEMENT", "ERRORS", "SampleOptions", "predict"]
@@ -110,15 +112,10 @@ def predict(
 
 
 def _predict_batch(method: Method, samples: Samples, store: CorrespondenceStore, truth: Tensor) -> dict[str, Tensor]:
-    x1, x2 = samples.points1.double(), samples.points2.double()
-    # Compute the transforms once: a search takes its time.
-    transforms = normalizing_transforms(method.normalizer, x1, x2, None)
-
-    def known(*_: Tensor | None) -> tuple[Tensor, Tensor]:
-        return transforms
-
-    F_mat = method.solve(x1, x2, known)
-    inside = diagnose(x1, x2, known)
+    problem = LinearProblem.from_points(samples.points1, samples.points2)
+    x1, x2 = problem.points1, problem.points2
+    T1, T2 = normalizing_transforms(method.normalizer, problem)
+    F_mat, inside = method.solve(problem, T1, T2), diagnose_in_coordinates(problem, T1, T2)
     K, R, t = (torch.from_numpy(part)[samples.pair] for part in (store.K, store.R, store.t))
     found = relative_pose(F_mat, K[:, 0], K[:, 1], x1, x2)
     return {

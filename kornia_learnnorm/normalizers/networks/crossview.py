@@ -1,7 +1,9 @@
 r"""Set networks that predict the parameters of both views' transforms from correspondences.
 
 The contract is ``(points1, points2, weights) -> (params1, params2)``: points :math:`(B, N, 2)` in the coordinates of
-the base normaliser, parameters :math:`(B, P)` for a transform builder. Zero parameters mean the base itself.
+the base normaliser, parameters :math:`(B, P)` for a transform builder. Zero parameters mean the base itself. A network
+whose attribute ``needs_null_matrix`` is true also gets the null matrix of the DLT in these coordinates, as
+``null_matrix``.
 """
 
 from __future__ import annotations
@@ -12,11 +14,11 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import weighted_mean
-from kornia_learnnorm.geometry.linear import design_matrix, null_vector, smallest_right_singular_vector
+from kornia_learnnorm.geometry.linear import design_matrix, null_vector, smallest_singular_vectors
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 
-# What the network sees of a correspondence and of the set.
+# Numbers of features of a correspondence and of the set.
 _POINT_FEATURES, _SET_FEATURES = {"own": 2, "both": 4, "epipolar": 13}, {"own": 1, "both": 1, "epipolar": 10}
 
 
@@ -38,7 +40,7 @@ class CrossViewNetwork(nn.Module):
             both views, ``"own"`` only its own points.
 
     Raises:
-        ValueError: if ``features`` is none of these.
+        ValueError: if ``features`` is not one of these names.
 
     Example:
         >>> network = CrossViewNetwork(width=16, depth=2)
@@ -58,38 +60,48 @@ class CrossViewNetwork(nn.Module):
         self.features = features
         self.set_network = SetNetwork(_POINT_FEATURES[features], _SET_FEATURES[features], width, depth, num_parameters)
 
-    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    @property
+    def needs_null_matrix(self) -> bool:
+        """Whether :meth:`forward` uses the null matrix."""
+        return self.features == "epipolar"
+
+    def forward(
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, null_matrix: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return the parameters of both views.
 
         Args:
             points1: points of the first view in base coordinates with shape :math:`(B, N, 2)`, :math:`N >= 8`.
             points2: points of the second view in base coordinates with shape :math:`(B, N, 2)`.
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+            null_matrix: the DLT's unit null vectors in base coordinates with shape :math:`(B, 3, 3)`; solved from the
+                points when not given.
 
         Returns:
             parameters with shape :math:`(B, P)` of view 1 and view 2, in the dtype of the points.
 
         """
-        views = self._views(points1, points2, weights)
-        point, whole = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
+        views = self._views(points1, points2, weights, null_matrix)
+        point_features, set_features = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
         doubled = None if weights is None else torch.cat([weights, weights]).to(self.dtype)
-        params = self.set_network(point, whole, doubled).to(points1.dtype)
+        params = self.set_network(point_features, set_features, doubled).to(points1.dtype)
         params1, params2 = (self.bound * torch.tanh(params / self.bound)).chunk(2)
         return params1, params2
 
     def _views(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, null_matrix: Tensor | None
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Features of the points and of the set, as either view sees them."""
+        """Return the features of the points and of the set as each view sees them."""
         if self.features != "epipolar":
             nothing = torch.ones_like(points1[:, 0, :1])
             if self.features == "own":
                 return (points1, nothing), (points2, nothing)
             return (torch.cat([points1, points2], -1), nothing), (torch.cat([points2, points1], -1), nothing)
         x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
-        F = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
-        F = F * _sign(F)
-        v, u = smallest_right_singular_vector(F), smallest_right_singular_vector(F.mT)
+        if null_matrix is None:
+            null_matrix = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
+        F = null_matrix * _sign(null_matrix)
+        u, v = smallest_singular_vectors(F)
         return _epipolar_features(x1, x2, F, v, u, weights), _epipolar_features(x2, x1, F.mT, u, v, weights)
 
     @property
@@ -99,7 +111,7 @@ class CrossViewNetwork(nn.Module):
 
 
 def _sign(F: Tensor) -> Tensor:
-    """Sign that makes the largest entry of ``F`` positive: one and the same for ``F`` and its transpose."""
+    """Return the sign that makes the largest entry of ``F`` positive, equal for ``F`` and its transpose."""
     entries = F.detach().flatten(-2)
     return entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
 
@@ -107,10 +119,10 @@ def _sign(F: Tensor) -> Tensor:
 def _epipolar_features(
     own: Tensor, other: Tensor, F: Tensor, v: Tensor, u: Tensor, weights: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Describe the problem as one view sees it, where ``other^T F own = 0``.
+    """Return features of the problem as one view sees it, where ``other^T F own = 0``.
 
     ``v`` and ``u`` are the right and left singular vectors of the smallest singular value of ``F``: projected to rank
-    2, ``F`` loses ``(u^T F v) u v^T``. Returns features of the points ``(B, N, 13)`` and of the set ``(B, 10)``.
+    2, ``F`` loses ``(u^T F v) u v^T``. The features of the points are ``(B, N, 13)``, those of the set ``(B, 10)``.
     """
     line, other_line = (other @ F)[..., :2], (own @ F.mT)[..., :2]
     norm, other_norm = line.norm(dim=-1, keepdim=True), other_line.norm(dim=-1, keepdim=True)
@@ -125,7 +137,7 @@ def _epipolar_features(
 
 
 class SetNetwork(nn.Module):
-    """Residual layers over the points of a set, with the set's maximum as context; blind to their order.
+    """Residual layers over the points of a set, with the set's maximum as context; permutation invariant.
 
     Args:
         point_features: features of a point.
@@ -150,16 +162,16 @@ class SetNetwork(nn.Module):
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), last)
 
-    def forward(self, points: Tensor, whole: Tensor, weights: Tensor | None = None) -> Tensor:
+    def forward(self, points: Tensor, set_features: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return the outputs with shape :math:`(B, P)`.
 
         Args:
             points: features of the points with shape :math:`(B, N, C)`.
-            whole: features of the sets with shape :math:`(B, D)`.
+            set_features: features of the sets with shape :math:`(B, D)`.
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
 
         """
-        h = self.point_stem(points) + self.set_stem(whole)[:, None]
+        h = self.point_stem(points) + self.set_stem(set_features)[:, None]
         absent = None if weights is None else (weights <= 0)[..., None]
         for layer in self.layers:
             h = layer(h, absent)
@@ -186,7 +198,7 @@ class ContextLayer(nn.Module):
 
 
 def _maximum(h: Tensor, absent: Tensor | None) -> Tensor:
-    """Maximum over the present points, ``(B, C)``; zero where all are absent."""
+    """Return the maximum over the present points, ``(B, C)``; zero where all are absent."""
     if absent is None:
         return h.amax(1)
     empty = absent.all(1)
@@ -194,7 +206,7 @@ def _maximum(h: Tensor, absent: Tensor | None) -> Tensor:
 
 
 def _average(h: Tensor, weights: Tensor | None) -> Tensor:
-    """Average over the points, ``(B, C)``."""
+    """Return the average over the points, ``(B, C)``."""
     if weights is None:
         return h.mean(1)
     total = weights.sum(1, keepdim=True)

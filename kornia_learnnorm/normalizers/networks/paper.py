@@ -115,7 +115,7 @@ class ResidualBlock(nn.Module):
 
 
 def _instance_norm(h: Tensor, weights: Tensor | None) -> Tensor:
-    """Give each channel of each sample zero mean and unit variance over the points, ``(N, B, C)``."""
+    """Return features with zero mean and unit variance over the points of each channel and sample, ``(N, B, C)``."""
     if weights is None:  # every channel of every sample is a channel of its own, the points are the batch
         return batch_norm(h.flatten(1), None, None, training=True, eps=_EPSILON).view_as(h)
     total = weights.sum(0)
@@ -125,7 +125,7 @@ def _instance_norm(h: Tensor, weights: Tensor | None) -> Tensor:
 
 
 def _maximum(h: Tensor, weights: Tensor | None) -> Tensor:
-    """Maximum over the present points, ``(B, C)``; zero where all are absent."""
+    """Return the maximum over the present points, ``(B, C)``; zero where all are absent."""
     if weights is None:
         return h.amax(0)
     absent = weights <= 0

@@ -14,7 +14,7 @@ Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 from make_sequences import FOCAL, FRAMES, SIZE, STEP, metres, write_colmap  # noqa: E402
 
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap  # noqa: E402
-from kornia_learnnorm.data.datasets.frames import listed_pairs  # noqa: E402
+from kornia_learnnorm.data.datasets.pairs import listed_pairs  # noqa: E402
 
 NAMES = ["one/0.png", "one/1.png", "two/2.png", "two/3.png"]
 
@@ -157,7 +157,7 @@ class TestReadColmap:
 
     def test_without_pycolmap(self, written, monkeypatch):
         monkeypatch.setitem(sys.modules, "pycolmap", None)
-        with pytest.raises(ImportError, match=r"pip install 'kornia-learnnorm\[colmap\]'"):
+        with pytest.raises(ImportError, match=r"pip install '\.\[colmap\]'"):
             read(written)
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.data.datasets.frames import Frame, FramePair, listed_pairs, pair_frames, resize_frames
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair, resize_frames
 
 CAMERA = np.array([[500.0, 0, 310], [0, 510, 250], [0, 0, 1]])
 SEEDS = st.integers(0, 2**32 - 1)
@@ -39,14 +39,6 @@ def projections(pair: FramePair, count: int = 20, seed: int = 0) -> list[np.ndar
     world = np.column_stack([np.random.default_rng(seed).normal(size=(count, 3)) * 5, np.ones(count)])
     pixels = [world @ np.linalg.inv(f.pose)[:3].T @ f.K.T for f in (pair.frame1, pair.frame2)]
     return [x / x[:, 2:] for x in pixels]
-
-
-def numbered(*sequences: str) -> list[Frame]:
-    return [frame(f"{sequence}/{n}.png", sequence) for sequence in sequences for n in range(4)]
-
-
-def names(pairs) -> list[tuple[str, str]]:
-    return [(pair.frame1.name, pair.frame2.name) for pair in pairs]
 
 
 class TestFrame:
@@ -138,58 +130,6 @@ class TestFramePair:
             turned = replace(pair.frame2, pose=np.column_stack([pair.frame2.pose[:, :3], pair.frame1.pose[:, 3]]))
             for still in (pair.frame1, turned):
                 assert np.isnan(FramePair(pair.frame1, still).F).all()
-
-
-class TestPairFrames:
-    def test_neighbours_of_one_sequence(self):
-        pairs = names(pair_frames(numbered("x", "y")))
-        assert pairs == [(f"{s}/{n}.png", f"{s}/{n + 1}.png") for s in "xy" for n in range(3)]
-
-    @given(gap=st.integers(1, 6))
-    def test_gap(self, gap):
-        assert names(pair_frames(numbered("x"), gap)) == [(f"x/{n}.png", f"x/{n + gap}.png") for n in range(4 - gap)]
-
-    def test_nothing(self):
-        assert names(pair_frames([])) == []
-
-    @pytest.mark.parametrize("gap", [0, -1])
-    def test_wrong_gap(self, gap):
-        with pytest.raises(ValueError, match=f"at least 1, got {gap}"):
-            list(pair_frames(numbered("x"), gap))
-
-
-class TestListedPairs:
-    def test_order_of_the_lines(self, tmp_path):
-        (tmp_path / "pairs.txt").write_text("x/3.png  x/0.png\n\nx/1.png\ty/2.png\n")
-        pairs = listed_pairs(numbered("x", "y"), str(tmp_path / "pairs.txt"))
-        assert names(pairs) == [("x/3.png", "x/0.png"), ("x/1.png", "y/2.png")]
-
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            ("x/0.png x/1.png\nx/0.png\n", r"pairs\.txt, line 2: two names expected, got 'x/0\.png'"),
-            ("x/0.png x/1.png x/2.png", r"line 1: two names expected"),
-            ("x/0.png x/0.png", r"line 1: two images expected, got 'x/0\.png' with itself"),
-            (
-                "x/0.png x/1.png\nx/1.png x/0.png\n\nx/0.png  x/1.png",
-                r"line 4: 'x/0\.png  x/1\.png' is in line 1 already",
-            ),
-            ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
-        ],
-    )
-    def test_malformed(self, tmp_path, text, message):
-        (tmp_path / "pairs.txt").write_text(text)
-        with pytest.raises(ValueError, match=message):
-            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
-
-    def test_binary(self, tmp_path):
-        (tmp_path / "pairs.txt").write_bytes(b"\x89HDF")
-        with pytest.raises(ValueError, match=r"pairs\.txt is not a text file in UTF-8"):
-            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
-
-    def test_missing(self, tmp_path):
-        with pytest.raises(FileNotFoundError, match=r"no list of pairs at .*pairs\.txt"):
-            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
 
 
 class TestResizeFrames:

@@ -7,8 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
-import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -24,8 +22,9 @@ pytest.importorskip("joblib", reason="joblib is not installed")
 
 from make_sequences import write_image
 
-from kornia_learnnorm.data.datasets.frames import FramePair, pair_frames
-from kornia_learnnorm.data.datasets.sequences import read_folder
+from kornia_learnnorm.data.datasets.folder import read_folder
+from kornia_learnnorm.data.datasets.frames import FramePair
+from kornia_learnnorm.data.datasets.pairs import pair_frames
 from kornia_learnnorm.data.matching import cache as feature_cache
 from kornia_learnnorm.data.matching import collect
 from kornia_learnnorm.data.matching.cache import FeatureCache
@@ -35,7 +34,6 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 
 OPTIONS = MatchOptions(num_features=200, max_matches=30)
 ARRAYS = ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t")
-COMMAND = [sys.executable, "-m", "kornia_learnnorm.cli.main", "match", "folder"]
 
 
 def frames_of(root: Path, number: int = 6) -> Path:
@@ -146,7 +144,7 @@ class TestProcesses:
             killed.clear()
             collect_matches(pairs_of(images), tmp_path / f"{attempt}.h5", OPTIONS, jobs=2)
             assert_same(expected, tmp_path / f"{attempt}.h5")
-            if "a process was killed; going on" in capfd.readouterr().err:
+            if "a worker process was killed; continuing" in capfd.readouterr().err:
                 return
         pytest.fail("no run missed its worker")
 
@@ -185,32 +183,58 @@ def loky_workers() -> list[int]:
     return found
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+# The command, stopped by a signal after its eighth pair: kill -9 of one process, or Ctrl-C, which reaches all of them.
+# It waits until its workers ignore SIGINT, so that none of them is met while it starts.
+STOPPED = """
+import os, signal, sys, time
+from pathlib import Path
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.matching import collect
+
+kind, add, added = signal.Signals(int(sys.argv[1])), collect.StoreWriter.add, []
+
+def children_ignore_sigint():
+    for status in Path("/proc").glob("[0-9]*/status"):
+        try:
+            fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        except OSError:
+            continue
+        mine = int(fields["PPid"]) == os.getpid() and not fields["State"].strip().startswith("Z")
+        if mine and not int(fields["SigIgn"], 16) >> signal.SIGINT - 1 & 1:
+            return False
+    return True
+
+def add_and_stop(writer, place, pair):
+    add(writer, place, pair)
+    added.append(place)
+    if len(added) == 8:
+        while not children_ignore_sigint():
+            time.sleep(0.05)
+        os.killpg(0, kind) if kind == signal.SIGINT else os.kill(os.getpid(), kind)
+
+collect.StoreWriter.add = add_and_stop
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="there is no /proc")
 class TestSignals:
     @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGINT])
     def test_stopped_run_goes_on(self, images, expected, tmp_path, kind):
         out, parts = tmp_path / "store.h5", tmp_path / "store.h5.parts"
-        args = [*COMMAND, images, "--out", out, "--jobs", "2", "--num-features", "200", "--max-matches", "30"]
-        for _ in range(5):  # on a busy machine a run can end before it is stopped
-            with subprocess.Popen(args, stderr=subprocess.PIPE, text=True, start_new_session=True) as run:
-                until = time.time() + 60
-                while not (any(parts.glob("0*.h5")) or out.exists()) and time.time() < until:
-                    time.sleep(0.005)
-                # Ctrl-C reaches the whole group, kill -9 one process.
-                os.killpg(run.pid, kind) if kind == signal.SIGINT else os.kill(run.pid, kind)
-                error = run.communicate(timeout=30)[1]
-            if not out.exists():
-                break
-            out.unlink()
-        assert any(parts.glob("0*.h5"))
+        args = ["match", "folder", images, "--out", out, "--jobs", "2", "--num-features", "200", "--max-matches", "30"]
+        stopped = [sys.executable, "-c", STOPPED, str(int(kind)), *map(str, args)]
+        run = subprocess.run(stopped, capture_output=True, text=True, timeout=120, start_new_session=True)
+        assert len(list(parts.glob("0*.h5"))) == 8
         assert not out.exists()
+        assert run.returncode == (130 if kind == signal.SIGINT else -kind)
         if kind == signal.SIGINT:
-            assert run.returncode == 130
-            error = re.sub(JOBLIB, "", error)
+            error = re.sub(JOBLIB, "", run.stderr)
             assert error.rstrip().endswith("interrupted")
             assert "Traceback" not in error
-        again = subprocess.run(args, capture_output=True, text=True, timeout=60, check=True)
-        assert len(again.stderr.splitlines()) <= 4  # the bar is quiet where stderr is no terminal
+        again = [sys.executable, "-m", "kornia_learnnorm.cli.main", *map(str, args)]
+        run = subprocess.run(again, capture_output=True, text=True, timeout=120, check=True)
+        assert len(run.stderr.splitlines()) <= 4  # the bar is quiet where stderr is no terminal
         store, whole = read_store(out), read_store(expected)
         assert all(np.array_equal(getattr(store, name), getattr(whole, name), equal_nan=True) for name in ARRAYS)
 
@@ -224,31 +248,19 @@ class TestDask:
         ) as cluster:
             yield cluster
 
-    def test_same_store_though_a_worker_is_killed(self, images, expected, tmp_path, cluster):
-        for attempt in range(5):  # on a busy machine a run can end before the worker is killed
-            path = tmp_path / f"{attempt}.h5"
-            killed = self.match_and_kill(images, path, cluster)
-            assert_same(expected, path)
-            if 0 < killed < 23:  # in the middle
-                return
-        pytest.fail("no run was met in its middle")
+    def test_same_store_though_a_worker_is_killed(self, images, expected, tmp_path, cluster, monkeypatch):
+        add, places = collect.StoreWriter.add, []
 
-    def match_and_kill(self, images, path, cluster) -> int:
-        """Match while a worker is killed; how many pairs there were at its death."""
-        parts, done = path.with_name(path.name + ".parts"), []
+        def add_and_kill(writer, place, pair):
+            add(writer, place, pair)
+            places.append(place)
+            if len(places) == 4:  # the last 7 of 23 pairs are not sent before the first 16 are written
+                os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
 
-        def kill() -> None:
-            until = time.time() + 60
-            while not (any(parts.glob("0*.h5")) or path.exists()) and time.time() < until:
-                time.sleep(0.005)
-            os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
-            done.append(len(list(parts.glob("0*.h5"))))
-
-        thread = threading.Thread(target=kill)
-        thread.start()
-        collect_matches(pairs_of(images), path, OPTIONS, dask=cluster.scheduler_address)
-        thread.join()
-        return done[0]
+        monkeypatch.setattr(collect.StoreWriter, "add", add_and_kill)
+        collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask=cluster.scheduler_address)
+        assert places == list(range(23))
+        assert_same(expected, tmp_path / "store.h5")
 
     def test_nobody_at_the_address(self, images, tmp_path):
         pytest.importorskip("distributed", reason="Dask is not installed")  # before its settings are changed
@@ -274,7 +286,7 @@ class TestGoingOn:
         before = path.stat().st_mtime_ns
         assert collect_matches(pairs_of(root), path, OPTIONS) == skipped
         assert path.stat().st_mtime_ns == before
-        assert "is there already" in capsys.readouterr().err
+        assert "exists already" in capsys.readouterr().err
 
     def test_other_options_or_cameras_are_refused(self, images, expected):
         pairs = pairs_of(images)
@@ -282,7 +294,7 @@ class TestGoingOn:
             collect_matches(pairs, expected, replace(OPTIONS, num_features=201))
         moved = [FramePair(replace(pair.frame1, camera=np.eye(3)), pair.frame2) for pair in pairs]
         with pytest.raises(
-            ValueError, match=r"other data.* the images, their cameras or poses, or the pairs have changed"
+            ValueError, match=r"other data.* the images, their cameras, their poses or the pairs have changed"
         ):
             collect_matches(moved, expected, OPTIONS)
 
@@ -366,7 +378,7 @@ class TestBadInput:
         [
             ({"detector": "orb"}, r"detector must be one of sift, .* got 'orb'"),
             ({"matcher": "magic"}, r"matcher must be one of nearest, lightglue, got 'magic'"),
-            ({"matcher": "lightglue"}, r"lightglue takes features of the detector disk, got sift"),
+            ({"matcher": "lightglue"}, r"lightglue needs features of the detector disk, got sift"),
             ({"num_features": 1}, "num_features must be at least 2, got 1"),
             ({"max_matches": 7}, "max_matches must be at least 8, or None .* got 7"),
             ({"seed": -1}, "seed must be 0 or more, got -1"),

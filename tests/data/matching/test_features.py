@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.feature import DISK, LightGlue
+from make_sequences import blurred_noise as texture
 
 from kornia_learnnorm.data.matching import features as module
 from kornia_learnnorm.data.matching import matchers as matching
@@ -31,11 +32,6 @@ def _no_networks_kept():
     yield
     for cache in caches:
         cache.cache_clear()
-
-
-def texture(width: int = 240, height: int = 180) -> np.ndarray:
-    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(height, width)), (0, 0), 2)
-    return cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def test_rootsift_is_the_root_of_sift_of_unit_sum():

@@ -5,17 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from make_sequences import blurred_noise as texture
 
 from kornia_learnnorm.data.matching.matchers import match_images
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
-
-
-def texture(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
-    """Blurred noise at two scales, with the full range of grey values."""
-    rng = np.random.default_rng(seed)
-    image = sum(cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
-    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 class TestMatchImages:

@@ -2,8 +2,16 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.data import synthetic
-from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
+from kornia_learnnorm.data.synthetic import (
+    TwoViewScene,
+    draws,
+    forward_driving,
+    handheld,
+    orbit,
+    random_scenes,
+    scenes,
+    two_views,
+)
 
 NAMED = [forward_driving, handheld, orbit]
 ALL = [random_scenes, *NAMED]
@@ -17,7 +25,7 @@ def clean(make, monkeypatch, batch_size=64, num_points=24, seed=0):
     """Scenes without noise or gross outliers."""
     if make is not random_scenes:
         return make(batch_size, num_points, generator(seed), noise=0.0)
-    monkeypatch.setattr(synthetic, "_student_t", lambda shape, generator: torch.zeros(shape, dtype=torch.float64))
+    monkeypatch.setattr(scenes, "student_t", lambda shape, generator: torch.zeros(shape, dtype=torch.float64))
     return make(batch_size, num_points, generator(seed))
 
 
@@ -141,7 +149,7 @@ def test_share_of_gross_outliers(make, outliers, expected):
 
 
 def test_student_t_noise():
-    noise = synthetic._student_t((200_000, 2), generator(4)).numpy()
+    noise = draws.student_t((200_000, 2), generator(4)).numpy()
     # Quantiles of Student's t with three degrees of freedom, from its closed-form distribution function:
     # F(x) = 1/2 + (x / (sqrt(3) (1 + x^2/3)) + atan(x / sqrt(3))) / pi.
     for x in (-3.0, -1.0, 0.0, 0.5, 2.0, 6.0):
@@ -177,9 +185,7 @@ def test_random_scenes_have_the_breadth_promised():
 
 def test_half_of_the_random_scenes_are_clustered():
     size = torch.tensor([[1000.0, 500.0]]).double().expand(2000, 2)
-    spread = [
-        synthetic._spread_points(size, 30, generator(8), clustered=share).std(1).prod(-1) for share in (0.0, 0.5, 1.0)
-    ]
+    spread = [draws.spread_points(size, 30, generator(8), clustered=share).std(1).prod(-1) for share in (0.0, 0.5, 1.0)]
     below = [(values < 20_000).double().mean().item() for values in spread]  # uniform: 289 x 144 = 41,600
     assert below[0] < 0.01
     assert below[2] > 0.3
@@ -187,10 +193,10 @@ def test_half_of_the_random_scenes_are_clustered():
 
 
 def test_ground_plane():
-    size, K = synthetic._random_cameras(2000, generator(9))
-    points = synthetic._spread_points(size, 20, generator(10))
+    size, K = draws.random_cameras(2000, generator(9))
+    points = draws.spread_points(size, 20, generator(10))
     height = torch.full((2000, 1), 2.0).double()
-    depths = synthetic._draw_depths(points, K, 3.0, 75.0, height, generator(11))
+    depths = draws.draw_depths(points, K, 3.0, 75.0, height, generator(11))
     assert depths.min() >= 3
     assert depths.max() <= 75
     level = (points[..., 1] - K[:, 1, 2, None]) / K[:, 1, 1, None] * depths  # how far below the camera
@@ -207,27 +213,27 @@ def test_random_scenes_are_finite_for_many_seeds(seed):
 
 
 def test_points_that_no_motion_shows_become_outliers():
-    size, K = synthetic._fixed_camera(2, (640.0, 480.0), 500.0, (319.5, 239.5), generator())
-    points = synthetic._spread_points(size, 32, generator())
+    size, K = draws.fixed_camera(2, (640.0, 480.0), 500.0, (319.5, 239.5), generator())
+    points = draws.spread_points(size, 32, generator())
     depths = torch.full((2, 32), 5.0).double()
     R = torch.diag(torch.tensor([-1.0, 1.0, -1.0])).double().expand(2, 1, 3, 3)  # the camera looks back
-    scene = synthetic._two_views(points, depths, K, R, torch.ones(2, 1, 3).double(), size, 8)
+    scene = two_views.two_views(points, depths, K, R, torch.ones(2, 1, 3).double(), size, 8)
     assert not scene.inliers.any()
     zero = torch.zeros(2, 8, 2).double()
-    scene = synthetic._corrupt(scene, zero, zero, torch.zeros(2, 1).double(), generator())
+    scene = two_views.corrupt(scene, zero, zero, torch.zeros(2, 1).double(), generator())
     assert not scene.inliers.any()
     assert (scene.points2 >= 0).all()
     assert (scene.points2 <= size[:, None] - 1).all()
 
 
 def test_the_first_motion_that_shows_enough_is_chosen():
-    size, K = synthetic._fixed_camera(1, (640.0, 480.0), 500.0, (319.5, 239.5), generator())
-    points = synthetic._spread_points(size, 64, generator())
+    size, K = draws.fixed_camera(1, (640.0, 480.0), 500.0, (319.5, 239.5), generator())
+    points = draws.spread_points(size, 64, generator())
     depths = torch.full((1, 64), 5.0).double()
     back, ahead = torch.diag(torch.tensor([-1.0, 1.0, -1.0])).double(), torch.eye(3).double()
     R = torch.stack([back, ahead, ahead])[None]
     t = torch.tensor([[[0.0, 0, 0], [0.125, 0, 0], [0.01, 0, 0]]]).double()
-    scene = synthetic._two_views(points, depths, K, R, t, size, 24)
+    scene = two_views.two_views(points, depths, K, R, t, size, 24)
     assert scene.inliers.all()
     assert scene.t.tolist() == [[0.125, 0.0, 0.0]]
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.evaluation.methods import Method
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.evaluation.runs.consensus import consensus
 from kornia_learnnorm.evaluation.runs.motion import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import predict
@@ -27,7 +28,7 @@ def test_predictions_agree_with_the_expectation_under_known_noise():
     points1, points2 = (torch.from_numpy(p).reshape(40, 64, 2) for p in (store.points1, store.points2))
     samples = Samples(points1, points2, points1[:, :1], points2[:, :1], torch.arange(40))
     F_mat = torch.from_numpy(store.F)
-    found = predict(Method(kln.Hartley(), lambda *_: F_mat), samples, store, None)
+    found = predict(SimpleNamespace(normalizer=kln.Hartley(), solve=lambda *_: F_mat), samples, store, None)
     x1, x2 = (np.concatenate([p.double().numpy(), np.ones((40, 64, 1))], -1) for p in (points1, points2))
     n2, n1 = (np.linalg.norm((x @ f)[..., :2], axis=-1) for x, f in ((x1, store.F.swapaxes(1, 2)), (x2, store.F)))
     deviation = 0.5 * np.hypot(n1, n2) * (1 / n1 + 1 / n2)

@@ -14,9 +14,10 @@ import torch
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.cli.synthesize import synthetic_store
 from kornia_learnnorm.data.samples import plain_residual
-from kornia_learnnorm.data.store import read_store, write_store
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method
 from kornia_learnnorm.evaluation.runs import record
 from kornia_learnnorm.evaluation.runs.predict import ERRORS, SampleOptions

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch.autograd import gradcheck
-from two_view import correspondences, numpy_whitening, shaken, uniform
+from two_view import correspondences, numpy_whitening, prepared, shaken, uniform
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer
 from kornia_learnnorm.normalizers.networks import crossview as networks
@@ -22,11 +20,7 @@ from kornia_learnnorm.normalizers.networks.crossview import SetNetwork
 FEATURES = ["epipolar", "both", "own"]
 
 
-def whitened(name="handheld", batch_size=6, num_points=12, seed=0):
-    """Correspondences in the coordinates that the network gets."""
-    points = correspondences(name, batch_size, num_points, seed)
-    T = [torch.from_numpy(numpy_whitening(p)) for p in points]
-    return tuple(p @ t[:, :2, :2].mT + t[:, None, :2, 2] for p, t in zip(points, T, strict=True))
+whitened = partial(prepared, numpy_whitening)
 
 
 def network(**options) -> CrossViewNetwork:
@@ -97,67 +91,6 @@ class TestSetNetwork:
 
 
 class TestCrossViewNetwork:
-    @pytest.mark.parametrize("batch_size", [0, 1, 3])
-    @pytest.mark.parametrize("num_points", [8, 9, 30])
-    @pytest.mark.parametrize("weighted", [False, True])
-    @pytest.mark.parametrize(
-        ("num_parameters", "features"), [(3, "epipolar"), (5, "epipolar"), (5, "both"), (5, "own")]
-    )
-    def test_untrained_answers_zero(self, batch_size, num_points, weighted, num_parameters, features, device, dtype):
-        net = CrossViewNetwork(width=8, depth=1, num_parameters=num_parameters, features=features).to(device)
-        points = [uniform(batch_size, num_points, 2, low=-1, seed=k).to(device, dtype) for k in (0, 1)]
-        weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
-        for params in net(*points, weights):
-            assert params.shape == (batch_size, num_parameters)
-            assert params.dtype == dtype
-            assert params.count_nonzero() == 0
-
-    @pytest.mark.parametrize("num_points", [8, 20])
-    @pytest.mark.parametrize("weighted", [False, True])
-    @pytest.mark.parametrize("features", FEATURES)
-    def test_swapped_views_swap_the_answers(self, num_points, weighted, features):
-        net, (points1, points2) = network(features=features), whitened("driving", 10, num_points)
-        weights = uniform(10, num_points, low=0.1) if weighted else None
-        params1, params2 = net(points1, points2, weights)
-        swapped2, swapped1 = net(points2, points1, weights)
-        assert not torch.allclose(params1, params2, atol=1e-3)
-        assert torch.allclose(swapped1, params1, atol=1e-8)
-        assert torch.allclose(swapped2, params2, atol=1e-8)
-
-    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.randoms(), st.sampled_from(FEATURES))
-    def test_order_does_not_matter(self, seed, num_points, random, features):
-        net, (points1, points2) = network(features=features), whitened("handheld", 3, num_points, seed)
-        order = random.sample(range(num_points), num_points)
-        for found, expected in zip(net(points1[:, order], points2[:, order]), net(points1, points2), strict=True):
-            assert torch.allclose(found, expected, atol=1e-5)
-
-    @pytest.mark.parametrize("num_points", [8, 9, 20])
-    @pytest.mark.parametrize("features", FEATURES)
-    def test_zero_weight_is_absence(self, num_points, features):
-        net, (points1, points2) = network(features=features), whitened("handheld", 10, num_points)
-        weights = uniform(10, num_points, low=0.5) if num_points > 8 else torch.ones(10, 8).double()
-        junk1, junk2 = (uniform(10, 5, 2, low=-20, high=20, seed=seed) for seed in (1, 2))
-        extended = [torch.cat(p, 1) for p in [(junk1, points1), (junk2, points2), (weights[:, :5] * 0, weights)]]
-        for found, expected in zip(net(*extended), net(points1, points2, weights), strict=True):
-            assert torch.allclose(found, expected, atol=1e-8)
-
-    @pytest.mark.parametrize("features", FEATURES)
-    def test_whole_weights_are_repetitions(self, features):
-        net, (points1, points2) = network(features=features), whitened("handheld", 10, 9)
-        counts = torch.tensor([1, 2, 3, 1, 2, 1, 1, 4, 1])
-        repeated = [p.repeat_interleave(counts, 1) for p in (points1, points2)]
-        weighted = net(points1, points2, counts.double().expand(10, -1))
-        for found, expected in zip(weighted, net(*repeated), strict=True):
-            assert torch.allclose(found, expected, atol=1e-8)
-
-    @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
-    @pytest.mark.parametrize("num_points", [8, 12])
-    def test_equal_weights_are_none(self, factor, num_points):
-        net, (points1, points2) = network(), whitened("handheld", 10, num_points)
-        weights = torch.full((10, num_points), factor).double()
-        for found, expected in zip(net(points1, points2, weights), net(points1, points2), strict=True):
-            assert torch.allclose(found, expected, atol=1e-8)
-
     @pytest.mark.parametrize("bound", [0.5, 3.0])
     def test_answers_stay_within_the_bound(self, bound):
         net = CrossViewNetwork(width=8, depth=1, bound=bound).double()
@@ -175,16 +108,6 @@ class TestCrossViewNetwork:
         assert len(net.set_network.layers) == 3
         assert list(inspect.signature(CrossViewNetwork).parameters) == arguments
 
-    def test_computes_in_its_own_dtype(self):
-        points = whitened()
-        net = network()
-        assert net.dtype == torch.float64
-        double, single = net(*points), copy.deepcopy(net).float()(*points)
-        for exact, rounded in zip(double, single, strict=True):
-            assert rounded.dtype == torch.float64  # that of the points
-            assert torch.allclose(rounded, exact, atol=1e-4)
-            assert not torch.equal(rounded, exact)
-
     @pytest.mark.parametrize("num_points", [8, 11])
     @pytest.mark.parametrize("features", FEATURES)
     def test_gradcheck(self, num_points, features):
@@ -197,12 +120,6 @@ class TestCrossViewNetwork:
         torch.cat(net(points1, points2)).square().sum().backward()
         for name, parameter in net.named_parameters():
             assert parameter.grad.count_nonzero() > 0, name
-
-    def test_an_untrained_network_can_start_to_learn(self):
-        net, (points1, points2) = CrossViewNetwork(width=8, depth=1), whitened()
-        torch.cat(net(points1, points2)).sum().backward()
-        assert net.set_network.head[-1].weight.grad.abs().sum() > 0
-        assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters())
 
 
 class TestFeatures:

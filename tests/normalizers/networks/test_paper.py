@@ -1,17 +1,17 @@
-"""The paper's network: its size, its answers against NumPy, what it is blind to and what it sees."""
+"""The paper's network: its size, its answers against NumPy, what it sees, and the normaliser made of it."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from torch import nn
 from torch.autograd import gradcheck
-from two_view import correspondences, in_hartley, numpy_hartley, uniform, up_to_sign
+from two_view import correspondences, numpy_hartley, prepared, uniform
 
-from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork, find_fundamental, paper_transform
+from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork, paper_transform
 
 
 def network(width: int = 16, depth: int = 3) -> PaperNetwork:
@@ -24,15 +24,7 @@ def network(width: int = 16, depth: int = 3) -> PaperNetwork:
     return net.eval()
 
 
-def composed(net: PaperNetwork | None = None) -> LearnedNormalizer:
-    return LearnedNormalizer(Hartley(), network() if net is None else net, paper_transform)
-
-
-def normalized(name="handheld", batch_size=6, num_points=12, seed=0):
-    """Correspondences in the coordinates that the network gets."""
-    points = correspondences(name, batch_size, num_points, seed)
-    T = [torch.from_numpy(numpy_hartley(p)) for p in points]
-    return tuple(p @ t[:, :2, :2].mT + t[:, None, :2, 2] for p, t in zip(points, T, strict=True))
+normalized = partial(prepared, numpy_hartley)
 
 
 def numpy_features(net, points, weights=None):
@@ -109,19 +101,6 @@ class TestArchitecture:
 
 
 class TestForward:
-    @pytest.mark.parametrize("batch_size", [0, 1, 3])
-    @pytest.mark.parametrize("num_points", [8, 9, 30])
-    @pytest.mark.parametrize("weighted", [False, True])
-    def test_untrained_answers_zero(self, batch_size, num_points, weighted, device, dtype):
-        net = PaperNetwork(16, 3).to(device)
-        points = [uniform(batch_size, num_points, 2, low=-1, seed=k).to(device, dtype) for k in (0, 1)]
-        weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
-        for params in net(*points, weights):
-            assert params.shape == (batch_size, 3)
-            assert params.dtype == dtype
-            assert params.device.type == device.type
-            assert params.count_nonzero() == 0
-
     @pytest.mark.parametrize("name", ["driving", "handheld"])
     @pytest.mark.parametrize("num_points", [8, 30])
     @pytest.mark.parametrize("weighted", [False, True])
@@ -159,14 +138,6 @@ class TestForward:
         found = net.blocks[0](h.transpose(0, 1), None).transpose(0, 1)
         assert torch.allclose(found, expected, atol=1e-12)
 
-    def test_computes_in_its_own_dtype(self):
-        points, net = normalized(), network()
-        double = net(*points)
-        for single, exact in zip(net.float()(*points), double, strict=True):
-            assert single.dtype == torch.float64  # that of the points
-            assert torch.allclose(single, exact, atol=1e-4)
-            assert not torch.equal(single, exact)
-
     def test_training_and_evaluation_agree(self):
         """The statistics are always the sample's own."""
         net, points = network(), normalized()
@@ -181,16 +152,7 @@ class TestForward:
                 assert torch.allclose(alone[0], params[k], atol=1e-12)
 
 
-class TestBlindness:
-    @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.booleans(), st.randoms())
-    def test_order_does_not_matter(self, seed, num_points, weighted, random):
-        net, (points1, points2) = network(), normalized("handheld", 3, num_points, seed)
-        weights = uniform(3, num_points, low=0.1, seed=seed) if weighted else None
-        order = random.sample(range(num_points), num_points)
-        shuffled = net(points1[:, order], points2[:, order], None if weights is None else weights[:, order])
-        for found, expected in zip(shuffled, net(points1, points2, weights), strict=True):
-            assert (found - expected).abs().max() < 1e-10
-
+class TestSight:
     def test_each_view_is_on_its_own(self):
         net, (points1, points2) = network(), normalized()
         params1, params2 = net(points1, points2)
@@ -198,40 +160,6 @@ class TestBlindness:
         assert torch.equal(net(points1.flip(0) ** 2, points2)[1], params2)
         assert not torch.allclose(params1, params2, atol=1e-3)
 
-    def test_swapped_views_swap_the_answers(self):
-        net, (points1, points2), weights = network(), normalized(), uniform(6, 12)
-        for w in (None, weights):
-            (params1, params2), (swapped2, swapped1) = net(points1, points2, w), net(points2, points1, w)
-            assert torch.allclose(swapped1, params1, atol=1e-12)
-            assert torch.allclose(swapped2, params2, atol=1e-12)
-
-    @pytest.mark.parametrize("num_points", [8, 20])
-    @pytest.mark.parametrize("size", [1.0, 1e4])
-    def test_zero_weight_is_absence(self, num_points, size):
-        net, points = network(), normalized("handheld", 6, num_points)
-        weights = uniform(6, num_points, low=0.1)
-        junk = [uniform(6, 5, 2, low=-size, high=size, seed=seed) for seed in (1, 2)]
-        extended = [torch.cat(p, 1) for p in zip((*junk, 0 * weights[:, :5]), (*points, weights), strict=True)]
-        for found, expected in zip(net(*extended), net(*points, weights), strict=True):
-            assert torch.allclose(found, expected, atol=1e-10)
-
-    @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_equal_weights_are_none(self, factor, num_points):
-        net, points = network(), normalized("handheld", 6, num_points)
-        weights = torch.full((6, num_points), factor).double()
-        for found, expected in zip(net(*points, weights), net(*points), strict=True):
-            assert torch.allclose(found, expected, atol=1e-11)
-
-    def test_whole_weights_are_repetitions(self):
-        net, points = network(), normalized("handheld", 6, 9)
-        counts = torch.tensor([1, 2, 3, 1, 2, 1, 1, 4, 1])
-        repeated = [p.repeat_interleave(counts, 1) for p in points]
-        for found, expected in zip(net(*points, counts.double().expand(6, -1)), net(*repeated), strict=True):
-            assert torch.allclose(found, expected, atol=1e-10)
-
-
-class TestSight:
     def test_sees_the_points_and_the_weights(self):
         net, points = network(), normalized()
         (expected, _), weights = net(*points), uniform(6, 12)
@@ -246,12 +174,6 @@ class TestSight:
         blind = {f"blocks.{k}.{layer}.bias" for k in range(3) for layer in ("first", "second")}
         assert {name for name, gradient in largest.items() if gradient < 1e-12} == blind
         assert min(gradient for name, gradient in largest.items() if name not in blind) > 1e-6
-
-    def test_an_untrained_network_can_start_to_learn(self):
-        net = PaperNetwork(8, 2)
-        torch.cat(net(*normalized())).sum().backward()
-        assert net.head[-1].weight.grad.abs().sum() > 0
-        assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters())
 
     @pytest.mark.parametrize("num_points", [8, 10])
     def test_gradcheck(self, num_points):
@@ -272,72 +194,16 @@ class TestSight:
             assert torch.isfinite(gradient).all()
 
 
-class TestComposed:
-    """With Hartley's base and the paper's transform, as a normaliser."""
-
-    @pytest.mark.parametrize("num_points", [8, 20])
-    @pytest.mark.parametrize("weighted", [False, True])
-    def test_untrained_is_exactly_hartley(self, num_points, weighted, dtype):
-        points = [p.to(dtype) for p in correspondences("handheld", 5, num_points)]
-        weights = uniform(5, num_points, low=0.1) if weighted else None
-        expected = Hartley()(*(p.double() for p in points), weights)
-        for T, H in zip(composed(PaperNetwork(16, 3))(*points, weights), expected, strict=True):
-            assert torch.equal(T, H.to(dtype))
-
-    def test_transforms_are_those_of_the_paper(self):
-        """diag(alpha1, alpha2, 1) R(theta) of Hartley's coordinates."""
-        points, net = correspondences("driving", 5, 8), network()
-        for T, p, h in zip(composed(net)(*points), points, normalized("driving", 5, 8), strict=True):
-            H = numpy_hartley(p)
-            for k in range(5):
-                log1, log2, theta = numpy_params(net, h[k].numpy())
-                c, s = np.cos(theta), np.sin(theta)
-                rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-                expected = np.diag([np.exp(log1), np.exp(log2), 1]) @ rotation @ H[k]
-                np.testing.assert_allclose(T[k].detach().numpy(), expected, rtol=1e-8, atol=1e-10)
-
-    @given(
-        st.integers(0, 2**31),
-        st.sampled_from([8, 20]),
-        st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
-        st.tuples(*[st.floats(-2e3, 2e3)] * 4),
-    )
-    def test_scale_and_shift_of_either_view(self, seed, num_points, log_scales, shifts):
-        normalizer, points = composed(), correspondences("driving", 3, num_points, seed)
-        S = torch.eye(3).double().repeat(2, 1, 1)
-        S[:, 0, 0] = S[:, 1, 1] = 10 ** torch.tensor(log_scales).double()
-        S[:, :2, 2] = S[:, :1, 0] * torch.tensor(shifts).double().view(2, 2)
-        moved = [p @ s[:2, :2] + s[:2, 2] for p, s in zip(points, S, strict=True)]
-        with torch.no_grad():
-            pulled_back = S[1].mT @ find_fundamental(*moved, normalizer=normalizer) @ S[0]
-            expected = find_fundamental(*points, normalizer=normalizer)
-        assert up_to_sign(in_hartley(pulled_back, *points), in_hartley(expected, *points)) < 1e-6
-
-    def test_swapped_views_transpose_the_matrix(self):
-        normalizer, (points1, points2) = composed(), correspondences("driving", 20)
-        with torch.no_grad():
-            mirrored = find_fundamental(points2, points1, normalizer=normalizer).mT
-            F_mat = find_fundamental(points1, points2, normalizer=normalizer)
-        assert up_to_sign(in_hartley(mirrored, points1, points2), in_hartley(F_mat, points1, points2)) < 1e-8
-
-    def test_differs_from_hartley_once_trained(self):
-        points = correspondences("driving", 10)
-        with torch.no_grad():
-            found, hartley = (find_fundamental(*points, normalizer=n) for n in (composed(), Hartley()))
-        assert np.abs(in_hartley(found, *points) - in_hartley(hartley, *points)).max(axis=(1, 2)).min() > 1e-6
-
-    def test_round_trip(self, tmp_path):
-        normalizer = composed()
-        normalizer.save_pretrained(tmp_path / "weights.safetensors")
-        loaded = LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
-        assert (type(loaded.base), type(loaded.network)) == (Hartley, PaperNetwork)
-        assert (loaded.network.width, loaded.network.depth, loaded.network.num_parameters) == (16, 3, 3)
-        assert loaded.transform is paper_transform
-        assert not loaded.training
-        points = correspondences("driving", 5, 9)
-        for T, expected in zip(loaded(*points), normalizer(*points), strict=True):
-            assert torch.equal(T, expected)
-
-    def test_too_few_points(self):
-        with pytest.raises(ValueError, match="at least 8 correspondences are needed, got 7"):
-            composed()(torch.rand(2, 7, 2), torch.rand(2, 7, 2))
+def test_transforms_are_those_of_the_paper():
+    """diag(alpha1, alpha2, 1) R(theta) of Hartley's coordinates."""
+    points, net = correspondences("driving", 5, 8), network()
+    for T, p, h in zip(
+        LearnedNormalizer(Hartley(), net, paper_transform)(*points), points, normalized("driving", 5, 8), strict=True
+    ):
+        H = numpy_hartley(p)
+        for k in range(5):
+            log1, log2, theta = numpy_params(net, h[k].numpy())
+            c, s = np.cos(theta), np.sin(theta)
+            rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+            expected = np.diag([np.exp(log1), np.exp(log2), 1]) @ rotation @ H[k]
+            np.testing.assert_allclose(T[k].detach().numpy(), expected, rtol=1e-8, atol=1e-10)

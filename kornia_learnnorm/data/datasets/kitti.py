@@ -1,0 +1,86 @@
+"""KITTI odometry as frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_learnnorm.data.datasets.frames import Frame
+from kornia_learnnorm.data.datasets.splits import choose_sequences
+from kornia_learnnorm.data.datasets.textfiles import parse_numbers, rigid_motion, text_lines
+from kornia_learnnorm.data.images import image_size
+
+__all__ = ["read_kitti"]
+
+Array = NDArray[np.float64]
+
+
+def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera: str = "image_0") -> list[Frame]:
+    """Return the frames of the KITTI odometry benchmark (A. Geiger et al., CVPR 2012; conventions of its devkit).
+
+    Args:
+        root: folder with ``sequences/SS/calib.txt``, ``sequences/SS/image_N/*.png`` and ``poses/SS.txt``, metres.
+        sequences: names ``SS`` in the order to read; None for all.
+        camera: ``image_0`` and ``image_1`` are grey, ``image_2`` and ``image_3`` colour, left and right.
+
+    Returns:
+        the frames, sequence after sequence; poses are NaN for a sequence without a file of poses (11 to 21). The
+        size of an image that cannot be read is (0, 0).
+
+    Raises:
+        FileNotFoundError: if a folder, an image of a sequence or a ``calib.txt`` is missing.
+        ValueError: if a sequence or camera is unknown, a line is malformed, a frame lacks its pose, or the name of an
+            image is not a number.
+        TypeError: if ``sequences`` is a string.
+
+    """
+    root = Path(root)
+    if camera not in {f"image_{number}" for number in range(4)}:
+        raise ValueError(f"a camera of KITTI must be one of image_0 to image_3, got {camera!r}")
+    frames = []
+    for name, folder in choose_sequences("kitti", root, sequences).items():
+        K, shift = _camera(folder / "calib.txt", f"P{camera[-1]}")
+        path = root / "poses" / f"{name}.txt"
+        poses = _poses(path) if path.exists() else None
+        for number, image in _images(folder / camera):
+            if poses is not None and number not in poses:
+                raise ValueError(f"{path} has no line {number + 1}, the pose of {image}")
+            pose = np.full((4, 4), np.nan) if poses is None else poses[number] @ shift
+            frames.append(Frame(image, image.relative_to(root).as_posix(), name, image_size(image), K, pose))
+    return frames
+
+
+def _camera(path: Path, key: str) -> tuple[Array, Array]:
+    """Return a camera's matrix (3, 3) and its pose in camera 0 (4, 4) from its projection K (I | b)."""
+    for number, line in text_lines(path, "calibration"):
+        name, _, rest = line.partition(":")
+        if name.strip() != key:
+            continue
+        K, b = np.split(
+            parse_numbers(path, number, rest.split(), 12, f"{key}: and 12 numbers", line).reshape(3, 4), [3], 1
+        )
+        if min(K[0, 0], K[1, 1]) <= 0 or K[1, 0] or K[2].tolist() != [0, 0, 1]:
+            raise ValueError(f"{path}, line {number}: a camera matrix and a fourth column expected, got {line!r}")
+        return K, rigid_motion(np.eye(3), np.asarray(-np.linalg.solve(K, b)[:, 0], np.float64))
+    raise ValueError(f"{path} has no line '{key}: 12 numbers'")
+
+
+def _poses(path: Path) -> dict[int, Array]:
+    poses = {}
+    for number, line in text_lines(path, "poses"):
+        rows = parse_numbers(path, number, line.split(), 12, "the 12 numbers of a pose").reshape(3, 4)
+        poses[number - 1] = rigid_motion(rows[:, :3], rows[:, 3])
+    return poses
+
+
+def _images(folder: Path) -> list[tuple[int, Path]]:
+    images = list(folder.glob("*.png"))
+    if not images:
+        raise FileNotFoundError(f"no images *.png in {folder}")
+    for image in images:
+        if not (image.stem.isascii() and image.stem.isdecimal()):
+            raise ValueError(f"{image}: an image's name must be its frame's number, as in 000000.png")
+    return sorted((int(image.stem), image) for image in images)

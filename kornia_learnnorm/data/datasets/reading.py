@@ -1,0 +1,85 @@
+"""Reading a dataset by its name, and naming the ground truth that it lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kornia_learnnorm.data.datasets.cambridge import read_cambridge
+from kornia_learnnorm.data.datasets.colmap import read_colmap
+from kornia_learnnorm.data.datasets.folder import read_folder
+from kornia_learnnorm.data.datasets.frames import Frame
+from kornia_learnnorm.data.datasets.kitti import read_kitti
+from kornia_learnnorm.data.datasets.splits import sequence_folders, split_sequences
+from kornia_learnnorm.data.datasets.tum import read_tum
+
+__all__ = ["DATASETS", "missing_ground_truth", "read_dataset"]
+
+# name: title, reader, and the options that the reader takes
+DATASETS: dict[str, tuple[str, Callable[..., list[Frame]], tuple[str, ...]]] = {
+    "kitti": ("KITTI odometry", read_kitti, ("sequences", "split", "camera")),
+    "tum": ("TUM RGB-D", read_tum, ("sequences", "split", "max_difference")),
+    "cambridge": ("Cambridge Landmarks", read_cambridge, ("split",)),
+    "folder": ("images of", read_folder, ()),
+    "colmap": ("COLMAP model", lambda root, model: read_colmap(model, root), ("model",)),
+}
+
+
+def read_dataset(dataset: str, root: str | Path, **options: Any) -> list[Frame]:
+    """Return the frames of a dataset.
+
+    Args:
+        dataset: a key of :data:`DATASETS`.
+        root: folder of the dataset; for ``colmap`` the folder of the images.
+        **options: arguments of the dataset's reader, and ``split``, a split of
+            :data:`~kornia_learnnorm.data.datasets.splits.SPLITS`.
+
+    Raises:
+        ValueError: if the dataset is unknown, an option is not one of its reader, ``split`` comes with ``sequences``,
+            or as the reader says.
+        FileNotFoundError: if a folder or a file is missing.
+
+    """
+    if dataset not in DATASETS:
+        raise ValueError(f"a dataset must be one of {', '.join(DATASETS)}, got {dataset!r}")
+    _, read, known = DATASETS[dataset]
+    for name in options.keys() - set(known):
+        takers = " and ".join(key for key, (_, _, names) in DATASETS.items() if name in names) or "no dataset"
+        raise ValueError(f"{name} is for {takers}, got {dataset}")
+    if dataset == "colmap" and "model" not in options:
+        raise ValueError("colmap needs a model, the folder of cameras, images and points, got none")
+    if not Path(root).is_dir():
+        raise FileNotFoundError(f"no folder at {root}")
+    if "split" in options and "sequences" in known:
+        if "sequences" in options:
+            raise ValueError("sequences and split exclude each other, got both")
+        options["sequences"] = split_sequences(dataset, options.pop("split"), root)
+    return read(root, **options)
+
+
+def missing_ground_truth(dataset: str, root: str | Path, frames: Sequence[Frame]) -> list[str]:
+    """Return a line for each file and camera that a dataset lacks, without which pairs have no ground truth.
+
+    Args:
+        dataset: a key of :data:`DATASETS`; for ``folder`` and ``colmap`` there are no lines.
+        root: folder of the dataset.
+        frames: its frames, from :func:`read_dataset`.
+
+    """
+    root = Path(root)
+    sequences = {frame.sequence: frame for frame in frames}
+    wanted: dict[str, Path] = {}
+    lines = []
+    if dataset == "kitti":
+        wanted = {f"pose known for sequence {name}": root / "poses" / f"{name}.txt" for name in sequences}
+    elif dataset == "tum":
+        folders = sequence_folders("tum", root)
+        wanted = {f"pose known for sequence {name}": folders[name] / "groundtruth.txt" for name in sequences}
+        unknown = [name for name, frame in sequences.items() if not np.isfinite(frame.camera).all()]
+        lines = [f"no camera known for sequence {name}: its name has no fr1, fr2 or fr3" for name in unknown]
+    elif dataset == "cambridge":
+        wanted = {"camera known": root / "reconstruction.nvm"}
+    return lines + [f"no {what}: no file {path}" for what, path in wanted.items() if not path.exists()]

@@ -1,0 +1,105 @@
+"""TUM RGB-D as frames."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_learnnorm.data.datasets.frames import Frame
+from kornia_learnnorm.data.datasets.splits import choose_sequences
+from kornia_learnnorm.data.datasets.textfiles import (
+    camera_matrix,
+    listed_image,
+    parse_numbers,
+    rigid_motion,
+    rotation,
+    text_lines,
+)
+from kornia_learnnorm.data.images import image_size
+
+__all__ = ["read_tum"]
+
+Array = NDArray[np.float64]
+
+# fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3 of the three Kinects; https://cvg.cit.tum.de/data/datasets/rgbd-dataset,
+# file formats, calibration of the colour camera. The images of the third are already undistorted.
+KINECTS: dict[str, tuple[tuple[float, float, float, float], tuple[float, ...]]] = {
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+
+
+def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_difference: float = 0.02) -> list[Frame]:
+    """Return the frames of the TUM RGB-D benchmark (J. Sturm et al., IROS 2012; conventions of its file formats page).
+
+    Args:
+        root: a sequence's folder, with ``rgb.txt`` and ``groundtruth.txt``, metres, or a folder of sequences.
+        sequences: names of folders in the order to read; None for all.
+        max_difference: largest difference in time between a frame and its pose, seconds. A frame gets the nearest
+            pose, the earlier one of a tie.
+
+    Returns:
+        the frames, sequence after sequence, by time. Cameras are NaN unless the folder's name has ``freiburg1`` to
+        ``freiburg3`` or ``fr1`` to ``fr3`` in it; poses are NaN without ``groundtruth.txt`` or beyond
+        ``max_difference``. The size of an image that cannot be read is (0, 0).
+
+    Raises:
+        FileNotFoundError: if there is no sequence, or an image that ``rgb.txt`` lists is missing.
+        ValueError: if a sequence is unknown, a line malformed, a file is empty or ``max_difference`` is negative.
+        TypeError: if ``sequences`` is a string.
+
+    """
+    root = Path(root)
+    if not max_difference >= 0:
+        raise ValueError(f"max_difference must be zero or more seconds, got {max_difference}")
+    frames = []
+    for name, folder in choose_sequences("tum", root, sequences).items():
+        K, distortion = _camera(name)
+        times, poses = _trajectory(folder / "groundtruth.txt")
+        for time, listed in _images(folder):
+            # Stamps have microseconds; at 1e9 s float64 resolves a quarter of one, which must not decide on ties.
+            differences = np.abs(times - time).round(6)
+            known = len(times) > 0 and differences.min() <= max_difference
+            pose = poses[int(differences.argmin())] if known else np.full((4, 4), np.nan)
+            image, short = folder / listed, str(PurePosixPath(folder.relative_to(root), listed))
+            frames.append(Frame(image, short, name, image_size(image), K, pose, distortion))
+    return frames
+
+
+def _camera(name: str) -> tuple[Array, tuple[float, ...]]:
+    """Return the camera matrix (3, 3) and the distortion of a sequence; NaN and empty if its name does not tell."""
+    kinect = re.search(r"(?<![a-z])fr(?:eiburg)?([1-3])(?!\d)", name)
+    if kinect is None:
+        return np.full((3, 3), np.nan), ()
+    focal, distortion = KINECTS[kinect[1]]
+    return camera_matrix(*focal), distortion
+
+
+def _images(folder: Path) -> list[tuple[float, str]]:
+    path, images = folder / "rgb.txt", []
+    for number, line in text_lines(path, "list of images"):
+        time, _, listed = line.replace("\t", " ").partition(" ")
+        seconds = parse_numbers(path, number, [time] if listed else [], 1, "a timestamp and a file name", line)
+        images.append((float(seconds[0]), listed_image(path, number, listed.strip())))
+    if not images:
+        raise ValueError(f"{path} lists no images")
+    return sorted(images)
+
+
+def _trajectory(path: Path) -> tuple[Array, Array]:
+    """Return the times (N,) and the poses (N, 4, 4) by time; N = 0 without a file."""
+    if not path.exists():
+        return np.empty(0), np.empty((0, 4, 4))
+    rows = []
+    for number, line in text_lines(path, "poses"):
+        row = parse_numbers(path, number, line.split(), 8, "timestamp tx ty tz qx qy qz qw")
+        rows.append((row[0], rigid_motion(rotation(path, number, row[[7, 4, 5, 6]]), row[1:4])))
+    if not rows:
+        raise ValueError(f"{path} has no poses")
+    rows.sort(key=lambda row: row[0])
+    return np.array([time for time, _ in rows]), np.array([pose for _, pose in rows])

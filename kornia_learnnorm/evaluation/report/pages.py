@@ -1,0 +1,167 @@
+"""Report of a run as Markdown and as a self-contained HTML page; reads results and runs no model."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from kornia_learnnorm.evaluation.report.figures import report_figures
+from kornia_learnnorm.evaluation.report.formatting import Table
+from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_figures, hypothesis_tables
+from kornia_learnnorm.evaluation.report.rates import with_baseline
+from kornia_learnnorm.evaluation.report.robust import robust_tables
+from kornia_learnnorm.evaluation.report.style import Picture
+from kornia_learnnorm.evaluation.report.tables import report_tables
+from kornia_learnnorm.evaluation.robust.run import RobustRun, read_robust
+from kornia_learnnorm.evaluation.runs.manifest import read_section
+from kornia_learnnorm.evaluation.runs.run import Run, read_run
+from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.protocol import RATIO
+
+__all__ = ["Report", "write_report"]
+
+GREY = "#808890"  # lines and letters of a picture in its own file: legible on white and on black
+PAGE_STYLE = """
+:root { color-scheme: light dark; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem;
+       color: light-dark(#1d2329, #dfe5ea); background: light-dark(#fff, #14181d); }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 13px; }
+th, td { padding: 0.25rem 0.6rem; text-align: right; white-space: nowrap;
+         border-bottom: 1px solid light-dark(#d8dee4, #333b44); }
+th:first-child, td:first-child { text-align: left; }
+th { white-space: normal; vertical-align: bottom; }
+.wide { overflow-x: auto; }
+svg { width: 100%; height: auto; font-family: system-ui, sans-serif; }
+"""
+
+
+class Report(NamedTuple):
+    """A written report.
+
+    Attributes:
+        tables: all tables.
+        missing: results that the run does not have yet.
+    """
+
+    tables: list[Table]
+    missing: list[str]
+
+
+def write_report(folder: str | Path) -> Report:
+    """Write ``report.md``, ``report.html`` and the pictures into the folder of a run.
+
+    Args:
+        folder: folder that ``learnnorm evaluate --out``, ``learnnorm robust --out`` or both wrote.
+
+    Returns:
+        the tables, and what is missing.
+
+    Raises:
+        FileNotFoundError: if the run does not exist or is not complete.
+        ValueError: if a file of the run is damaged.
+        ImportError: if Matplotlib is not installed.
+
+    """
+    folder = Path(folder)
+    about: list[str] = []
+    tables: list[Table] = []
+    pictures: list[Picture] = []
+    missing: list[str] = []
+    robust = read_robust(folder)
+    if robust is None or read_section(folder, "evaluate") is not None:
+        run = with_baseline(read_run(folder))
+        about.append(_about_run(run))
+        tables += report_tables(run)
+        pictures += report_figures(run)
+        missing += run.missing
+    if robust is not None:
+        about.append(_about_robust(robust))
+        tables += [*robust_tables(robust), *hypothesis_tables(robust)]
+        pictures += hypothesis_figures(robust)
+        missing += robust.missing
+    for picture in pictures:
+        _write(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", GREY))
+    _write(folder / "report.md", _markdown(about, tables, pictures))
+    _write(folder / "report.html", _html(about, tables, pictures))
+    return Report(tables, missing)
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _about_run(run: Run) -> str:
+    """Return what a run of predictions consists of."""
+    about = run.about
+    most = about["max_samples"]
+    samples = "All samples" if most is None else f"At most {most} random samples"
+    return (
+        f"Stores: {_stores(about)}. Methods: {', '.join(about['methods'])}. {samples} of each store, filtered by the "
+        f"ratio test (the nearest descriptor is less than {RATIO:g} times as far as the second nearest) and "
+        f"unfiltered, seed {about['seed']}. {', '.join(_versions(about))}.{_missing(run.missing)}"
+    )
+
+
+def _about_robust(run: RobustRun) -> str:
+    """Return what a run of robust estimators consists of."""
+    about = run.about
+    identities: dict[str, str | None] = about["estimators"]
+    absent = [name for name, identity in identities.items() if identity is None]
+    peers = {identity for name, identity in identities.items() if identity and " " in identity and ":" not in name}
+    versions = ", ".join(dict.fromkeys([*_versions(about), *sorted(peers)]))
+    not_installed = f" Left out, since not installed: {', '.join(absent)}." if absent else ""
+    return (
+        f"Robust estimation: {_stores(about)}; {_pairs(about['pairs'])} of each store, {about['seeds']} runs on each "
+        f"pair from seed {about['seed']} ({about['slow_seeds']} of the slow estimators), hypotheses of "
+        f"{_pairs(about['hypotheses'])}; PyTorch on {about['threads']} threads; {versions}.{not_installed}"
+        f"{_missing(run.missing)}"
+    )
+
+
+def _stores(about: dict[str, Any]) -> str:
+    return "; ".join(f"`{name}`: {text}" for name, text in about["stores"].items())
+
+
+def _versions(about: dict[str, Any]) -> list[str]:
+    return [f"{name} {version}" for name, version in about["versions"].items()]
+
+
+def _pairs(number: int) -> str:
+    return f"at most {number} evenly spaced image pairs" if number else "all image pairs"
+
+
+def _missing(missing: Sequence[str]) -> str:
+    return f" Not there yet, so left out: {'; '.join(missing)}." if missing else ""
+
+
+def _markdown(about: Sequence[str], tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
+    parts = ["# Evaluation", *about]
+    parts += [f"## {t.title}\n\n{t.text}\n\n{format_table(t.header, t.rows)}" for t in tables]
+    parts += [f"## {p.title}\n\n{p.text}\n\n![{p.title}]({p.name}.svg)" for p in pictures]
+    return "\n\n".join(parts) + "\n"
+
+
+def _html(about: Sequence[str], tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
+    body = ["<h1>Evaluation</h1>", *(f"<p>{_inline(text)}</p>" for text in about)]
+    for table in tables:
+        rows = "".join(_row("td", row) for row in table.rows)
+        grid = f"<table><thead>{_row('th', table.header)}</thead><tbody>{rows}</tbody></table>"
+        body.append(f'<h2>{_inline(table.title)}</h2><p>{_inline(table.text)}</p><div class="wide">{grid}</div>')
+    body += [f"<h2>{_inline(p.title)}</h2><p>{_inline(p.text)}</p><figure>{p.svg}</figure>" for p in pictures]
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>Evaluation</title>'
+    head += f"<style>{PAGE_STYLE}</style>"
+    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>\n'
+
+
+def _row(tag: str, cells: Sequence[str]) -> str:
+    return "<tr>" + "".join(f"<{tag}>{_inline(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+
+def _inline(text: str) -> str:
+    """Return a text as HTML, with the parts in backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))

@@ -1,0 +1,101 @@
+r"""The relative pose of two cameras from a fundamental matrix.
+
+A pose is :math:`X_2 = R X_1 + t` for points in space; the length of :math:`t` is unknown.
+"""
+
+from __future__ import annotations
+
+import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from kornia.geometry.epipolar import essential_from_fundamental, motion_from_essential
+from torch import Tensor
+
+from kornia_learnnorm.geometry.checks import check_mask, check_tensor, solve_dtype
+
+__all__ = ["relative_pose"]
+
+
+def relative_pose(
+    F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    r"""Return the pose of the second camera that a fundamental matrix and known cameras give.
+
+    :math:`E = K_2^\top F K_1` has four poses; the one with most correspondences in front of both cameras is taken.
+
+    Args:
+        F_mat: fundamental matrices with shape :math:`(B, 3, 3)`, any scale.
+        K1: cameras of the first images with shape :math:`(B, 3, 3)`.
+        K2: cameras of the second images with shape :math:`(B, 3, 3)`.
+        points1: pixels in the first images with shape :math:`(B, N, 2)`.
+        points2: pixels in the second images with shape :math:`(B, N, 2)`.
+        mask: true for the correspondences that vote, inliers say, boolean with shape :math:`(B, N)`; default: all.
+
+    Returns:
+        rotations with shape :math:`(B, 3, 3)` and unit translations with shape :math:`(B, 3)`, solved in float64 where
+        the device has it, in the dtype of ``F_mat``. Both are NaN where ``F_mat`` is not finite or of rank below two,
+        or where two poses tie for the most votes.
+
+    Raises:
+        TypeError: if a tensor is not floating-point or the mask is not boolean.
+        ShapeError: if a shape is wrong.
+        ValueError: if the points do not pair up, the batches differ, or the mask does not fit the points.
+        torch.linalg.LinAlgError: if a camera is singular.
+
+    Reference:
+        R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2004, section 9.6.
+
+    Example:
+        >>> from kornia_learnnorm.data.synthetic import handheld
+        >>> scene = handheld(2, 20, torch.Generator().manual_seed(0))
+        >>> R, t = relative_pose(scene.F_mat, scene.K1, scene.K2, scene.points1, scene.points2)
+        >>> bool((R - scene.R).abs().max() < 1e-6)
+        True
+
+    """
+    _check(F_mat, K1, K2, points1, points2, mask)
+    dtype, work = F_mat.dtype, solve_dtype(F_mat.device)
+    F_mat, K1, K2, points1, points2 = (value.to(work) for value in (F_mat, K1, K2, points1, points2))
+    E_mat = essential_from_fundamental(F_mat, K1, K2)
+    E_mat = torch.where(E_mat.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), E_mat, 0.0)
+    R, t = motion_from_essential(E_mat)
+    t = t[..., 0]
+    front = _in_front(R, t, _rays(points1, K1), _rays(points2, K2))
+    votes = (front if mask is None else front & mask[:, None]).sum(-1)
+    first, second = votes.topk(2).values.unbind(-1)
+    known = (first > second) & (torch.linalg.matrix_rank(E_mat) >= 2)
+    row, best = torch.arange(len(R), device=R.device), votes.argmax(-1)
+    R = torch.where(known[:, None, None], R[row, best], torch.nan)
+    return R.to(dtype), torch.where(known[:, None], t[row, best], torch.nan).to(dtype)
+
+
+def _check(F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None) -> None:
+    named = {"F_mat": F_mat, "K1": K1, "K2": K2, "points1": points1, "points2": points2}
+    for name, value in named.items():
+        check_tensor(name, value, ["B", "N", "2"] if name.startswith("points") else ["B", "3", "3"])
+    if points1.shape != points2.shape:
+        raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
+    sizes = {name: len(value) for name, value in named.items()}
+    if len(set(sizes.values())) > 1:
+        raise ValueError(f"all must be of one batch, got {sizes}")
+    if mask is not None:
+        check_mask(mask, points1, points2)
+
+
+def _rays(points: Tensor, K: Tensor) -> Tensor:
+    """Return directions of pixels, ``(B, 1, N, 3)``."""
+    rays: Tensor = torch.linalg.solve(K, convert_points_to_homogeneous(points).mT)
+    return rays.mT[:, None]
+
+
+def _in_front(R: Tensor, t: Tensor, rays1: Tensor, rays2: Tensor) -> Tensor:
+    """Return whether the depths of z2 x2 = z1 R x1 + t are positive; crossed with one ray, it leaves the other's depth.
+
+    Poses ``(B, 4, 3, 3)`` and ``(B, 4, 3)``, rays ``(B, 1, N, 3)``, booleans ``(B, 4, N)``.
+    """
+    turned = rays1 @ R.mT
+    t = t[..., None, :]
+    normal = torch.linalg.cross(rays2, turned)
+    depth1 = (torch.linalg.cross(t, rays2) * normal).sum(-1)  # times the squared length of the normal
+    depth2 = (torch.linalg.cross(t, turned) * normal).sum(-1)
+    front: Tensor = (depth1 > 0) & (depth2 > 0)
+    return front

@@ -1,0 +1,143 @@
+r"""The linear problem of one set of correspondences: normalised and solved once, then handed down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from torch import Tensor
+
+from kornia_learnnorm.geometry.checks import solve_dtype
+from kornia_learnnorm.geometry.linear import MIN_GAP, design_matrix, independence_gap, null_vector, solve_null_vector
+from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental
+
+__all__ = ["LinearProblem"]
+
+
+@dataclass
+class LinearProblem:
+    r"""Correspondences in Hartley's coordinates and the null matrix of their design matrix.
+
+    Built once per call, from checked input, by :meth:`from_points`. The null matrix is solved when it is first asked
+    for. Eight points have an exact null vector, so it is carried to other coordinates,
+    :math:`F' = R_2^{-\top} F R_1^{-1}`; with more points it minimises another sum of squares there and is solved again.
+
+    Attributes:
+        points1: pixels in the first view, (B, N, 2), float64 where the device has it.
+        points2: pixels in the second view.
+        weights: weights, (B, N), or None.
+        T1: Hartley's transform of the first view, (B, 3, 3).
+        T2: Hartley's transform of the second view.
+        x1: homogeneous points of the first view in Hartley's coordinates, (B, N, 3).
+        x2: homogeneous points of the second view.
+        solution: null matrix and relative gap, once solved.
+
+    Example:
+        >>> _ = torch.manual_seed(0)
+        >>> problem = LinearProblem.from_points(torch.rand(2, 8, 2) * 600, torch.rand(2, 8, 2) * 600)
+        >>> problem.null_matrix.shape, problem.determined
+        (torch.Size([2, 3, 3]), tensor([True, True]))
+
+    """
+
+    points1: Tensor
+    points2: Tensor
+    weights: Tensor | None
+    T1: Tensor
+    T2: Tensor
+    x1: Tensor
+    x2: Tensor
+    solution: tuple[Tensor, Tensor] | None = None
+
+    @classmethod
+    def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> LinearProblem:
+        r"""Return the problem of correspondences, in float64 where the device has it.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, checked.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+
+        """
+        dtype = solve_dtype(points1.device)
+        points1, points2, weights = points1.to(dtype), points2.to(dtype), None if weights is None else weights.to(dtype)
+        T1, T2 = hartley_transform(points1, weights), hartley_transform(points2, weights)
+        x1 = convert_points_to_homogeneous(points1) @ T1.mT
+        x2 = convert_points_to_homogeneous(points2) @ T2.mT
+        return cls(points1, points2, weights, T1, T2, x1, x2)
+
+    @property
+    def null_matrix(self) -> Tensor:
+        """The DLT's solution before the rank-2 constraint in Hartley's coordinates, unit norm, (B, 3, 3)."""
+        return self._solve()[0]
+
+    @property
+    def gap(self) -> Tensor:
+        """Relative gap that tells how well the points determine the null matrix, (B,); see ``solve_null_vector``."""
+        return self._solve()[1]
+
+    @property
+    def determined(self) -> Tensor:
+        """Whether the null matrix is unique, (B,) bool."""
+        return self.gap > MIN_GAP
+
+    def _solve(self) -> tuple[Tensor, Tensor]:
+        if self.solution is None:
+            h, gap = solve_null_vector(design_matrix(self.x1, self.x2), self.weights)
+            self.solution = torch.unflatten(h, -1, (3, 3)), gap
+        return self.solution
+
+    def null_matrix_in(self, T1: Tensor, T2: Tensor) -> Tensor:
+        r"""Return the null matrix in the coordinates :math:`T_i x_i`, unit norm.
+
+        Args:
+            T1: transforms of pixels of the first view with shape :math:`(B, 3, 3)`, invertible.
+            T2: transforms of pixels of the second view.
+
+        Returns:
+            matrices with shape :math:`(B, 3, 3)`, sign arbitrary.
+
+        """
+        if T1 is self.T1 and T2 is self.T2:
+            return self.null_matrix
+        if self.points1.shape[1] == 8:
+            R1, R2 = self.T1 @ torch.linalg.inv_ex(T1)[0], self.T2 @ torch.linalg.inv_ex(T2)[0]
+            F = transform_fundamental(self.null_matrix, R1, R2)
+            # A null matrix without gradient must not get one by way of Hartley's transforms either.
+            F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
+            carried: Tensor = F / torch.linalg.matrix_norm(F, keepdim=True)
+            return carried
+        x1, x2 = convert_points_to_homogeneous(self.points1), convert_points_to_homogeneous(self.points2)
+        return torch.unflatten(null_vector(design_matrix(x1 @ T1.mT, x2 @ T2.mT), self.weights), -1, (3, 3))
+
+    def select(self, rows: Tensor) -> LinearProblem:
+        """Return the problem of some of the sets, solved if this one is.
+
+        Args:
+            rows: their indices, or a mask.
+
+        """
+        return self._changed(lambda value: value[rows])
+
+    def detach(self, rows: Tensor) -> LinearProblem:
+        """Return the same problem, where some of the sets send no gradient.
+
+        Args:
+            rows: which sets, boolean with shape :math:`(B,)`.
+
+        """
+        return self._changed(lambda v: torch.where(rows.view(-1, *[1] * (v.ndim - 1)), v.detach(), v))
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> LinearProblem:
+        return LinearProblem(
+            change(self.points1),
+            change(self.points2),
+            None if self.weights is None else change(self.weights),
+            change(self.T1),
+            change(self.T2),
+            change(self.x1),
+            change(self.x2),
+            None if self.solution is None else (change(self.solution[0]), change(self.solution[1])),
+        )

@@ -1,0 +1,153 @@
+"""Bootstrap over image pairs: intervals of means, and paired comparisons of two methods."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["PairedDifference", "bootstrap_interval", "bootstrap_means", "paired_bootstrap", "percentile_interval"]
+
+
+def bootstrap_interval(
+    values: Tensor, groups: Tensor, level: float = 0.95, draws: int = 2000, seed: int = 0
+) -> tuple[float, float]:
+    """Return the percentile bootstrap interval of a mean whose samples come in groups.
+
+    Samples of one image pair share its motion and scene, so the groups are drawn with replacement, each with all its
+    samples (the cluster bootstrap).
+
+    Args:
+        values: one value per sample with shape (S,).
+        groups: index of each sample's group, its image pair, with shape (S,), integers.
+        level: share of the draws within the interval.
+        draws: number of draws.
+        seed: seed of the draws.
+
+    Returns:
+        lower and upper end.
+
+    Raises:
+        ValueError: if the shapes differ, there are fewer than two groups, or ``level`` is not between 0 and 1.
+
+    Reference:
+        A. Davison, D. Hinkley, Bootstrap Methods and their Application, 1997, sections 3.8 and 5.3.
+
+    Example:
+        >>> bootstrap_interval(torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([0, 0, 1, 1]))
+        (0.0, 1.0)
+
+    """
+    return percentile_interval(bootstrap_means(values, groups, draws, seed), level)
+
+
+def percentile_interval(means: Tensor, level: float = 0.95) -> tuple[float, float]:
+    """Return the lower and upper end of the middle share ``level`` of a bootstrap's draws.
+
+    Args:
+        means: what :func:`bootstrap_means` returns.
+        level: share of the draws within the interval.
+
+    Raises:
+        ValueError: if ``level`` is not between 0 and 1.
+
+    Example:
+        >>> percentile_interval(torch.arange(5.0), 0.5)
+        (1.0, 3.0)
+
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level must be between 0 and 1, got {level}")
+    return means.quantile((1 - level) / 2).item(), means.quantile((1 + level) / 2).item()
+
+
+def bootstrap_means(values: Tensor, groups: Tensor, draws: int = 2000, seed: int = 0) -> Tensor:
+    """Return the mean of each draw of whole groups with replacement, (draws,) float64.
+
+    Args:
+        values: one value per sample with shape (S,).
+        groups: index of each sample's group with shape (S,), integers.
+        draws: number of draws.
+        seed: seed of the draws.
+
+    Raises:
+        ValueError: if the shapes differ or there are fewer than two groups.
+
+    Example:
+        >>> means = bootstrap_means(torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([0, 0, 1, 1]))
+        >>> means.unique().tolist()
+        [0.0, 0.5, 1.0]
+
+    """
+    if values.shape != groups.shape or values.ndim != 1:
+        raise ValueError(f"values and groups must be two (S,) tensors, got {[*values.shape]} and {[*groups.shape]}")
+    present, group = torch.unique(groups, return_inverse=True)
+    if len(present) < 2:
+        raise ValueError(f"at least two groups are needed, got {len(present)}")
+    counts = torch.bincount(group).double()
+    sums = torch.zeros_like(counts).index_add_(0, group, values.double())
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.randint(len(present), (draws, len(present)), generator=generator).to(counts.device)
+    return sums[drawn].sum(1) / counts[drawn].sum(1)
+
+
+class PairedDifference(NamedTuple):
+    """How far the mean of one method is above another's on the same samples.
+
+    Attributes:
+        mean: mean of ``values - baseline`` over samples.
+        low: lower end of its bootstrap interval.
+        high: upper end.
+        p_value: two-sided p-value of no difference.
+    """
+
+    mean: float
+    low: float
+    high: float
+    p_value: float
+
+
+def paired_bootstrap(
+    values: Tensor, baseline: Tensor, groups: Tensor, level: float = 0.95, draws: int = 2000, seed: int = 0
+) -> PairedDifference:
+    r"""Compare the means of two methods on the same samples by drawing whole image pairs with replacement.
+
+    The p-value is that of the percentile interval which just reaches zero: with :math:`\bar d^*` the mean difference of
+    a draw, :math:`p = 2 (1 + \min(|\{\bar d^* \le 0\}|, |\{\bar d^* \ge 0\}|)) / (1 + \text{draws})`, at most one. No
+    number of draws makes it smaller than ``2 / (1 + draws)``.
+
+    Args:
+        values: one number per sample with shape (S,), or per image pair.
+        baseline: numbers of the other method for the samples with shape (S,).
+        groups: index of each sample's image pair with shape (S,), integers.
+        level: share of the draws within the interval.
+        draws: number of draws.
+        seed: seed of the draws.
+
+    Returns:
+        the mean difference, its interval of :func:`~kornia_learnnorm.bootstrap_interval`, and the p-value.
+
+    Raises:
+        ValueError: if the shapes differ, a difference is not finite (drop such samples of both methods and count them),
+            there are fewer than two groups, or ``level`` is not between 0 and 1.
+
+    Reference:
+        A. Davison, D. Hinkley, Bootstrap Methods and their Application, 1997, chapters 4 and 5.
+
+    Example:
+        >>> values, groups = torch.tensor([0.9, 0.8, 0.7, 0.9]), torch.arange(4)
+        >>> paired_bootstrap(values, values - 0.25, groups)
+        PairedDifference(mean=0.25, low=0.25, high=0.25, p_value=0.00099...)
+
+    """
+    if values.shape != baseline.shape or values.ndim != 1:
+        raise ValueError(f"values must be two (S,) tensors, got {[*values.shape]} and {[*baseline.shape]}")
+    difference = values.double() - baseline.double()
+    bad = int((~difference.isfinite()).sum())
+    if bad:
+        raise ValueError(f"differences must be finite, got {bad} NaN or infinite ones of {len(difference)}")
+    means = bootstrap_means(difference, groups, draws, seed)
+    low, high = percentile_interval(means, level)
+    fewest = min(int((means <= 0).sum()), int((means >= 0).sum()))
+    return PairedDifference(difference.mean().item(), low, high, min(1.0, 2 * (1 + fewest) / (1 + draws)))

@@ -1,0 +1,108 @@
+r"""The contract of a normaliser, and how the solver calls one.
+
+A normaliser is any callable ``(points1, points2, weights=None) -> (T1, T2)``: pixels :math:`(B, N, 2)` of both views
+and optional weights :math:`(B, N)` go in, two transforms :math:`(B, 3, 3)` come out. It may also offer
+``transforms(problem)``, which takes a solved :class:`~kornia_learnnorm.geometry.problem.LinearProblem` instead, so that
+nothing is checked or solved twice. :class:`ProblemNormalizer` turns that method into the contract.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor, nn
+
+from kornia_learnnorm.geometry.checks import check_correspondences, is_true
+from kornia_learnnorm.geometry.problem import LinearProblem
+
+__all__ = ["ProblemNormalizer", "normalizing_transforms", "transforms_of"]
+
+Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
+
+
+class ProblemNormalizer(nn.Module):
+    """Base of the normalisers that compute their transforms from a linear problem.
+
+    Attributes:
+        min_points: smallest number of correspondences.
+    """
+
+    min_points = 1
+
+    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        r"""Return the transforms of both views.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, float32 or float64.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+
+        Returns:
+            two affine transforms with shape :math:`(B, 3, 3)` in the dtype of the points.
+
+        Raises:
+            TypeError: if the points are not float32 or float64 tensors of one dtype.
+            ShapeError: if a shape is wrong.
+            ValueError: if there are too few correspondences, a value is not finite, or a weight is negative.
+
+        """
+        check_correspondences(points1, points2, weights, self.min_points)
+        T1, T2 = self.transforms(LinearProblem.from_points(points1, points2, weights))
+        return T1.to(points1.dtype), T2.to(points1.dtype)
+
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+        """Return the transforms :math:`(B, 3, 3)` of both views.
+
+        Args:
+            problem: the correspondences, checked.
+
+        """
+        raise NotImplementedError
+
+
+def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+    """Call a normaliser on a problem: its ``transforms`` where it has that method, else the contract.
+
+    Args:
+        normalizer: a module or function.
+        problem: the correspondences.
+
+    Returns:
+        whatever it returns.
+
+    Raises:
+        TypeError: if it cannot be called.
+
+    """
+    if isinstance(normalizer, type) or not callable(normalizer):
+        raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
+    if hasattr(normalizer, "transforms"):
+        found: tuple[Tensor, Tensor] = normalizer.transforms(problem)
+        return found
+    return normalizer(problem.points1, problem.points2, problem.weights)
+
+
+def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+    """Call a normaliser, which may be the user's own, and check what it returns.
+
+    Args:
+        normalizer: a module or function.
+        problem: the correspondences.
+
+    Returns:
+        two transforms with shape :math:`(B, 3, 3)` in the dtype of the problem.
+
+    Raises:
+        TypeError: if it cannot be called.
+        ValueError: if it does not return two finite transforms :math:`(B, 3, 3)`.
+
+    """
+    result = transforms_of(normalizer, problem)
+    expected = (len(problem.points1), 3, 3)
+    shapes = [tuple(getattr(T, "shape", ())) for T in result] if isinstance(result, tuple | list) else [type(result)]
+    if shapes != [expected, expected]:
+        raise ValueError(f"a normalizer must return two transforms of shape {expected}, got {shapes}")
+    T1, T2 = result
+    if is_true(~(T1.isfinite().all() & T2.isfinite().all())):
+        raise ValueError(f"the transforms of {type(normalizer).__name__} are not finite")
+    return T1.to(problem.x1), T2.to(problem.x1)

@@ -1,0 +1,109 @@
+"""Cambridge Landmarks, against the layout that make_sequences.py writes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from make_sequences import FOCAL, FRAMES, SIZE, STEP, edit, moved, rotated
+
+from kornia_learnnorm.data.datasets.cambridge import read_cambridge
+
+
+def test_frames(written):
+    frames = read_cambridge(written / "cambridge")
+    assert [frame.name for frame in frames] == [f"seq{s}/frame{n + 1:05}.png" for s in (1, 2) for n in range(FRAMES)]
+    for number, frame in enumerate(frames):
+        assert frame.sequence == frame.name[:4]
+        assert frame.size == SIZE
+        assert np.allclose(frame.K, [[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1]])
+        assert np.allclose(frame.pose, moved(STEP * (number % FRAMES)), atol=1e-8)
+
+
+@pytest.mark.parametrize(("split", "folder"), [("train", "seq1"), ("test", "seq2")])
+def test_split(written, split, folder):
+    assert {frame.sequence for frame in read_cambridge(str(written / "cambridge"), split)} == {folder}
+
+
+def test_convention(cambridge):
+    # Points of the world go to the camera by x = R(q) (X - C), as DSAC* and hloc read these files.
+    rng = np.random.default_rng(0)
+    q, C, points = rng.normal(size=4), rng.normal(size=3), rng.normal(size=(6, 3))
+    q /= np.linalg.norm(q)
+    edit(cambridge / "dataset_train.txt", 4, f"seq1/frame00001.png {' '.join(map(repr, [*C.tolist(), *q.tolist()]))}")
+    world_to_camera = np.linalg.inv(read_cambridge(cambridge, "train")[0].pose)
+    assert np.allclose(points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3], rotated(q, points - C))
+
+
+def test_without_reconstruction(cambridge):
+    edit(cambridge / "reconstruction.nvm", 4, None)
+    edit(cambridge / "reconstruction.nvm", 3, "7")
+    frames = read_cambridge(cambridge, "train")
+    assert np.isnan(frames[0].K).all()
+    assert np.isfinite(frames[1].K).all()
+    (cambridge / "reconstruction.nvm").unlink()
+    assert all(np.isnan(frame.K).all() for frame in read_cambridge(cambridge))
+
+
+def test_suffix_of_the_reconstruction(cambridge):
+    path = cambridge / "reconstruction.nvm"
+    path.write_text(path.read_text().replace(".jpg", ".png"))
+    assert np.isfinite(read_cambridge(cambridge)[0].K).all()
+
+
+def test_an_unreadable_image_has_no_camera(cambridge):
+    (cambridge / "seq1/frame00001.png").write_bytes(b"")
+    frame = read_cambridge(cambridge)[0]
+    assert frame.size == (0, 0)
+    assert np.isnan(frame.K).all()
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "text", "message"),
+    [
+        (
+            "dataset_train.txt",
+            5,
+            "seq1/frame00002.png 1 2 3",
+            r"dataset_train\.txt, line 5: ImageFile X Y Z W P Q R",
+        ),
+        ("dataset_test.txt", 4, "seq2/frame00001.png 0 0 0 0 0 0 0", "line 4: a quaternion other than zero expected"),
+        (
+            "dataset_train.txt",
+            5,
+            "seq1/frame00001.png 0 0 0 1 0 0 0",
+            "line 5: seq1/frame00001.png is listed twice",
+        ),
+        ("reconstruction.nvm", 1, "NVM_V3 FixedK 1 2 3 4 5", r"reconstruction\.nvm, line 1: NVM_V3 expected"),
+        ("reconstruction.nvm", 3, "many", "line 3: the number of images expected, got 'many'"),
+        ("reconstruction.nvm", 3, "99", r"reconstruction\.nvm, line 13: an image, its focal length"),
+        ("reconstruction.nvm", 5, "seq1/frame00002.jpg 1 2", r"line 5: an image, its focal length"),
+        ("reconstruction.nvm", 5, "a.jpg 0 1 0 0 0 0 0 0 0 0", r"line 5: a positive focal length expected, got 0"),
+    ],
+)
+def test_malformed(cambridge, file, line, text, message):
+    edit(cambridge / file, line, text)
+    with pytest.raises(ValueError, match=message):
+        read_cambridge(cambridge)
+
+
+def test_truncated_reconstruction(cambridge):
+    (cambridge / "reconstruction.nvm").write_text("NVM_V3\n\n3\n")
+    with pytest.raises(ValueError, match=r"reconstruction\.nvm announces 3 images and has 0"):
+        read_cambridge(cambridge)
+    (cambridge / "reconstruction.nvm").write_text("NVM_V3\n")
+    with pytest.raises(ValueError, match="the number of images expected, got ''"):
+        read_cambridge(cambridge)
+
+
+def test_missing(cambridge):
+    with pytest.raises(ValueError, match="'train', 'test' or None for both, got 'val'"):
+        read_cambridge(cambridge, "val")
+    edit(cambridge / "dataset_train.txt", 5, "seq1/none.png 0 0 0 1 0 0 0")
+    with pytest.raises(FileNotFoundError, match=r"dataset_train\.txt, line 5: no image at .*none\.png"):
+        read_cambridge(cambridge)
+    (cambridge / "dataset_train.txt").write_text("a\nb\n\n")
+    with pytest.raises(ValueError, match=r"dataset_train\.txt lists no images"):
+        read_cambridge(cambridge)
+    (cambridge / "dataset_train.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no list of images at .*dataset_train\.txt"):
+        read_cambridge(cambridge)

@@ -1,0 +1,50 @@
+"""Folders of images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from make_sequences import SIZE
+
+from kornia_learnnorm.data.datasets.folder import read_folder
+from kornia_learnnorm.data.datasets.pairs import pair_frames
+
+
+def test_frames(written):
+    frames = read_folder(written / "folder")
+    assert [(frame.sequence, frame.name) for frame in frames] == [
+        ("", "a.png"),
+        ("", "b.PNG"),
+        ("left", "left/1.jpg"),
+        ("left", "left/2.JPG"),
+        ("left/deep", "left/deep/1.bmp"),
+        ("right", "right/1.tif"),
+        ("right", "right/2.webp"),
+    ]
+    for frame in frames:
+        assert frame.size == SIZE
+        assert np.isnan(frame.K).all()
+        assert np.isnan(frame.pose).all()
+
+
+def test_a_folder_within_does_not_part_its_sequence(tmp_path):
+    for name in ("s/1.png", "s/2/1.png", "s/3.png", "s-1/1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / name).touch()
+    pairs = pair_frames(read_folder(str(tmp_path)))
+    assert [(pair.frame1.name, pair.frame2.name) for pair in pairs] == [("s/1.png", "s/3.png")]
+
+
+def test_hidden(tmp_path):
+    for name in (".thumbs/1.png", "._1.png", "1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    frames = read_folder(tmp_path)
+    assert [(frame.name, frame.size) for frame in frames] == [("1.png", (0, 0))]
+
+
+def test_missing(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no images \(\.bmp, .*\) in "):
+        read_folder(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no folder at .*none"):
+        read_folder(tmp_path / "none")

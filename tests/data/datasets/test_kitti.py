@@ -1,0 +1,132 @@
+"""KITTI odometry, against the layout that make_sequences.py writes."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from make_sequences import FRAMES, KITTI_BASELINES, KITTI_K, SIZE, STEP, edit, moved
+
+from kornia_learnnorm.data.datasets.kitti import read_kitti
+
+
+def test_frames(written):
+    frames = read_kitti(written / "kitti")
+    assert [frame.sequence for frame in frames] == [s for s in ("00", "06", "11") for _ in range(FRAMES)]
+    assert [frame.name for frame in frames[:2]] == [f"sequences/00/image_0/{n:06}.png" for n in range(2)]
+    for frame in frames:
+        assert frame.path == written / "kitti" / frame.name
+        assert frame.size == SIZE
+        assert frame.distortion == ()
+        assert np.array_equal(frame.K, KITTI_K)
+
+
+def test_poses(written):
+    frames = read_kitti(str(written / "kitti"), ["06", "11"])
+    for number, frame in enumerate(frames[:FRAMES]):
+        assert np.allclose(frame.pose, moved(STEP * number), atol=1e-8)
+    assert all(np.isnan(frame.pose).all() for frame in frames[FRAMES:])
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_other_cameras_stand_beside_the_first(written, number):
+    frames = read_kitti(written / "kitti", ["00"], f"image_{number}")
+    assert np.allclose(frames[1].pose, moved(STEP + KITTI_BASELINES[number]), atol=1e-8)
+
+
+def test_a_point_of_the_world_projects_through_every_camera(kitti):
+    # From the definition: x_N = P_N X for X in camera 0, with any fourth column and any pose.
+    rng = np.random.default_rng(0)
+    b, (R, _) = rng.normal(size=3), np.linalg.qr(rng.normal(size=(3, 3)))
+    R, t = R * np.linalg.det(R), rng.normal(size=3)
+    P = np.column_stack([KITTI_K, b])
+    edit(kitti / "sequences/00/calib.txt", 3, "P2: " + " ".join(map(repr, P.ravel().tolist())))
+    edit(kitti / "poses/00.txt", 1, " ".join(map(repr, np.column_stack([R, t]).ravel().tolist())))
+    frame = read_kitti(kitti, ["00"], "image_2")[0]
+    point = np.array([0.2, -0.4, 3.0])
+    world = R @ point + t
+    through = frame.K @ (np.linalg.inv(frame.pose) @ [*world, 1])[:3]
+    assert np.allclose(through, P @ [*point, 1])
+
+
+def test_given_order(written):
+    assert [frame.sequence for frame in read_kitti(written / "kitti", ["06", "00"])][::FRAMES] == ["06", "00"]
+
+
+def test_line_number_is_the_frame_number(kitti):
+    (kitti / "sequences/00/image_0/000001.png").unlink()
+    assert np.allclose(read_kitti(kitti, ["00"])[1].pose, moved(2 * STEP), atol=1e-8)
+
+
+def test_frames_are_in_order_of_their_numbers(kitti):
+    folder = kitti / "sequences/00/image_0"
+    (folder / "000003.png").rename(folder / "10.png")
+    (folder / "000000.png").rename(folder / "9.png")
+    shutil.rmtree(kitti / "poses")
+    assert [frame.path.stem for frame in read_kitti(kitti, ["00"])] == ["000001", "000002", "9", "10"]
+
+
+def test_an_unreadable_image_is_kept(kitti):
+    (kitti / "sequences/00/image_0/000001.png").write_bytes(b"")
+    frames = read_kitti(kitti, ["00"])
+    assert [frame.size for frame in frames] == [SIZE, (0, 0), SIZE, SIZE]
+
+
+@pytest.mark.parametrize("text", ["1 2 3", "1 0 0 nan 0 1 0 0 0 0 1 0", "a b", "1 " * 13])
+def test_malformed_pose(kitti, text):
+    edit(kitti / "poses/00.txt", 2, text)
+    with pytest.raises(ValueError, match=rf"00\.txt, line 2: the 12 numbers of a pose expected, got '{text[:3]}"):
+        read_kitti(kitti, ["00"])
+
+
+@pytest.mark.parametrize(("line", "text"), [(FRAMES, None), (FRAMES, "")])
+def test_too_few_poses(kitti, line, text):
+    edit(kitti / "poses/00.txt", line, text)
+    with pytest.raises(ValueError, match=rf"00\.txt has no line {FRAMES}, the pose of .*000003\.png"):
+        read_kitti(kitti, ["00"])
+
+
+def test_calibration(kitti):
+    path = kitti / "sequences/00/calib.txt"
+    edit(path, 2, "P1: 1 2 3")
+    assert len(read_kitti(kitti, ["00"])) == FRAMES
+    with pytest.raises(ValueError, match=r"calib\.txt, line 2: P1: and 12 numbers expected, got 'P1: 1 2 3'"):
+        read_kitti(kitti, ["00"], "image_1")
+    edit(path, 2, "P1: " + "0 " * 12)
+    with pytest.raises(ValueError, match=r"calib\.txt, line 2: a camera matrix and a fourth column expected"):
+        read_kitti(kitti, ["00"], "image_1")
+    edit(path, 2, None)
+    with pytest.raises(ValueError, match=r"calib\.txt has no line 'P1: 12 numbers'"):
+        read_kitti(kitti, ["00"], "image_1")
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match=r"calib\.txt is not a text file in UTF-8"):
+        read_kitti(kitti, ["00"])
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"no calibration at .*calib\.txt"):
+        read_kitti(kitti, ["00"])
+
+
+def test_images(kitti):
+    folder = kitti / "sequences/00/image_0"
+    (folder / "000003.png").rename(folder / "left3.png")
+    with pytest.raises(ValueError, match=r"left3\.png: an image's name must be its frame's number"):
+        read_kitti(kitti, ["00"])
+    shutil.rmtree(folder)
+    with pytest.raises(FileNotFoundError, match=r"no images \*\.png in .*image_0"):
+        read_kitti(kitti, ["00"])
+
+
+def test_wrong_arguments(written, tmp_path):
+    with pytest.raises(ValueError, match=r"no sequence '07' at .*, there are 00, 06, 11"):
+        read_kitti(written / "kitti", ["07"])
+    with pytest.raises(ValueError, match=r"each once, got \['00', '00'\]"):
+        read_kitti(written / "kitti", ["00", "00"])
+    with pytest.raises(ValueError, match=r"one name or more, each once, got \[\]"):
+        read_kitti(written / "kitti", [])
+    with pytest.raises(TypeError, match="a list of names, got the string '00'"):
+        read_kitti(written / "kitti", "00")
+    with pytest.raises(ValueError, match="image_0 to image_3, got 'image_4'"):
+        read_kitti(written / "kitti", camera="image_4")
+    with pytest.raises(FileNotFoundError, match=r"no folder .*sequences"):
+        read_kitti(tmp_path)

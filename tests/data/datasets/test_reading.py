@@ -1,0 +1,98 @@
+"""Reading datasets by their names, and the ground truth of real and written ones."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from make_sequences import STEP
+
+from kornia_learnnorm.data.datasets.frames import FramePair
+from kornia_learnnorm.data.datasets.pairs import choose_pairs, pair_frames
+from kornia_learnnorm.data.datasets.reading import read_dataset
+
+FR3 = "rgbd_dataset_freiburg3_long_office_household"
+
+
+def epipoles_agree(pair: FramePair) -> bool:
+    """The wall moves sideways only: with the true F, y stays and any shift in x is allowed."""
+    x1 = np.array([[20.0, 30, 1], [90, 80, 1], [140, 10, 1]])
+    x2 = x1 - np.array([STEP, 0, 0])
+    return bool(np.abs((x2 @ pair.F * x1).sum(1)).max() < 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "options", "count"),
+    [
+        ("kitti", {"sequences": ["06"], "camera": "image_3"}, 4),
+        ("kitti", {"split": "test"}, 4),
+        ("tum", {"split": "val"}, 4),
+        ("cambridge", {"split": "test"}, 4),
+    ],
+)
+def test_ground_truth_fits_the_images(written, dataset, options, count):
+    frames = read_dataset(dataset, written / dataset, **options)
+    assert len(frames) == count
+    if dataset != "tum":  # its wall is turned
+        assert all(epipoles_agree(pair) for pair in pair_frames(frames))
+
+
+@pytest.mark.parametrize(
+    ("dataset", "options", "message"),
+    [
+        ("kiti", {}, "must be one of kitti, tum, cambridge, folder, colmap, got 'kiti'"),
+        ("kitti", {"colour": True}, "colour is for no dataset, got kitti"),
+    ],
+)
+def test_wrong_arguments(written, dataset, options, message):
+    with pytest.raises(ValueError, match=message):
+        read_dataset(dataset, written, **options)
+    with pytest.raises(FileNotFoundError, match=r"no folder at .*none"):
+        read_dataset("folder", written / "none")
+
+
+def test_points_in_common_need_a_model(written):
+    frames = read_dataset("kitti", written / "kitti")
+    with pytest.raises(ValueError, match="min_points 5 needs a COLMAP model, got none"):
+        choose_pairs(frames, min_points=5)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "options", "store", "count"),
+    [
+        ("kitti", {"sequences": ["06"]}, "kitti_06", 50),
+        # That store takes the nearest pose whatever the difference, 0.067 s for the first frame.
+        ("tum", {"sequences": [FR3], "max_difference": 0.1}, "tum_fr3_office", 19),
+    ],
+)
+def test_real_data(dataset, options, store, count):
+    """Cameras, motions and F are those of stores that other code made of the same frames."""
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    data = os.environ.get("LEARNNORM_DATA")
+    if data is None:
+        pytest.skip("LEARNNORM_DATA does not name a folder of real data")
+    pairs = {
+        (pair.frame1.path.name, pair.frame2.path.name): pair
+        for pair in pair_frames(read_dataset(dataset, Path(data) / dataset, **options))
+    }
+    with h5py.File(Path(data) / "correspondences" / f"{store}.h5") as file:
+        rows = [(row, tuple(names)) for row, names in enumerate(file["names"].asstr()[:]) if tuple(names) in pairs]
+        assert len(rows) == len(pairs) == count
+        for row, names in rows:
+            pair = pairs[names]
+            R, t = pair.motion
+            assert np.allclose(pair.F, file["F"][row], rtol=0, atol=1e-6)
+            assert np.allclose(np.stack([pair.frame1.K, pair.frame2.K]), file["K"][row], rtol=0, atol=1e-6)
+            assert np.allclose(R, file["R"][row], rtol=0, atol=1e-6)
+            assert np.allclose(t, file["t"][row], rtol=0, atol=1e-6)
+            assert [pair.frame1.size, pair.frame2.size] == [tuple(size) for size in file["image_size"][row]]
+
+
+def test_real_frame_without_a_pose_near_enough():
+    data = os.environ.get("LEARNNORM_DATA")
+    if data is None:
+        pytest.skip("LEARNNORM_DATA does not name a folder of real data")
+    known = [bool(np.isfinite(frame.pose).all()) for frame in read_dataset("tum", Path(data) / "tum")]
+    assert known == [False] + [True] * 19  # the motion capture starts 0.067 s after the first frame

@@ -1,0 +1,153 @@
+"""TUM RGB-D, against the layout that make_sequences.py writes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from make_sequences import FRAMES, STEP, TUM_START, edit, moved, rotated
+from PIL import Image
+
+from kornia_learnnorm.data.datasets.tum import read_tum
+
+FR1 = "rgbd_dataset_freiburg1_wall"
+FR3 = "rgbd_dataset_freiburg3_long_office_household"
+
+
+def test_frames(written):
+    frames = read_tum(written / "tum")
+    assert [frame.sequence for frame in frames] == [FR1] * FRAMES + [FR3] * FRAMES
+    assert frames[0].name == f"{FR1}/rgb/{TUM_START:.6f}.png"
+    assert all(frame.path == written / "tum" / frame.name and frame.size == (640, 480) for frame in frames)
+
+
+def test_cameras(written):
+    first, third = read_tum(written / "tum")[:: 2 * FRAMES - 1]
+    assert np.array_equal(first.K, [[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
+    assert first.distortion == (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    assert np.array_equal(third.K, [[535.4, 0, 320.1], [0, 539.2, 247.6], [0, 0, 1]])
+    assert third.distortion == ()
+
+
+def test_unknown_camera(tum):
+    (tum / FR1).rename(tum / "mine")
+    frame = read_tum(tum, ["mine"])[0]
+    assert np.isnan(frame.K).all()
+    assert frame.distortion == ()
+
+
+@pytest.mark.parametrize(("name", "known"), [("fr1_wall", True), ("tum-fr1", True), ("fr10", False), ("afr1", False)])
+def test_camera_is_told_by_the_name(tum, name, known):
+    (tum / FR1).rename(tum / name)
+    assert np.isfinite(read_tum(tum, [name])[0].K).all() == known
+
+
+def test_a_sequence_alone(written, monkeypatch):
+    frames = read_tum(written / "tum" / FR3)
+    assert frames[0].name == f"rgb/{TUM_START:.6f}.png"
+    assert frames[0].sequence == FR3
+    monkeypatch.chdir(written / "tum" / FR3)
+    assert [frame.sequence for frame in read_tum(".", [FR3])] == [FR3] * FRAMES
+    assert read_tum(".")[0].camera[0, 0] == 535.4
+
+
+def test_the_nearest_pose(written):
+    turn = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    for number, frame in enumerate(read_tum(written / "tum" / FR3)):
+        assert np.allclose(frame.pose, turn @ moved(STEP * number, 535.4), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "expected"),
+    [
+        ([-0.01, 0.01], 0),  # a tie: the earlier
+        ([0.01, -0.01], 1),  # unsorted
+        ([-0.011, 0.01], 1),
+        ([0.02], 0),  # at the limit
+        ([0.020001], None),
+        ([-5.0, 5.0], None),
+    ],
+)
+def test_association(tum, stamps, expected):
+    lines = [f"{TUM_START + stamp:.6f} {index} 0 0 0 0 0 1" for index, stamp in enumerate(stamps)]
+    (tum / FR1 / "groundtruth.txt").write_text("\n".join(lines))
+    x = read_tum(tum, [FR1])[0].pose[0, 3]
+    assert np.isnan(x) if expected is None else x == expected
+
+
+def test_max_difference(written):
+    assert np.isnan(read_tum(written / "tum", max_difference=0.001)[0].pose).all()
+    for wrong in (-0.1, float("nan")):
+        with pytest.raises(ValueError, match=f"zero or more seconds, got {wrong}"):
+            read_tum(written / "tum", max_difference=wrong)
+
+
+@given(seed=st.integers(0, 2**32 - 1), norm=st.floats(0.01, 100))
+def test_quaternions(tmp_path_factory, seed, norm):
+    root = tmp_path_factory.getbasetemp() / "quaternion"
+    root.mkdir(exist_ok=True)
+    rng = np.random.default_rng(seed)
+    q, t, points = rng.normal(size=4), rng.normal(size=3), rng.normal(size=(5, 3))
+    q /= np.linalg.norm(q)
+    (root / "rgb.txt").write_text("1.0 a.png\n")
+    Image.new("L", (4, 3)).save(root / "a.png")
+    values = [*t.tolist(), *(norm * q[[1, 2, 3, 0]]).tolist()]
+    (root / "groundtruth.txt").write_text("1.0 " + " ".join(map(repr, values)))
+    pose = read_tum(root)[0].pose
+    assert np.allclose(points @ pose[:3, :3].T + pose[:3, 3], rotated(q, points) + t)
+    assert np.array_equal(pose[3], [0, 0, 0, 1])
+
+
+def test_images_are_in_order_of_time(tum):
+    path = tum / FR1 / "rgb.txt"
+    path.write_text("\n".join(reversed(path.read_text().splitlines())))
+    frames = read_tum(tum, [FR1])
+    assert [frame.name for frame in frames] == sorted(frame.name for frame in frames)
+
+
+def test_no_ground_truth(tum):
+    (tum / FR1 / "groundtruth.txt").unlink()
+    frames = read_tum(tum)
+    assert np.isnan([frame.pose for frame in frames[:FRAMES]]).all()
+    assert np.isfinite([frame.pose for frame in frames[FRAMES:]]).all()
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "text", "message"),
+    [
+        ("rgb.txt", 3, "12.5", r"rgb\.txt, line 3: a timestamp and a file name expected, got '12\.5'"),
+        ("rgb.txt", 4, "noon rgb/1.png", r"line 4: a timestamp and a file name expected, got 'noon rgb/1\.png'"),
+        (
+            "groundtruth.txt",
+            2,
+            "1 2 3",
+            r"groundtruth\.txt, line 2: timestamp tx ty tz qx qy qz qw expected, got '1",
+        ),
+        ("groundtruth.txt", 3, "1 2 3 4 0 0 0 inf", "line 3: timestamp tx"),
+        ("groundtruth.txt", 3, "1 2 3 4 0 0 0 0", "line 3: a quaternion other than zero expected"),
+    ],
+)
+def test_malformed(tum, file, line, text, message):
+    edit(tum / FR1 / file, line, text)
+    with pytest.raises(ValueError, match=message):
+        read_tum(tum, [FR1])
+
+
+def test_missing(tum, tmp_path):
+    edit(tum / FR1 / "rgb.txt", 3, "12.5 rgb/none.png")
+    with pytest.raises(FileNotFoundError, match=r"rgb\.txt, line 3: no image at .*none\.png"):
+        read_tum(tum)
+    (tum / FR1 / "rgb.txt").write_text("# nothing\n")
+    with pytest.raises(ValueError, match=r"rgb\.txt lists no images"):
+        read_tum(tum)
+    (tum / FR3 / "groundtruth.txt").write_text("# nothing\n")
+    with pytest.raises(ValueError, match=r"groundtruth\.txt has no poses"):
+        read_tum(tum / FR3)
+    with pytest.raises(ValueError, match=f"no sequence 'desk' at .*, there are {FR1}, {FR3}"):
+        read_tum(tum, ["desk"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"no rgb\.txt in .*empty, nor in a folder in it"):
+        read_tum(tmp_path / "empty")
+    with pytest.raises(FileNotFoundError, match=r"no folder at .*none"):
+        read_tum(tmp_path / "none")

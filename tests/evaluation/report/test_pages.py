@@ -1,0 +1,94 @@
+"""Reports as Markdown and HTML."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.evaluation.report.pages import write_report
+from kornia_learnnorm.evaluation.robust.run import read_robust
+from kornia_learnnorm.evaluation.runs import example
+
+matplotlib = pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
+
+
+def test_files(copied, capsys):
+    assert main(["report", str(copied)]) == 0
+    assert "Better than Hartley" in capsys.readouterr().out
+    text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
+    for name in re.findall(r"\]\(([\w-]+\.svg)\)", text):
+        ElementTree.parse(copied / name)
+    assert page.count("<svg") == text.count(".svg)") == 7
+    assert not re.findall(r'(?:src|href)="(?!#)', page)  # nothing from elsewhere
+    identifiers = re.findall(r'\bid="([^"]+)"', page)
+    assert len(identifiers) == len(set(identifiers))
+    for reference in re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', page):
+        assert "".join(reference) in identifiers
+
+
+def test_without_the_baseline(copied, capsys):
+    for protocol in ("filtered", "unfiltered"):
+        (copied / "scenes" / protocol / "Hartley.npz").unlink()
+    assert main(["report", str(copied)]) == 2
+    assert "compares with Hartley, the run has predictions of Hartley+LM, " in capsys.readouterr().err
+
+
+def test_not_a_run(tmp_path, capsys):
+    assert main(["report", str(tmp_path)]) == 2
+    assert "no run at" in capsys.readouterr().err
+
+
+def test_what_is_there_of_a_run(copied, capsys):
+    """Of a run that was stopped, with what was left out."""
+    for path in ("scenes/filtered/crossview", "scenes/unfiltered/samples", "sizes/none"):
+        (copied / f"{path}.npz").unlink()
+    assert main(["report", str(copied)]) == 0
+    left = "crossview on scenes, filtered; all methods on scenes, unfiltered; none by the number of correspondences"
+    assert f"not there yet, so left out: {left}" in capsys.readouterr().err
+    assert f"Not there yet, so left out: {left}." in (copied / "report.md").read_text()
+    (copied / "example.npz").unlink()
+    assert write_report(copied).missing[-1] == "the example of a pair"
+    assert "Figure 11" not in (copied / "report.md").read_text()
+
+
+def test_robust_estimators(robust_copied):
+    settings = dict(matplotlib.rcParams)
+    write_report(robust_copied)
+    assert dict(matplotlib.rcParams) == settings
+    text, page = (robust_copied / "report.md").read_text(), (robust_copied / "report.html").read_text()
+    for title in ("kitti_06, filtered (Table 2)", "unfiltered (Table 3)", "## Pose and time", "## Best of k"):
+        assert title in text
+    assert "as printed: Ranftl and Koltun" in text
+    assert page.count("<svg") == text.count(".svg)") == 2
+    assert {path.stem for path in robust_copied.glob("*.svg")} == {"hypotheses-1", "hypotheses-1-relative"}
+
+
+def test_robust_estimators_beside_predictions(robust_copied, robust_store, monkeypatch):
+    monkeypatch.setattr(example, "TRIALS", 5)
+    options = ["--methods", "Hartley", "--max-samples", "50"]
+    assert main(["evaluate", str(robust_store), "--out", str(robust_copied), *options]) == 0
+    write_report(robust_copied)
+    text = (robust_copied / "report.md").read_text()
+    assert "Better than Hartley, filtered (Table 1)" in text
+    assert "unfiltered (Table 3)" in text
+
+
+def test_incomplete_robust_run(robust_copied):
+    (robust_copied / "robust/kitti_06/filtered/1px/RANSAC.npz").unlink()
+    (robust_copied / "hypotheses/kitti_06/unfiltered/Hartley.npz").unlink()
+    about = json.loads((robust_copied / "robust.json").read_text())
+    about["estimators"]["poselib"] = None
+    (robust_copied / "robust.json").write_text(json.dumps(about))
+    lacking = ["RANSAC (kitti_06, filtered)", "hypotheses of Hartley (kitti_06, unfiltered)"]
+    assert write_report(robust_copied).missing == lacking
+    text = (robust_copied / "report.md").read_text()
+    assert "; ".join(lacking) in text
+    assert "Left out, since not installed: poselib." in text
+    assert "| poselib" not in text
+    cells = read_robust(robust_copied).cells
+    assert "RANSAC" not in cells[0].estimates
+    assert "RANSAC" in cells[1].estimates

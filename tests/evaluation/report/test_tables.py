@@ -1,0 +1,76 @@
+"""Tables of a run of predictions."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_tables
+from kornia_learnnorm.evaluation.report.robust import robust_tables
+from kornia_learnnorm.evaluation.report.tables import report_tables
+from kornia_learnnorm.evaluation.robust.run import read_robust
+from kornia_learnnorm.evaluation.runs.run import read_run
+
+
+def test_rates_are_those_of_the_samples(run):
+    found = read_run(run)
+    cell = found.cells[0]
+    own = {name: prediction["own"].numpy() for name, prediction in cell.predictions.items()}
+    table = report_tables(found)[0]
+    for row in table.rows:
+        if row[0] in own and row[0] != "Hartley":
+            assert row[2].startswith(f"{100 * np.mean(own[row[0]] < own['Hartley']):.1f} [")
+    assert table.header[2] == f"scenes: {len(cell.pair)} of {cell.drawn}"
+    assert {row[0]: row[1] for row in table.rows}["crossview"] == "kitti_00, kitti_01, kitti_03"
+    raw = np.load(run / "scenes" / "filtered" / "samples.npz")["plain_residual"]
+    assert len(cell.pair) == (raw < 60).sum()
+
+
+def test_accuracy_and_tests(run):
+    tables = {table.title: table for table in report_tables(read_run(run))}
+    rows = {row[0]: row for row in tables["Fit and accuracy: scenes, filtered"].rows}
+    assert float(rows["Hartley+LM"][1]) < float(rows["Hartley"][1]) < float(rows["none"][1])
+    tests = {row[0]: row for row in tables["Paired tests: scenes, filtered"].rows}
+    assert tests["none"][1].startswith("+")
+    assert tests["Hartley+LM"][1].startswith("-")
+    assert len(tables["By motion: scenes, filtered"].rows) == 8
+    assert 0 < len(tables["Worst failures: scenes, filtered"].rows) <= 10
+
+
+def without_truth(run, robust):
+    truth = ("truth", "heldout", "f1", "error", "rotation_error", "translation_error")
+    robust_results = [r for cell in robust.cells for e in cell.estimates.values() for r in e.values()]
+    hypotheses = [h for cell in robust.cells for h in cell.hypotheses.values()]
+    for results in (*(p for cell in run.cells for p in cell.predictions.values()), *robust_results, *hypotheses):
+        for key in results.keys() & truth:
+            results[key][:] = torch.nan
+    for values in run.pairs["scenes"].values():
+        if values.dtype.kind == "f":
+            values[:] = np.nan
+    return run, robust
+
+
+def of_one_pair(run, robust):
+    cells = []
+    for cell in run.cells:
+        kept = cell.pair == cell.pair[0]
+        predictions = {name: {key: v[kept] for key, v in p.items()} for name, p in cell.predictions.items()}
+        cells.append(dataclasses.replace(cell, pair=cell.pair[kept], predictions=predictions))
+    for cell in robust.cells:
+        for results in (*(r for e in cell.estimates.values() for r in e.values()), *cell.hypotheses.values()):
+            results.update({key: values[:1] for key, values in results.items()})
+    return dataclasses.replace(run, cells=cells), robust
+
+
+@pytest.mark.parametrize("change", [without_truth, of_one_pair])
+def test_unknown_numbers_are_empty_cells(run, robust_run, change):
+    found, robust = change(read_run(run), read_robust(robust_run))
+    tables = [*report_tables(found), *robust_tables(robust), *hypothesis_tables(robust)]
+    cells = [cell for table in tables for row in table.rows for cell in row]
+    assert len(tables) >= 20
+    assert "" in cells
+    assert not [cell for cell in cells if re.search("nan|inf", cell)]

@@ -1,0 +1,148 @@
+"""The linear problem: solved once, carried to other coordinates, and handed down through the layer."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.autograd import gradcheck
+from torch.overrides import TorchFunctionMode
+from two_view import correspondences, homogeneous, numpy_hartley, signless, uniform, up_to_sign
+
+from kornia_learnnorm import EightPoint, LearnedNormalizer, ReweightedWhitening, Whitening, find_fundamental
+from kornia_learnnorm.geometry import checks
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.transforms import affine_transform, unit_fundamental
+
+READS = {"__bool__", "item", "__int__", "__float__", "tolist", "nonzero", "is_nonzero", "__len__"} - {"__len__"}
+
+
+class Calls(TorchFunctionMode):
+    """Counts the calls of torch by name."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = Counter()
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        self.names[getattr(function, "__name__", str(function))] += 1
+        return function(*args, **(kwargs or {}))
+
+
+def null_matrices(points1, points2, T1, T2) -> np.ndarray:
+    """The last right singular vectors of the design matrices, solved in the coordinates of the transforms."""
+    x1 = homogeneous(points1.numpy()) @ np.asarray(T1).swapaxes(-1, -2)
+    x2 = homogeneous(points2.numpy()) @ np.asarray(T2).swapaxes(-1, -2)
+    A = (x2[..., :, None] * x1[..., None, :]).reshape(*x1.shape[:2], 9)
+    return np.linalg.svd(A, full_matrices=True)[2][:, -1].reshape(-1, 3, 3)
+
+
+class TestLinearProblem:
+    @pytest.mark.parametrize("num_points", [8, 20])
+    def test_agrees_with_numpy(self, num_points):
+        points = correspondences("handheld", 10, num_points)
+        problem = LinearProblem.from_points(*points)
+        T1, T2 = (numpy_hartley(p) for p in points)
+        assert np.allclose(problem.T1, T1)
+        assert np.allclose(problem.x2, homogeneous(points[1].numpy()) @ T2.swapaxes(-1, -2))
+        assert up_to_sign(problem.null_matrix, null_matrices(*points, T1, T2)) < 1e-8
+        assert problem.determined.all()
+
+    @pytest.mark.parametrize("num_points", [8, 20])
+    @given(entries=st.lists(st.floats(-0.5, 0.5), min_size=4, max_size=4), shift=st.floats(-2, 2))
+    def test_other_coordinates(self, num_points, entries, shift):
+        points = correspondences("handheld", 5, num_points)
+        problem = LinearProblem.from_points(*points)
+        linear = torch.eye(2, dtype=torch.float64) + torch.tensor(entries, dtype=torch.float64).view(2, 2)
+        if torch.linalg.cond(linear) > 10:
+            return
+        move = affine_transform(linear, torch.full((2,), shift, dtype=torch.float64))
+        T1, T2 = move @ problem.T1, move.flip(0, 1).mT.triu() @ problem.T2
+        T2 = move.inverse() @ problem.T2
+        assert up_to_sign(problem.null_matrix_in(T1, T2), null_matrices(*points, T1, T2)) < 1e-7
+
+    @pytest.mark.parametrize("num_points", [8, 12])
+    def test_gradcheck(self, num_points):
+        def in_whitened(x1, x2):
+            problem = LinearProblem.from_points(x1, x2)
+            return signless(problem.null_matrix_in(*Whitening().transforms(problem)))
+
+        points = [p.requires_grad_() for p in correspondences("handheld", 2, num_points)]
+        assert gradcheck(in_whitened, points, eps=1e-6, atol=1e-5, rtol=1e-3)
+
+    def test_gap_of_a_noisy_plane(self):
+        """A rank test passes a plane with noise; the gap says how little it means."""
+        plane = uniform(20, 12, 2, high=500)
+        moved = plane @ torch.tensor([[1.1, 0.1], [-0.2, 0.9]], dtype=torch.float64) + 5
+        exact, noisy = (
+            LinearProblem.from_points(plane, moved + size * uniform(20, 12, 2, low=-1, seed=1)) for size in (0.0, 0.01)
+        )
+        scene = LinearProblem.from_points(*correspondences("handheld", 20, 12))
+        assert not exact.determined.any()
+        assert noisy.determined.all()
+        assert noisy.gap.max() < 0.1 * scene.gap.median()
+
+    def test_select_and_detach(self):
+        points = [p.requires_grad_() for p in correspondences("handheld", 4, 10)]
+        problem = LinearProblem.from_points(*points, uniform(4, 10, low=0.1))
+        problem.null_matrix  # noqa: B018 (solved before it is cut)
+        part = problem.select(torch.tensor([2, 0]))
+        assert torch.equal(part.null_matrix, problem.null_matrix[[2, 0]])
+        assert torch.equal(part.weights, problem.weights[[2, 0]])
+        held = problem.detach(torch.tensor([True, False, False, True]))
+        gradient = torch.autograd.grad(signless(held.null_matrix).sum(), points[0])[0]
+        assert gradient.flatten(1).any(1).tolist() == [False, True, True, False]
+
+
+class TestOnePath:
+    """A forward of eights through the whole layer."""
+
+    @pytest.mark.parametrize("normalizer", [ReweightedWhitening(), LearnedNormalizer.from_pretrained()])
+    def test_solved_once(self, normalizer, monkeypatch):
+        validations = []
+        validate = checks.check_correspondences
+        for module in ("estimators.eight_point", "estimators.fundamental", "normalizers.contract", "geometry.rank2"):
+            monkeypatch.setattr(
+                f"kornia_learnnorm.{module}.check_correspondences",
+                lambda *args: (validations.append(1), validate(*args))[1],
+            )
+        points = correspondences("handheld", 64)
+        with torch.no_grad(), Calls() as calls:
+            EightPoint(normalizer)(*points)
+        assert calls.names["qr"] + calls.names["linalg_qr"] == 1
+        assert len(validations) == 1
+        assert sum(calls.names[name] for name in READS) <= 3
+
+    def test_undetermined_samples_are_solved_apart(self):
+        points1, points2 = correspondences("handheld", 64)
+        points1[5] = points1[5, :1]
+        with torch.no_grad(), Calls() as calls:
+            EightPoint(LearnedNormalizer.from_pretrained())(points1, points2)
+        assert calls.names["qr"] + calls.names["linalg_qr"] == 1
+
+    def test_two_decompositions_of_small_matrices(self):
+        """One for both lines of the rank-2 correction, one for the projection, one for the first reweighted lines."""
+        with torch.no_grad(), Calls() as calls:
+            EightPoint(LearnedNormalizer.from_pretrained())(*correspondences("handheld", 64))
+        assert calls.names["svd"] + calls.names["linalg_svd"] <= 3
+
+
+class TestSign:
+    @pytest.mark.parametrize("num_points", [8, 30])
+    @given(seed=st.integers(0, 2**20))
+    def test_does_not_depend_on_the_order(self, num_points, seed):
+        points = correspondences("handheld", 20, num_points)
+        order = torch.randperm(num_points, generator=torch.Generator().manual_seed(seed))
+        F_mat, shuffled = find_fundamental(*points), find_fundamental(*(p[:, order] for p in points))
+        assert (F_mat - shuffled).abs().max() < 1e-6
+
+    @given(seed=st.integers(0, 2**20), size=st.floats(-1e-13, 1e-13))
+    def test_does_not_depend_on_rounding_under_pure_translation(self, seed, size):
+        x, y, z = uniform(3, low=-1, seed=seed).tolist()
+        F_mat = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+        moved = -F_mat + size * uniform(3, 3, low=-1, seed=seed + 1)
+        assert (unit_fundamental(F_mat) - unit_fundamental(moved)).abs().max() < 1e-6
