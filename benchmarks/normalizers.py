@@ -27,9 +27,9 @@ points1, points2 = scenes.points1.to(args.device, torch.float32), scenes.points2
 normalizers = {
     "Hartley": kln.Hartley(),
     "whitening": kln.Whitening(),
-    "reweighted whitening": kln.ReweightedWhitening(),
-    "learned: paper": kln.LearnedNormalizer.from_pretrained("paper").to(args.device),
-    "learned: crossview": kln.LearnedNormalizer.from_pretrained().to(args.device),
+    "reweighted": kln.ReweightedWhitening(),
+    "paper": kln.LearnedNormalizer.from_pretrained("paper").to(args.device),
+    "crossview": kln.LearnedNormalizer.from_pretrained().to(args.device),
 }
 methods = {"kornia (Hartley)": lambda: find_fundamental(points1, points2)}
 for name, normalizer in normalizers.items():

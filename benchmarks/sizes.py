@@ -26,11 +26,11 @@ ransac = kln.RANSAC(seed=0)
 methods = {
     "Hartley": kln.EightPoint(),
     "whitening": kln.EightPoint(kln.Whitening()),
-    "reweighted whitening": kln.EightPoint(kln.ReweightedWhitening()),
-    "learned: paper": kln.EightPoint(kln.LearnedNormalizer.from_pretrained("paper")),
-    "learned: crossview": kln.EightPoint(kln.LearnedNormalizer.from_pretrained()),
-    "learned: crossview-synthetic": kln.EightPoint(kln.LearnedNormalizer.from_pretrained("crossview-synthetic")),
-    "Hartley, optimal correction": kln.EightPoint(rank2="optimal"),
+    "reweighted": kln.EightPoint(kln.ReweightedWhitening()),
+    "paper": kln.EightPoint(kln.LearnedNormalizer.from_pretrained("paper")),
+    "crossview": kln.EightPoint(kln.LearnedNormalizer.from_pretrained()),
+    "crossview-synthetic": kln.EightPoint(kln.LearnedNormalizer.from_pretrained("crossview-synthetic")),
+    "Hartley+optimal": kln.EightPoint(rank2="optimal"),
     "RANSAC": lambda x1, x2: torch.stack([ransac(*pair)[0] for pair in zip(x1, x2, strict=True)]),
 }
 store, generator = read_store(args.store), torch.Generator().manual_seed(args.seed)
