@@ -52,12 +52,17 @@ def _no_arguments(app, what, name, obj, options, signature, returns):
 
 
 def _resolve_exported(app, env, node, contnode):
-    """Find names of the package itself where they are described, in the modules that define them."""
-    name, _, method = node.get("reftarget", "").removeprefix("kornia_learnnorm.").partition(".")
-    if name not in kornia_learnnorm.__all__:
+    """Find names of the package itself in the modules that define them, attributes and constants by their owner."""
+    target, role = node.get("reftarget", ""), node.get("reftype")
+    name, _, member = target.removeprefix("kornia_learnnorm.").partition(".")
+    if name in kornia_learnnorm.__all__:
+        target = ".".join([getattr(kornia_learnnorm, name).__module__, name, *filter(None, [member])])
+    elif role != "data":
         return None
-    target = ".".join([getattr(kornia_learnnorm, name).__module__, name, *filter(None, [method])])
-    return env.get_domain("py").resolve_xref(env, node["refdoc"], app.builder, node["reftype"], target, node, contnode)
+    owner = {"attr": "class", "data": "mod"}.get(role)
+    if owner is not None:
+        target, role = target.rpartition(".")[0], owner
+    return env.get_domain("py").resolve_xref(env, node["refdoc"], app.builder, role, target, node, contnode)
 
 
 def setup(app):
