@@ -84,8 +84,8 @@ class RANSAC(nn.Module):
         distance: ``"sampson"``, ``"symmetric"`` (Fan et al., Eq. 7), or a function such as
             :func:`~kornia_learnnorm.sampson_scale`.
         rank2: how the singularity constraint is enforced on minimal samples: ``"projection"`` in the normaliser's
-            coordinates, or ``"optimal"`` correction, on which no normaliser has an effect and which takes fewer samples
-            and a fraction of the time. When not given, ``"projection"`` with a ``normalizer``, ``"optimal"`` without.
+            coordinates, or ``"optimal"`` correction, which takes fewer samples and, without a normaliser, a fraction of
+            the time. When not given, ``"projection"`` with a ``normalizer`` and ``"optimal"`` without.
         refine: whether to optimise; otherwise the result is the minimal sample of highest score.
         sampler: how weights steer the sampling: :class:`~kornia_learnnorm.ransac.samplers.ProsacSampler` or
             :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`.
@@ -258,7 +258,7 @@ class RANSAC(nn.Module):
     def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
         """Return the matrices of the non-degenerate minimal samples (K, 8), or of all where every one is degenerate."""
         x1, x2 = scorer.samples(rows)
-        if self.rank2 == "optimal":
+        if self.normalizer is None:
             F_mat = solve_samples(x1, x2, MIN_SAMPLE_SHIFT * self.inl_th)
             if len(F_mat):
                 return F_mat
