@@ -61,7 +61,7 @@ class ProblemNormalizer(nn.Module):
 
 
 def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
-    """Return what a normaliser gives for a problem, by its method ``transforms`` where it has one, else by the contract."""
+    """Call a normaliser on a problem: its method ``transforms`` where it has one, else the contract."""
     if isinstance(normalizer, type) or not callable(normalizer):
         raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
     if hasattr(normalizer, "transforms"):

@@ -112,7 +112,7 @@ class PairScorer:
         return Hypotheses(F_mat[order[:positive]], score[:positive])
 
     def shortlist(self, F_mat: Tensor) -> Tensor:
-        """Return the 64 matrices of highest score on the first 512 correspondences that count; all if it saves little."""
+        """Return the 64 matrices that score best on the first 512 correspondences; all if it saves little."""
         if self.terms.shape[-1] < 2 * PRESCORED or len(F_mat) <= SHORTLIST:
             return F_mat
         return F_mat[self._scores(F_mat, self.terms[:, :PRESCORED]).topk(SHORTLIST).indices]
