@@ -61,14 +61,7 @@ def read_dataset(dataset: str, root: str | Path, **options: Any) -> list[Frame]:
 
 
 def missing_ground_truth(dataset: str, root: str | Path, frames: Sequence[Frame]) -> list[str]:
-    """Return a line for each file and camera that a dataset lacks, without which pairs have no ground truth.
-
-    Args:
-        dataset: a key of :data:`DATASETS`; for ``folder`` and ``colmap`` there are no lines.
-        root: folder of the dataset.
-        frames: its frames, from :func:`read_dataset`.
-
-    """
+    """Return a line for each file and camera that a dataset lacks, without which pairs have no ground truth."""
     root = Path(root)
     sequences = {frame.sequence: frame for frame in frames}
     wanted: dict[str, Path] = {}

@@ -120,7 +120,7 @@ class TestFramePair:
     def test_unknown(self, missing, which):
         pair = random_pair(0)
         shape = getattr(pair.frame1, missing).shape
-        pair = replace(pair, **{which: replace(getattr(pair, which), **{missing: np.full(shape, np.nan)})})
+        pair = pair._replace(**{which: replace(getattr(pair, which), **{missing: np.full(shape, np.nan)})})
         assert np.isnan(pair.F).all()
         assert np.isfinite(pair.motion[0]).all() == (missing == "camera")
 
