@@ -422,6 +422,6 @@ class TestMatchPair:
 
         features = [detect(read_frame(pair.frame1), 50) for pair in pairs_of(images)[:5]]
         sides = list(pairwise(features))
-        straight = [match_pair(pairs[i], *sides[i], i, OPTIONS) for i in range(4)]
-        shuffled = {i: match_pair(pairs[i], *sides[i], i, OPTIONS) for i in order}
+        straight = [match_pair(pairs[i], *sides[i], OPTIONS, i) for i in range(4)]
+        shuffled = {i: match_pair(pairs[i], *sides[i], OPTIONS, i) for i in order}
         assert all(np.array_equal(straight[i].points1, shuffled[i].points1) for i in range(4))
