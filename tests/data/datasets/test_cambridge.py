@@ -60,19 +60,9 @@ def test_an_unreadable_image_has_no_camera(cambridge):
 @pytest.mark.parametrize(
     ("file", "line", "text", "message"),
     [
-        (
-            "dataset_train.txt",
-            5,
-            "seq1/frame00002.png 1 2 3",
-            r"dataset_train\.txt, line 5: ImageFile X Y Z W P Q R",
-        ),
+        ("dataset_train.txt", 5, "seq1/frame00002.png 1 2 3", r"train\.txt, line 5: ImageFile X Y Z W P Q R"),
         ("dataset_test.txt", 4, "seq2/frame00001.png 0 0 0 0 0 0 0", "line 4: a quaternion other than zero expected"),
-        (
-            "dataset_train.txt",
-            5,
-            "seq1/frame00001.png 0 0 0 1 0 0 0",
-            "line 5: seq1/frame00001.png is listed twice",
-        ),
+        ("dataset_train.txt", 5, "seq1/frame00001.png 0 0 0 1 0 0 0", "5: seq1/frame00001.png is listed twice"),
         ("reconstruction.nvm", 1, "NVM_V3 FixedK 1 2 3 4 5", r"reconstruction\.nvm, line 1: NVM_V3 expected"),
         ("reconstruction.nvm", 3, "many", "line 3: the number of images expected, got 'many'"),
         ("reconstruction.nvm", 3, "99", r"reconstruction\.nvm, line 13: an image, its focal length"),
