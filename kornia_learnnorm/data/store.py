@@ -184,10 +184,7 @@ class StoreReader:
         return len(self.offsets) - 1
 
     def read(self, pairs: Sequence[int]) -> CorrespondenceStore:
-        """Return a store of some pairs, in the order given.
-
-        Args:
-            pairs: indices of the pairs; a range is read fastest, then increasing indices.
+        """Return a store of some pairs, in the order given; a range is read fastest, then increasing indices.
 
         Raises:
             IndexError: if an index is negative or too large.

@@ -22,17 +22,8 @@ def choose_pairs(
 ) -> tuple[list[FramePair], str]:
     """Return pairs of frames and, in words, how they were chosen: listed, by common points, or by their order.
 
-    Args:
-        frames: frames in their order, sequence after sequence.
-        gap: pairs each frame with the one ``gap`` later in its sequence, if ``listed`` and ``min_points`` are None.
-        listed: file that lists the pairs, for :func:`listed_pairs`.
-        model: COLMAP model for ``min_points``.
-        min_points: points that the frames of a pair share in ``model``.
-
-    Raises:
-        ValueError: if there is no pair, an argument is out of range or a file is malformed.
-        FileNotFoundError: if the list or the model is missing.
-
+    ``gap``, of :func:`pair_frames`, decides if there is neither a file with a list of pairs nor a number of points that
+    the frames of a pair share in a COLMAP model.
     """
     found: Iterable[FramePair]
     if listed is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import islice
 from pathlib import Path
 
 __all__ = ["SPLITS", "choose_sequences", "sequence_folders", "split_sequences"]
@@ -16,7 +15,6 @@ SPLITS: dict[str, dict[str, tuple[str, ...] | None]] = {
     "tum": {"train": None, "val": ("rgbd_dataset_freiburg3_long_office_household",)},
 }
 MARKER = "rgb.txt"  # file that makes a folder a sequence of TUM
-MAX_LISTED = 30  # names in a message
 
 
 def split_sequences(dataset: str, split: str, root: str | Path) -> list[str]:
@@ -29,7 +27,9 @@ def split_sequences(dataset: str, split: str, root: str | Path) -> list[str]:
     chosen = [name for name in found if (name not in taken if wanted is None else name in wanted)]
     if not chosen:
         expected = f"others than {', '.join(taken)}" if wanted is None else ", ".join(wanted)
-        raise FileNotFoundError(f"no {split} sequence of {dataset} at {root}: expected {expected}, got {_some(found)}")
+        raise FileNotFoundError(
+            f"no {split} sequence of {dataset} at {root}: expected {expected}, got {', '.join(found)}"
+        )
     return chosen
 
 
@@ -60,9 +60,5 @@ def choose_sequences(dataset: str, root: str | Path, sequences: Sequence[str] | 
         raise ValueError(f"sequences must be one name or more, each once, got {names}")
     for name in names:
         if name not in found:
-            raise ValueError(f"no sequence {name!r} at {root}, there are {_some(found)}")
+            raise ValueError(f"no sequence {name!r} at {root}, there are {', '.join(found)}")
     return {name: found[name] for name in names}
-
-
-def _some(names: dict[str, Path]) -> str:
-    return ", ".join(islice(names, MAX_LISTED)) + (", ..." if len(names) > MAX_LISTED else "") or "none"

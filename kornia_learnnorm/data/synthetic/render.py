@@ -107,9 +107,6 @@ def write_pair(folder: str | Path, pair: RenderedPair) -> None:
         folder: folder to write to; created if missing. Existing files of these names are replaced.
         pair: the rendered pair. The ground truth holds ``K``, ``R``, ``t``, ``F_mat``, ``width`` and ``height``.
 
-    Raises:
-        ImportError: if OpenCV is not installed.
-
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:

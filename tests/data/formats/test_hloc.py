@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import h5py
@@ -284,18 +283,3 @@ class TestHloc:
             LINKS[kind](file["seq/a.png"])
         with pytest.raises(ValueError, match=r"'seq/a\.png' must have keypoints and image_size"):
             import_hloc(features, matches)
-
-
-def test_real_matches(tmp_path, paths):
-    folder = os.environ.get("LEARNNORM_DATA")
-    if not folder:
-        pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
-    kitti = read_store(f"{folder}/correspondences/kitti_06.h5@0:3")
-    dropped = export_hloc(kitti, *paths)
-    got = stored(import_hloc(*paths), tmp_path)
-    assert got.names == kitti.names
-    assert len(got.ratio) == len(kitti.ratio) - dropped
-    for pair in range(3):
-        assert set(rows(got, pair)) <= set(rows(kitti, pair))
-        points1, points2 = got.matches(pair)[0], kitti.matches(pair)[0]
-        assert len(np.unique(points1, axis=0)) == len(points1) == len(np.unique(points2, axis=0))

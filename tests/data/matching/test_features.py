@@ -111,7 +111,7 @@ def test_lightglue_of_random_weights(monkeypatch):
     assert ((matches.ratio >= 0) & (matches.ratio <= 1)).all()
 
 
-@pytest.mark.parametrize("error", [urllib.error.URLError("no net"), RuntimeError("cut"), EOFError("Ran out of input")])
+@pytest.mark.parametrize("error", [RuntimeError("cut"), EOFError("Ran out of input")])
 def test_weights_that_are_not_there(error):
     def load():
         raise error
