@@ -31,12 +31,7 @@ SCENES_PER_BLOCK = 8192
 
 
 class Block(NamedTuple):
-    """The size of a block before samples are filtered.
-
-    Attributes:
-        samples: number of samples.
-        pairs: number of image pairs with a sample.
-    """
+    """Numbers of samples, and of image pairs with a sample, of a block before samples are filtered."""
 
     samples: int
     pairs: int

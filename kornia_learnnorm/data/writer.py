@@ -97,15 +97,10 @@ class StoreWriter:
 
     Each pair becomes a store of its own, a part, in the folder ``<path>.parts``. A later run finds the parts of a run
     that was killed; parts, or a complete store, of other options or of another program are a ValueError.
-    :meth:`finish` joins the parts in the order of their places and removes the folder.
-
-    Args:
-        path: the store to write, an HDF5 file.
-        options: options that the store depends on, values of JSON's types.
+    :meth:`finish` joins the parts in the order of their places and removes the folder. The options are all that the
+    store depends on, values of JSON's types.
 
     Attributes:
-        path: the store to write.
-        folder: the folder of the parts.
         complete: whether the store exists, made with the same options.
         skipped: the pairs that a complete store leaves out, and why; empty while it is not complete.
     """

@@ -27,9 +27,8 @@ def split_sequences(dataset: str, split: str, root: str | Path) -> list[str]:
     chosen = [name for name in found if (name not in taken if wanted is None else name in wanted)]
     if not chosen:
         expected = f"others than {', '.join(taken)}" if wanted is None else ", ".join(wanted)
-        raise FileNotFoundError(
-            f"no {split} sequence of {dataset} at {root}: expected {expected}, got {', '.join(found)}"
-        )
+        got = ", ".join(found) or "none"
+        raise FileNotFoundError(f"no {split} sequence of {dataset} at {root}: expected {expected}, got {got}")
     return chosen
 
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.store import CorrespondenceStore, open_hdf5, own_dataset
+from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, open_hdf5, own_dataset
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import import_extra
 
@@ -177,7 +177,7 @@ def _sort_key(name: str) -> list[str | int]:
 
 
 def _store(pairs: list[_Pair], dataset: str) -> CorrespondenceStore:
-    number = len(pairs)
+    unknown: dict[str, Any] = {name: np.full((len(pairs), *LAYOUT[name][0]), np.nan) for name in "FKRt"}
     return CorrespondenceStore(
         points1=np.concatenate([pair.points1 for pair in pairs]).astype(np.float32),
         points2=np.concatenate([pair.points2 for pair in pairs]).astype(np.float32),
@@ -185,10 +185,7 @@ def _store(pairs: list[_Pair], dataset: str) -> CorrespondenceStore:
         offsets=np.cumsum([0, *(len(pair.ratio) for pair in pairs)], dtype=np.int64),
         image_size=np.stack([pair.image_size for pair in pairs]).astype(np.int32),
         names=[pair.names for pair in pairs],
-        F=np.full((number, 3, 3), np.nan),
-        K=np.full((number, 2, 3, 3), np.nan),
-        R=np.full((number, 3, 3), np.nan),
-        t=np.full((number, 3), np.nan),
+        **unknown,
         dataset=dataset,
         pairs="not known",
         detector="not known",

@@ -28,11 +28,10 @@ def synthetic_store(
     outliers: float = 0.2,
     scenes: Sequence[str] = tuple(SCENES),
 ) -> CorrespondenceStore:
-    """Return a store of synthetic scenes, ``pairs`` of each kind.
+    """Return a store of synthetic scenes, ``pairs`` of each kind; the kinds are keys of :data:`SCENES`.
 
-    Lowe's ratio is drawn so that the ratio test of 0.8 keeps all inliers and half of the outliers.
-
-    Noise is in pixels, ``outliers`` the share of gross outliers, ``scenes`` the kinds of scenes, keys of :data:`SCENES`.
+    Noise is in pixels, ``outliers`` the share of gross outliers. Lowe's ratio is drawn so that the ratio test of 0.8
+    keeps all inliers and half of the outliers.
 
     Example:
         >>> store = synthetic_store(pairs=2, points=30, scenes=["orbit"])
