@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from make_sequences import blurred_noise as texture
+from make_sequences import texture
 
 from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.images import image_size, read_frame, read_image

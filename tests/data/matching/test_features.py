@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.feature import DISK, LightGlue
-from make_sequences import blurred_noise as texture
+from make_sequences import texture
 
 from kornia_learnnorm.data.matching import features as module
 from kornia_learnnorm.data.matching import matchers as matching

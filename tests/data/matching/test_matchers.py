@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from make_sequences import blurred_noise as texture
+from make_sequences import texture
 
 from kornia_learnnorm.data.matching.matchers import match_images
 
