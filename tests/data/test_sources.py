@@ -14,15 +14,10 @@ from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 
-def test_store_source(store, tmp_path, monkeypatch):
-    for name in ("a", "b"):
-        write_store(tmp_path / f"{name}.h5", store)
+def test_paths(store, tmp_path, monkeypatch):
+    write_store(tmp_path / "a.h5", store)
     monkeypatch.setenv("SOME_DATA", str(tmp_path))
-    source = StoreSamples(["$SOME_DATA/a.h5", "$SOME_DATA/b.h5"], [0.8, None], num_heldout=2, max_residual=None)
-    samples = source.draw(3, 0)
-    assert samples.pair.max() == 17  # pairs of the second store count on
-    assert torch.equal(samples.points1, source.draw(3, 0).points1)
-    assert not torch.equal(samples.points1, source.draw(4, 0).points1)
+    assert len(StoreSamples(["$SOME_DATA/a.h5", "${SOME_DATA}/a.h5@0:2"]).stores) == 2
     for unset in ("$UNSET_DATA", "${EMPTY_DATA}"):
         monkeypatch.setenv("EMPTY_DATA", "")
         with pytest.raises(ValueError, match=rf"environment variable {unset.strip('${}')}.* is not set; data\.train, "):

@@ -277,14 +277,9 @@ class TestGoingOn:
         assert path.stat().st_mtime_ns == before
         assert "exists already" in capsys.readouterr().err
 
-    def test_other_options_or_cameras_are_refused(self, images, expected):
-        pairs = pairs_of(images)
-        with pytest.raises(ValueError, match=r"other options.* num_features was 200 and is 201"):
-            collect_matches(pairs, expected, replace(OPTIONS, num_features=201))
-        moved = [FramePair(replace(pair.frame1, camera=np.eye(3)), pair.frame2) for pair in pairs]
-        with pytest.raises(
-            ValueError, match=r"other data.* the images, their cameras, their poses or the pairs have changed"
-        ):
+    def test_other_cameras_are_refused(self, images, expected):
+        moved = [FramePair(replace(pair.frame1, camera=np.eye(3)), pair.frame2) for pair in pairs_of(images)]
+        with pytest.raises(ValueError, match=r"other data.* the images, their cameras, their poses or the pairs"):
             collect_matches(moved, expected, OPTIONS)
 
     @pytest.mark.parametrize(
