@@ -129,7 +129,7 @@ def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = BATCH_SIZ
 
     """
     identity, residuals = Identity(), []
-    for x1, x2 in zip(points1.double().split(batch_size), points2.double().split(batch_size), strict=True):
+    for x1, x2 in zip(*(torch.split(points.double(), batch_size) for points in (points1, points2)), strict=True):
         F_mat = find_fundamental(x1, x2, normalizer=identity)
         residuals.append(symmetric_epipolar_distance(x1, x2, F_mat).mean(-1))
     return torch.cat(residuals)

@@ -7,7 +7,7 @@ grow with the number of pairs.
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
@@ -167,7 +167,7 @@ def _versions() -> dict[str, str]:
 
 
 def _match_all(
-    pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: dict[str, str], workers: Workers
+    pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: Mapping[str, Any], workers: Workers
 ) -> dict[str, str]:
     """Match the pairs that are not done; continue after a worker was killed. Return the skipped pairs and why."""
     from joblib.externals.loky.process_executor import BrokenProcessPool
