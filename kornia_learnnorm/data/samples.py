@@ -39,7 +39,7 @@ class Samples(NamedTuple):
         """Return the samples of the given rows (indices or mask)."""
         return Samples(*(field[rows] for field in self))
 
-    def below(self, max_residual: float | None) -> Samples:
+    def with_residual_below(self, max_residual: float | None) -> Samples:
         """Return the samples whose :func:`plain_residual` is below a limit in pixels; None keeps all."""
         return self if max_residual is None else self.select(plain_residual(self.points1, self.points2) < max_residual)
 
@@ -89,7 +89,7 @@ def draw_samples(
     heldout = _draw_heldout(rows, pair[rows[:, 0]], pair, ratio < RATIO, num_heldout, generator)
     cut, rest = points[rows], points[heldout]
     samples = Samples(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], pair[rows[:, 0]])
-    return samples.below(max_residual)
+    return samples.with_residual_below(max_residual)
 
 
 def _draw_heldout(

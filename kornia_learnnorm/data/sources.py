@@ -118,7 +118,7 @@ class StoreSamples:
                     parts.append(part._replace(pair=torch.from_numpy(own)[part.pair]))
         samples = Samples(*map(torch.cat, zip(*parts, strict=True)))
         if self.cache is None or self.max_residual is None:
-            return samples.below(self.max_residual)
+            return samples.with_residual_below(self.max_residual)
         return samples.select(self._kept(self.cache, samples, self.max_residual, seed, block))
 
     def _pairs(self, seed: int) -> list[NDArray[np.int64]]:
@@ -133,7 +133,7 @@ class StoreSamples:
         return low if low == high else int(torch.randint(low, high + 1, (), generator=generator))
 
     def _kept(self, cache: Path, samples: Samples, max_residual: float, seed: int, block: int) -> Tensor:
-        """Return the mask (S,) of the samples that the residual filter keeps, which the cache remembers."""
+        """Return the mask (S,) of the samples that the residual filter keeps, from the cache or computed and cached."""
         files = [(str(s.path.resolve()), s.path.stat().st_mtime_ns, s.offsets[[0, -1]].tolist()) for s in self.stores]
         about = [files, self.max_ratios, self.sizes, self.num_heldout, max_residual, self.block_pairs, seed, block]
         path = cache / f"{sha256(json.dumps(about).encode()).hexdigest()[:32]}.npy"
@@ -191,7 +191,7 @@ class SyntheticSamples:
         points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
         points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
         pair = block * SCENES_PER_BLOCK + torch.arange(number)
-        return Samples(points1, points2, heldout1, heldout2, pair).below(self.max_residual)
+        return Samples(points1, points2, heldout1, heldout2, pair).with_residual_below(self.max_residual)
 
 
 def _expand(path: str) -> str:
