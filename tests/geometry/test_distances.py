@@ -18,7 +18,7 @@ from kornia_learnnorm import (
     symmetric_epipolar_distance,
     symmetric_scale,
 )
-from kornia_learnnorm.geometry.distances import find_scale, scale_value
+from kornia_learnnorm.geometry.distances import find_scale, line_norms, scale_value
 
 ALL = [symmetric_epipolar_distance, sampson_distance, algebraic_distance]
 ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x2^T F x1 = y1 - y2
@@ -205,3 +205,28 @@ class TestDistanceScales:
             find_scale("huber")
         with pytest.raises(TypeError, match="'sampson', 'symmetric' or a function, got 3"):
             find_scale(3)
+
+
+class TestLineNorms:
+    def test_agrees_with_numpy(self, dtype):
+        F_mat = uniform(5, 3, 3, low=-1, dtype=dtype)
+        x1, x2 = (uniform(5, 8, 3, low=-1, seed=seed, dtype=dtype) for seed in (1, 2))
+        first, second = line_norms(x1, x2, F_mat)
+        for found, lines in ((first, x2.numpy() @ F_mat.numpy()), (second, x1.numpy() @ F_mat.mT.numpy())):
+            norms = np.linalg.norm(lines[..., :2], axis=-1)
+            np.testing.assert_allclose(found.numpy(), norms + 1e-3 * norms.mean(1, keepdims=True), rtol=1e-5)
+
+    def test_absent_points_have_no_part_in_the_mean(self):
+        F_mat, weights = uniform(1, 3, 3, low=-1), torch.tensor([[1.0, 2.0, 0.0]], dtype=torch.float64)
+        x1, x2 = uniform(1, 3, 3), uniform(1, 3, 3, seed=1)
+        norms = np.linalg.norm((x2 @ F_mat).numpy()[0, :, :2], axis=-1)
+        expected = norms + 0.5 * (norms[0] + 2 * norms[1]) / 3
+        np.testing.assert_allclose(line_norms(x1, x2, F_mat, weights, floor=0.5)[0][0].numpy(), expected)
+
+    def test_is_positive_on_the_epipole(self):
+        F_mat = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])  # epipoles at the origin
+        x = torch.tensor([[[0.0, 0.0, 1.0], [3.0, 4.0, 1.0]]])
+        for norms in line_norms(x, x, F_mat):  # lines (0, 0), (4, -3): mean 2.5
+            np.testing.assert_allclose(norms[0].numpy(), [0.0025, 5.0025], rtol=1e-5)
+        for norms in line_norms(x[:, :1], x[:, :1], F_mat):
+            assert (norms > 0).all()

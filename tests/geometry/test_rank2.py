@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from torch.autograd import gradcheck
+from torch.autograd import gradcheck, gradgradcheck
 from two_view import (
     SCENES,
     correspondences,
@@ -26,7 +26,7 @@ from two_view import (
     up_to_sign,
 )
 
-from kornia_learnnorm import Hartley, Whitening, find_fundamental
+from kornia_learnnorm import Hartley, Whitening, find_fundamental, rank2_projection
 from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.geometry.rank2 import optimal_rank2
@@ -233,6 +233,39 @@ class TestOptimalRank2:
         corrected = epipolar_distances(points1, points2, F_mat).mean(-1)
         assert (corrected < plain).mean() > 0.99
         assert corrected.mean() < 0.1 * plain.mean()
+
+
+class TestRank2Projection:
+    def test_is_the_truncated_decomposition(self, dtype, device):
+        F_mat = uniform(50, 3, 3, low=-1).to(device, dtype)
+        U, s, Vh = np.linalg.svd(F_mat.cpu().double().numpy())
+        expected = U[:, :, :2] * s[:, None, :2] @ Vh[:, :2]
+        found = rank2_projection(F_mat)
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found.cpu().numpy(), expected, atol=20 * torch.finfo(dtype).eps)
+
+    def test_leaves_rank_two_alone(self):
+        F_mat = uniform(20, 3, 2, low=-1) @ uniform(20, 2, 3, low=-1, seed=1)
+        np.testing.assert_allclose(rank2_projection(F_mat).numpy(), F_mat.numpy(), atol=1e-14)
+
+    @given(st.integers(0, 2**31))
+    def test_no_matrix_of_rank_two_is_nearer(self, seed):
+        F_mat = uniform(3, 3, low=-1, seed=seed)
+        distance = (F_mat - rank2_projection(F_mat)).norm()
+        others = uniform(100, 3, 2, low=-1, seed=seed + 1) @ uniform(100, 2, 3, low=-1, seed=seed + 2)
+        near = rank2_projection(F_mat + 0.01 * uniform(100, 3, 3, low=-1, seed=seed + 3))
+        for candidate in (*others, *near):
+            assert (F_mat - candidate).norm() >= distance - 1e-12
+
+    def test_gradients(self):
+        F_mat = uniform(2, 3, 3, low=-1).requires_grad_()
+        assert gradcheck(rank2_projection, [F_mat])
+        assert gradgradcheck(rank2_projection, [F_mat])
+
+    def test_any_batch_shape(self):
+        assert rank2_projection(uniform(3, 3)).shape == (3, 3)
+        assert rank2_projection(uniform(2, 4, 3, 3)).shape == (2, 4, 3, 3)
+        assert rank2_projection(uniform(0, 3, 3)).shape == (0, 3, 3)
 
 
 class TestExceptions:

@@ -21,9 +21,7 @@ from two_view import (
     up_to_sign,
 )
 
-from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening, find_fundamental, symmetric_epipolar_distance
-from kornia_learnnorm.geometry.distances import line_norms
-from kornia_learnnorm.geometry.linear import adjugate
+from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening, find_fundamental
 
 
 def numpy_factor(x1, x2, F):
@@ -195,58 +193,3 @@ class TestTheory:
         ]
         points = scene.points1, scene.points2
         assert up_to_sign(*(in_hartley(F, *points) for F in F_mats)) < 1e-8
-
-
-class TestAdjugate:
-    def test_is_determinant_times_inverse(self, dtype):
-        A = uniform(20, 3, 3, low=-1, dtype=dtype)
-        expected = np.linalg.det(A.numpy())[:, None, None] * np.linalg.inv(A.numpy())
-        np.testing.assert_allclose(adjugate(A).numpy(), expected, atol=2e-6 if dtype == torch.float32 else 1e-14)
-
-    def test_of_singular_matrices(self):
-        """Of rank 2, the product of both null vectors; of rank 1, zero."""
-        F_mat = uniform(20, 3, 2, low=-1) @ uniform(20, 2, 3, low=-1, seed=1)
-        U, s, Vh = np.linalg.svd(F_mat.numpy())
-        expected = (
-            np.linalg.det(U @ Vh)[:, None, None]
-            * (s[:, 0] * s[:, 1])[:, None, None]
-            * Vh[:, 2, :, None]
-            * U[:, None, :, 2]
-        )
-        np.testing.assert_allclose(adjugate(F_mat).numpy(), expected, atol=1e-14)
-        assert adjugate(uniform(20, 3, 1) @ uniform(20, 1, 3, seed=1)).abs().max() < 1e-15
-
-    def test_gradcheck(self):
-        assert gradcheck(adjugate, [uniform(2, 3, 3, low=-1).requires_grad_()])
-
-
-class TestLineNorms:
-    def test_agrees_with_numpy(self, dtype):
-        F_mat = uniform(5, 3, 3, low=-1, dtype=dtype)
-        x1, x2 = (uniform(5, 8, 3, low=-1, seed=seed, dtype=dtype) for seed in (1, 2))
-        first, second = line_norms(x1, x2, F_mat)
-        for found, lines in ((first, x2.numpy() @ F_mat.numpy()), (second, x1.numpy() @ F_mat.mT.numpy())):
-            norms = np.linalg.norm(lines[..., :2], axis=-1)
-            np.testing.assert_allclose(found.numpy(), norms + 1e-3 * norms.mean(1, keepdims=True), rtol=1e-5)
-
-    def test_absent_points_have_no_part_in_the_mean(self):
-        F_mat, weights = uniform(1, 3, 3, low=-1), torch.tensor([[1.0, 2.0, 0.0]], dtype=torch.float64)
-        x1, x2 = uniform(1, 3, 3), uniform(1, 3, 3, seed=1)
-        norms = np.linalg.norm((x2 @ F_mat).numpy()[0, :, :2], axis=-1)
-        expected = norms + 0.5 * (norms[0] + 2 * norms[1]) / 3
-        np.testing.assert_allclose(line_norms(x1, x2, F_mat, weights, floor=0.5)[0][0].numpy(), expected)
-
-    def test_is_positive_on_the_epipole(self):
-        F_mat = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])  # epipoles at the origin
-        x = torch.tensor([[[0.0, 0.0, 1.0], [3.0, 4.0, 1.0]]])
-        for norms in line_norms(x, x, F_mat):  # lines (0, 0), (4, -3): mean 2.5
-            np.testing.assert_allclose(norms[0].numpy(), [0.0025, 5.0025], rtol=1e-5)
-        for norms in line_norms(x[:, :1], x[:, :1], F_mat):
-            assert (norms > 0).all()
-
-
-def test_residuals_agree_with_the_reference():
-    """The references of this file measure what the package measures."""
-    scene = scenes("handheld", 5, 20)
-    expected = symmetric_epipolar_distance(scene.points1, scene.points2, scene.F_mat)
-    np.testing.assert_allclose(epipolar_distances(scene.points1, scene.points2, scene.F_mat), expected, rtol=1e-9)
