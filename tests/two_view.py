@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
@@ -114,3 +115,51 @@ def in_hartley(F, points1, points2) -> np.ndarray:
 def signless(F: Tensor) -> Tensor:
     """Smooth numbers of unit matrices that do not see the sign; a gradient check must not trip on it."""
     return (F.flatten(-2) @ uniform(9, 4, low=-1, seed=9).to(F)).square()
+
+
+def _wrong_correspondences() -> list[tuple]:
+    """Points, weights, and the error that every function of correspondences raises for them."""
+    points, ones = uniform(2, 8, 2), torch.ones(2, 8)
+    wrong = [
+        (points.long(), points, None, TypeError, "points1 must be .* got torch.int64"),
+        (points, points.int(), None, TypeError, "points2 must be .* got torch.int32"),
+        (points.half(), points.half(), None, TypeError, "float32 or float64 tensor, got torch.float16"),
+        (points.numpy(), points, None, TypeError, "points1 must be .* got <class 'numpy.ndarray'>"),
+        (points, None, None, TypeError, "points2 must be .* got <class 'NoneType'>"),
+        (points.float(), points, None, TypeError, "one dtype, got torch.float32 and torch.float64"),
+        (points, points.to("meta"), None, ValueError, "must be on one device, got cpu and meta"),
+        (points, points, -0.25 * ones, ValueError, r"weights must not be negative, got a minimum of -0\.25"),
+        (points, points, ones.bool(), TypeError, "floating-point tensor, got torch.bool; a boolean tensor is a mask"),
+        (points, points, [[1.0] * 8] * 2, TypeError, "weights must be a floating-point tensor, got <class 'list'>"),
+    ]
+    for shape in ([8, 2], [2, 8, 3], [2, 8, 1], [1, 2, 8, 2]):
+        message = str(shape).replace("[", r"\[")
+        wrong += [(x, torch.zeros(shape), None, ShapeError, message) for x in (torch.zeros(shape), points.float())]
+    for shape in ([2, 9, 2], [3, 8, 2], [1, 8, 2]):
+        message = rf"pair up, got shapes \[2, 8, 2\] and \{shape}"
+        wrong.append((points, points.new_zeros(shape), None, ValueError, message))
+    for shape in ([8], [2, 9], [2, 8, 1]):
+        message = rf"weights must have shape \[2, 8\], got \{shape}"
+        wrong.append((points, points, torch.ones(shape), ValueError, message))
+    for number in (0, 1, 7):
+        few = points[:, :number]
+        wrong.append((few, few, None, ValueError, f"at least 8 correspondences are needed, got {number}"))
+    for value in (torch.nan, torch.inf, -torch.inf):
+        for k, (name, count) in enumerate([("points1", 2), ("points2", 2), ("weights", 1)]):
+            values = [points.clone(), points.clone(), ones.clone()]
+            values[k][1, 3] = value
+            wrong.append((*values, ValueError, f"{name} must be finite, got {count} NaN or infinite"))
+    return wrong
+
+
+WRONG_CORRESPONDENCES = _wrong_correspondences()
+WRONG_MATRICES = [  # with two sets of points
+    (None, TypeError, "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
+    (torch.ones(2, 3, 3, dtype=torch.int64), TypeError, "F_mat must be .* got torch.int64"),
+    (torch.ones(3, 3), ShapeError, r"\[3, 3\]"),
+    (torch.ones(2, 3, 2), ShapeError, r"\[2, 3, 2\]"),
+    (torch.ones(3, 3, 3), ValueError, "got 3 matrices and 2 sets"),
+    (torch.full((2, 3, 3), torch.nan), ValueError, "F_mat must be finite, got 18 NaN"),
+    (torch.full((2, 3, 3), torch.inf), ValueError, "F_mat must be finite, got 18 NaN or infinite"),
+    (torch.stack([torch.eye(3), torch.zeros(3, 3)]), ValueError, "F_mat must not be zero, got 1 zero"),
+]

@@ -30,6 +30,10 @@ class TestDesignMatrix:
         values = [uniform(2, 3, 3).requires_grad_(), uniform(2, 3, 3, seed=1).requires_grad_()]
         assert gradcheck(design_matrix, values)
 
+    def test_shape(self):
+        with pytest.raises(ShapeError):
+            design_matrix(torch.rand(8, 2), torch.rand(8, 3))
+
 
 class TestNullVector:
     @pytest.mark.parametrize("num_points", [8, 9, 40])
