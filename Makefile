@@ -16,6 +16,7 @@ KITTI = "$(DATA)"/kitti/sequences/06/image_0
 STORES = "$(DATA)"/correspondences
 
 AUDIT := .venv-audit
+comma := ,
 
 .PHONY: demo test test-cpus lint docs audit wheel clean ablations table1
 
@@ -47,9 +48,9 @@ test: $(VENV)/.ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 # Results that depend on the order of rounding differ between processors. OpenBLAS (NumPy), MKL and ATen (PyTorch) choose
-# their kernels by the processor; each line makes them choose older ones. The newest are those of `make test`.
-# Haswell's are also AMD's: OpenBLAS gives the same bits for Haswell and Zen. A test marked long is left out.
-CPUS := OPENBLAS_CORETYPE=SkylakeX,ATEN_CPU_CAPABILITY=avx2
+# their kernels by the processor; each line makes them choose others. SkylakeX's need a processor with AVX-512. Zen's are
+# left out: OpenBLAS gives the same bits as for Haswell. A test marked long is left out.
+CPUS := $(if $(shell grep -m 1 avx512f /proc/cpuinfo 2>/dev/null),OPENBLAS_CORETYPE=SkylakeX$(comma)ATEN_CPU_CAPABILITY=avx2)
 CPUS += OPENBLAS_CORETYPE=Haswell,MKL_CBWR=AVX2,ATEN_CPU_CAPABILITY=avx2
 CPUS += OPENBLAS_CORETYPE=Sandybridge,MKL_CBWR=COMPATIBLE,ATEN_CPU_CAPABILITY=default
 

@@ -29,6 +29,7 @@ methods = {
     "reweighted whitening": kln.EightPoint(kln.ReweightedWhitening()),
     "learned: paper": kln.EightPoint(kln.LearnedNormalizer.from_pretrained("paper")),
     "learned: crossview": kln.EightPoint(kln.LearnedNormalizer.from_pretrained()),
+    "learned: crossview-synthetic": kln.EightPoint(kln.LearnedNormalizer.from_pretrained("crossview-synthetic")),
     "Hartley, optimal correction": kln.EightPoint(rank2="optimal"),
     "RANSAC": lambda x1, x2: torch.stack([ransac(*pair)[0] for pair in zip(x1, x2, strict=True)]),
 }

@@ -12,6 +12,8 @@ from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import save_file
 from torch import Tensor, distributed
 
+from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
+from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.files import atomic_write
 from lightning_modules.task import NormalizerTask
 
@@ -45,6 +47,8 @@ class Checkpoints(ModelCheckpoint):
 class ExportWeights(Callback):
     """Write the normaliser as safetensors when training ends, for ``LearnedNormalizer.from_pretrained``.
 
+    The file names the training data: the stores, or ``synthetic scenes``; nothing for a source of another class.
+
     Args:
         filename: name of the file in the trainer's default root directory.
     """
@@ -59,8 +63,17 @@ class ExportWeights(Callback):
             path.parent.mkdir(parents=True, exist_ok=True)
             if not isinstance(pl_module, NormalizerTask):
                 raise TypeError(f"only a NormalizerTask has a normaliser to export, got {type(pl_module).__name__}")
+            pl_module.normalizer.trained_on = _names_of_source(getattr(trainer, "datamodule", None))
             pl_module.normalizer.save_pretrained(path)
             print(f"wrote {path}")
+
+
+def _names_of_source(datamodule: Any) -> tuple[str, ...]:
+    """Return the names of the data that a datamodule trains on; nothing where they are not known."""
+    source = getattr(datamodule, "train", None)
+    if isinstance(source, StoreSamples):
+        return tuple(dict.fromkeys(names_of([path])[0] for path in source.paths))
+    return ("synthetic scenes",) if isinstance(source, SyntheticSamples) else ()
 
 
 class WritePredictions(Callback):

@@ -25,7 +25,7 @@ from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
-from kornia_learnnorm.evaluation.runs.run import read_arrays
+from kornia_learnnorm.evaluation.runs.arrays import read_arrays
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import NormalizerTask
 

@@ -47,6 +47,7 @@ def draw_samples(
     max_ratio: float | None = RATIO,
     num_heldout: int = 0,
     max_residual: float | None = None,
+    require_heldout: bool = True,
 ) -> Samples:
     """Draw samples: shuffle the correspondences of each pair and split them into sets of ``size``, without the rest.
 
@@ -60,12 +61,14 @@ def draw_samples(
         max_ratio: keep correspondences with Lowe's ratio below this; None keeps all.
         num_heldout: held-out correspondences per sample, drawn with replacement.
         max_residual: drop samples whose :func:`plain_residual` is at least this many pixels; None keeps all.
+        require_heldout: refuse a store in which a pair has no correspondence to hold out; if False, the held-out points
+            of such a pair's samples are NaN.
 
     Returns:
         samples in the order of the pairs, float32.
 
     Raises:
-        ValueError: if ``size`` is below 8 or no pair fills a sample.
+        ValueError: if ``size`` is below 8, no pair fills a sample, or a pair has no correspondence to hold out.
 
     """
     if size < 8:
@@ -82,9 +85,16 @@ def draw_samples(
     if len(rows) == 0:
         limit = "" if max_ratio is None else f" with ratio below {max_ratio}"
         raise ValueError(f"no pair of the store has {size} correspondences{limit}, which a sample needs")
-    heldout = _draw_heldout(rows, pair[rows[:, 0]], pair, ratio < RATIO, num_heldout, generator)
-    cut, rest = points[rows], points[heldout]
-    samples = Samples(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], pair[rows[:, 0]])
+    sample_pair, passes = pair[rows[:, 0]], ratio < RATIO
+    passing = torch.bincount(pair[passes], minlength=len(store))[sample_pair]
+    if num_heldout and require_heldout and int(passing.min()) <= size:
+        few = int(passing.min())
+        expected = f"expected more than the {size} of a sample"
+        raise ValueError(f"held-out correspondences: a pair has only {few} with ratio below {RATIO}, {expected}")
+    cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
+    drawable = passing > size
+    rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]
+    samples = Samples(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)
     if max_residual is None:
         return samples
     return samples.select(plain_residual(samples.points1, samples.points2) < max_residual)
@@ -97,10 +107,6 @@ def _draw_heldout(
     pool = torch.nonzero(passes)[:, 0]
     count = torch.bincount(pair[pool], minlength=int(pair.max()) + 1)
     start = count.cumsum(0) - count
-    if number and int(count[sample_pair].min()) <= rows.shape[1]:
-        few = int(count[sample_pair].min())
-        expected = f"expected more than the {rows.shape[1]} of a sample"
-        raise ValueError(f"held-out correspondences: a pair has only {few} with ratio below {RATIO}, {expected}")
 
     def draw() -> Tensor:
         u = torch.rand(len(rows), number, generator=generator, dtype=torch.float64)

@@ -91,6 +91,7 @@ class StoreSamples:
         if len(self.sizes) != 2 or not 8 <= self.sizes[0] <= self.sizes[1] or block_pairs < 1:
             got = f"size={size}, block_pairs={block_pairs}"
             raise ValueError(f"a sample needs at least 8 correspondences, a block at least one pair, got {got}")
+        self.paths = tuple(paths)
         self.stores = [StoreReader(_expand(path)) for path in paths]
         self.max_ratios = tuple(max_ratios)
         self.num_heldout = num_heldout

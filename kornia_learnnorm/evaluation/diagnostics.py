@@ -1,4 +1,4 @@
-r"""Diagnostics of a normalisation: what it does to the design matrix, to the rank-2 projection and to the points."""
+r"""Diagnostics of a normalisation: its effect on the design matrix, the rank-2 projection and the points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ from kornia_learnnorm.geometry.rank2 import rank2_projection
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
 
-__all__ = ["Diagnostics", "condition_number", "diagnose", "normalized_distance", "singularity_ratio"]
+__all__ = [
+    "Diagnostics",
+    "condition_number",
+    "diagnose",
+    "diagnose_in_coordinates",
+    "normalized_distance",
+    "singularity_ratio",
+]
 
 
 class Diagnostics(NamedTuple):
@@ -29,8 +36,8 @@ class Diagnostics(NamedTuple):
         distance1: mean normalised distance from the origin in the first view, see :func:`normalized_distance`.
         distance2: the same in the second view.
         rank2_share: share of the mean symmetric epipolar distance that the projection adds,
-            :math:`1 - e_{DLT} / e`. With eight points the DLT leaves nothing and the share is one; it is negative where
-            the projection lowers the distance, and means nothing where both distances are rounding errors.
+            :math:`1 - e_{DLT} / e`. With eight points the DLT has no error and the share is one; it is negative where
+            the projection lowers the distance, and meaningless where both distances are rounding errors.
     """
 
     condition_number: Tensor
@@ -41,7 +48,7 @@ class Diagnostics(NamedTuple):
 
 
 def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagnostics:
-    r"""Measure what a normaliser does to samples on their way through the eight-point algorithm.
+    r"""Compute the diagnostics of a normaliser on samples.
 
     Args:
         points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
@@ -69,8 +76,12 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
     """
     check_correspondences(points1, points2)
     problem = LinearProblem.from_points(points1, points2)
+    return diagnose_in_coordinates(problem, *normalizing_transforms(normalizer, problem))
+
+
+def diagnose_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> Diagnostics:
+    """Return the diagnostics of a problem under known transforms (B, 3, 3); see :func:`diagnose`."""
     points1, points2 = problem.points1, problem.points2
-    T1, T2 = normalizing_transforms(normalizer, problem)
     x1, x2 = convert_points_to_homogeneous(points1) @ T1.mT, convert_points_to_homogeneous(points2) @ T2.mT
     A, F_hat = design_matrix(x1, x2), problem.null_matrix_in(T1, T2)
     before = _distance(points1, points2, transform_fundamental(F_hat, T1, T2))
@@ -87,14 +98,14 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
 def condition_number(A: Tensor) -> Tensor:
     r"""Return :math:`\kappa(A) = \sqrt{d_1 / d_8}` with the descending eigenvalues :math:`d_i` of :math:`A^\top A`.
 
-    The ninth is left out: it is zero, or the residual (Fan et al., section 3).
+    The ninth eigenvalue is left out: it is zero, or the residual (Fan et al., section 3).
 
     Args:
         A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
 
     Returns:
-        condition numbers with shape :math:`(*)`, at least 1. Up to rounding, that of a matrix of lower rank is
-        infinite and that of zero NaN.
+        condition numbers with shape :math:`(*)`, at least 1; up to rounding, infinite for a matrix of lower rank and
+        NaN for zero.
 
     Raises:
         ShapeError: if the shape is wrong.
@@ -115,14 +126,14 @@ def condition_number(A: Tensor) -> Tensor:
 def singularity_ratio(F_mat: Tensor) -> Tensor:
     r"""Return :math:`\rho = r_2 / r_3`, the two smaller singular values of matrices before the rank-2 projection.
 
-    The larger, the less the projection takes away (Fan et al., section 4).
+    The larger the ratio, the less the projection changes the matrix (Fan et al., section 4).
 
     Args:
         F_mat: matrices with shape :math:`(*, 3, 3)`.
 
     Returns:
-        ratios with shape :math:`(*)`, at least 1. Up to rounding, that of a matrix of rank 2 is infinite and of
-        lower rank NaN.
+        ratios with shape :math:`(*)`, at least 1; up to rounding, infinite for a matrix of rank 2 and NaN for one of
+        lower rank.
 
     Raises:
         ShapeError: if the shape is wrong.

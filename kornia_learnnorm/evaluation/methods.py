@@ -12,16 +12,28 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.estimators.fundamental import solve_in_coordinates
 from kornia_learnnorm.estimators.refinement import refine_fundamental
-from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
+from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
-from kornia_learnnorm.normalizers.contract import normalizing_transforms
+from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
 from kornia_learnnorm.normalizers.learned import WEIGHTS, LearnedNormalizer
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
-__all__ = ["DEFAULT_METHODS", "Method", "base_name", "find_method", "identify_method", "short_names"]
+__all__ = [
+    "DEFAULT_METHODS",
+    "OPTIMAL",
+    "REFINED",
+    "SHIPPED",
+    "Method",
+    "base_name",
+    "default_methods",
+    "find_method",
+    "identify_method",
+    "short_names",
+]
 
 CLOSED_FORMS: dict[str, Callable[[], Normalizer]] = {
     "none": Identity,
@@ -30,20 +42,24 @@ CLOSED_FORMS: dict[str, Callable[[], Normalizer]] = {
     "reweighted": ReweightedWhitening,
     "searched": SearchedNormalizer,
 }
-REFINED, OPTIMAL = "+LM", "+optimal"
-DEFAULT_METHODS = (
-    "none",
-    "Hartley",
-    "whitening",
-    "reweighted",
-    "paper",
-    "crossview",
-    "crossview-synthetic",
-    "searched",
-    "Hartley+optimal",
-    "Hartley+LM",
-    "crossview+LM",
-)
+REFINED, OPTIMAL = "+LM", "+optimal"  # suffixes of a method's name
+SHIPPED = ("paper", "crossview", "crossview-synthetic")  # weights
+UNKNOWN = "not known"  # training data
+
+
+def default_methods(weights: Sequence[str] = SHIPPED) -> tuple[str, ...]:
+    """Return the closed forms, weights, and the search as the limit of them all.
+
+    Example:
+        >>> default_methods(["mine.safetensors"])
+        ('none', 'Hartley', 'whitening', 'reweighted', 'mine.safetensors', 'searched')
+
+    """
+    *closed_forms, search = CLOSED_FORMS
+    return (*closed_forms, *weights, search)
+
+
+DEFAULT_METHODS = (*default_methods(), "Hartley+optimal", "Hartley+LM", "crossview+LM")  # of a run that is kept
 
 
 class Method(NamedTuple):
@@ -51,15 +67,26 @@ class Method(NamedTuple):
 
     Attributes:
         normalizer: maps ``(points1, points2, weights)`` to two transforms.
-        solve: maps points in pixels, (B, N, 2) float64 each, and a normaliser to fundamental matrices (B, 3, 3).
+        rank2: how the singularity constraint is enforced.
+        refined: whether Levenberg-Marquardt follows.
+        trained_on: the training data, as in :attr:`~kornia_learnnorm.LearnedNormalizer.trained_on`; ``not known`` of
+            weights that do not say it and of code that is not this package's.
     """
 
     normalizer: Normalizer
-    solve: Callable[[Tensor, Tensor, Normalizer], Tensor]
+    rank2: Literal["projection", "optimal"] = "projection"
+    refined: bool = False
+    trained_on: tuple[str, ...] = ()
 
     def estimate(self, points1: Tensor, points2: Tensor) -> Tensor:
         """Return the fundamental matrices (B, 3, 3) of points in pixels, (B, N, 2) float64 each."""
-        return self.solve(points1, points2, self.normalizer)
+        problem = LinearProblem.from_points(points1, points2)
+        return self.solve(problem, *normalizing_transforms(self.normalizer, problem))
+
+    def solve(self, problem: LinearProblem, T1: Tensor, T2: Tensor) -> Tensor:
+        """Return the fundamental matrices (B, 3, 3) of a problem under the transforms of the normaliser."""
+        F_mat = solve_in_coordinates(problem, T1, T2, self.rank2)
+        return refine_fundamental(problem.points1, problem.points2, F_mat).F_mat if self.refined else F_mat
 
 
 def find_method(name: str) -> Method:
@@ -68,25 +95,24 @@ def find_method(name: str) -> Method:
     Args:
         name: ``none``, ``Hartley``, ``whitening``, ``reweighted`` or ``searched``; weights that ship or the path of a
             ``.safetensors`` file; or the import path of a normaliser class or function, ``package.module:Name``, which
-            is looked for in the current folder last. With
-            ``+LM``, the result is refined by Levenberg-Marquardt on the Sampson distance; with ``+optimal``, the
-            covariance-weighted correction takes the place of the projection to rank 2.
+            is looked for in the current folder last. With ``+LM``, the result is refined by Levenberg-Marquardt on the
+            Sampson distance; with ``+optimal``, the covariance-weighted correction takes the place of the projection to
+            rank 2.
 
     Raises:
         ValueError: if there is no such class or function, or the class needs arguments.
         FileNotFoundError: if there is no such normalisation and there are no such weights.
 
     """
-    normalizer = _find_normalizer(base_name(name))
-    if name.endswith(OPTIMAL):
-        return Method(normalizer, lambda x1, x2, n: _solve(x1, x2, n, "optimal"))
-    if name.endswith(REFINED):
-        return Method(normalizer, lambda x1, x2, n: refine_fundamental(x1, x2, _solve(x1, x2, n)).F_mat)
-    return Method(normalizer, _solve)
+    base = base_name(name)
+    normalizer = _find_normalizer(base)
+    trained_on = () if base in CLOSED_FORMS else getattr(normalizer, "trained_on", ()) or (UNKNOWN,)
+    rank2: Literal["projection", "optimal"] = "optimal" if name.endswith(OPTIMAL) else "projection"
+    return Method(normalizer, rank2, name.endswith(REFINED), trained_on)
 
 
 def base_name(name: str) -> str:
-    """Return a method's name without what follows the normalisation.
+    """Return a method's name without suffix, the name of its normalisation.
 
     Example:
         >>> base_name("Hartley+LM")
@@ -111,21 +137,19 @@ def _find_normalizer(name: str) -> Normalizer:
 
 
 def _own_normalizer(name: str) -> Normalizer:
-    """Return a user's normaliser, made where it is a class, whose errors say whose they are."""
+    """Return a user's normaliser, an instance if it is a class; its errors become a ValueError with its name."""
     found = _import(name)
     try:
         made = found() if isinstance(found, type) else found
     except Exception as error:  # of code that is not ours
         text = f"{type(error).__name__}: {error}"
-        raise ValueError(
-            f"{name!r} cannot be made without arguments, which a method's class must be: {text}"
-        ) from error
+        raise ValueError(f"{name!r} cannot be made without arguments, as the class of a method must: {text}") from error
     if not callable(made):
         raise ValueError(f"{name!r} is not a normaliser: it cannot be called")
 
     def normalize(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         try:
-            return normalizing_transforms(made, points1, points2, weights)
+            return normalizing_transforms(made, LinearProblem.from_points(points1, points2, weights))
         except Exception as error:
             text = f"{type(error).__name__}: {error}"
             raise ValueError(f"{name} failed, called with points1, points2 and weights: {text}") from error
@@ -134,26 +158,23 @@ def _own_normalizer(name: str) -> Normalizer:
 
 
 def _import(name: str) -> Any:
-    """Import what an import path names, from the current folder too, as ``python -m`` does."""
+    """Import a class or function by its import path, from the current folder too, as ``python -m`` does."""
     module, _, attribute = name.partition(":")
     if not module or not attribute:
         raise ValueError(f"no normaliser at {name!r}: expected module:Name")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)
+    here, before = str(Path.cwd()), [*sys.path]
     try:
+        sys.path.append(here)
         return getattr(importlib.import_module(module), attribute)
     except Exception as error:  # importing runs code that is not ours
         text = f"{type(error).__name__}: {error}"
         raise ValueError(f"no normaliser at {name!r}, looked for in {here} too: {text}") from error
-
-
-def _solve(x1: Tensor, x2: Tensor, normalizer: Normalizer, rank2: Literal["optimal"] | None = None) -> Tensor:
-    return find_fundamental(x1, x2, normalizer=normalizer, rank2=rank2)
+    finally:
+        sys.path[:] = before
 
 
 def identify_method(name: str) -> str:
-    """Return what a method's predictions depend on: its name, of weights and own code with the digest of the files."""
+    """Return what a method's predictions depend on: its name, and for weights and own code the digest of the files."""
     base = base_name(name)
     if base in CLOSED_FORMS:
         return name
@@ -165,7 +186,7 @@ def identify_method(name: str) -> str:
 
 
 def _source_files(name: str) -> list[Path]:
-    """Return the files of the module that an import path names and of that which defines what it found."""
+    """Return the files of the module in an import path, and of the module that defines the class or function."""
     found = _import(name)
     parts = (sys.modules[name.partition(":")[0]], inspect.getmodule(found), inspect.getmodule(type(found)))
     files = {getattr(part, "__file__", None) for part in parts}
@@ -173,21 +194,17 @@ def _source_files(name: str) -> list[Path]:
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return each method's name for tables and files: of a path, the run's folder or the file's name.
+    """Return each method's name for tables and files: for a path, that of the run's folder or of the file.
 
     Raises:
         ValueError: if two methods have the same name.
 
     """
-    short = {}
+    short = []
     for name in names:
         base = base_name(name)
-        path = Path(base)
-        if path.suffix == ".safetensors":
-            stem = path.resolve().parent.name if path.name == "weights.safetensors" else path.stem
-            short[name] = stem + name[len(base) :]
-        else:
-            short[name] = name
-    if len(set(short.values())) < len(names):
-        raise ValueError(f"two methods have the same name: {', '.join(names)}")
-    return short
+        is_path = Path(base).suffix == ".safetensors"
+        short.append(names_of([base])[0] + name[len(base) :] if is_path else name)
+    if twice := {name for name in short if short.count(name) > 1}:
+        raise ValueError(f"two methods have the same name, {', '.join(sorted(twice))}: rename a file or leave one out")
+    return dict(zip(names, short, strict=True))

@@ -16,9 +16,9 @@ from torch import Tensor
 from kornia_learnnorm.data.images import import_cv2, read_image
 from kornia_learnnorm.data.matching.matchers import match_images
 from kornia_learnnorm.estimators.fundamental import find_fundamental
-from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
 __all__ = ["PairEstimate", "estimate_pair", "write_json"]

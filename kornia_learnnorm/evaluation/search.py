@@ -23,11 +23,11 @@ MAX_PARAMETER = 3.0  # beyond it rounding errors of F would pass for gains
 class SearchedNormalizer(ProblemNormalizer):
     r"""Search each sample's transforms by gradient descent on its own symmetric epipolar distance.
 
-    :math:`T_i = B(p_i)\, T_i^{base}` with parameters :math:`p_i` of its own for every sample, from zero. Adam lowers
-    the logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters met are kept, so that no sample ends
-    above its base. They stay within plus and minus 3: beyond, rounding errors of :math:`F` would pass for gains.
+    :math:`T_i = B(p_i)\, T_i^{base}` with parameters :math:`p_i` for every sample, which start at zero. Adam lowers the
+    logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters of all steps are kept, so that no sample
+    ends above its base. They stay within plus and minus 3: beyond, rounding errors of :math:`F` would pass for gains.
 
-    It is a limit to compare with, not a method to use: it fits the sample's own points, noise included, costs a
+    Use it as a limit to compare with, not as a method: it fits the sample's own points, noise included, costs a
     hundred solutions and its result carries no gradient. It is a local search, so the true optimum may be lower still.
 
     Args:

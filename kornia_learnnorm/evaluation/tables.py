@@ -1,4 +1,4 @@
-"""Tables of methods from their residuals."""
+"""Tables of methods from the errors of their samples."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.predict import Residuals
-from kornia_learnnorm.metrics.better_rate import better_rate
+from kornia_learnnorm.metrics.better_rate import better_rate, comparable
+from kornia_learnnorm.metrics.summary import median
 
-__all__ = ["format_table", "method_rows", "names_of"]
+__all__ = ["DIAGNOSTICS", "HEADER", "diagnostic_rows", "format_table", "method_rows", "names_of"]
 
 HEADER = (
     "method",
@@ -22,35 +22,57 @@ HEADER = (
     "truth: median px",
     "truth: better than Hartley %",
 )
+DIAGNOSTICS = ("method", "condition number", "rho", "distance 1", "distance 2", "error due to rank 2 %")
+
+Predictions = Mapping[str, Mapping[str, Tensor]]
 
 
-def method_rows(residuals: Mapping[str, Residuals]) -> list[list[str]]:
-    """Make a row per method: better rates, mean and median residual, ground-truth residual and its better rate.
+def method_rows(predictions: Predictions) -> list[list[str]]:
+    """Return a row per method: better rates, mean and median residual, ground-truth residual and its better rate.
 
     Args:
-        residuals: residuals by method, with ``"Hartley"`` and ``"whitening"`` among them.
+        predictions: by method, ``own``, the mean symmetric epipolar distance of each sample's points, and ``truth``,
+            the median one of the ground-truth inliers of its pair, NaN where there are none; pixels, (S,) each.
 
     Returns:
         cells as text, in the order of :data:`HEADER`. The mean leaves out samples whose residual is infinite for any
-        method (a point on an epipole).
+        method (a point on an epipole). Without Hartley or whitening among the methods, their rates are empty.
 
     """
-    finite = torch.stack([r.own for r in residuals.values()]).isfinite().all(0)
+    finite = torch.stack([errors["own"] for errors in predictions.values()]).isfinite().all(0)
     rows = []
-    for name, (own, truth) in residuals.items():
-        rates = [_rate(own, residuals[baseline].own, name == baseline) for baseline in ("Hartley", "whitening")]
-        known = ~truth.isnan()
-        truth_cells = ["-", "-"]
-        if bool(known.any()):
-            truth_rate = _rate(truth[known], residuals["Hartley"].ground_truth[known], name == "Hartley")
-            truth_cells = [f"{truth[known].quantile(0.5).item():.3f}", truth_rate]
-        mean, median = own[finite].mean().item(), own.quantile(0.5).item()
-        rows.append([name, *rates, f"{mean:.3f}", f"{median:.3f}", *truth_cells])
+    for name, errors in predictions.items():
+        own, truth = errors["own"], errors["truth"]
+        rates = [_rate(predictions, name, baseline, "own") for baseline in ("Hartley", "whitening")]
+        numbers = [f"{own[finite].mean().item():.3f}", f"{median(own).item():.3f}"]
+        accuracy = "-" if truth.isnan().all() else f"{median(truth).item():.3f}"
+        rows.append([name, *rates, *numbers, accuracy, _rate(predictions, name, "Hartley", "truth")])
     return rows
 
 
-def _rate(residual: Tensor, baseline: Tensor, same: bool) -> str:
-    return "-" if same else f"{100 * better_rate(residual, baseline).rate:.1f}"
+def _rate(predictions: Predictions, name: str, baseline: str, quantity: str) -> str:
+    if name == baseline or baseline not in predictions:
+        return "-"
+    errors, other = predictions[name][quantity], predictions[baseline][quantity]
+    return f"{100 * better_rate(errors, other).rate:.1f}" if comparable(errors, other).any() else "-"
+
+
+def diagnostic_rows(predictions: Predictions) -> list[list[str]]:
+    """Return a row per method: the medians of its diagnostics.
+
+    Args:
+        predictions: by method, (S,) each, the diagnostics that a run keeps.
+
+    Returns:
+        cells as text, in the order of :data:`DIAGNOSTICS`.
+
+    """
+    rows = []
+    for name, found in predictions.items():
+        numbers = [median(found[key]).item() for key in ("condition_number", "rho", "distance1", "distance2")]
+        rank2 = 100 * median(found["rank2_share"]).item()
+        rows.append([name, *(f"{number:.4g}" for number in numbers), f"{rank2:z.0f}"])
+    return rows
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -84,5 +106,5 @@ def names_of(paths: Sequence[str]) -> list[str]:
     names = [f.resolve().parent.name if f.name == "weights.safetensors" else f.name for f in files]
     names = [name.removesuffix(".safetensors").replace(".h5", "") for name in names]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: {', '.join(paths)}")
+        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: rename one of {', '.join(paths)}")
     return names

@@ -44,6 +44,10 @@ class LearnedNormalizer(ProblemNormalizer):
             :class:`~kornia_learnnorm.CrossViewNetwork` of their size when not given.
         transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
 
+    Attributes:
+        trained_on: names of the stores that the weights were trained on, ``STORE@FIRST:STOP`` for some pairs of one, or
+            ``synthetic scenes``; empty where that is not known. It is saved with the weights.
+
     Reference:
         Fan et al., section 4: normalisation matrices predicted from the correspondences by a network that is
         invariant to their order.
@@ -69,6 +73,7 @@ class LearnedNormalizer(ProblemNormalizer):
         self.base: Normalizer = ReweightedWhitening() if base is None else base
         self.network = CrossViewNetwork() if network is None else network
         self.transform = transform
+        self.trained_on: tuple[str, ...] = ()
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views, in the dtype of the problem."""
@@ -101,9 +106,14 @@ class LearnedNormalizer(ProblemNormalizer):
             "transform": _name(self.transform, transforms),
         }
         state = {key: value.detach().cpu().contiguous() for key, value in self.state_dict().items()}
+        metadata = {
+            "format": FORMAT,
+            "architecture": json.dumps(architecture),
+            "trained_on": json.dumps(self.trained_on),
+        }
         with atomic_write(path) as beside:
             try:
-                save_file(state, beside, metadata={"format": FORMAT, "architecture": json.dumps(architecture)})
+                save_file(state, beside, metadata=metadata)
             except SafetensorError as error:
                 raise OSError(f"{path} could not be written: {error}") from error
 
@@ -150,7 +160,19 @@ class LearnedNormalizer(ProblemNormalizer):
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
         if broken:
             raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
+        normalizer.trained_on = _read_names(path, metadata.get("trained_on", "[]"))
         return normalizer.eval()
+
+
+def _read_names(path: Path, text: str) -> tuple[str, ...]:
+    """Return the names in a JSON list."""
+    try:
+        names = json.loads(text)
+    except ValueError:
+        names = None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{path}: trained_on must be a JSON list of names, got {text[:80]!r}")
+    return tuple(names)
 
 
 def _name(part: Any, *modules: Any) -> str:

@@ -78,3 +78,6 @@ def test_bad_arguments(store, arguments, message):
 def test_too_few_to_hold_out(store):
     with pytest.raises(ValueError, match="held-out correspondences: a pair has only"):
         draw_samples(store, seeded(), size=96, max_ratio=None, num_heldout=4)
+    samples = draw_samples(store, seeded(), size=96, max_ratio=None, num_heldout=4, require_heldout=False)
+    assert samples.heldout1.isnan().any()
+    assert torch.equal(samples.points1, draw_samples(store, seeded(), size=96, max_ratio=None).points1)

@@ -13,7 +13,6 @@ from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import estimators, hypotheses
 from kornia_learnnorm.evaluation.runs import example
 
-METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
 ESTIMATORS = ["kornia-8pt", "count:Hartley", "count:whitening", "time:Hartley", "time:whitening", "RANSAC"]
 SOLVERS = ["Hartley", "whitening", "seven-point"]
 
@@ -26,12 +25,23 @@ def store(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def run(store, tmp_path_factory):
-    """A run of predictions, not to be changed."""
+def methods():
+    return ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
+
+
+@pytest.fixture(scope="session")
+def command(store, methods):
+    """The command that makes the run, without its folder."""
+    return ["evaluate", str(store), "--methods", *methods, "--out"]
+
+
+@pytest.fixture(scope="session")
+def run(command, tmp_path_factory):
+    """A run, not to be changed."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(example, "TRIALS", 20)
-        assert main(["evaluate", str(store), "--out", str(folder), "--methods", *METHODS]) == 0
+        assert main([*command, str(folder)]) == 0
     return folder
 
 
@@ -80,3 +90,8 @@ def robust_run(robust_command, small_budgets, tmp_path_factory):
 @pytest.fixture
 def robust_copied(robust_run, tmp_path):
     return shutil.copytree(robust_run, tmp_path / "run")
+
+
+@pytest.fixture
+def few_trials(monkeypatch):
+    monkeypatch.setattr(example, "TRIALS", 20)

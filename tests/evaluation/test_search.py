@@ -9,7 +9,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kornia.core.exceptions import ShapeError
 from two_view import SCENES, correspondences, eight_point, epipolar_distances, numpy_hartley, shaken, uniform
 
 from kornia_learnnorm import (
@@ -92,11 +91,6 @@ class TestSmoke:
         ("points1", "points2", "weights", "error", "message"),
         [
             (torch.rand(2, 7, 2), torch.rand(2, 7, 2), None, ValueError, "at least 8 correspondences .* got 7"),
-            (torch.rand(2, 8, 2), torch.rand(2, 9, 2), None, ValueError, "pair up"),
-            (torch.rand(2, 8, 3), torch.rand(2, 8, 3), None, ShapeError, "2, 8, 3"),
-            (torch.rand(2, 8, 2), torch.rand(2, 8, 2).double(), None, TypeError, "one dtype"),
-            (torch.ones(2, 8, 2).int(), torch.rand(2, 8, 2), None, TypeError, "points1 must be .* got torch.int32"),
-            (np.ones((2, 8, 2)), torch.rand(2, 8, 2), None, TypeError, "points1 must be .* got .*ndarray"),
             (torch.full((2, 8, 2), torch.nan), torch.rand(2, 8, 2), None, ValueError, "points1 must be finite"),
             (torch.rand(2, 8, 2), torch.rand(2, 8, 2), -torch.ones(2, 8), ValueError, "must not be negative"),
         ],
@@ -232,16 +226,13 @@ class TestInvariances:
         self.same(normalizer(points2, points1)[::-1], normalizer(points1, points2), 1e-4)
 
     @pytest.mark.parametrize("num_points", [8, 20])
-    def test_zero_weight_is_absence(self, num_points):
+    def test_zero_weight_is_absence_and_equal_weights_are_none(self, num_points):
         points, normalizer = correspondences("handheld", 6, num_points), SearchedNormalizer(steps=5)
         weights = uniform(6, num_points, low=0.5) if num_points > 8 else torch.ones(6, 8).double()
         junk = [uniform(6, 4, 2, high=600, seed=seed) for seed in (1, 2)]
         extended = [torch.cat(p, 1) for p in zip((*junk, 0 * weights[:, :4]), (*points, weights), strict=True)]
         self.same(normalizer(*extended), normalizer(*points, weights), 1e-4)
-
-    def test_equal_weights_are_none(self):
-        points, normalizer = correspondences("handheld", 6, 12), SearchedNormalizer(steps=5)
-        self.same(normalizer(*points, torch.full((6, 12), 0.25).double()), normalizer(*points), 1e-4)
+        self.same(normalizer(*points, torch.full_like(weights, 0.25)), normalizer(*points), 1e-4)  # equal weights
 
     def test_weights_are_those_of_the_mean_and_of_the_solution(self):
         points, weights = correspondences("handheld", 20, 12), uniform(20, 12)
@@ -254,30 +245,25 @@ class TestInvariances:
 
 class TestGradients:
     @pytest.mark.parametrize("learned", [False, True])
-    def test_the_result_carries_none(self, learned):
+    def test_the_result_carries_none_and_the_points_stay_as_they_are(self, learned):
         base = shaken() if learned else ReweightedWhitening()
         values = [v.requires_grad_() for v in (*correspondences("handheld", 3), uniform(3, 8, low=0.5))]
+        before = [v.detach().clone() for v in values]
         for T in SearchedNormalizer(base, steps=3)(*values):
             assert not T.requires_grad
-        assert all(v.grad is None for v in values)
+        assert all(v.grad is None and torch.equal(v, b) for v, b in zip(values, before, strict=True))
         assert all(parameter.grad is None for parameter in base.parameters())
 
-    def test_works_where_gradients_are_off_and_leaves_them_off(self):
+    @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+    def test_works_where_gradients_are_off_and_leaves_them_off(self, mode):
         points, normalizer = correspondences("handheld", 3), SearchedNormalizer(Hartley(), steps=10)
         expected = normalizer(*points)
-        with torch.no_grad():
-            found = normalizer(*points)
+        with mode():
+            found = normalizer(*(p + 0 for p in points))
             assert not torch.is_grad_enabled()
         for T, want, H in zip(found, expected, Hartley()(*points), strict=True):
             assert torch.equal(T, want)
             assert not torch.allclose(T, H)
-
-    def test_works_in_inference_mode(self):
-        points, normalizer = correspondences("handheld", 3), SearchedNormalizer(steps=5)
-        expected = normalizer(*points)
-        with torch.inference_mode():
-            found = normalizer(*(p + 0 for p in points))
-        assert all(torch.equal(f, e) for f, e in zip(found, expected, strict=True))
 
     def test_the_matrix_still_depends_on_the_points(self):
         """With the transforms held, the eight-point algorithm has its derivatives."""
@@ -286,12 +272,6 @@ class TestGradients:
         for p in points:
             assert torch.isfinite(p.grad).all()
             assert p.grad.count_nonzero() > 0
-
-    def test_the_points_stay_as_they_are(self):
-        points = correspondences("handheld", 3)
-        before = [p.clone() for p in points]
-        SearchedNormalizer(steps=2)(*points)
-        assert all(torch.equal(p, b) for p, b in zip(points, before, strict=True))
 
 
 LINE = uniform(4, 20, 1, high=600) * torch.tensor([1.0, 0.5])

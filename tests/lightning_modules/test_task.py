@@ -135,6 +135,7 @@ def test_export_and_predictions(tmp_path):
     trainer = make_trainer(tmp_path, [ExportWeights(), WritePredictions()], max_steps=3, enable_checkpointing=False)
     trainer.fit(task, data)
     exported = kln.LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
+    assert exported.trained_on == ("synthetic scenes",)
     trainer.predict(task, data)
     written = load_file(tmp_path / "predictions.safetensors")
     samples = data.test.draw(EVALUATION_SEED, 0)

@@ -280,9 +280,11 @@ class TestFiles:
     )
     def test_round_trip(self, parts, tmp_path):
         normalizer = shaken(LearnedNormalizer(*parts))
+        normalizer.trained_on = ("kitti_00", "tum@0:9")
         normalizer.save_pretrained(tmp_path / "weights.safetensors")
         loaded = LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
         assert not loaded.training
+        assert loaded.trained_on == ("kitti_00", "tum@0:9")
         assert loaded.transform is normalizer.transform
         for part, saved in ((loaded.base, normalizer.base), (loaded.network, normalizer.network)):
             assert type(part) is type(saved)
@@ -402,8 +404,13 @@ class TestStrictness:
         assert file.name in str(caught.value)
 
     def test_control(self, file):
-        self.rewrite(file)
-        LearnedNormalizer.from_pretrained(file)
+        self.rewrite(file, change_metadata=lambda metadata: metadata.pop("trained_on"))
+        assert LearnedNormalizer.from_pretrained(file).trained_on == ()
+
+    @pytest.mark.parametrize("text", ["kitti_00", '"kitti_00"', "[0]"])
+    def test_trained_on_is_not_a_list_of_names(self, file, text):
+        self.rewrite(file, change_metadata=lambda metadata: metadata.update(trained_on=text))
+        self.fails(file, "trained_on must be a JSON list of names, got")
 
     def test_missing_tensor(self, file):
         self.rewrite(file, lambda state: state.pop("network.set_network.head.2.bias"))

@@ -16,6 +16,7 @@ from kornia_learnnorm.evaluation.report.robust import robust_tables
 from kornia_learnnorm.evaluation.report.style import Picture
 from kornia_learnnorm.evaluation.report.tables import report_tables
 from kornia_learnnorm.evaluation.robust.run import RobustRun, read_robust
+from kornia_learnnorm.evaluation.runs.manifest import read_section
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write
@@ -71,7 +72,7 @@ def write_report(folder: str | Path) -> Report:
     pictures: list[Picture] = []
     missing: list[str] = []
     robust = read_robust(folder)
-    if robust is None or (folder / "run.json").is_file():
+    if robust is None or read_section(folder, "evaluate") is not None:
         run = with_baseline(read_run(folder))
         about.append(_about_run(run))
         tables += report_tables(run)

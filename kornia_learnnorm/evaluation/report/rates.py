@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from kornia_learnnorm.evaluation.report.formatting import BASELINE, Table, rate_text
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
-from kornia_learnnorm.evaluation.runs.trained import saw
+from kornia_learnnorm.evaluation.runs.trained import was_trained_on
 from kornia_learnnorm.metrics.better_rate import better_rate
-from kornia_learnnorm.protocol import MAX_RESIDUAL, PROTOCOLS, RATIO
+from kornia_learnnorm.protocol import PROTOCOLS, RATIO
 
 __all__ = ["TESTS", "rate_tables", "with_baseline"]
 
@@ -61,7 +61,9 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     trained, protocol = run.about["trained_on"], cells[0].protocol
     rows = []
     for name in run.about["methods"]:
-        rates = [_rate(cell, name, baseline) + (" *" if saw(trained[name], cell.store) else "") for cell in cells]
+        rates = [
+            _rate(cell, name, baseline) + (" *" if was_trained_on(cell.store, trained[name]) else "") for cell in cells
+        ]
         rows.append([name, ", ".join(trained[name]) or "-", *rates])
     found = [
         better_rate(prediction["own"], cell.predictions[baseline]["own"])
@@ -71,12 +73,12 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     ]
     ties, degenerate = sum(rate.ties for rate in found), sum(rate.degenerate for rate in found)
     text = (
-        "Share of samples of eight correspondences with a smaller mean symmetric epipolar distance than under "
-        f"{baseline}, %, with the 95 % bootstrap interval over image pairs. An asterisk marks a method that was "
+        f"Share of samples of {run.about['size']} correspondences with a smaller mean symmetric epipolar distance than "
+        f"under {baseline}, %, with the 95 % bootstrap interval over image pairs. An asterisk marks a method that was "
         f"trained on pairs of the store. The whole table has {ties} ties, which count as not better, and leaves out "
         f"{degenerate} degenerate comparisons. The header gives the number of samples used and drawn; samples with a "
         "mean symmetric epipolar distance under the eight-point algorithm without normalisation of "
-        f"{MAX_RESIDUAL:g} px or more are not used."
+        f"{run.about['max_residual']:g} px or more are not used."
     )
     if protocol == "filtered":
         text += f" Filtered matches: the nearest descriptor is less than {RATIO:g} times as far as the second nearest."

@@ -5,7 +5,6 @@ Results that exist are not computed again, and a run of other options is refused
 
 from __future__ import annotations
 
-import importlib.metadata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from kornia_learnnorm.evaluation.robust.estimators import (
 from kornia_learnnorm.evaluation.robust.peers import PEERS
 from kornia_learnnorm.evaluation.robust.record import record_missing
 from kornia_learnnorm.evaluation.robust.run import begin_run, leave_out
+from kornia_learnnorm.evaluation.runs.manifest import describe_stores, package_versions
 
 __all__ = ["DEFAULT_OPTIONS", "record_robust"]
 
@@ -71,12 +71,12 @@ def record_robust(
     solve = {solver_names[name]: find_solver(name) for name in solvers}
     read = {name: read_store(path) for name, path in stores.items()}
     about: dict[str, Any] = {
-        "stores": {name: f"{s.dataset}, {len(s)} pairs, {s.offsets[-1]} matches" for name, s in read.items()},
+        "stores": describe_stores(read),
         "estimators": {names[name]: found[name] and identify_estimator(name) for name in estimators},
         "solvers": {solver_names[name]: identify_estimator(name) for name in solvers},
         **options,
         "threads": torch.get_num_threads(),
-        "versions": {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")},
+        "versions": package_versions(),
     }
     begin_run(folder, about, [(names | solver_names)[name] for name in redo])
     installed = {names[name]: estimator for name, estimator in found.items() if estimator is not None}

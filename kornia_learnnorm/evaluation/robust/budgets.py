@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.minimal import are_determined
-from kornia_learnnorm.evaluation.predict import Normalizer
 from kornia_learnnorm.evaluation.robust.matches import Matches
 from kornia_learnnorm.evaluation.robust.peers import Peer
+from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, draw_distinct
 from kornia_learnnorm.ransac.scoring import PairScorer
@@ -133,16 +133,6 @@ def best_of(number: int, solver: Solver) -> Estimator:
     return estimate
 
 
-class _Counted(RANSAC):
-    """RANSAC that counts the samples it draws."""
-
-    samples = 0
-
-    def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
-        self.samples += len(rows)
-        return super()._solve(scorer, rows)
-
-
 def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
     """Return :class:`~kornia_learnnorm.RANSAC` as an estimator.
 
@@ -155,12 +145,12 @@ def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
     def estimate(matches: Matches, seed: int, thresholds: Sequence[float]) -> list[Estimate]:
         found = []
         for threshold in thresholds:
-            estimator = _Counted(normalizer, inl_th=threshold, seed=seed, **options)
+            estimator = RANSAC(normalizer, inl_th=threshold, seed=seed, **options)
             start = time.perf_counter()
-            F_mat = estimator(matches.points1, matches.points2)[0]
+            result = estimator.estimate(matches.points1, matches.points2)
             seconds = time.perf_counter() - start
-            F_mat = F_mat if bool(F_mat.any()) else _failure()
-            found.append(Estimate(F_mat, seconds, estimator.samples))
+            F_mat = result.F_mat if bool(result.F_mat.any()) else _failure()
+            found.append(Estimate(F_mat, seconds, result.num_samples))
         return found
 
     return estimate

@@ -1,4 +1,4 @@
-"""Running robust estimators and minimal solvers on stores, and keeping their figures."""
+"""Run robust estimators and minimal solvers on stores, and keep their results."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from tqdm import tqdm
 
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.robust.budgets import Estimate, Estimator, Solver, run_estimator
@@ -18,10 +16,9 @@ from kornia_learnnorm.evaluation.robust.estimators import is_slow, is_timed
 from kornia_learnnorm.evaluation.robust.hypotheses import hypothesis_quality, samples_of
 from kornia_learnnorm.evaluation.robust.matches import Matches, draw_matches, even_pairs, measure
 from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path
-from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS
-from kornia_learnnorm.evaluation.runs.record import PROTOCOLS
-from kornia_learnnorm.evaluation.runs.run import read_arrays
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
+from kornia_learnnorm.optional import import_extra
+from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
 __all__ = ["record_missing"]
 
@@ -44,7 +41,7 @@ def record_missing(
     solvers: Mapping[str, Solver],
     options: Mapping[str, int],
 ) -> dict[str, str]:
-    """Compute what is not there yet; a step of the bar is a run on an image pair, or a solver on one.
+    """Compute what a run does not have yet; a step of the bar is a run on an image pair, or a solver on one.
 
     Args:
         folder: the run.
@@ -57,9 +54,10 @@ def record_missing(
         why estimators and solvers failed, by name; all others go on.
 
     Raises:
-        ValueError: if a file that is there is damaged.
+        ValueError: if a file is damaged.
 
     """
+    tqdm = import_extra("tqdm", "images", "the progress bar of robust estimation").tqdm
     failed = dict[str, str]()
     runs = {name: min(options["seeds"], options["slow_seeds"] if is_slow(name) else 10**9) for name in estimators}
     # What depends on time takes turns, so that the load of the machine is the same for all.
@@ -96,17 +94,15 @@ def _missing(folder: Path, store: str, protocol: str, name: str) -> dict[float, 
 
 
 def _is_there(path: Path) -> bool:
-    """Tell whether a file is there; a damaged one is an error."""
+    """Return whether a file exists; a damaged one is an error."""
     return path.is_file() and bool(read_arrays(path))
 
 
-def _record_estimates(
-    jobs: Sequence[_Job], draw: Draw, pairs: Sequence[int], failed: dict[str, str], bar: tqdm
-) -> None:
-    """Run estimators in turn on every pair with every seed, and write their figures of each threshold."""
+def _record_estimates(jobs: Sequence[_Job], draw: Draw, pairs: Sequence[int], failed: dict[str, str], bar: Any) -> None:
+    """Run estimators in turn on every pair with every seed, and write their results at each threshold."""
     todo = [job for job in jobs if job.paths]
     bar.update(len(pairs) * sum(job.runs for job in jobs if not job.paths))
-    figures: dict[Path, dict[str, NDArray[Any]]] = {path: {} for job in todo for path in job.paths.values()}
+    results: dict[Path, Arrays] = {path: {} for job in todo for path in job.paths.values()}
     for (place, pair), seed in product(enumerate(pairs), range(max((job.runs for job in todo), default=0))):
         matches = draw(pair=pair, order=seed)
         for job in todo:
@@ -120,21 +116,21 @@ def _record_estimates(
             for (threshold, path), estimate in zip(job.paths.items(), estimates, strict=True):
                 for key, value in _describe(matches, estimate, threshold).items():
                     empty = np.full((len(pairs), job.runs, *np.shape(value)), np.nan)
-                    figures[path].setdefault(key, empty)[place, seed] = value
+                    results[path].setdefault(key, empty)[place, seed] = value
             bar.update()
     for job in todo:
         if job.name not in failed:
             for path in job.paths.values():
-                _write(path, {"pair": np.array(pairs), **figures[path]})
+                write_arrays(path, {"pair": np.array(pairs), **results[path]})
 
 
 def _describe(matches: Matches, estimate: Estimate, threshold: float) -> dict[str, Any]:
-    figures = measure(matches, estimate.F_mat, threshold)
-    return {**figures, "F_mat": estimate.F_mat.numpy(), "seconds": estimate.seconds, "samples": estimate.samples}
+    measured = measure(matches, estimate.F_mat, threshold)
+    return {**measured, "F_mat": estimate.F_mat.numpy(), "seconds": estimate.seconds, "samples": estimate.samples}
 
 
 def _record_hypotheses(
-    path: Path, solver: Solver, number: int, draw: Draw, pairs: Sequence[int], seed: int, bar: tqdm
+    path: Path, solver: Solver, number: int, draw: Draw, pairs: Sequence[int], seed: int, bar: Any
 ) -> None:
     """Measure a minimal solver's hypotheses of every pair."""
     if _is_there(path):
@@ -146,10 +142,4 @@ def _record_hypotheses(
         errors.append(error.float().numpy())
         scores.append(score.float().numpy())
         bar.update()
-    _write(path, {"pair": np.array(pairs), "error": np.stack(errors), "score": np.stack(scores)})
-
-
-def _write(path: Path, arrays: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as beside:
-        np.savez_compressed(beside, **arrays)
+    write_arrays(path, {"pair": np.array(pairs), "error": np.stack(errors), "score": np.stack(scores)})

@@ -1,4 +1,4 @@
-"""How many of a pair's correspondences agree with the matrix of each of its samples."""
+"""How many of a pair's matches agree with the matrix of each of its samples."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.evaluation.runs.pairs import pair_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.protocol import THRESHOLDS
 
-__all__ = ["THRESHOLDS", "consensus"]
-
-THRESHOLDS = (0.1, 1.0)  # pixels
+__all__ = ["consensus"]
 
 
 def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
-    """Measure share of inliers and F1 of many matrices, each over all correspondences of its image pair.
+    """Compute share of inliers and F1 of many matrices, each over all matches of its image pair.
 
-    What :func:`~kornia_learnnorm.metrics.pairs.inlier_share` and :func:`~kornia_learnnorm.metrics.pairs.f1_score` say
-    of one matrix, with the distances computed once for both and for all of :data:`THRESHOLDS`.
+    The values are those of :func:`~kornia_learnnorm.metrics.pairs.inlier_share` and
+    :func:`~kornia_learnnorm.metrics.pairs.f1_score`, with the distances computed once for both and for all of
+    :data:`~kornia_learnnorm.protocol.THRESHOLDS`.
 
     Args:
         F_mat: estimated matrices with shape (S, 3, 3), float64.
         pair: image pair of each with shape (S,), int64.
-        store: the correspondences and the true matrices.
-        max_ratio: only correspondences with Lowe's ratio below this count; None for all.
+        store: the matches and the true matrices.
+        max_ratio: only matches with Lowe's ratio below count; None for all.
 
     Returns:
         ``inliers`` and ``f1`` with shape (S, thresholds); F1 is NaN where the ground truth has no inliers.
@@ -33,7 +34,7 @@ def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio
     f1 = inliers.clone()
     for index in torch.unique(pair).tolist():
         rows = torch.nonzero(pair == index).flatten()
-        points1, points2 = _matches(store, index, max_ratio)
+        points1, points2 = pair_matches(store, index, max_ratio)
         true = _within(points1[None], points2[None], torch.from_numpy(store.F[index : index + 1]))
         number = len(rows), -1, -1
         found = _within(points1.expand(*number), points2.expand(*number), F_mat[rows])
@@ -43,16 +44,7 @@ def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio
     return {"inliers": inliers, "f1": f1}
 
 
-def _matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
-    rows = slice(int(store.offsets[pair]), int(store.offsets[pair + 1]))
-    points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
-    if max_ratio is None:
-        return points1, points2
-    passes = torch.from_numpy(store.ratio[rows]) < max_ratio
-    return points1[passes], points2[passes]
-
-
 def _within(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    """Which points lie within each threshold, (S, thresholds, N); none do under a matrix of NaN."""
+    """Return which points lie within each threshold, (S, thresholds, N); none do under a matrix of NaN."""
     distance = symmetric_epipolar_distance(points1, points2, F_mat).nan_to_num(nan=torch.inf)
     return distance[:, None] < distance.new_tensor(THRESHOLDS)[:, None]

@@ -1,130 +1,148 @@
-"""``run.json``: what a run of predictions is of."""
+"""``run.json``: what a run was computed from, in a section for ``evaluate`` and one for ``robust``."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import atomic_write
 
-__all__ = ["begin_run", "leave_out", "read_about", "read_object"]
+__all__ = ["About", "begin_section", "describe_stores", "leave_out", "package_versions", "read_section"]
 
-FORMAT = 2  # of what a run keeps; others are refused
-JOINED = ("stores", "methods", "trained_on")
-PACKAGES = ("kornia_learnnorm", "torch", "kornia")
+FORMAT = 3  # of the folder; runs of another format are refused
+# Parts of a section that may grow: what each is, by its name.
+JOINED = {
+    "evaluate": ("stores", "methods", "trained_on", "versions"),
+    "robust": ("stores", "estimators", "solvers", "versions"),
+}
+# Parts that must stay as they are.
+OPTIONS = {
+    "evaluate": ("size", "seed", "max_samples", "max_residual"),
+    "robust": ("pairs", "hypotheses", "seeds", "slow_seeds", "seed", "threads"),
+}
 
 About = dict[str, Any]
 
 
-def read_about(folder: Path) -> About:
-    """Return what a run is of.
+def read_section(folder: Path, section: str) -> About | None:
+    """Return what a run was computed from.
 
     Args:
         folder: the run.
+        section: ``evaluate`` or ``robust``.
 
     Returns:
-        ``stores`` and ``methods``, what each is by its name; ``trained_on``, names by method; ``seed``,
-        ``max_samples``, ``versions`` by package, and ``format``.
+        the options by name, and by the names in ``JOINED`` what each store, method and so on is; None where the folder
+        holds no such run.
 
     Raises:
-        FileNotFoundError: if the folder has no run.
-        ValueError: if another version of the package made it, or the file is damaged.
+        ValueError: if another version of the package made it, or ``run.json`` is damaged.
 
     """
-    path = folder / "run.json"
-    if not path.is_file():
-        raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
-    about = read_object(path)
-    if about.get("format") != FORMAT:
-        raise ValueError(
-            f"{folder} is a run of format {about.get('format')}, expected {FORMAT}: another version of the package made"
-            " it, learnnorm evaluate STORE --out ELSEWHERE makes it anew"
-        )
-    wrong = [key for key in (*JOINED, "versions") if not isinstance(about.get(key), dict)]
-    wrong += [key for key in ("seed", "max_samples") if key not in about]
-    if wrong or about["methods"].keys() != about["trained_on"].keys():
-        raise ValueError(f"{path} is damaged: {', '.join(wrong or ['methods and trained_on'])} not as they should be")
-    return about
-
-
-def read_object(path: Path) -> About:
-    """Return the object of a JSON file.
-
-    Args:
-        path: the file.
-
-    Raises:
-        ValueError: if the file is damaged.
-
-    """
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged, it is not JSON: {error}") from error
+    about = _read(folder).get(section)
+    if about is None:
+        return None
     if not isinstance(about, dict):
-        raise ValueError(f"{path} is damaged: expected an object of JSON, got {type(about).__name__}")
+        raise ValueError(f"{folder / 'run.json'} is damaged: {section} must be an object, got {about!r}")
+    wrong = [key for key in JOINED[section] if not isinstance(about.get(key), dict)]
+    wrong += [key for key in OPTIONS[section] if key not in about]
+    if wrong:
+        raise ValueError(f"{folder / 'run.json'} is damaged: {', '.join(wrong)} missing or not an object")
     return about
 
 
-def begin_run(folder: Path, joined: dict[str, dict[str, Any]], seed: int, max_samples: int | None) -> list[str]:
-    """Write what a run is of, or refuse a folder of another one; further stores and methods may join it.
+def begin_section(folder: Path, section: str, about: About, redo: Collection[str] = ()) -> None:
+    """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
 
     Args:
         folder: the run, made if missing.
-        joined: what each store and method is, and what the methods were trained on.
-        seed: seed of the shuffles.
-        max_samples: at most so many samples of each store and protocol; None for all.
-
-    Returns:
-        the methods that were not there before.
+        section: ``evaluate`` or ``robust``.
+        about: the options, and by the names in ``JOINED`` what each store, method and so on is; None for one whose
+            package is not installed.
+        redo: names whose description may change.
 
     Raises:
-        ValueError: if the folder holds a run of other options.
+        ValueError: if the folder holds a run of other options or of another version of the package.
         OSError: if it cannot be written.
 
     """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: expected a folder for the run, or a new name")
-    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
-    about: About = {"format": FORMAT, **joined, "seed": seed, "max_samples": max_samples, "versions": versions}
-    new = list(joined["methods"])
-    if (folder / "run.json").is_file():
-        had = read_about(folder)
-        new = [name for name in new if name not in had["methods"]]
-        differ = [
-            f"{key} {had[key]!r}, now {about[key]!r}" for key in ("seed", "max_samples") if had[key] != about[key]
-        ]
-        for key in (*JOINED, "versions"):
-            differ += [
-                f"{name} {old!r}, now {about[key][name]!r}"
-                for name, old in had[key].items()
-                if about[key].get(name, old) != old
-            ]
-            about[key] = {**had[key], **about[key]}
-        if differ:
-            raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
+    joined, had = JOINED[section], read_section(folder, section) or about
+    differ = [f"{key} {had[key]!r}, now {about[key]!r}" for key in OPTIONS[section] if had[key] != about[key]]
+    differ += [text for key in joined for text in _changes(had[key], about[key], redo)]
+    if differ:
+        raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder, about)
-    return new
+    _write(folder, section, about | {key: _join(had[key], about[key]) for key in joined})
 
 
-def leave_out(folder: Path, methods: Sequence[str]) -> None:
-    """Take methods out of what a run is of; their files are the caller's.
+def leave_out(folder: Path, section: str, names: Collection[str]) -> None:
+    """Remove methods, estimators or solvers from what a run was computed from; their files are the caller's.
 
     Args:
         folder: the run.
-        methods: their names.
+        section: ``evaluate`` or ``robust``.
+        names: what to remove.
 
     """
-    about = read_about(folder)
-    for key in ("methods", "trained_on"):
-        about[key] = {name: value for name, value in about[key].items() if name not in methods}
-    _write(folder, about)
+    about = read_section(folder, section) or {}
+    for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
+        about[key] = {name: value for name, value in about[key].items() if name not in names}
+    _write(folder, section, about)
 
 
-def _write(folder: Path, about: About) -> None:
-    with atomic_write(folder / "run.json") as beside:
-        beside.write_text(json.dumps(about, indent=1), encoding="utf-8")
+def describe_stores(stores: Mapping[str, CorrespondenceStore]) -> dict[str, str]:
+    """Return what each store of a run is, by its name."""
+    return {
+        name: f"{store.dataset or 'no description'}, {len(store)} pairs, {store.offsets[-1]} matches"
+        for name, store in stores.items()
+    }
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that the numbers of a run depend on."""
+    return {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")}
+
+
+def _changes(had: About, now: About, redo: Collection[str]) -> list[str]:
+    """Return what is described otherwise than before; a package that is or was not installed is no change."""
+    return [
+        f"{name} {had[name]!r}, now {value!r}"
+        for name, value in now.items()
+        if name in had and name not in redo and had[name] != value and None not in (had[name], value)
+    ]
+
+
+def _join(had: About, now: About) -> About:
+    """Return what was there, then what is new; a package that is not installed now stays as it was."""
+    return had | {name: value for name, value in now.items() if value is not None or name not in had}
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    """Return the sections; none where there is no run."""
+    path = folder / "run.json"
+    advice = "another version of the package made it, remove it or give another folder to --out"
+    if (folder / "robust.json").is_file():
+        raise ValueError(f"{folder} is a run of format 1 with a robust.json, expected {FORMAT}: {advice}")
+    if not path.is_file():
+        return {}
+    try:
+        sections = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged, it is not JSON: {error}") from error
+    if not isinstance(sections, dict):
+        raise ValueError(f"{path} is damaged: expected an object of JSON, got {type(sections).__name__}")
+    if (found := sections.pop("format", None)) != FORMAT:
+        raise ValueError(f"{folder} is a run of format {found}, expected {FORMAT}: {advice}")
+    return sections
+
+
+def _write(folder: Path, section: str, about: About) -> None:
+    content = {"format": FORMAT, **_read(folder), section: about}
+    with atomic_write(folder / "run.json") as temporary:
+        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")

@@ -1,24 +1,25 @@
-"""What the cameras did between the images of a pair, from a store's ground truth."""
+"""The motion of the cameras between the images of a pair, from a store's ground truth."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from kornia.geometry.conversions import convert_points_to_homogeneous
 
-from kornia_learnnorm.data.samples import RATIO
 from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.evaluation.runs.arrays import Arrays
+from kornia_learnnorm.evaluation.runs.pairs import pair_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
 __all__ = ["pair_motions"]
 
-INLIER = 1.0  # pixels
+QUANTITIES = ("rotation", "forward", "parallax", "inliers")
 
 
-def pair_motions(store: CorrespondenceStore) -> dict[str, NDArray[Any]]:
-    """Return figures of each pair's motion; NaN where its ground truth is not known.
+def pair_motions(store: CorrespondenceStore) -> Arrays:
+    """Return a description of each pair's motion; NaN where its ground truth is not known.
 
     Args:
         store: correspondences with ground truth.
@@ -32,30 +33,26 @@ def pair_motions(store: CorrespondenceStore) -> dict[str, NDArray[Any]]:
     """
     rows = [_motion(store, pair) for pair in range(len(store))]
     return {
-        **{key: np.array([row[key] for row in rows]) for key in ("rotation", "forward", "parallax", "inliers")},
+        **{key: np.array([row.get(key, np.nan) for row in rows]) for key in QUANTITIES},
         "names": np.array([f"{first} {second}" for first, second in store.names]),
     }
 
 
 def _motion(store: CorrespondenceStore, pair: int) -> dict[str, float]:
-    unknown = dict.fromkeys(("rotation", "forward", "parallax", "inliers"), float("nan"))
-    rows = slice(int(store.offsets[pair]), int(store.offsets[pair + 1]))
-    passes = store.ratio[rows] < RATIO
-    if not np.isfinite(store.F[pair]).all() or not passes.any():
-        return unknown
-    x1, x2 = (points[rows][passes].astype(float) for points in (store.points1, store.points2))
-    distance = symmetric_epipolar_distance(torch.from_numpy(x1), torch.from_numpy(x2), torch.from_numpy(store.F[pair]))
-    near = distance.numpy() < INLIER
-    R, t, (K1, K2) = store.R[pair], store.t[pair], store.K[pair]
-    if not np.isfinite(R).all() or not near.any():
-        return {**unknown, "inliers": float(near.mean())}
-    turned = np.c_[x1[near], np.ones(near.sum())] @ (K2 @ R @ np.linalg.inv(K1)).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        parallax = np.linalg.norm(x2[near] - turned[:, :2] / turned[:, 2:], axis=1)
-    sine, cosine = np.linalg.norm(R - R.T) / 2**0.5, np.trace(R) - 1
-    return {
-        "rotation": float(np.degrees(np.arctan2(sine, cosine))),
-        "forward": float(abs(t[2]) / np.linalg.norm(t)),
-        "parallax": float(np.median(parallax)),
-        "inliers": float(near.mean()),
+    """Return what is known of a pair's motion."""
+    x1, x2 = pair_matches(store, pair, RATIO)
+    F_mat, R, t, K = (torch.from_numpy(part[pair]) for part in (store.F, store.R, store.t, store.K))
+    if not bool(F_mat.isfinite().all()) or len(x1) == 0:
+        return {}
+    near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD
+    known = {"inliers": near.double().mean().item()}
+    if not bool(R.isfinite().all()) or not bool(near.any()):
+        return known
+    rotated = convert_points_to_homogeneous(x1[near]) @ (K[1] @ R @ K[0].inverse()).mT
+    parallax = (x2[near] - rotated[:, :2] / rotated[:, 2:]).norm(dim=1)
+    sine, cosine = (R - R.mT).norm() / 2**0.5, R.trace() - 1
+    return known | {
+        "rotation": torch.atan2(sine, cosine).rad2deg().item(),
+        "forward": (t[2].abs() / t.norm()).item(),
+        "parallax": median(parallax).item(),
     }

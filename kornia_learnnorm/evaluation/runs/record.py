@@ -1,172 +1,222 @@
-"""Predictions of methods on stores, computed once and kept: ``learnnorm evaluate STORE ... --out RUN``.
+"""Predictions of methods on stores, computed once and kept in a folder: a run.
 
-A run is a folder. ``run.json`` says what it is of. Each store has a folder with its pairs and the protocols, in each of
-which are the samples and a file per method: NumPy archives of arrays in the order of the samples. What is there
-already is read, to know that it is whole, and not computed again; a run of other options is refused. A method that
+Its ``run.json`` says what it was computed from. Each store has a folder with the motion of its pairs and the protocols,
+in each of which are the samples and a file per method: NumPy archives of arrays in the order of the samples. A file
+that exists is read, to know that it is whole, and not computed again; a run of other options is refused. A method that
 fails is left out of the run, all others go on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from tqdm import tqdm
+import torch
 
-from kornia_learnnorm.data.samples import RATIO
+from kornia_learnnorm.data.samples import Samples, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
 from kornia_learnnorm.evaluation.runs.example import random_pair, sweep
-from kornia_learnnorm.evaluation.runs.manifest import begin_run, leave_out
+from kornia_learnnorm.evaluation.runs.manifest import (
+    begin_section,
+    describe_stores,
+    leave_out,
+    package_versions,
+    read_section,
+)
 from kornia_learnnorm.evaluation.runs.motion import pair_motions
-from kornia_learnnorm.evaluation.runs.predict import describe, draw, predict
+from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS, SampleOptions, predict
 from kornia_learnnorm.evaluation.runs.run import (
     EXAMPLE,
     PAIRS,
-    PREDICTIONS,
     SAMPLES,
     SWEEP,
-    file_name,
+    Run,
     is_swept,
-    method_files,
-    read_arrays,
-    within_limit,
+    method_path,
+    read_run,
+    sweep_path,
 )
-from kornia_learnnorm.evaluation.runs.trained import trained_on
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.optional import import_extra
+from kornia_learnnorm.protocol import PROTOCOLS
 
-__all__ = ["PROTOCOLS", "record_run"]
+__all__ = ["record_run", "temporary_run"]
 
-PROTOCOLS: dict[str, float | None] = {"filtered": RATIO, "unfiltered": None}
 
-Arrays = dict[str, NDArray[Any]]
-Methods = dict[str, Method]
-Failed = dict[str, str]
+def temporary_run(
+    stores: Mapping[str, str],
+    methods: Sequence[str],
+    options: SampleOptions | None = None,
+    protocols: Sequence[str] = tuple(PROTOCOLS),
+) -> Run:
+    """Return a run that is not kept, without shares of inliers and errors by the number of correspondences.
+
+    Args:
+        stores: paths of the stores by the names that tables give them.
+        methods: names for :func:`~kornia_learnnorm.evaluation.methods.find_method`.
+        options: how the samples are drawn.
+        protocols: ``filtered``, ``unfiltered`` or both.
+
+    Raises:
+        ValueError: if a store or a method is wrong, or a method fails.
+        OSError: if a file is missing.
+
+    """
+    with TemporaryDirectory(prefix="learnnorm-") as folder:
+        record_run(folder, stores, methods, options, protocols, complete=False)
+        return read_run(folder, complete=False)
 
 
 def record_run(
-    folder: str | Path, stores: Mapping[str, str], methods: list[str], seed: int = 0, max_samples: int | None = None
+    folder: str | Path,
+    stores: Mapping[str, str],
+    methods: Sequence[str],
+    options: SampleOptions | None = None,
+    protocols: Sequence[str] = tuple(PROTOCOLS),
+    complete: bool = True,
 ) -> str:
-    """Compute what is not there yet of a run, with a progress bar.
+    """Compute what a run does not have yet, with a progress bar.
 
     Args:
         folder: the run, made if missing.
         stores: paths of the stores by the names that tables give them.
         methods: names for :func:`~kornia_learnnorm.evaluation.methods.find_method`.
-        seed: seed of the shuffles.
-        max_samples: at most so many samples of each store and protocol, drawn at random; None for all.
+        options: how the samples are drawn.
+        protocols: ``filtered``, ``unfiltered`` or both.
+        complete: compute everything that a report shows: also the shares of inliers, F1 and, for one pair, the errors
+            by the number of correspondences.
 
     Returns:
-        why there is no example of a pair; empty where there is one.
+        why there is no example of a pair; empty where there is one or none was wanted.
 
     Raises:
-        ValueError: if the folder holds a run of other options, a store or a method is wrong, what is there is damaged,
-            or, at the end, if a method has failed.
+        ValueError: if the folder holds a run of other options, a store or a method is wrong, a file is damaged, or, at
+            the end, if a method has failed.
         OSError: if a file is missing or cannot be written.
 
     """
+    options = SampleOptions() if options is None else options
     folder, names = Path(folder), short_names(methods)
     found = {names[name]: find_method(name) for name in methods}
-    read = {name: read_store(path) for name, path in stores.items()}
-    joined: dict[str, dict[str, Any]] = {
-        "stores": {name: f"{s.dataset}, {len(s)} pairs, {s.offsets[-1]} matches" for name, s in read.items()},
+    recorder = _Recorder(folder, found, {name: read_store(path) for name, path in stores.items()}, options, complete)
+    about = {
+        **vars(options),
+        "stores": describe_stores(recorder.stores),
         "methods": {names[name]: identify_method(name) for name in methods},
-        "trained_on": {names[name]: trained_on(name) for name in methods},
+        "trained_on": {name: list(method.trained_on) for name, method in found.items()},
+        "versions": package_versions(),
     }
-    new, failed = begin_run(folder, joined, seed, max_samples), Failed()
-    with tqdm(total=len(read) * (2 * len(found) + 2), unit="step", disable=None) as bar:
-        for name, store in read.items():
-            bar.set_postfix_str(name)
-            _record_store(folder / name, store, found, failed, seed, max_samples, bar)
-    about_example = _record_sizes(folder, read, found, failed, seed)
-    if failed:
-        _forget(folder, read, [name for name in failed if name in new])
-        # Own code says its name, since it fails elsewhere too.
-        texts = [text if text.startswith(base_name(name)) else f"{name}: {text}" for name, text in failed.items()]
-        raise ValueError(f"{'; '.join(texts)}. All others are in {folder}")
-    return about_example
+    before = (read_section(folder, "evaluate") or about | {"methods": {}})["methods"]
+    begin_section(folder, "evaluate", about)
+    recorder.record_stores(protocols)
+    no_example = recorder.record_sizes() if complete else ""
+    if recorder.failed:
+        recorder.forget(recorder.failed.keys() - before.keys())
+        # A normaliser of the user's own is named in its message already.
+        texts = [
+            text if text.startswith(base_name(name)) else f"{name}: {text}" for name, text in recorder.failed.items()
+        ]
+        raise ValueError("; ".join(texts) + (f". All others are in {folder}" if complete else ""))
+    return no_example
 
 
-def _record_store(
-    folder: Path,
-    store: CorrespondenceStore,
-    methods: Methods,
-    failed: Failed,
-    seed: int,
-    max_samples: int | None,
-    bar: tqdm,
-) -> None:
-    """Compute what is not there yet of a store's pairs, samples and predictions."""
-    _once(folder / "pairs.npz", partial(pair_motions, store), PAIRS, len(store))
-    for protocol, ratio in PROTOCOLS.items():
-        place = folder / protocol
-        drawn = draw(store, ratio, seed, max_samples)
-        _once(place / "samples.npz", partial(describe, drawn, place), SAMPLES, len(drawn.pair))
-        if not np.array_equal(read_arrays(place / "samples.npz")["pair"], drawn.pair.numpy()):
-            raise ValueError(f"{place} is of other samples than the run's seed draws of the store, remove it")
-        samples = drawn.select(within_limit(place))
-        bar.update()
-        for name, method in methods.items():
-            path, compute = place / f"{file_name(name)}.npz", partial(predict, method, samples, store, ratio)
-            _attempt(name, failed, path, compute, PREDICTIONS, len(samples.pair))
+@dataclass
+class _Recorder:
+    """What computes the missing files of a run; ``failed`` says why methods failed, by name."""
+
+    folder: Path
+    methods: dict[str, Method]
+    stores: dict[str, CorrespondenceStore]
+    options: SampleOptions
+    complete: bool
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def record_stores(self, protocols: Sequence[str]) -> None:
+        """Compute the missing motions, samples and predictions of all stores."""
+        tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
+        steps = len(self.stores) * len(protocols) * len(self.methods)
+        with tqdm(total=steps, unit="step", disable=None) as bar:
+            for name, store in self.stores.items():
+                bar.set_postfix_str(name)
+                _once(self.folder / name / "pairs.npz", partial(pair_motions, store), PAIRS, len(store))
+                for protocol in protocols:
+                    self._record_cell(name, protocol, bar)
+
+    def _record_cell(self, store: str, protocol: str, bar: Any) -> None:
+        """Compute the missing samples and predictions of a store and protocol."""
+        max_ratio = PROTOCOLS[protocol]
+        samples = self._samples(store, protocol)
+        keys = (*ERRORS, *AGREEMENT) if self.complete else ERRORS
+        for name, method in self.methods.items():
+            compute = partial(predict, method, samples, self.stores[store], max_ratio, self.complete)
+            self._attempt(name, method_path(self.folder, store, protocol, name), compute, keys, len(samples.pair))
             bar.update()
 
+    def _samples(self, store: str, protocol: str) -> Samples:
+        """Return the samples within the limit on the residual; write all that were drawn."""
+        drawn, limit = self.options.draw(self.stores[store], PROTOCOLS[protocol]), self.options.max_residual
 
-def _record_sizes(
-    folder: Path, stores: Mapping[str, CorrespondenceStore], methods: Methods, failed: Failed, seed: int
-) -> str:
-    """Compute what is not there yet of the example and its errors, or return why there is no example."""
-    path = folder / "example.npz"
-    if not path.is_file():
-        try:
-            example = random_pair(stores, seed)
-        except ValueError as error:
-            return str(error)
-        _write(path, example)
-    example = read_arrays(path, EXAMPLE)
-    for name, method in methods.items():
-        if is_swept(name):
-            compute = partial(sweep, method, example, seed)
-            _attempt(name, failed, folder / "sizes" / f"{file_name(name)}.npz", compute, SWEEP)
-    return ""
+        def describe() -> Arrays:
+            residual = plain_residual(drawn.points1, drawn.points2).numpy()
+            if not (residual < limit).any():
+                few = f"none of {len(residual)} samples has an un-normalised residual below {limit:g} px"
+                raise ValueError(f"{store}, {protocol}: {few}")
+            return {"pair": drawn.pair.numpy(), "plain_residual": residual}
+
+        path = self.folder / store / protocol / "samples.npz"
+        _once(path, describe, SAMPLES, len(drawn.pair))
+        found = read_arrays(path)
+        if not np.array_equal(found["pair"], drawn.pair.numpy()):
+            raise ValueError(f"{path.parent} is of other samples than the run's seed draws of the store, remove it")
+        return drawn.select(torch.from_numpy(found["plain_residual"] < limit))
+
+    def record_sizes(self) -> str:
+        """Compute the missing example and its errors by the number of correspondences, or return why there is none."""
+        path = self.folder / "example.npz"
+        if not path.is_file():
+            try:
+                write_arrays(path, random_pair(self.stores, self.options.seed))
+            except ValueError as error:
+                return str(error)
+        example = read_arrays(path, EXAMPLE)
+        for name, method in self.methods.items():
+            if is_swept(name):
+                compute = partial(sweep, method, example, self.options.seed)
+                self._attempt(name, sweep_path(self.folder, name), compute, SWEEP)
+        return ""
+
+    def _attempt(
+        self, name: str, path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None
+    ) -> None:
+        """Write a method's file unless it exists or the method has failed; note if it fails now."""
+        if path.is_file():
+            read_arrays(path, keys, rows)
+        elif name not in self.failed:
+            try:
+                arrays = compute()
+            except ValueError as error:
+                self.failed[name] = str(error)
+            else:
+                write_arrays(path, arrays)
+
+    def forget(self, methods: Collection[str]) -> None:
+        """Remove methods from the run, with their files: their code will be another when they come again."""
+        leave_out(self.folder, "evaluate", methods)
+        for name in methods:
+            cells = [method_path(self.folder, store, protocol, name) for store in self.stores for protocol in PROTOCOLS]
+            for path in (*cells, sweep_path(self.folder, name)):
+                path.unlink(missing_ok=True)
 
 
 def _once(path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None) -> None:
-    """Write the arrays that ``compute`` returns, unless the file is there: then see that it holds such arrays."""
+    """Write the computed arrays, or check that an existing file holds such arrays."""
     if path.is_file():
         read_arrays(path, keys, rows)
     else:
-        _write(path, compute())
-
-
-def _attempt(
-    name: str, failed: Failed, path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None
-) -> None:
-    """Do the same for a method that has not failed, and note if it does."""
-    if path.is_file():
-        read_arrays(path, keys, rows)
-    elif name not in failed:
-        try:
-            arrays = compute()
-        except ValueError as error:
-            failed[name] = str(error)
-        else:
-            _write(path, arrays)
-
-
-def _write(path: Path, arrays: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as beside:
-        np.savez_compressed(beside, **arrays)
-
-
-def _forget(folder: Path, stores: Iterable[str], methods: list[str]) -> None:
-    """Take methods out of a run, with their files: they will not be the same when they come again."""
-    leave_out(folder, methods)
-    for name in methods:
-        for path in method_files(folder, stores, name):
-            path.unlink(missing_ok=True)
+        write_arrays(path, compute())

@@ -80,9 +80,9 @@ def test_robust_estimators_beside_predictions(robust_copied, robust_store, monke
 def test_incomplete_robust_run(robust_copied):
     (robust_copied / "robust/kitti_06/filtered/1px/RANSAC.npz").unlink()
     (robust_copied / "hypotheses/kitti_06/unfiltered/Hartley.npz").unlink()
-    about = json.loads((robust_copied / "robust.json").read_text())
-    about["estimators"]["poselib"] = None
-    (robust_copied / "robust.json").write_text(json.dumps(about))
+    about = json.loads((robust_copied / "run.json").read_text())
+    about["robust"]["estimators"]["poselib"] = None
+    (robust_copied / "run.json").write_text(json.dumps(about))
     lacking = ["RANSAC (kitti_06, filtered)", "hypotheses of Hartley (kitti_06, unfiltered)"]
     assert write_report(robust_copied).missing == lacking
     text = (robust_copied / "report.md").read_text()

@@ -16,7 +16,8 @@ def test_the_rate_of_known_distributions():
     own = {"Hartley": rng.exponential(1.0, 20_000), "crossview": rng.exponential(0.5, 20_000)}
     predictions = {name: {"own": torch.from_numpy(values)} for name, values in own.items()}
     cell = Cell("kitti_06", "filtered", torch.arange(20_000) // 100, 20_000, predictions)
-    about = {"methods": dict.fromkeys(own, ""), "trained_on": {"Hartley": [], "crossview": ["kitti_06@0:3"]}}
+    trained_on = {"Hartley": [], "crossview": ["kitti_06@0:3"]}
+    about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(own, ""), "trained_on": trained_on}
     (table,) = rate_tables(Run(about, [cell], {}, {}, {}))
     rate, interval = table.rows[1][2].split(" ", 1)
     low, high = (float(end) for end in interval.strip("[] *").split(", "))

@@ -1,26 +1,21 @@
-"""Predictions of a run, against closed forms and functions of one pair."""
+"""What a run keeps, against closed forms and functions of one pair."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-import yaml
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
-from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.runs import predict as predict_run
-from kornia_learnnorm.evaluation.runs.consensus import THRESHOLDS, consensus
-from kornia_learnnorm.evaluation.runs.trained import SHIPPED, saw, trained_on
-from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.evaluation.runs.consensus import consensus
+from kornia_learnnorm.evaluation.runs.motion import pair_motions
+from kornia_learnnorm.evaluation.runs.predict import predict
 from kornia_learnnorm.metrics.pairs import f1_score, inlier_share
-from kornia_learnnorm.normalizers.learned import WEIGHTS
-
-CONFIGS = Path(__file__).parents[3] / "configs"
+from kornia_learnnorm.protocol import THRESHOLDS
 
 
 def test_predictions_agree_with_the_expectation_under_known_noise():
@@ -33,7 +28,7 @@ def test_predictions_agree_with_the_expectation_under_known_noise():
     points1, points2 = (torch.from_numpy(p).reshape(40, 64, 2) for p in (store.points1, store.points2))
     samples = Samples(points1, points2, points1[:, :1], points2[:, :1], torch.arange(40))
     F_mat = torch.from_numpy(store.F)
-    found = predict_run.predict(Method(kln.Hartley(), lambda *_: F_mat), samples, store, None)
+    found = predict(SimpleNamespace(normalizer=kln.Hartley(), solve=lambda *_: F_mat), samples, store, None)
     x1, x2 = (np.concatenate([p.double().numpy(), np.ones((40, 64, 1))], -1) for p in (points1, points2))
     n2, n1 = (np.linalg.norm((x @ f)[..., :2], axis=-1) for x, f in ((x1, store.F.swapaxes(1, 2)), (x2, store.F)))
     deviation = 0.5 * np.hypot(n1, n2) * (1 / n1 + 1 / n2)
@@ -72,39 +67,13 @@ def test_consensus_is_that_of_the_metrics(max_ratio):
     assert (found["f1"][0] > 0).any()
 
 
-class TestTrainedOn:
-    @pytest.mark.parametrize(("name", "config"), [("paper", "paper-short"), ("crossview", "crossview")])
-    def test_what_ships_is_as_configured(self, name, config):
-        paths = yaml.safe_load((CONFIGS / f"{config}.yaml").read_text())["data"]["train"]["init_args"]["paths"]
-        assert trained_on(name) == trained_on(f"{name}+LM") == names_of(paths)
-
-    def test_all_that_ship(self):
-        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {*SHIPPED}
-        assert trained_on("crossview-synthetic") == ["synthetic scenes"]
-
-    def test_without_weights(self):
-        assert trained_on("whitening") == trained_on("Hartley+optimal") == []
-        assert trained_on("package.module:Name") == ["not known"]
-
-    @pytest.mark.parametrize(
-        ("train", "expected"),
-        [
-            ({"init_args": {"paths": ["$DATA/tum.h5@0:9", "kitti_00.h5"]}}, ["tum@0:9", "kitti_00"]),
-            ({"class_path": "kornia_learnnorm.data.sources.SyntheticSamples"}, ["synthetic scenes"]),
-            ({"class_path": "mine.Own"}, ["not known"]),
-            (None, ["not known"]),
-        ],
-    )
-    def test_weights_of_ones_own(self, tmp_path, train, expected):
-        assert trained_on(str(tmp_path / "weights.safetensors")) == ["not known"]
-        folder = tmp_path / "lightning_logs" / "version_0"
-        folder.mkdir(parents=True)
-        (folder / "config.yaml").write_text(yaml.safe_dump({"data": {"train": train}}))
-        assert trained_on(f"{tmp_path / 'weights.safetensors'}+LM") == expected
-
-    def test_a_store_of_some_pairs(self):
-        assert saw(["a", "b@3:6"], "b@5:9")
-        assert saw(["a", "b@3:6"], "a@1:2")
-        assert not saw(["a", "b@3:6"], "b@6:9")
-        assert not saw([], "a")
-        assert not saw(["not known"], "a")
+def test_motions_by_hand():
+    store = synthetic_store(pairs=2, points=100, seed=0, outliers=0.0)
+    found = pair_motions(store)
+    angle = np.degrees(np.arccos((np.trace(store.R, axis1=1, axis2=2) - 1) / 2))
+    np.testing.assert_allclose(found["rotation"], angle, atol=1e-4)
+    np.testing.assert_allclose(found["forward"], np.abs(store.t[:, 2]) / np.linalg.norm(store.t, axis=1))
+    assert (found["parallax"] > 0).all()
+    assert (found["inliers"] > 0.4).all()
+    store.F[0] = np.nan
+    assert np.isnan(pair_motions(store)["parallax"][0])

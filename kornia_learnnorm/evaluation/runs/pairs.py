@@ -1,0 +1,73 @@
+"""The matches of image pairs, their ground-truth inliers, and the distances of both from epipolar lines."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+
+__all__ = ["ground_truth_inliers", "median_distance", "pair_matches"]
+
+MIN_INLIERS = 16  # a pair with fewer has no ground-truth inliers to measure with
+MAX_INLIERS = 200  # of a pair, the first in the store's random order
+
+
+def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
+    """Return the matches of an image pair in both views, pixels, (M, 2) float64 each.
+
+    Args:
+        store: correspondences of image pairs.
+        pair: index of the pair.
+        max_ratio: only matches with Lowe's ratio below; None for all.
+
+    """
+    rows = slice(int(store.offsets[pair]), int(store.offsets[pair + 1]))
+    points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
+    if max_ratio is None:
+        return points1, points2
+    passes = torch.from_numpy(store.ratio[rows]) < max_ratio
+    return points1[passes], points2[passes]
+
+
+def ground_truth_inliers(store: CorrespondenceStore) -> Tensor:
+    """Return each pair's matches that pass the ratio test and lie within 1 px of their ground-truth epipolar lines.
+
+    Args:
+        store: correspondences of image pairs.
+
+    Returns:
+        points (x1, y1, x2, y2) with shape (P, 200, 4), pixels, float64, padded with NaN; all NaN for a pair without
+        ground truth or with fewer than 16 inliers.
+
+    """
+    result = torch.full((len(store), MAX_INLIERS, 4), torch.nan, dtype=torch.float64)
+    for pair, F_mat in enumerate(torch.from_numpy(store.F)):
+        if not bool(torch.isfinite(F_mat).all()):
+            continue
+        x1, x2 = pair_matches(store, pair, RATIO)
+        near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD
+        points = torch.cat([x1, x2], -1)[near][:MAX_INLIERS]
+        if len(points) >= MIN_INLIERS:
+            result[pair, : len(points)] = points
+    return result
+
+
+def median_distance(points: Tensor, F_mat: Tensor) -> Tensor:
+    """Return the median symmetric epipolar distance of each set of correspondences.
+
+    Args:
+        points: correspondences (x1, y1, x2, y2) with shape (S, N, 4), pixels; rows of NaN are left out.
+        F_mat: matrices with shape (S, 3, 3).
+
+    Returns:
+        medians with shape (S,), pixels; NaN where a set is empty.
+
+    """
+    known = points.nan_to_num()
+    distance = symmetric_epipolar_distance(known[..., :2], known[..., 2:], F_mat)
+    distance[points.isnan().any(-1)] = torch.nan
+    return median(distance)

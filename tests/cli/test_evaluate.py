@@ -1,0 +1,175 @@
+"""The tables that ``evaluate``, ``compare`` and ``diagnose`` print, on files that the tests write."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from two_view import epipolar_distances
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.samples import draw_samples
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
+
+METHODS = ["none", "Hartley", "whitening", "reweighted", "tilted", "crossview", "searched"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Stores of three pairs, with and without ground truth, and weights whose rates are neither 0 nor 100."""
+    folder = tmp_path_factory.mktemp("compared")
+    store = synthetic_store(pairs=1, points=90)
+    write_store(folder / "known.h5", store)
+    write_store(folder / "unknown.h5", replace(store, F=np.full_like(store.F, np.nan)))
+    for name in ("other", "tilted"):
+        (folder / name).mkdir()
+    write_store(folder / "other/known.h5", store)
+    network = kln.CrossViewNetwork(width=8, depth=1)
+    torch.nn.init.constant_(network.set_network.head[-1].bias, 0.3)
+    kln.LearnedNormalizer(kln.Hartley(), network).save_pretrained(folder / "tilted/weights.safetensors")
+    return folder
+
+
+def read_tables(text):
+    """Titles, and of each table the columns' names and the cells by row; texts that no table follows are left out."""
+    parts, read = text.strip().split("\n\n"), {}
+    for title, table in itertools.pairwise(parts):
+        if table.startswith("|"):
+            header, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines())
+            read[title] = header, {row[0]: row[1:] for row in rows}
+    return read
+
+
+def samples_of(folder, store, **options):
+    """Filtered samples below the limit, and the number before it."""
+    everything, kept = (
+        draw_samples(read_store(f"{folder / store}"), torch.Generator().manual_seed(0), max_residual=limit, **options)
+        for limit in (None, 60.0)
+    )
+    return kept, len(everything.pair)
+
+
+def errors_by_hand(folder, samples):
+    """Mean distance of each sample's points and median one of its pair's inliers, by method, from NumPy's distances."""
+    store, points = read_store(folder / "known.h5"), (samples.points1.double(), samples.points2.double())
+    weights = kln.LearnedNormalizer.from_pretrained(folder / "tilted/weights.safetensors")
+    own, truth = {}, {}
+    for name, normalizer in {"Hartley": kln.Hartley(), "whitening": kln.Whitening(), "tilted": weights}.items():
+        F_mat = kln.find_fundamental(*points, normalizer=normalizer).detach()
+        own[name], truth[name] = epipolar_distances(*points, F_mat).mean(1), []
+        for F_sample, pair in zip(F_mat, samples.pair, strict=True):
+            rows = slice(store.offsets[pair], store.offsets[pair + 1])
+            x1, x2 = store.points1[rows].astype(float), store.points2[rows].astype(float)
+            inliers = (epipolar_distances(x1, x2, store.F[pair]) < 1) & (store.ratio[rows] < 0.8)
+            truth[name].append(np.median(epipolar_distances(x1[inliers], x2[inliers], F_sample)))
+    return own, {name: np.array(values) for name, values in truth.items()}
+
+
+def test_compare(folder, capsys):
+    stores = [str(folder / store) for store in ("known.h5", "known.h5@1:2", "unknown.h5")]
+    weights = [str(folder / "tilted/weights.safetensors"), "crossview"]
+    assert main(["compare", *stores, "--weights", *weights]) == 0
+    tables = read_tables(capsys.readouterr().out)
+    assert list(tables) == ["better than Hartley %", "better than whitening %", "ground truth: better than Hartley %"]
+    drawn = [samples_of(folder, "known.h5"), samples_of(folder, "known.h5@1:2")]
+    counts = [f"{len(kept.pair)} of {number} samples" for kept, number in drawn]
+    columns = [f"known: {counts[0]}, 3 pairs", f"known@1:2: {counts[1]}, 1 pair", f"unknown: {counts[0]}, 3 pairs"]
+    for title, (header, rows) in tables.items():
+        assert header == ["method", *columns]
+        assert list(rows) == METHODS
+        for method, (three, one, unknown) in rows.items():
+            if title.endswith(f"{method} %"):
+                assert three == one == unknown == "-"
+                continue
+            rate, low, high = map(float, three.replace("[", "").replace("]", "").replace(",", "").split())
+            assert 0 <= low <= rate <= high <= 100
+            assert 0 <= float(one) <= 100  # of one pair there is no interval
+            assert unknown == ("-" if title.startswith("ground truth") else three)
+    for baseline in ("Hartley", "whitening"):
+        assert tables[f"better than {baseline} %"][1]["searched"][:2] == ["100.0 [100.0, 100.0]", "100.0"]
+
+
+def test_the_commands_agree_with_a_computation_by_hand(folder, capsys):
+    shared = [str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--weights"]
+    shared += [str(folder / "tilted/weights.safetensors")]
+    samples, drawn = samples_of(folder, "known.h5")
+    own, truth = errors_by_hand(folder, samples)
+    rates = {}
+    assert main(["compare", *shared]) == 0
+    tables = read_tables(capsys.readouterr().out)
+    for title, errors, baseline in [
+        ("better than Hartley %", own, "Hartley"),
+        ("better than whitening %", own, "whitening"),
+        ("ground truth: better than Hartley %", truth, "Hartley"),
+    ]:
+        better = errors["tilted"] < errors[baseline]
+        assert 0 < better.mean() < 1
+        low, high = bootstrap_interval(torch.from_numpy(better), samples.pair)
+        rates[title] = f"{100 * better.mean():.1f}"
+        assert tables[title][1]["tilted"] == [f"{rates[title]} [{100 * low:.1f}, {100 * high:.1f}]"]
+    assert main(["evaluate", *shared]) == 0
+    (title, (_, rows)), _ = read_tables(capsys.readouterr().out).items()
+    assert (
+        title
+        == f"matches with ratio below 0.8: {len(samples.pair)} of {drawn} samples, un-normalised residual below 60 px"
+    )
+    better_hartley, better_whitening, better_truth = rates.values()
+    numbers = (own["tilted"].mean(), np.median(own["tilted"]), np.median(truth["tilted"]))
+    assert rows["tilted"] == [better_hartley, better_whitening, *(f"{number:.3f}" for number in numbers), better_truth]
+    assert rows["Hartley"][0] == rows["Hartley"][-1] == rows["whitening"][1] == "-"
+
+
+def test_evaluate_prints_the_same_with_and_without_a_folder(folder, tmp_path, capsys):
+    command = ["evaluate", str(folder / "unknown.h5"), "--methods", "none", "whitening"]
+    assert main(command) == main([*command, "--out", str(tmp_path / "run")]) == 0
+    tables, again = capsys.readouterr().out.split("\nunknown: ")[1:]
+    assert again.startswith(tables)
+    rows = [row for _, rows in read_tables(tables).values() for row in rows.values()]
+    assert len(rows) == 4
+    assert all(row[0] == "-" and row[-2:] == ["-", "-"] for row in rows)  # neither Hartley nor ground truth
+
+
+@pytest.mark.parametrize("size", [8, 20])
+def test_diagnose(folder, capsys, size):
+    command = ["diagnose", str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--sizes", str(size)]
+    assert main(command) == 0
+    ((title, (_, rows)),) = read_tables(capsys.readouterr().out).items()
+    samples, drawn = samples_of(folder, "known.h5", size=size)
+    assert title.startswith(f"known: medians over {len(samples.pair)} of {drawn} samples of {size}, ratio below 0.8")
+    for name, normalizer in {"Hartley": kln.Hartley(), "whitening": kln.Whitening()}.items():
+        *expected, share = (np.median(v) for v in kln.diagnose(samples.points1, samples.points2, normalizer))
+        assert rows[name] == [*(f"{value:.4g}" for value in expected), f"{100 * share:z.0f}"]
+
+
+@pytest.mark.parametrize(
+    ("stores", "weights", "message"),
+    [
+        (["known.h5"], ["tilted", "other/tilted"], "two methods have the same name, tilted: "),
+        (["known.h5"], ["tilted", "tilted"], "two methods have the same name, tilted: "),
+        (["known.h5"], ["Hartley.safetensors"], "two methods have the same name, Hartley: "),
+        (["known.h5", "other/known.h5"], ["tilted"], "two files have the same name, known: "),
+        (["known.h5", "none.h5"], ["tilted"], "no store at"),
+        (["known.h5", "known.h5@2:9"], ["tilted"], "pairs 2:9 were asked for, the store has 0:3"),
+        (["known.h5", "known.h5@2"], ["tilted"], "FILE.h5@FIRST:STOP"),
+        (["known.h5"], ["tilted", "nothing"], "no weights"),
+        (["known.h5"], ["known.h5"], "no weights"),
+        (["tilted/weights.safetensors"], ["tilted"], "not a readable HDF5 file"),
+    ],
+)
+@pytest.mark.parametrize("command", ["evaluate", "compare", "diagnose"])
+def test_stores_and_weights_are_checked_first(folder, command, stores, weights, message, capsys):
+    stores = [str(folder / store) for store in stores]
+    weights = [str(folder / name / "weights.safetensors" if "." not in name else folder / name) for name in weights]
+    assert main([command, *stores, "--weights", *weights]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith(f"learnnorm {command}: error: ")
+    assert printed.err.count("\n") == 1
+    assert message in printed.err

@@ -1,0 +1,278 @@
+"""Runs of predictions: what is computed, kept, refused and left out."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.samples import plain_residual
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.evaluation.methods import find_method
+from kornia_learnnorm.evaluation.runs import record
+from kornia_learnnorm.evaluation.runs.predict import ERRORS, SampleOptions
+from kornia_learnnorm.evaluation.runs.run import read_run
+from kornia_learnnorm.normalizers.learned import WEIGHTS
+
+
+def change(folder, **values):
+    """Change values of the section of ``evaluate`` in ``run.json``."""
+    about = json.loads((folder / "run.json").read_text())
+    about["evaluate"] |= values
+    (folder / "run.json").write_text(json.dumps(about))
+
+
+def assert_same(one, other):
+    """The same numbers in two runs, by method, wherever both have the method."""
+    for cell, again in zip(one.cells, other.cells, strict=True):
+        assert (cell.title, cell.drawn) == (again.title, again.drawn)
+        for name in cell.predictions.keys() & again.predictions.keys():
+            for key in cell.predictions[name].keys() & again.predictions[name].keys():
+                np.testing.assert_array_equal(cell.predictions[name][key], again.predictions[name][key])
+
+
+def test_predictions_are_those_of_the_functions(run, store):
+    cell = read_run(run).cells[0]
+    samples = SampleOptions().draw(read_store(store), 0.8)
+    assert cell.drawn == len(samples.pair)
+    samples = samples.select(plain_residual(samples.points1, samples.points2) < 60)
+    x1, x2 = samples.points1.double(), samples.points2.double()
+    with torch.no_grad():
+        F_mat = find_method("crossview").estimate(x1, x2)
+    found = cell.predictions["crossview"]
+    assert torch.equal(found["F_mat"], F_mat)
+    torch.testing.assert_close(found["own"], kln.symmetric_epipolar_distance(x1, x2, F_mat).mean(-1))
+    heldout = kln.symmetric_epipolar_distance(samples.heldout1.double(), samples.heldout2.double(), F_mat)
+    np.testing.assert_allclose(found["heldout"], np.median(heldout, axis=1))
+
+
+def test_a_temporary_run_has_the_same_numbers(run, store, methods):
+    found = record.temporary_run({"scenes": str(store)}, methods)
+    assert_same(read_run(run), found)
+    assert {*found.cells[1].predictions["Hartley+LM"]} == {*ERRORS}
+    assert found.about == read_run(run).about
+
+
+def test_another_run_computes_nothing_and_adds_what_is_new(copied, command, methods, monkeypatch, few_trials):
+    files = {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")}
+    with monkeypatch.context() as patch:
+        patch.setattr(record, "predict", pytest.fail)
+        assert main([*command, str(copied)]) == 0
+    assert {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")} == files
+    assert main([*command[:3], "reweighted", "--out", str(copied)]) == 0
+    assert [*read_run(copied).about["methods"]] == [*methods, "reweighted"]
+    assert len([*copied.rglob("*.npz")]) == len(files) + 3
+
+
+@pytest.mark.parametrize(
+    ("options", "differs"),
+    [
+        (["--seed", "1"], "seed 0, now 1"),
+        (["--max-samples", "9"], "max_samples 16000, now 9"),
+        (["--max-residual", "30"], "max_residual 60.0, now 30.0"),
+        (["--size", "9"], "size 8, now 9"),
+        ([], "crossview 'crossview 0000', now 'crossview "),
+    ],
+)
+def test_a_run_of_other_options_is_refused(copied, command, capsys, options, differs):
+    if not options:
+        change(copied, methods={"crossview": "crossview 0000"})
+    assert main([*command, str(copied), *options]) == 2
+    error = capsys.readouterr().err
+    assert f"{copied} is a run of other options, remove it or write elsewhere: {differs}" in error
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("run.json", "{", "run.json is damaged, it is not JSON"),
+        ("run.json", "[1]", "run.json is damaged: expected an object of JSON, got list"),
+        ("run.json", "{}", "a run of format None, expected 3: another version of the package made it, remove it"),
+        ("run.json", '{"format": 2, "stores": {}}', "a run of format 2, expected 3"),
+        ("robust.json", "{}", "a run of format 1 with a robust.json, expected 3"),
+        ("run.json", '{"format": 3, "evaluate": 1}', "evaluate must be an object, got 1"),
+        ("run.json", '{"format": 3, "evaluate": {"stores": {}}}', "damaged: methods, trained_on, versions, size, seed"),
+    ],
+)
+def test_damaged_or_of_another_version(copied, command, capsys, name, text, message):
+    (copied / name).write_text(text)
+    for again in (["report", str(copied)], [*command, str(copied)]):
+        assert main(again) == 2
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["scenes/filtered/crossview", "scenes/pairs", "sizes/none", "example"])
+def test_damaged_arrays(copied, command, capsys, name):
+    path = copied / f"{name}.npz"
+    path.write_bytes(path.read_bytes()[:200])
+    for again in (["report", str(copied)], [*command, str(copied)]):
+        assert main(again) == 2
+        assert f"{path.name} is damaged, remove it" in capsys.readouterr().err
+
+
+def test_other_samples(copied, command, capsys):
+    """Files of the unfiltered samples in the place of the filtered ones."""
+    commands, filtered = (["report", str(copied)], [*command, str(copied)]), copied / "scenes/filtered"
+    shutil.copy(copied / "scenes/unfiltered/none.npz", filtered / "none.npz")
+    for again in commands:
+        assert main(again) == 2
+        assert "none.npz is of other samples, remove it: expected" in capsys.readouterr().err
+    np.savez(filtered / "none.npz", own=np.zeros(3))
+    for again in commands:
+        assert main(again) == 2
+        assert "expected arrays F_mat, heldout" in capsys.readouterr().err
+    shutil.rmtree(filtered)
+    shutil.copytree(copied / "scenes/unfiltered", filtered)
+    assert main(commands[1]) == 2
+    assert "samples.npz is of other samples, remove it" in capsys.readouterr().err
+
+
+def test_a_store_that_joins_later_changes_no_number(copied, command, tmp_path, few_trials):
+    """Errors by the number of correspondences stay those of the pair that the run began with."""
+    write_store(tmp_path / "other.h5", synthetic_store(pairs=2, points=330, seed=2))
+    before = read_run(copied)
+    (copied / "sizes/Hartley.npz").unlink()
+    assert main([command[0], str(tmp_path / "other.h5"), *command[2:], str(copied)]) == 0
+    after = read_run(copied)
+    assert [*after.about["stores"]] == ["scenes", "other"]
+    assert str(after.example["store"]) == "scenes"
+    np.testing.assert_array_equal(after.sizes["Hartley"]["own"], before.sizes["Hartley"]["own"])
+
+
+def test_names_do_not_change_numbers(store, tmp_path):
+    """The same weights under exchanged names: the numbers go with the weights."""
+    found = []
+    for first, second in (("crossview", "paper"), ("paper", "crossview")):
+        for name, weights in (("one", first), ("two", second)):
+            shutil.copy(WEIGHTS / f"{weights}.safetensors", tmp_path / f"{name}.safetensors")
+        methods = [str(tmp_path / "one.safetensors"), str(tmp_path / "two.safetensors")]
+        cell = record.temporary_run({"scenes": str(store)}, methods, protocols=["filtered"]).cells[0]
+        found.append({name: errors["own"] for name, errors in cell.predictions.items()})
+    assert torch.equal(found[0]["one"], found[1]["two"])
+    assert torch.equal(found[0]["two"], found[1]["one"])
+    assert not torch.equal(found[0]["one"], found[0]["two"])
+
+
+def test_order_does_not_change_numbers(run, store, methods):
+    found = record.temporary_run({"scenes": str(store)}, methods[::-1])
+    assert [*found.about["methods"]] == methods[::-1]
+    assert_same(read_run(run), found)
+
+
+class TestOwnCode:
+    """Normalisers in the folder that the command is called in."""
+
+    GOOD = "from kornia_learnnorm import Whitening as Mine\n"
+
+    @pytest.fixture(autouse=True)
+    def here(self, tmp_path, monkeypatch, few_trials):
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)
+        monkeypatch.chdir(tmp_path)
+
+    def evaluate(self, store, text):
+        Path("own_normaliser.py").write_text(text)
+        sys.modules.pop("own_normaliser", None)
+        importlib.invalidate_caches()
+        methods = ["own_normaliser:Mine", "Hartley"]
+        return main(["evaluate", str(store), "--out", "run", "--methods", *methods, "--max-samples", "40"])
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("def Mine(a, b, c):\n    raise RuntimeError('boom')", "RuntimeError: boom"),
+            ("def Mine(a, b):\n    pass", "Mine() takes 2 positional arguments"),
+            ("def Mine(a, b, c):\n    return 1", "must return two transforms of shape"),
+            ("def Mine(a, b, c):\n    return 2 * [float('nan') * a.new_ones(len(a), 3, 3)]", "are not finite"),
+        ],
+    )
+    def test_one_that_fails_is_left_out(self, store, capsys, text, message):
+        before = [*sys.path]
+        assert self.evaluate(store, text) == 2
+        assert sys.path == before
+        error = capsys.readouterr().err
+        assert message in error
+        assert "own_normaliser:Mine failed, called with" in error
+        assert error.splitlines()[-1].endswith("All others are in run")
+        assert [*read_run("run").about["methods"]] == ["Hartley"]
+        assert main(["report", "run"]) == 0
+        assert self.evaluate(store, self.GOOD) == 0
+        assert len(read_run("run").cells[0].predictions) == 2
+
+    def test_one_that_fails_late_leaves_nothing(self, store):
+        """There is a file of the filtered samples when the unfiltered ones fail."""
+        text = "n = []\ndef Mine(a, b, c):\n    n.append(a)\n    return Whitening()(a, b, c) if len(n) < 2 else None\n"
+        assert self.evaluate(store, "from kornia_learnnorm import Whitening\n" + text) == 2
+        assert not [*Path("run").rglob("own_normaliser*")]
+
+    def test_edited_code_is_refused(self, store, capsys):
+        assert self.evaluate(store, self.GOOD) == 0
+        assert len([*Path("run").rglob("own_normaliser_Mine.npz")]) == 3
+        assert self.evaluate(store, self.GOOD) == 0
+        assert self.evaluate(store, self.GOOD + "# edited") == 2
+        assert "is a run of other options, remove it or write elsewhere: own_normaliser:Mine" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("class Mine:\n    def __init__(self, size):\n        pass", "cannot be made without arguments"),
+            ("Mine = (", "SyntaxError"),
+            ("1 / 0", "ZeroDivisionError"),
+        ],
+    )
+    def test_one_that_cannot_be_made(self, store, capsys, text, message):
+        assert self.evaluate(store, text) == 2
+        assert message in capsys.readouterr().err
+        assert not Path("run").exists()
+
+
+def test_pairs_with_few_matches_have_no_example_and_nothing_held_out(tmp_path, capsys):
+    """Of nine matches eight are a sample, and the last of those left over may be held out; of eight none."""
+    few = synthetic_store(pairs=2, points=60, seed=1, outliers=0.0)
+    few.ratio[:] = 0.9
+    few.ratio[few.offsets[1] : few.offsets[1] + 9] = few.ratio[:8] = 0.5
+    write_store(tmp_path / "few.h5", few)
+    command = ["evaluate", str(tmp_path / "few.h5"), "--out", str(tmp_path / "run"), "--methods", "Hartley"]
+    assert main([*command, "--max-residual", "inf"]) == 0
+    printed = capsys.readouterr()
+    assert "without Figures 10 and 11: no pair of few has 256 matches" in printed.err
+    filtered, unfiltered = read_run(tmp_path / "run").cells
+    assert filtered.predictions["Hartley"]["heldout"].isnan().tolist() == [True, False]
+    assert torch.equal(unfiltered.predictions["Hartley"]["heldout"].isnan(), unfiltered.pair != 1)
+    assert main(["report", str(tmp_path / "run")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--out", ""], "--out is empty: expected a folder"),
+        (["--out", "FILE"], "FILE is a file: expected a folder"),
+        (["--out", "RUN", "--max-samples", "-1"], "--max-samples must be 0, for all, or more, got -1"),
+        (["--out", "RUN", "--size", "7"], "a sample needs at least 8 correspondences, got size=7"),
+        (["--max-residual", "0"], "scenes, filtered: none of "),
+    ],
+)
+def test_options_that_are_refused(store, tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    Path("FILE").touch()
+    assert main(["evaluate", str(store), "--methods", "none", *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not Path("RUN").exists()
+
+
+@pytest.mark.parametrize("most", [50, 60, None])
+def test_a_few_samples(store, most):
+    options, everything = SampleOptions(max_samples=most), SampleOptions()
+    for max_ratio in (0.8, None):
+        few, samples = (part.draw(read_store(store), max_ratio) for part in (options, everything))
+        assert len(few.pair) == (most or len(samples.pair))
+        assert {*map(tuple, few.points1[:, 0].tolist())} <= {*map(tuple, samples.points1[:, 0].tolist())}

@@ -1,0 +1,102 @@
+"""Methods by name, and what their weights were trained on."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.evaluation.methods import SHIPPED, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.runs.trained import was_trained_on
+from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.normalizers.learned import WEIGHTS
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(scope="module")
+def scene():
+    store = synthetic_store(pairs=1, points=40, seed=4, outliers=0.0)
+    return [torch.from_numpy(p).double().reshape(3, 40, 2)[:, :9] for p in (store.points1, store.points2)]
+
+
+@pytest.mark.parametrize(
+    ("name", "normalizer"),
+    [
+        ("Hartley", kln.Hartley()),
+        ("crossview", kln.LearnedNormalizer.from_pretrained()),
+        ("kornia_learnnorm.normalizers.closed_form:Whitening", kln.Whitening()),
+        ("kornia_learnnorm:Whitening", kln.Whitening()),
+    ],
+)
+def test_estimates_are_those_of_the_normalizer(scene, name, normalizer):
+    assert torch.equal(find_method(name).estimate(*scene), kln.find_fundamental(*scene, normalizer=normalizer))
+
+
+def test_refined_is_the_better_fit(scene):
+    plain, refined = (kln.sampson_distance(*scene, find_method(n).estimate(*scene)) for n in ("Hartley", "Hartley+LM"))
+    assert (refined.square().sum(-1) <= plain.square().sum(-1)).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("nothing", FileNotFoundError, "no weights 'nothing'"),
+        ("hartley+LM", FileNotFoundError, r"expected none, Hartley, .*paper, .*module:Name, .*\+LM or \+optimal"),
+        ("Hartley+foo", FileNotFoundError, r"no weights 'Hartley\+foo'"),
+        ("Hartley+optimal+LM", FileNotFoundError, "expected none, Hartley"),
+        (":Whitening", ValueError, "expected module:Name"),
+        ("no.such.module:Thing", ValueError, "no normaliser at"),
+        ("kornia_learnnorm:Nothing", ValueError, "no normaliser at"),
+        ("kornia_learnnorm:__version__", ValueError, "cannot be called"),
+    ],
+)
+def test_unknown(name, error, message):
+    before = [*sys.path]
+    with pytest.raises(error, match=message):
+        find_method(name)
+    assert sys.path == before
+
+
+def test_names(tmp_path):
+    path = str(tmp_path / "mine" / "weights.safetensors")
+    assert short_names([path, path + "+LM", "paper"]) == {path: "mine", path + "+LM": "mine+LM", "paper": "paper"}
+    assert identify_method("paper").startswith("paper ")
+    assert identify_method("Hartley+LM") == "Hartley+LM"
+    with pytest.raises(ValueError, match="same name"):
+        short_names([path, path])
+
+
+class TestTrainedOn:
+    @pytest.mark.parametrize(("name", "config"), [("paper", "paper-short"), ("crossview", "crossview")])
+    def test_shipped_weights_are_as_configured(self, name, config):
+        paths = yaml.safe_load((CONFIGS / f"{config}.yaml").read_text())["data"]["train"]["init_args"]["paths"]
+        assert find_method(name).trained_on == find_method(f"{name}+LM").trained_on == tuple(names_of(paths))
+
+    def test_shipped_weights(self):
+        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {*SHIPPED}
+        assert find_method("crossview-synthetic").trained_on == ("synthetic scenes",)
+
+    def test_without_weights_or_without_names(self, tmp_path):
+        assert find_method("whitening").trained_on == find_method("Hartley+optimal").trained_on == ()
+        kln.LearnedNormalizer().save_pretrained(tmp_path / "new.safetensors")
+        for name in ("kornia_learnnorm:Whitening", f"{tmp_path / 'new.safetensors'}+LM"):
+            assert find_method(name).trained_on == ("not known",)
+
+    @pytest.mark.parametrize(
+        ("store", "trained_on", "expected"),
+        [
+            ("b@5:9", ["a", "b@3:6"], True),
+            ("a@1:2", ["a", "b@3:6"], True),
+            ("b@6:9", ["a", "b@3:6"], False),
+            ("a", [], False),
+            ("a", ["not known"], False),
+        ],
+    )
+    def test_a_store_of_some_pairs(self, store, trained_on, expected):
+        assert was_trained_on(store, trained_on) == expected
