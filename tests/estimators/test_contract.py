@@ -91,13 +91,23 @@ def test_float32_is_float64_rounded(solve, num_points):
 
 
 @pytest.mark.parametrize(
-    ("name", "bound"),
-    [("projection", 1e-10), ("optimal", 1e-7), ("corrected", 1e-7), ("refined", 1e-7), ("refined, symmetric", 1e-7)],
+    ("name", "scene", "bound"),
+    [
+        *((name, "driving", 1e-10) for name in ("projection", "optimal", "corrected")),
+        *((name, "orbit", 1e-7) for name in ("refined", "refined, symmetric")),
+    ],
 )
-def test_swapped_views_give_the_transpose(name, bound):
-    points, weights = correspondences("orbit", 20, 12), uniform(20, 12)
+def test_swapped_views_give_the_transpose(name, scene, bound):
+    points, weights = correspondences(scene, 20, 12), uniform(20, 12)
     F_mat, mirrored = ALL[name](*points, weights), ALL[name](*points[::-1], weights)
     assert difference(mirrored.mT, F_mat, points) < bound
+
+
+@pytest.mark.parametrize(("name", "bound"), [("projection", 1e-12), ("optimal", 1e-10), ("corrected", 1e-10)])
+def test_batch_is_many_single_calls(name, bound):
+    points = correspondences("random", 6, 12)
+    alone = [ALL[name](*(p[k : k + 1] for p in points)) for k in range(6)]
+    assert up_to_sign(ALL[name](*points), torch.cat(alone)) < bound
 
 
 @pytest.mark.parametrize(

@@ -118,12 +118,6 @@ class TestFindFundamental:
             # Two values apart from zero, where all entries count.
             assert (np.linalg.svd(in_hartley(F_mat, points1, points2))[1][:, 1] > 1e-4).all()
 
-    def test_batch_is_many_single_calls(self):
-        points1, points2 = correspondences("random", 6, 12)
-        together = find_fundamental(points1, points2)
-        alone = torch.cat([find_fundamental(p[None], q[None]) for p, q in zip(points1, points2, strict=True)])
-        assert up_to_sign(together, alone) < 1e-12
-
     @given(
         st.integers(0, 2**31),
         st.sampled_from([8, 15]),

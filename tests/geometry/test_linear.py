@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from kornia.core.exceptions import ShapeError
 from torch.autograd import gradcheck, gradgradcheck
 from two_view import SCENES, correspondences, homogeneous, numpy_hartley, signless, uniform
 

@@ -145,11 +145,7 @@ class TestRelativePose:
             (lambda F, K1, K2, a, b: (F, K1, K2, a[:, :9], b), ValueError, "must pair up"),
             (lambda F, K1, K2, a, b: (F, K1[:1], K2, a, b), ValueError, "one batch, got {'F_mat': 3, 'K1': 1"),
             (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[..., 0]), TypeError, "mask must be a boolean tensor"),
-            (
-                lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[0] > 0),
-                ValueError,
-                r"must have shape \[3, 10\], got \[10, 2\]",
-            ),
+            (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[0] > 0), ValueError, r"shape \[3, 10\] .*got \[10, 2\]"),
             (lambda F, K1, K2, a, b: (F, 0 * K1, K2, a, b), torch.linalg.LinAlgError, "singular"),
         ],
     )

@@ -154,7 +154,7 @@ class TestPoseAUC:
 
     @pytest.mark.parametrize("thresholds", [(0,), (5, -1), (NAN,)])
     def test_thresholds(self, thresholds):
-        with pytest.raises(ValueError, match=f"a threshold must be positive, got {thresholds[-1]}"):
+        with pytest.raises(ValueError, match=rf"thresholds must be positive, got \{[*thresholds]}"):
             pose_auc(torch.ones(3), thresholds)
 
 
