@@ -9,19 +9,14 @@ import pytest
 import torch
 from torch import nn
 from torch.autograd import gradcheck
-from two_view import correspondences, numpy_hartley, prepared, uniform
+from two_view import correspondences, numpy_hartley, prepared, shaken, uniform
 
 from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork, paper_transform
 
 
 def network(width: int = 16, depth: int = 3) -> PaperNetwork:
     """A small network in float64 whose answers are not zero."""
-    torch.manual_seed(0)
-    net = PaperNetwork(width, depth).double()
-    with torch.no_grad():
-        for value in net.head[-1].parameters():
-            value.normal_(0, 0.3)
-    return net.eval()
+    return shaken(LearnedNormalizer(network=PaperNetwork(width, depth))).network.double()
 
 
 normalized = partial(prepared, numpy_hartley)
