@@ -18,7 +18,7 @@ from kornia_learnnorm.geometry import checks
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import affine_transform, unit_fundamental
 
-READS = {"__bool__", "item", "__int__", "__float__", "tolist", "nonzero", "is_nonzero", "__len__"} - {"__len__"}
+READS = {"__bool__", "item", "__int__", "__float__", "tolist", "nonzero", "is_nonzero"}
 
 
 class Calls(TorchFunctionMode):
@@ -61,8 +61,7 @@ class TestLinearProblem:
         if torch.linalg.cond(linear) > 10:
             return
         move = affine_transform(linear, torch.full((2,), shift, dtype=torch.float64))
-        T1, T2 = move @ problem.T1, move.flip(0, 1).mT.triu() @ problem.T2
-        T2 = move.inverse() @ problem.T2
+        T1, T2 = move @ problem.T1, move.inverse() @ problem.T2
         assert up_to_sign(problem.null_matrix_in(T1, T2), null_matrices(*points, T1, T2)) < 1e-7
 
     @pytest.mark.parametrize("num_points", [8, 12])
