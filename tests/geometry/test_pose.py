@@ -54,17 +54,6 @@ class TestRelativePose:
         assert torch.allclose(t.norm(dim=-1).cpu(), torch.ones(20).double())
         assert torch.allclose(torch.linalg.det(R).cpu(), torch.ones(20).double())
 
-    @pytest.mark.parametrize("name", SCENES)
-    def test_opencv(self, name):
-        cv2 = pytest.importorskip("cv2")
-        scene = scenes(name, 10, 30)
-        R, t = relative_pose(scene.F_mat, scene.K1, scene.K2, scene.points1, scene.points2)
-        for k in range(10):
-            K, points1, points2 = (v[k].numpy() for v in (scene.K1, scene.points1, scene.points2))
-            found = cv2.recoverPose(K.T @ scene.F_mat[k].numpy() @ K, points1, points2, K, distanceThresh=1e9)
-            np.testing.assert_allclose(R[k].numpy(), found[1], atol=1e-8)
-            np.testing.assert_allclose(t[k].numpy(), found[2][:, 0], atol=1e-8)
-
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
     def test_noise_and_outliers_against_triangulation(self, name):
         arguments, _ = pair(name, 8, 50, noise=0.5, outliers=0.3)

@@ -122,13 +122,6 @@ class TestFeatures:
             assert not torch.isclose(moved, before, atol=1e-4).all(-1).any()
 
     @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
-    def test_gradient_of_the_other_view(self, features, sees):
-        net, points = network(features=features), [p.requires_grad_() for p in whitened()]
-        for params, others in zip(net(*points), points[::-1], strict=True):
-            (gradient,) = torch.autograd.grad(params.sum(), others, retain_graph=True)
-            assert (gradient.flatten(1).any(1) == sees).all()
-
-    @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
     def test_who_corresponds_to_whom(self, features, sees):
         net, (points1, points2) = network(features=features), whitened()
         for found, expected in zip(net(points1, points2.roll(1, 1)), net(points1, points2), strict=True):
