@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -14,6 +15,7 @@ from two_view import (
     WRONG_MATRICES,
     correspondences,
     in_hartley,
+    scenes,
     signless,
     uniform,
     up_to_sign,
@@ -62,6 +64,9 @@ ALL = {
 }
 
 
+PROJECTIONS = [partial(find_fundamental, normalizer=normalizer) for normalizer in NORMALIZERS]
+
+
 def difference(F_mat, expected, points) -> float:
     """The largest difference in Hartley's coordinates, where all nine entries count."""
     return up_to_sign(in_hartley(F_mat, *points), in_hartley(expected, *points))
@@ -79,10 +84,31 @@ def test_smoke(name, batch_size, num_points, weighted, device, dtype):
     assert torch.isfinite(F_mat).all()
 
 
+@pytest.mark.parametrize("solve", [*PROJECTIONS, ALL["optimal"], corrected])
+@pytest.mark.parametrize("num_points", [8, 20, 50])
+def test_finds_the_truth_without_noise(solve, num_points):
+    scene = scenes("orbit", 50, num_points, noise=0.0)
+    F_mat = solve(scene.points1, scene.points2)
+    assert up_to_sign(F_mat, scene.F_mat) < 1e-7
+    assert difference(F_mat, scene.F_mat, scene[:2]) < 1e-7
+
+
+@pytest.mark.parametrize("solve", [*PROJECTIONS, ALL["optimal"], corrected])
+@pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("num_points", [8, 20])
-@pytest.mark.parametrize(
-    "solve", [*(partial(find_fundamental, normalizer=n) for n in NORMALIZERS), ALL["optimal"], refined]
-)
+def test_rank_and_norm(solve, name, num_points, dtype):
+    points, eps = [p.to(dtype) for p in correspondences(name, 50, num_points)], torch.finfo(dtype).eps
+    F_mat = solve(*points)
+    assert np.linalg.norm(F_mat.double().numpy(), axis=(1, 2)) == pytest.approx(1, abs=4 * eps)
+    assert (np.linalg.svd(F_mat.double().numpy())[1][:, 2] < 10 * eps).all()
+    if dtype == torch.float64:  # two values apart from zero where all entries count
+        values = np.linalg.svd(in_hartley(F_mat, *points))[1]
+        assert (values[:, 1] > 1e-4).all()
+        assert (values[:, 2] < 1e-12).all()
+
+
+@pytest.mark.parametrize("num_points", [8, 20])
+@pytest.mark.parametrize("solve", [*PROJECTIONS, ALL["optimal"], refined])
 def test_float32_is_float64_rounded(solve, num_points):
     points = [p.float() for p in correspondences("orbit", 50, num_points)]
     single = solve(*points)

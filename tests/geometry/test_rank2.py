@@ -11,13 +11,11 @@ import torch
 from kornia.core.exceptions import ShapeError
 from torch.autograd import gradcheck, gradgradcheck
 from two_view import (
-    SCENES,
     correspondences,
     epipolar_distances,
     homogeneous,
     in_hartley,
     numpy_hartley,
-    scenes,
     signless,
     uniform,
     unit,
@@ -74,21 +72,6 @@ class TestOptimalRank2:
         F0 = linear(points1, points2)
         F_mat, expected = optimal_rank2(F0, points1, points2), reference(F0, points1, points2)
         assert up_to_sign(in_hartley(F_mat, points1, points2), in_hartley(expected, points1, points2)) < 1e-5
-
-    @pytest.mark.parametrize("name", SCENES)
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_rank_and_norm(self, name, num_points):
-        points1, points2 = correspondences(name, 50, num_points)
-        F_mat = optimal_rank2(linear(points1, points2), points1, points2)
-        assert np.linalg.norm(F_mat.numpy(), axis=(1, 2)) == pytest.approx(1, abs=1e-14)
-        for F in (F_mat.numpy(), in_hartley(F_mat, points1, points2)):
-            assert (np.linalg.svd(F)[1][:, 2] < 1e-12).all()
-
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_finds_the_truth_without_noise(self, num_points):
-        scene = scenes("orbit", 20, num_points, noise=0.0)
-        F_mat = optimal_rank2(linear(scene.points1, scene.points2), scene.points1, scene.points2)
-        assert up_to_sign(F_mat, scene.F_mat) < 1e-7
 
     @pytest.mark.parametrize("num_points", [8, 20])
     def test_no_iterations_are_hartleys_projection(self, num_points):
