@@ -112,6 +112,11 @@ def in_hartley(F, points1, points2) -> np.ndarray:
     return unit(inverse2.swapaxes(-1, -2) @ np.asarray(F, dtype=np.float64) @ inverse1)
 
 
+def hartley_difference(F, G, points1, points2) -> float:
+    """Largest difference of two batches of matrices of pixels in Hartley's coordinates."""
+    return up_to_sign(in_hartley(F, points1, points2), in_hartley(G, points1, points2))
+
+
 def signless(F: Tensor) -> Tensor:
     """Smooth numbers of unit matrices that do not see the sign; a gradient check must not trip on it."""
     return (F.flatten(-2) @ uniform(9, 4, low=-1, seed=9).to(F)).square()
