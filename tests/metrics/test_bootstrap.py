@@ -66,13 +66,6 @@ class TestBootstrapInterval:
         for level, expected in [(0.4, (0.75, 0.75)), (0.6, (0.0, 1.0))]:
             assert bootstrap_interval(torch.tensor(values), torch.tensor(groups), level) == expected
 
-    def test_four_times_the_pairs_halve_it(self):
-        values, groups = uneven_groups()
-        many = np.concatenate([groups + 40 * k for k in range(4)])
-        assert width(np.tile(values, 4), many, draws=4000) == pytest.approx(
-            width(values, groups, draws=4000) / 2, rel=0.1
-        )
-
     def test_agreement_within_pairs_widens_it(self):
         """Eight equal samples are worth one: the interval is wider by the root of eight."""
         values, groups = np.repeat(np.random.default_rng(3).normal(size=100), 8), np.repeat(np.arange(100), 8)

@@ -38,12 +38,6 @@ class TestAngles:
         angles = torch.cat([ANGLES, 180 - torch.logspace(-9, 0, 10, dtype=torch.float64)])
         torch.testing.assert_close(rotation_error(*rotations(angles)), angles, rtol=0, atol=1e-12)
 
-    def test_an_arc_cosine_would_not_do(self):
-        R, R_true = rotations(torch.tensor([1e-7], dtype=torch.float64))
-        cosine = ((R @ R_true.mT).diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
-        assert abs(torch.rad2deg(cosine.clamp(max=1).acos()) - 1e-7) > 1e-8
-        assert abs(rotation_error(R, R_true) - 1e-7) < 1e-12
-
     @given(st.floats(0, 180), st.integers(0, 2**31))
     def test_rotation_symmetries(self, angle, seed):
         R, R_true = rotations(torch.tensor([angle], dtype=torch.float64), seed)
@@ -146,12 +140,6 @@ class TestPoseAUC:
         assert found == pytest.approx(tuple(trapezoids(errors, threshold) for threshold in (5, 10, 20)))
         assert all(type(area) is float and 0 <= area <= 1 for area in found)
 
-    @given(ERRORS, st.randoms())
-    def test_order_does_not_matter(self, errors, random):
-        shuffled = random.sample(errors, len(errors))
-        found, expected = (pose_auc(torch.tensor(v, dtype=torch.float64)) for v in (shuffled, errors))
-        assert found == pytest.approx(expected, rel=1e-12)
-
     @pytest.mark.parametrize("thresholds", [(0,), (5, -1), (NAN,)])
     def test_thresholds(self, thresholds):
         with pytest.raises(ValueError, match=rf"thresholds must be positive, got \{[*thresholds]}"):
@@ -172,14 +160,6 @@ class TestMeanAverageAccuracy:
     def test_counting(self, errors, limit):
         expected = np.mean([np.mean([error < degrees for error in errors]) for degrees in range(1, limit + 1)])
         assert mean_average_accuracy(torch.tensor(errors, dtype=torch.float64), limit) == pytest.approx(expected)
-
-    @given(ERRORS)
-    def test_cumulative_histogram(self, errors):
-        """As its authors count, who differ at exactly 10 degrees."""
-        clipped = [1e6 if error in (10.0, INF) else error for error in errors]
-        histogram = np.histogram(clipped, np.arange(11))[0] / len(errors)
-        found = mean_average_accuracy(torch.tensor(errors, dtype=torch.float64))
-        assert found == pytest.approx(histogram.cumsum().mean())
 
     @pytest.mark.parametrize("limit", [0, -3])
     def test_limit(self, limit):

@@ -106,28 +106,8 @@ class TestForward:
         net, points = network(), normalized()
         torch.testing.assert_close(net.train()(*points), net.eval()(*points), rtol=0, atol=0)
 
-    def test_samples_do_not_influence_each_other(self):
-        net, points = network(), normalized()
-        together = net(*points)
-        for k in range(6):
-            for alone, params in zip(net(*(p[k : k + 1] for p in points)), together, strict=True):
-                assert torch.allclose(alone[0], params[k], atol=1e-12)
 
-
-class TestSight:
-    def test_each_view_is_on_its_own(self):
-        net, (points1, points2) = network(), normalized()
-        params1, params2 = net(points1, points2)
-        assert torch.equal(net(points1, points2.flip(0) ** 2)[0], params1)
-        assert torch.equal(net(points1.flip(0) ** 2, points2)[1], params2)
-        assert not torch.allclose(params1, params2, atol=1e-3)
-
-    def test_sees_the_points_and_the_weights(self):
-        net, points = network(), normalized()
-        (expected, _), weights = net(*points), uniform(6, 12)
-        assert not torch.allclose(net(1.1 * points[0], points[1])[0], expected, atol=1e-4)
-        assert not torch.allclose(net(*points, weights)[0], expected, atol=1e-4)
-
+class TestGradients:
     def test_every_parameter_learns_but_those_that_cannot(self):
         """A bias in front of instance normalisation is subtracted again."""
         net = network()
