@@ -12,7 +12,7 @@ Example:
 from kornia_learnnorm.estimators.eight_point import EightPoint, TwoViewEstimate
 from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.refinement import Refinement, refine_fundamental
-from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
+from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated, squared_loss
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.geometry.distances import (
@@ -92,6 +92,7 @@ __all__ = [
     "sampson_distance",
     "sampson_scale",
     "spd_transform",
+    "squared_loss",
     "symmetric_epipolar_distance",
     "symmetric_scale",
 ]

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and their short names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["atomic_write"]
+__all__ = ["atomic_write", "short_name"]
 
 
 @contextmanager
@@ -55,3 +55,19 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         raise type(error)(error.errno, f"cannot write {path}: {error.strerror}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def short_name(path: str | Path) -> str:
+    """Return a file's name for tables, without its suffix; for ``weights.safetensors``, the name of its folder.
+
+    Args:
+        path: a store, ``FILE.h5@FIRST:STOP`` for some of its pairs, or a file of weights.
+
+    Example:
+        >>> short_name("data/tum.h5@0:9"), short_name("runs/mine/weights.safetensors")
+        ('tum@0:9', 'mine')
+
+    """
+    path = Path(path)
+    name = path.resolve().parent.name if path.name == "weights.safetensors" else path.name
+    return name.removesuffix(".safetensors").replace(".h5", "")

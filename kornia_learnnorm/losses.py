@@ -68,6 +68,11 @@ class EpipolarLoss(nn.Module):
         self.heldout_floor = heldout_floor
         self.ceiling = ceiling
 
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        name = getattr(self.residual, "__name__", self.residual)
+        return f"residual={name}, log={self.log}, heldout_weight={self.heldout_weight:g}, ceiling={self.ceiling:g}"
+
     def forward(
         self,
         points1: Tensor,

@@ -13,8 +13,7 @@ from safetensors.torch import save_file
 from torch import Tensor, distributed
 
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
-from kornia_learnnorm.evaluation.tables import names_of
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.files import atomic_write, short_name
 from lightning_modules.task import NormalizerTask
 
 __all__ = ["Checkpoints", "ExportWeights", "WritePredictions"]
@@ -72,7 +71,7 @@ def _names_of_source(datamodule: Any) -> tuple[str, ...]:
     """Return the names of the data that a datamodule trains on; nothing where they are not known."""
     source = getattr(datamodule, "train", None)
     if isinstance(source, StoreSamples):
-        return tuple(dict.fromkeys(names_of([path])[0] for path in source.paths))
+        return tuple(dict.fromkeys(short_name(path) for path in source.paths))
     return ("synthetic scenes",) if isinstance(source, SyntheticSamples) else ()
 
 

@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Sequence
 
-from kornia_learnnorm import __version__
+import kornia_learnnorm
 from kornia_learnnorm.optional import import_extra
 
 __all__ = ["main"]
@@ -45,8 +45,8 @@ def main(args: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if args is None else args)
     try:
         if words and words[0] in TRAINING:
-            import_extra("pytorch_lightning", "train", "training")
-            importlib.import_module("lightning_modules.training").run(None if args is None else words)
+            training = import_extra("lightning_modules.training", "train", "training")
+            training.run(None if args is None else words)
             return 0
         return _run_tool(words)
     except KeyboardInterrupt:
@@ -59,7 +59,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _run_tool(words: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="learnnorm", description="Learned normalisation of the eight-point algorithm")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {kornia_learnnorm.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in TRAINING.items():
         commands.add_parser(name, help=text, add_help=False)

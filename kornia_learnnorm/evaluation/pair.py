@@ -18,6 +18,7 @@ from kornia_learnnorm.data.matching.matchers import match_images
 from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
@@ -142,7 +143,7 @@ def estimate_pair(
         points2=points2,
         inliers=inliers,
         mean_distance=distances.mean().item(),
-        median_distance=distances.quantile(0.5).item(),
+        median_distance=median(distances).item(),
         path1=Path(path1),
         path2=Path(path2),
         size1=(image1.shape[1], image1.shape[0]),
@@ -159,7 +160,7 @@ def _distinct_matches(points1: Tensor, points2: Tensor, ratios: Tensor, ratio: f
         raise ValueError(
             f"{len(kept)} distinct matches of {len(ratios)} pass the ratio test {ratio:g}, at least 8 are needed"
         )
-    displacement = (kept[:, 2:] - kept[:, :2]).norm(dim=-1).median().item()
+    displacement = median((kept[:, 2:] - kept[:, :2]).norm(dim=-1)).item()
     if displacement < MIN_DISPLACEMENT:
         raise ValueError(
             f"no motion between the images (median displacement {displacement:.2g} px of {len(kept)} matches): the "

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.files import short_name
 from kornia_learnnorm.metrics.better_rate import better_rate, comparable
 from kornia_learnnorm.metrics.summary import median
 
@@ -96,15 +96,16 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def names_of(paths: Sequence[str]) -> list[str]:
-    """Return short names of files, or of the runs that left them, for tables.
+    """Return the short names of files, which tables show.
+
+    Args:
+        paths: as for :func:`~kornia_learnnorm.files.short_name`.
 
     Raises:
         ValueError: if two have the same name.
 
     """
-    files = [Path(path) for path in paths]
-    names = [f.resolve().parent.name if f.name == "weights.safetensors" else f.name for f in files]
-    names = [name.removesuffix(".safetensors").replace(".h5", "") for name in names]
+    names = [short_name(path) for path in paths]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: rename one of {', '.join(paths)}")
     return names

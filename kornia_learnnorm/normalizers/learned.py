@@ -85,6 +85,10 @@ class LearnedNormalizer(ProblemNormalizer):
             params1, params2 = self.network(x1, x2, problem.weights)
         return self.transform(params1) @ T1, self.transform(params2) @ T2
 
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        return f"transform={getattr(self.transform, '__name__', self.transform)}, trained_on={self.trained_on}"
+
     def save_pretrained(self, path: str | Path) -> None:
         """Write weights and architecture to one safetensors file, beside the target and then renamed.
 

@@ -12,18 +12,15 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
 from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.minimal import are_determined, solve_samples
-from kornia_learnnorm.estimators.refinement import minimize
-from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
 from kornia_learnnorm.geometry.checks import check_rank2, check_tensor, solve_dtype
 from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
-from kornia_learnnorm.geometry.manifold import Rank2, decompose
+from kornia_learnnorm.geometry.manifold import decompose
 from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.contract import Normalizer
-from kornia_learnnorm.ransac.constrained_fit import constrained_fit
+from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.ransac.scoring import (
     MAX_MEDIAN_DISTANCES,
@@ -40,13 +37,6 @@ FIRST_BATCH = 64  # samples in the first batch; each batch is four times as larg
 MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
 POOL_SIZE = 8  # best hypotheses of a batch, which local optimisation fits
-LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps: a noisy sample has few inliers
-FINAL_POOL_SIZE = 4  # best hypotheses that the final fit starts from
-FINAL_LOSS_SCALE = 0.7  # scale of the final fit's loss, in thresholds
-FINAL_STEPS = 3  # steps of least squares on that loss
-FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
-MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
-LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
 MIN_RANK2_DETERMINANT = 1e-9  # of the 2x2 part of a matrix of rank 2 and unit norm
 MIN_SAMPLE_SHIFT = 0.01  # thresholds; a sample that a shift of a point by less makes degenerate is dropped
 
@@ -82,7 +72,8 @@ class RANSAC(nn.Module):
     constructor's arguments differ, the matrix has unit Frobenius norm, and weights steer the sampling.
 
     Args:
-        normalizer: maps ``(points1, points2, weights)`` to the transforms of both views; Hartley's when not given.
+        normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, for minimal samples with
+            ``rank2="projection"`` (Hartley's when not given) and for the refits of local optimisation.
         inl_th: largest distance of an inlier, pixels.
         max_samples: largest number of minimal samples (Kornia's ``max_iter`` counts batches of 2,048).
         max_seconds: time after which no further batch of samples, 64 at first and up to 1,024, is drawn; with it the
@@ -93,10 +84,10 @@ class RANSAC(nn.Module):
         distance: ``"sampson"``, ``"symmetric"`` (Fan et al., Eq. 7), or a function such as
             :func:`~kornia_learnnorm.sampson_scale`.
         rank2: how the singularity constraint is enforced on minimal samples: ``"projection"`` in the normaliser's
-            coordinates or ``"optimal"`` correction, which uses no normaliser, takes fewer samples than any and a
-            fraction of the time. When not given, ``"projection"`` with a ``normalizer`` and ``"optimal"`` without.
+            coordinates, or ``"optimal"`` correction, which takes fewer samples and, without a normaliser, a fraction of
+            the time. When not given, ``"projection"`` with a ``normalizer`` and ``"optimal"`` without.
         refine: whether to optimise; otherwise the result is the minimal sample of highest score.
-        sampler: what weights do: :class:`~kornia_learnnorm.ransac.samplers.ProsacSampler` or
+        sampler: how weights steer the sampling: :class:`~kornia_learnnorm.ransac.samplers.ProsacSampler` or
             :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
 
@@ -145,7 +136,7 @@ class RANSAC(nn.Module):
             rank2 = "optimal" if normalizer is None else "projection"
         check_rank2(rank2)
         find_scale(distance)
-        self.normalizer = Hartley() if normalizer is None else normalizer
+        self.normalizer = Hartley() if normalizer is None and rank2 == "projection" else normalizer
         self.rank2: Literal["projection", "optimal"] = rank2
         self.inl_th, self.max_samples, self.max_seconds, self.confidence = inl_th, max_samples, max_seconds, confidence
         self.distance, self.refine, self.sampler = distance, refine, sampler
@@ -209,8 +200,7 @@ class RANSAC(nn.Module):
             if torch.is_autocast_enabled(device):
                 stack.enter_context(torch.autocast(device, enabled=False))
             # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
-            uses_normalizer = self.rank2 == "projection"
-            stack.enter_context(torch.no_grad() if uses_normalizer else torch.inference_mode())
+            stack.enter_context(torch.inference_mode() if self.normalizer is None else torch.no_grad())
             result = self._estimate(points1, points2, weights)
         return result._replace(F_mat=result.F_mat.clone(), inliers=result.inliers.clone())
 
@@ -235,7 +225,7 @@ class RANSAC(nn.Module):
         pool, drawn = self._search(scorer, sampler, generator)
         if len(pool.F_mat) == 0:
             return _failure(points1, drawn)
-        state = self._polish(scorer, pool) if self.refine else decompose(pool.F_mat[:1])
+        state = fit_final(scorer, pool) if self.refine else decompose(pool.F_mat[:1])
         if state.A.det().abs() < MIN_RANK2_DETERMINANT:
             return _failure(points1, drawn)
         F = state.matrix()
@@ -268,7 +258,7 @@ class RANSAC(nn.Module):
     def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
         """Return the matrices of the non-degenerate minimal samples (K, 8), or of all where every one is degenerate."""
         x1, x2 = scorer.samples(rows)
-        if self.rank2 == "optimal":
+        if self.normalizer is None:
             F_mat = solve_samples(x1, x2, MIN_SAMPLE_SHIFT * self.inl_th)
             if len(F_mat):
                 return F_mat
@@ -280,31 +270,12 @@ class RANSAC(nn.Module):
 
     def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
         """Return the best of the matrices fitted to their inliers, the first of them also by the normaliser."""
-        if self.rank2 == "projection":
+        if self.normalizer is not None:
             inliers = scorer.inliers(F_mat[:1]).to(F_mat)
             points1, points2 = (points[None, scorer.rows] for points in scorer.pixels)
             refit = find_fundamental(points1, points2, inliers, self.normalizer, self.rank2)
             F_mat = torch.cat([scorer.from_pixels(refit), F_mat])
-        losses = [Truncated(scale * self.inl_th) for scale in LOCAL_SCALES]
-        x1, x2 = scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows]
-        return scorer.best(constrained_fit(x1, x2, F_mat, losses, find_scale(self.distance)).F_mat, POOL_SIZE)
-
-    def _polish(self, scorer: PairScorer, pool: Hypotheses) -> Rank2:
-        """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
-        loss = GemanMcClure(FINAL_LOSS_SCALE * self.inl_th)
-        losses: list[Loss] = [Truncated(self.inl_th), *FINAL_STEPS * [loss]]
-        fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL_SIZE], losses, find_scale(self.distance))
-        best = int(fit.cost.argmin())
-        state, cost = decompose(fit.F_mat[best : best + 1]), float(fit.cost[best])
-        if not float(fit.gain[best]) <= FINAL_GAIN:
-            ones = torch.ones_like(scorer.x1[:1])
-            objective = EpipolarCost(scorer.x1[None], scorer.x2[None], ones, find_scale(self.distance), loss)
-            optimum = minimize(objective, state, MAX_LM_STEPS, LM_TOLERANCE)[1]
-            state, cost = optimum.state, float(optimum.cost[0])
-        # The loss is nowhere above that of MSAC, so that the pool's best has no more of it than this but for a margin.
-        share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
-        most = self.inl_th**2 * (1.1 * share * scorer.x1.shape[-1] + SAMPLE_SIZE)
-        return state if cost <= most else decompose(pool.F_mat[:1])
+        return optimize_locally(scorer, F_mat, POOL_SIZE)
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""

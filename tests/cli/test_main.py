@@ -268,7 +268,9 @@ def test_errors_are_one_line_and_exit_code_2(arguments, message, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("blocked", "extra"), [("h5py", "images"), ("tqdm", "images"), ("pytorch_lightning", "train")])
+@pytest.mark.parametrize(
+    ("blocked", "extra"), [("h5py", "images"), ("tqdm", "images"), ("lightning_modules.training", "train")]
+)
 def test_a_missing_package_is_one_line(blocked, extra, tmp_path, monkeypatch, capsys):
     write_store(tmp_path / "s.h5", synthetic_store(pairs=1, points=40))
     monkeypatch.setitem(sys.modules, blocked, None)

@@ -21,7 +21,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC, sampson_scale, symmetric_scale
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.metrics.pairs import f1_score
-from kornia_learnnorm.ransac import ransac as module
+from kornia_learnnorm.ransac import local_optimization as module
 from kornia_learnnorm.ransac.samplers import WeightedSampler
 
 NORMALIZERS = [None, kln.Whitening(), kln.ReweightedWhitening()]
@@ -66,6 +66,40 @@ class TestSmoke:
         assert isinstance(copy.deepcopy(ransac).eval(), RANSAC)
 
 
+class TestResult:
+    def test_estimate(self):
+        points1, points2 = pair()[:2]
+        ransac = RANSAC(seed=0)
+        result = ransac.estimate(points1, points2)
+        F_mat, inliers = ransac(points1, points2)
+        assert torch.equal(result.F_mat, F_mat)
+        assert torch.equal(result.inliers, inliers)
+        distances = kln.sampson_distance(points1[None], points2[None], F_mat[None])[0]
+        expected = (1 - distances.square()).clamp(min=0).sum()
+        assert result.score == pytest.approx(expected.item(), rel=1e-6)
+        assert result.num_samples >= 64
+
+    def test_names_of_distances(self):
+        points = pair()[:2]
+        for name, scale in (("sampson", sampson_scale), ("symmetric", symmetric_scale)):
+            by_name, by_function = (RANSAC(seed=0, distance=distance)(*points)[0] for distance in (name, scale))
+            assert torch.equal(by_name, by_function)
+
+    def test_rank2_means_what_it_says(self):
+        """The default depends on whether there is a normaliser; what is given never changes."""
+        assert [RANSAC().rank2, RANSAC(kln.Whitening()).rank2] == ["optimal", "projection"]
+        assert isinstance(RANSAC(rank2="projection").normalizer, kln.Hartley)
+        points, options = pair()[:2], {"seed": 0, "refine": False}
+        given, default = (RANSAC(n, rank2="projection", **options)(*points)[0] for n in (kln.Hartley(), None))
+        assert torch.equal(given, default)
+        assert not torch.equal(given, RANSAC(**options)(*points)[0])
+
+    def test_repr_shows_the_parameters(self):
+        text = repr(RANSAC(inl_th=0.5, max_samples=100))
+        for part in ("inl_th=0.5", "max_samples=100", "distance='sampson'", "rank2='optimal'", "sampler=ProsacSampler"):
+            assert part in text
+
+
 POINTS, NAN = uniform(20, 2), float("nan")
 
 
@@ -100,6 +134,7 @@ class TestExceptions:
         ("points1", "points2", "weights", "error", "message"),
         [
             (POINTS.long(), POINTS, None, TypeError, "points1 must be a float32 or float64 tensor, got torch.int64"),
+            (POINTS.numpy(), POINTS, None, TypeError, r"got <class 'numpy.ndarray'>; torch.from_numpy\(points1\)"),
             (POINTS, POINTS.float(), None, TypeError, "one dtype"),
             (POINTS[None], POINTS[None], None, ShapeError, r"\[1, 20, 2\]"),
             (POINTS, POINTS[1:], None, ValueError, r"pair up, got shapes \[20, 2\] and \[19, 2\]"),

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,6 +13,7 @@ from kornia_learnnorm.evaluation.runs.run import Cell
 from kornia_learnnorm.metrics.better_rate import comparable
 from kornia_learnnorm.metrics.bootstrap import bootstrap_interval, paired_bootstrap
 from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.summary import median
 
 __all__ = [
     "BASELINE",
@@ -70,8 +70,7 @@ def median_text(values: Tensor, spec: str = ".3f") -> str:
         '2.500'
 
     """
-    known = values[~values.isnan()]
-    return format(np.median(known.numpy()), spec) if len(known) else ""
+    return number_text(median(values.flatten()).item(), spec)
 
 
 def mean_text(values: Tensor, pair: Tensor) -> str:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.report.formatting import BASELINE, Table, number_text, rate_text
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.metrics.summary import median
 
 __all__ = ["by_motion", "worst_failures"]
 
@@ -37,7 +38,7 @@ def by_motion(cell: Cell, run: Run, learned: str) -> Table:
         if reason := _why_not_split(values):
             left_out.append(f"{name}, {reason}")
             continue
-        middle = values[values.isfinite()].quantile(0.5)
+        middle = median(values[values.isfinite()])
         text = _distinct(middle, values)
         for half, chosen in ((f"up to {text}", values <= middle), (f"above {text}", values > middle)):
             inside = chosen[cell.pair]

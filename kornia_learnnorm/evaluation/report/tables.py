@@ -15,7 +15,6 @@ from kornia_learnnorm.evaluation.report.formatting import (
     Table,
     mean_text,
     median_text,
-    number_text,
     paired_text,
     pose_texts,
     rate_text,
@@ -55,7 +54,7 @@ def _accuracy(cell: Cell) -> Table:
     for name, p in cell.predictions.items():
         rate = "-" if name == BASELINE else rate_text(cell, name, BASELINE, "truth")
         angles = [p[key] for key in ("rotation_error", "translation_error")]
-        diagnostics = (p[key].nanmedian().item() for key in ("condition_number", "rho", "distance1", "distance2"))
+        diagnostics = (p[key] for key in ("condition_number", "rho", "distance1", "distance2"))
         rows.append(
             [
                 name,
@@ -63,7 +62,7 @@ def _accuracy(cell: Cell) -> Table:
                 rate,
                 *(median_text(angle, ".2f") for angle in angles),
                 *pose_texts(*(angle.nan_to_num(math.inf)[posed] for angle in angles)),
-                *(number_text(value, ".4g") for value in diagnostics),
+                *(median_text(values, ".4g") for values in diagnostics),
             ]
         )
     text = (

@@ -25,12 +25,8 @@ def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None)
         max_ratio: only matches with Lowe's ratio below; None for all.
 
     """
-    rows = slice(int(store.offsets[pair]), int(store.offsets[pair + 1]))
-    points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
-    if max_ratio is None:
-        return points1, points2
-    passes = torch.from_numpy(store.ratio[rows]) < max_ratio
-    return points1[passes], points2[passes]
+    points1, points2, _ = store.matches(pair, max_ratio)
+    return torch.from_numpy(points1).double(), torch.from_numpy(points2).double()
 
 
 def ground_truth_inliers(store: CorrespondenceStore) -> Tensor:

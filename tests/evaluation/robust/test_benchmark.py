@@ -104,7 +104,7 @@ def test_a_package_that_is_not_installed(robust_copied, robust_store, monkeypatc
     monkeypatch.setitem(peers.PEERS, "poselib", peers.PeerPackage(pytest.fail, "no_such_module", "poselib"))
     options = ["--seeds", "2", "--estimators", "poselib", "--solvers"]
     assert main(["robust", str(robust_store), *options, "--out", str(robust_copied)]) == 0
-    assert json.loads((robust_copied / "run.json").read_text())["robust"]["estimators"]["poselib"] is None
+    assert read_robust(robust_copied).about["estimators"]["poselib"] is None
 
 
 def test_damaged(robust_copied, robust_command, capsys):
@@ -116,8 +116,9 @@ def test_damaged(robust_copied, robust_command, capsys):
             assert main(again) == 2
             assert f"{path} is damaged, remove it" in capsys.readouterr().err
     (robust_copied / "run.json").write_text('{"format": 3, "robust": {"stores": {}}}')
-    assert main(["report", str(robust_copied)]) == 2
-    assert "run.json is damaged: estimators, solvers, versions, pairs, " in capsys.readouterr().err
+    for again in (["report", str(robust_copied)], [*robust_command, str(robust_copied)]):
+        assert main(again) == 2
+        assert "run.json is damaged: estimators, solvers, versions, pairs" in capsys.readouterr().err
 
 
 def test_what_fails_is_left_out_and_others_go_on(robust_store, tmp_path, monkeypatch, capsys):

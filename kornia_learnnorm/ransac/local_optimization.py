@@ -1,0 +1,54 @@
+"""Local optimisation of RANSAC's hypotheses, and the final fit of the best ones."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
+from kornia_learnnorm.estimators.refinement import minimize
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
+from kornia_learnnorm.geometry.manifold import Rank2, decompose
+from kornia_learnnorm.ransac.constrained_fit import constrained_fit
+from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
+from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
+
+__all__ = ["fit_final", "optimize_locally"]
+
+LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps: a noisy sample has few inliers
+FINAL_POOL_SIZE = 4  # best hypotheses that the final fit starts from
+FINAL_LOSS_SCALE = 0.7  # scale of the final fit's loss, in thresholds
+FINAL_STEPS = 3  # steps of least squares on that loss
+FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
+MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
+LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
+
+
+def optimize_locally(scorer: PairScorer, F_mat: Tensor, number: int) -> Hypotheses:
+    """Return the best of the matrices (K, 3, 3) fitted to their inliers among the scored correspondences.
+
+    Reference:
+        O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM 2003.
+
+    """
+    losses = [Truncated(scale * scorer.threshold) for scale in LOCAL_SCALES]
+    x1, x2 = scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows]
+    return scorer.best(constrained_fit(x1, x2, F_mat, losses, scorer.scale).F_mat, number)
+
+
+def fit_final(scorer: PairScorer, pool: Hypotheses) -> Rank2:
+    """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
+    threshold, loss = scorer.threshold, GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold)
+    losses: list[Loss] = [Truncated(threshold), *FINAL_STEPS * [loss]]
+    fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL_SIZE], losses, scorer.scale)
+    best = int(fit.cost.argmin())
+    state, cost = decompose(fit.F_mat[best : best + 1]), float(fit.cost[best])
+    if not float(fit.gain[best]) <= FINAL_GAIN:
+        ones = torch.ones_like(scorer.x1[:1])
+        objective = EpipolarCost(scorer.x1[None], scorer.x2[None], ones, scorer.scale, loss)
+        optimum = minimize(objective, state, MAX_LM_STEPS, LM_TOLERANCE)[1]
+        state, cost = optimum.state, float(optimum.cost[0])
+    # The loss is nowhere above that of MSAC: up to a margin, the optimum costs no more than the pool's best.
+    share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
+    most = threshold**2 * (1.1 * share * scorer.x1.shape[-1] + SAMPLE_SIZE)
+    return state if cost <= most else decompose(pool.F_mat[:1])
