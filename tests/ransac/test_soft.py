@@ -10,7 +10,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from torch import nn
 from torch.autograd import gradcheck
 from two_view import (
     correspondences,
@@ -23,7 +22,7 @@ from two_view import (
     up_to_sign,
 )
 
-from kornia_learnnorm import Hartley, Whitening, symmetric_epipolar_distance
+from kornia_learnnorm import Hartley, Whitening
 from kornia_learnnorm.ransac.soft import expected_loss, sample_minimal_sets
 
 
@@ -232,24 +231,6 @@ class TestExpectedLoss:
         assert found.loss.mean().item() == pytest.approx(exact.item(), abs=4 * found.loss.std().item() / 200)
         assert ((gradients.mean(0) - wanted[0]).abs() < 4.5 * error).all()
         assert (wanted[0].abs() > 6 * error).any()
-
-    def test_learns_where_to_sample(self, generator):
-        scene = correspondences("orbit", 1, 40, noise=0.1)
-        points = [p.clone() for p in scene]
-        points[1][:, 20:] = uniform(1, 20, 2, high=400)
-        logits = nn.Parameter(torch.zeros(1, 40, dtype=torch.float64))
-        optimizer = torch.optim.Adam([logits], 0.1)
-
-        def loss(F):
-            held_out = [p[:, None].expand(-1, F.shape[1], -1, -1) for p in scene]
-            return symmetric_epipolar_distance(*held_out, F).clamp(max=10).mean(-1)
-
-        for _ in range(40):
-            samples, log_probs = sample_minimal_sets(logits, 64, generator)
-            optimizer.zero_grad()
-            expected_loss(*points, samples, loss, log_probs).loss.sum().backward()
-            optimizer.step()
-        assert logits[0, :20].mean() > logits[0, 20:].mean() + 1
 
 
 def probabilities_to_be_last(p):
