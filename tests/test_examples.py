@@ -108,12 +108,8 @@ class Counting(torch.nn.Module):
         return kln.Hartley()(points1, points2, weights)
 
 
-@pytest.fixture
-def pair():
-    return orbit(1, 200, torch.Generator().manual_seed(0), noise=0.2, outliers=0.2)
-
-
-def test_kornia_ransac_solves_and_refits_by_the_layer(example, pair):
+def test_kornia_ransac_solves_and_refits_by_the_layer(example):
+    pair = orbit(1, 200, torch.Generator().manual_seed(0), noise=0.2, outliers=0.2)
     counting = Counting()
     F_mat, inliers = example("kornia_ransac").kornia_ransac(counting, 200)(pair.points1[0], pair.points2[0])
     assert 8 in counting.sizes
@@ -123,7 +119,8 @@ def test_kornia_ransac_solves_and_refits_by_the_layer(example, pair):
     assert distance[pair.inliers].median() < 1
 
 
-def test_kornia_ransac_calls_no_replaced_solver_by_default(pair):
+def test_kornia_ransac_calls_no_replaced_solver_by_default():
+    pair = orbit(1, 200, torch.Generator().manual_seed(0), noise=0.2, outliers=0.2)
     ransac, counting = RANSAC("fundamental_8pt", inl_th=1.0, max_samples=200, seed=0), Counting()
     ransac.minimal_solver = ransac.polisher_solver = kln.EightPoint(counting)
     ransac(pair.points1[0], pair.points2[0])

@@ -51,18 +51,20 @@ def unit(F: np.ndarray) -> np.ndarray:
     return F / np.linalg.norm(F, axis=(-2, -1), keepdims=True)
 
 
+def null_matrices(points1, points2, T1, T2, weights=None) -> np.ndarray:
+    """The last right singular vectors of the design matrices in the coordinates of the transforms."""
+    T1, T2 = (np.asarray(T, dtype=np.float64).swapaxes(-1, -2) for T in (T1, T2))
+    x1, x2 = homogeneous(np.asarray(points1, dtype=np.float64)) @ T1, homogeneous(np.asarray(points2, np.float64)) @ T2
+    A = (x2[..., :, None] * x1[..., None, :]).reshape(*x1.shape[:2], 9)
+    A = A if weights is None else A * np.sqrt(np.asarray(weights))[..., None]
+    return np.linalg.svd(A, full_matrices=True)[2][:, -1].reshape(-1, 3, 3)
+
+
 def eight_point(points1, points2, T1, T2, weights=None) -> np.ndarray:
     """The normalised eight-point algorithm by two singular value decompositions; the weights are of squares."""
-    points1, points2, T1, T2 = (np.asarray(value, dtype=np.float64) for value in (points1, points2, T1, T2))
-    F = []
-    for k, (p1, p2, t1, t2) in enumerate(zip(points1, points2, T1, T2, strict=True)):
-        x1, x2 = homogeneous(p1) @ t1.T, homogeneous(p2) @ t2.T
-        A = np.stack([np.kron(b, a) for a, b in zip(x1, x2, strict=True)])
-        if weights is not None:
-            A = A * np.sqrt(np.asarray(weights[k]))[:, None]
-        U, s, Vh = np.linalg.svd(np.linalg.svd(A, full_matrices=True)[2][-1].reshape(3, 3))
-        F.append(t2.T @ U @ np.diag([s[0], s[1], 0]) @ Vh @ t1)
-    return unit(np.stack(F))
+    U, s, Vh = np.linalg.svd(null_matrices(points1, points2, T1, T2, weights))
+    F = U[..., :2] * s[..., None, :2] @ Vh[..., :2, :]
+    return unit(np.asarray(T2, dtype=np.float64).swapaxes(-1, -2) @ F @ np.asarray(T1, dtype=np.float64))
 
 
 def numpy_hartley(points, weights=None) -> np.ndarray:

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.overrides import TorchFunctionMode
-from two_view import correspondences, homogeneous, numpy_hartley, signless, uniform, up_to_sign
+from two_view import correspondences, homogeneous, null_matrices, numpy_hartley, signless, uniform, up_to_sign
 
 from kornia_learnnorm import EightPoint, LearnedNormalizer, ReweightedWhitening, find_fundamental
 from kornia_learnnorm.geometry import checks
@@ -30,14 +30,6 @@ class Calls(TorchFunctionMode):
     def __torch_function__(self, function, types, args=(), kwargs=None):
         self.names[getattr(function, "__name__", str(function))] += 1
         return function(*args, **(kwargs or {}))
-
-
-def null_matrices(points1, points2, T1, T2) -> np.ndarray:
-    """The last right singular vectors of the design matrices, solved in the coordinates of the transforms."""
-    x1 = homogeneous(points1.numpy()) @ np.asarray(T1).swapaxes(-1, -2)
-    x2 = homogeneous(points2.numpy()) @ np.asarray(T2).swapaxes(-1, -2)
-    A = (x2[..., :, None] * x1[..., None, :]).reshape(*x1.shape[:2], 9)
-    return np.linalg.svd(A, full_matrices=True)[2][:, -1].reshape(-1, 3, 3)
 
 
 class TestLinearProblem:

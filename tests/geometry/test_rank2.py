@@ -15,6 +15,7 @@ from two_view import (
     epipolar_distances,
     hartley_difference,
     homogeneous,
+    null_matrices,
     numpy_hartley,
     signless,
     uniform,
@@ -31,11 +32,7 @@ from kornia_learnnorm.geometry.rank2 import optimal_rank2
 def linear(points1, points2, weights=None) -> torch.Tensor:
     """The DLT's solution in Hartley's coordinates, of rank 3, in pixels."""
     T1, T2 = numpy_hartley(points1, weights), numpy_hartley(points2, weights)
-    x1, x2 = homogeneous(points1.numpy()) @ T1.swapaxes(-1, -2), homogeneous(points2.numpy()) @ T2.swapaxes(-1, -2)
-    A = (x2[..., :, None] * x1[..., None, :]).reshape(*x1.shape[:2], 9)
-    A = A if weights is None else A * np.sqrt(weights.numpy())[..., None]
-    F = np.linalg.svd(A)[2][:, -1].reshape(-1, 3, 3)
-    return torch.from_numpy(unit(T2.swapaxes(-1, -2) @ F @ T1))
+    return torch.from_numpy(unit(T2.swapaxes(-1, -2) @ null_matrices(points1, points2, T1, T2, weights) @ T1))
 
 
 def reference(F, points1, points2, iterations: int = 3) -> np.ndarray:
