@@ -1,4 +1,4 @@
-"""Relative poses against OpenCV and triangulation in NumPy."""
+"""Relative poses against ground truth and triangulation in NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The covariance-weighted rank-2 correction against constrained least squares, and the properties it must have."""
+"""Both rank-2 corrections: against constrained least squares and a truncated decomposition in NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The better rate against counting by hand, the bootstrap against another one and against the normal law."""
+"""The better rate against counting by hand."""
 
 from __future__ import annotations
 

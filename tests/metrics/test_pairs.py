@@ -1,4 +1,4 @@
-"""Inlier share, F1 and epipolar error against loops over correspondences; the paired bootstrap against another one."""
+"""Inlier share, F1 and epipolar error against loops over correspondences."""
 
 from __future__ import annotations
 

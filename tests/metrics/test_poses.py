@@ -1,4 +1,4 @@
-"""Relative poses against OpenCV and triangulation in NumPy, angles by construction, recall curves by hand."""
+"""Pose errors by construction, recall curves and accuracies by hand."""
 
 from __future__ import annotations
 

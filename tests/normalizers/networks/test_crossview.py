@@ -1,4 +1,4 @@
-"""Set networks: what they are blind to, what they see, and what they may answer."""
+"""The cross-view network and its set network: what each depends on, and which answers are possible."""
 
 from __future__ import annotations
 

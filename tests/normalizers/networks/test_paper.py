@@ -1,4 +1,4 @@
-"""The paper's network: its size, its answers against NumPy, what it sees, and the normaliser made of it."""
+"""The paper's network: its size, its answers against NumPy, its gradients, and the normaliser made of it."""
 
 from __future__ import annotations
 
