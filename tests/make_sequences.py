@@ -27,8 +27,8 @@ def metres(pixels: float, focal: float = FOCAL) -> float:
 
 
 @cache
-def texture(seed: int = 0, width: int = 900, height: int = 500) -> np.ndarray:
-    """Random blobs, grey values from 0 to 255."""
+def texture(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
+    """Random blobs at two scales, grey values from 0 to 255; their features are stable."""
     spectrum = np.fft.rfft2(np.random.default_rng(seed).normal(size=(height, width)))
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
     image = sum(np.fft.irfft2(spectrum * np.exp(-((frequency * scale * 4) ** 2))) * scale for scale in (1.5, 4.0))
@@ -36,18 +36,9 @@ def texture(seed: int = 0, width: int = 900, height: int = 500) -> np.ndarray:
     return (np.clip((image - low) / (high - low), 0, 1) * 255).astype(np.uint8)
 
 
-def blurred_noise(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
-    """Blurred noise at two scales, with the full range of grey values; its features are stable."""
-    import cv2
-
-    rng = np.random.default_rng(seed)
-    image = sum(cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
-    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-
-
 def write_image(path: Path, shift: int, size: tuple[int, int] = SIZE, seed: int = 0) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(texture(seed)[: size[1], shift : shift + size[0]]).save(path)
+    Image.fromarray(texture(seed, 900, 500)[: size[1], shift : shift + size[0]]).save(path)
 
 
 def write_lines(path: Path, *lines: str) -> None:

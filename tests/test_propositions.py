@@ -43,7 +43,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn.functional import normalize
-from two_view import SCENES, correspondences, homogeneous, in_hartley, numpy_hartley, uniform, up_to_sign
+from two_view import (
+    SCENES,
+    correspondences,
+    hartley_difference,
+    homogeneous,
+    in_hartley,
+    numpy_hartley,
+    shaken,
+    uniform,
+    up_to_sign,
+)
 
 from kornia_learnnorm import (
     Hartley,
@@ -66,6 +76,10 @@ GRID = [(i, j) for i in range(3) for j in range(3)]
 def rows(x1, x2) -> np.ndarray:
     """Design matrices of homogeneous points: the products of the coordinates."""
     return (np.asarray(x2)[..., :, None] * np.asarray(x1)[..., None, :]).reshape(*x1.shape[:-1], 9)
+
+
+def move(x, T) -> np.ndarray:
+    return x @ np.swapaxes(T, -1, -2)
 
 
 def kappa(A) -> np.ndarray:
@@ -116,15 +130,6 @@ class TestConditionNumberOne:
         d = np.linalg.eigvalsh(expected)[:, -8:]
         sure = d[:, 0] > 1e-6 * d[:, 7]
         np.testing.assert_allclose(kappa(A)[sure], np.sqrt(d[:, 7] / d[:, 0])[sure], rtol=1e-4)
-
-    def test_is_orthogonal_rows_of_one_length(self):
-        Q = np.linalg.qr(np.random.default_rng(0).normal(size=(9, 9)))[0][:8]
-        assert kappa(3.0 * Q) == pytest.approx(1)
-        longer, skew = Q.copy(), Q.copy()
-        longer[0] *= 1.1
-        skew[0] += 0.1 * Q[1]
-        assert kappa(longer) == pytest.approx(1.1)
-        assert kappa(skew) > 1.05
 
     def test_fourteen_orthogonal_pairs_share_two(self):
         """Whatever the degrees of 8 points in a graph of 14 edges, more pairs have a common neighbour than exist."""
@@ -191,8 +196,7 @@ class TestCounterexamples:
     def test_three_places_by_three_places(self, missing):
         """Triangles in pixels, and the affine transforms that make both equilateral, at Hartley's distance."""
         random = np.random.default_rng(missing)
-        places = random.uniform(0, 600, (2, 3, 2))
-        angles = 2 * np.pi * np.arange(3) / 3
+        places, angles = random.uniform(0, 600, (2, 3, 2)), 2 * np.pi * np.arange(3) / 3
         even = np.sqrt(2) * np.stack([np.cos(angles), np.sin(angles)], 1)
         pairs = np.array([pair for k, pair in enumerate(GRID) if k != missing])
         T = [np.linalg.solve(homogeneous(p), homogeneous(even)).T for p in places]
@@ -221,9 +225,8 @@ class TestCounterexamples:
         for sign in (1, -1):
             pairs += [(e[0], e[0] + sign * e[1]), (e[2], e[1] + sign * e[2])]
             pairs += [(e[1] + sign * e[2], e[0]), (e[0] + sign * e[1], e[2])]
-        x1, x2 = (np.stack([v / np.linalg.norm(v) for v in x]) for x in zip(*pairs, strict=True))
-        x1, x2 = (np.delete(x, missing, 0) for x in (x1, x2))
-        self.check(x1, x2)
+        x = [np.stack([v / np.linalg.norm(v) for v in side]) for side in zip(*pairs, strict=True)]
+        self.check(*(np.delete(side, missing, 0) for side in x))
 
     @pytest.mark.parametrize("missing", range(9))
     def test_random_transforms_undo_it_and_their_inverses_restore_it(self, missing):
@@ -259,20 +262,14 @@ class TestScenes:
     """Real geometries: far from one, whatever the transforms."""
 
     @pytest.mark.parametrize("name", SCENES)
-    def test_points_are_distinct_and_the_null_vector_is_of_higher_rank(self, name):
+    def test_points_are_distinct_and_transforms_keep_the_rank_of_the_null_vector(self, name):
+        """It moves as F does, so its rank is that of the matrix in pixels: more than one."""
         x1, x2 = in_base(name, 50)
         assert all(distinct(x) for x in (*x1, *x2))
-        r = np.linalg.svd(null_matrix(rows(x1, x2)), compute_uv=False)
-        assert r[:, 1].min() > 1e-3
-
-    @pytest.mark.parametrize("name", SCENES)
-    def test_transforms_keep_the_rank(self, name):
-        """The null vector moves as F does, so its rank is that of the matrix in pixels."""
-        x1, x2 = in_base(name, 20)
-        T1, T2 = random_transforms(20, 1, 0.3), random_transforms(20, 2, 0.3)
-        F_mat = null_matrix(rows(x1, x2))
-        F_hat = null_matrix(rows(x1 @ T1.swapaxes(1, 2), x2 @ T2.swapaxes(1, 2)))
+        T1, T2 = random_transforms(50, 1, 0.3), random_transforms(50, 2, 0.3)
+        F_mat, F_hat = null_matrix(rows(x1, x2)), null_matrix(rows(move(x1, T1), move(x2, T2)))
         assert up_to_sign(T2.swapaxes(1, 2) @ F_hat @ T1, F_mat) < 1e-6
+        assert np.linalg.svd(F_mat, compute_uv=False)[:, 1].min() > 1e-3
         assert np.linalg.svd(F_hat, compute_uv=False)[:, 1].min() > 1e-4
 
     @pytest.mark.parametrize("name", SCENES)
@@ -286,8 +283,7 @@ class TestScenes:
             if affine:
                 for T in (T1, T2):
                     T[:, 2] = [0, 0, 1]
-            A = rows(x1[k] @ T1.swapaxes(1, 2), x2[k] @ T2.swapaxes(1, 2))
-            assert kappa(A).min() > 5
+            assert kappa(rows(move(x1[k], T1), move(x2[k], T2))).min() > 5
 
     @pytest.mark.parametrize("name", SCENES)
     def test_descent_ends_above_one(self, name):
@@ -313,10 +309,8 @@ class TestScenes:
         x1, x2 = in_base("handheld", 5, 8, seed)
         T1, T2 = random_transforms(5, seed), random_transforms(5, seed + 1)
         R1, R2 = (np.linalg.qr(T)[1] for T in (T1, T2))
-        found = []
-        for S1, S2 in [(T1, T2), (R1 / R1[:, 2:, 2:], R2 / R2[:, 2:, 2:])]:
-            found.append(kappa(rows(x1 @ S1.swapaxes(1, 2), x2 @ S2.swapaxes(1, 2))))
-        np.testing.assert_allclose(*found, rtol=1e-6)
+        affine = kappa(rows(move(x1, R1 / R1[:, 2:, 2:]), move(x2, R2 / R2[:, 2:, 2:])))
+        np.testing.assert_allclose(kappa(rows(move(x1, T1), move(x2, T2))), affine, rtol=1e-6)
 
     @pytest.mark.parametrize("flat", [1, 2])
     @pytest.mark.parametrize("view", [0, 1])
@@ -327,8 +321,7 @@ class TestScenes:
         found = []
         for size in (1e-2, 1e-3, 1e-4):
             scales = np.where(np.arange(3) < flat, size, 1.0)
-            moved = [p @ (U * scales @ V).swapaxes(1, 2) if k == view else p for k, p in enumerate(x)]
-            found.append(kappa(rows(*moved)))
+            found.append(kappa(rows(*(move(p, U * scales @ V) if k == view else p for k, p in enumerate(x)))))
         assert (found[1] > 5 * found[0]).all()
         assert (found[2] > 5 * found[1]).all()
 
@@ -346,17 +339,13 @@ def first_point(points1, points2, weights=None):
 @cache
 def normalizers():
     """Made once, and not at import: the networks draw random numbers and read files."""
-    torch.manual_seed(0)
-    network = PaperNetwork(16, 3)
-    with torch.no_grad():
-        network.head[-1].weight.normal_(0, 0.3)
     return {
         "identity": Identity(),
         "hartley": Hartley(),
         "whitening": Whitening(),
         "reweighted": ReweightedWhitening(),
         "learned": LearnedNormalizer.from_pretrained().double(),
-        "paper": LearnedNormalizer(Hartley(), network.double(), paper_transform),
+        "paper": shaken(LearnedNormalizer(Hartley(), PaperNetwork(16, 3), paper_transform)).double(),
     }
 
 
@@ -369,11 +358,9 @@ class TestOrder:
         points1, points2 = correspondences("handheld", 3, num_points, seed)
         order = random.sample(range(num_points), num_points)
         with torch.no_grad():
-            F_mats = [
-                find_fundamental(*p, normalizer=normalizers()[name])
-                for p in ((points1, points2), (points1[:, order], points2[:, order]))
-            ]
-        assert up_to_sign(*(in_hartley(F, points1, points2) for F in F_mats)) < 1e-5
+            F_mat = find_fundamental(points1, points2, normalizer=normalizers()[name])
+            shuffled = find_fundamental(points1[:, order], points2[:, order], normalizer=normalizers()[name])
+        assert hartley_difference(F_mat, shuffled, points1, points2) < 1e-5
 
     @pytest.mark.parametrize("num_points", [8, 20])
     def test_matters_to_a_normalization_that_depends_on_it(self, num_points):
@@ -381,8 +368,7 @@ class TestOrder:
         points = correspondences("handheld", 50, num_points, noise=1.0)
         F_mats = [find_fundamental(*(p.roll(k, 1) for p in points), normalizer=first_point) for k in (0, 1)]
         found, rolled = (in_hartley(F, *points) for F in F_mats)
-        signs = np.sign((found * rolled).sum((1, 2), keepdims=True))
-        difference = np.abs(found - signs * rolled).max((1, 2))
+        difference = np.minimum(np.abs(found - rolled).max((1, 2)), np.abs(found + rolled).max((1, 2)))
         assert np.median(difference) > 1e-3
         assert difference.min() > 1e-8
 

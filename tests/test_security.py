@@ -14,20 +14,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import pytorch_lightning as pl
 import torch
 from safetensors.torch import save_file
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.images import image_size, read_image
-from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
+from kornia_learnnorm.data.sources import StoreSamples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.runs.arrays import read_arrays
-from lightning_modules.datamodule import CorrespondenceDataModule
-from lightning_modules.task import NormalizerTask
 
 ROOT = Path(__file__).parent.parent
 NETWORK = "model.normalizer.init_args.network.init_args"
@@ -90,14 +87,6 @@ class TestCheckpoints:
         (tmp_path / "plain.ckpt").write_bytes(pickle.dumps(Touches(made)))
         self.refused(trained, tmp_path / "plain.ckpt", capsys)
 
-    def test_code_is_not_run_by_the_trainer(self, trained, made, tmp_path):
-        torch.save(torch.load(trained[0], weights_only=True) | {"callbacks": Touches(made)}, tmp_path / "forged.ckpt")
-        source = SyntheticSamples(number=64)
-        task, data = NormalizerTask(kln.LearnedNormalizer()), CorrespondenceDataModule(source, source, batch_size=16)
-        trainer = pl.Trainer(logger=False, enable_checkpointing=False, max_steps=1, accelerator="cpu")
-        with pytest.raises(pickle.UnpicklingError):
-            trainer.fit(task, data, ckpt_path=tmp_path / "forged.ckpt", weights_only=True)
-
     def test_a_checkpoint_configures_nothing(self, trained, made, tmp_path):
         """Lightning's command takes the model's arguments from a checkpoint, and they can name classes."""
         forged = {"normalizer": {"class_path": "subprocess.Popen", "init_args": {"args": ["touch", str(made)]}}}
@@ -123,13 +112,6 @@ class TestCheckpoints:
         assert path.stat().st_size < 10**5
         assert len(torch.load(path, weights_only=True)["state_dict"]["a"]) == 10**7
         self.refused(trained, path, capsys)
-
-    def test_of_another_network(self, trained, capsys):
-        for command in ("fit", "test"):
-            assert main([command, *trained[1], f"--{NETWORK}.width=16", f"--ckpt_path={trained[0]}"]) == 2
-            error = capsys.readouterr().err
-            assert "holds another network than the one configured" in error
-            assert error.count("\n") == 1
 
     def test_without_lightning(self, trained, tmp_path):
         """The lines of docs/training.md, where Lightning cannot be imported, give the weights that were exported."""
@@ -188,16 +170,6 @@ class TestWeights:
         metadata = {"format": "kornia_learnnorm.normalizer.v1", "architecture": json.dumps(architecture)}
         save_file({"network.set_network.head.2.bias": torch.zeros(5)}, tmp_path / "forged.safetensors", metadata)
         self.refused(tmp_path / "forged.safetensors", message)
-
-    def test_of_another_architecture(self, tmp_path):
-        small = kln.LearnedNormalizer(network=kln.CrossViewNetwork(width=8, depth=1))
-        small.save_pretrained(tmp_path / "small.safetensors")
-        with pytest.raises(RuntimeError, match="size mismatch"):
-            kln.LearnedNormalizer().load_state_dict(small.state_dict())
-        data = bytearray((tmp_path / "small.safetensors").read_bytes())
-        data = data.replace(b'\\"width\\": 8', b'\\"width\\": 9')
-        (tmp_path / "forged.safetensors").write_bytes(data)
-        self.refused(tmp_path / "forged.safetensors", "the tensors do not fit the architecture: .*size mismatch")
 
 
 def png(width, height, pixels):
@@ -277,10 +249,7 @@ def test_actions_are_pinned():
     [
         ("", "audit: not done (offline?): "),
         ("echo requests.exceptions.ConnectionError; exit 1", "audit: not done (offline?): requests.exceptions.Conn"),
-        (
-            "echo 'Found 1 known vulnerability in 1 package' >&2; echo one 1.0 CVE-1; exit 1",
-            "audit: Found 1 known vuln",
-        ),
+        ("echo 'Found 1 known vulnerability' >&2; echo one 1.0 CVE-1; exit 1", "audit: Found 1 known vuln"),
         ("echo 'No known vulnerabilities found'", "audit: no known vulnerabilities"),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
@@ -50,18 +51,20 @@ def unit(F: np.ndarray) -> np.ndarray:
     return F / np.linalg.norm(F, axis=(-2, -1), keepdims=True)
 
 
+def null_matrices(points1, points2, T1, T2, weights=None) -> np.ndarray:
+    """The last right singular vectors of the design matrices in the coordinates of the transforms."""
+    T1, T2 = (np.asarray(T, dtype=np.float64).swapaxes(-1, -2) for T in (T1, T2))
+    x1, x2 = homogeneous(np.asarray(points1, dtype=np.float64)) @ T1, homogeneous(np.asarray(points2, np.float64)) @ T2
+    A = (x2[..., :, None] * x1[..., None, :]).reshape(*x1.shape[:2], 9)
+    A = A if weights is None else A * np.sqrt(np.asarray(weights))[..., None]
+    return np.linalg.svd(A, full_matrices=True)[2][:, -1].reshape(-1, 3, 3)
+
+
 def eight_point(points1, points2, T1, T2, weights=None) -> np.ndarray:
     """The normalised eight-point algorithm by two singular value decompositions; the weights are of squares."""
-    points1, points2, T1, T2 = (np.asarray(value, dtype=np.float64) for value in (points1, points2, T1, T2))
-    F = []
-    for k, (p1, p2, t1, t2) in enumerate(zip(points1, points2, T1, T2, strict=True)):
-        x1, x2 = homogeneous(p1) @ t1.T, homogeneous(p2) @ t2.T
-        A = np.stack([np.kron(b, a) for a, b in zip(x1, x2, strict=True)])
-        if weights is not None:
-            A = A * np.sqrt(np.asarray(weights[k]))[:, None]
-        U, s, Vh = np.linalg.svd(np.linalg.svd(A, full_matrices=True)[2][-1].reshape(3, 3))
-        F.append(t2.T @ U @ np.diag([s[0], s[1], 0]) @ Vh @ t1)
-    return unit(np.stack(F))
+    U, s, Vh = np.linalg.svd(null_matrices(points1, points2, T1, T2, weights))
+    F = U[..., :2] * s[..., None, :2] @ Vh[..., :2, :]
+    return unit(np.asarray(T2, dtype=np.float64).swapaxes(-1, -2) @ F @ np.asarray(T1, dtype=np.float64))
 
 
 def numpy_hartley(points, weights=None) -> np.ndarray:
@@ -111,6 +114,59 @@ def in_hartley(F, points1, points2) -> np.ndarray:
     return unit(inverse2.swapaxes(-1, -2) @ np.asarray(F, dtype=np.float64) @ inverse1)
 
 
+def hartley_difference(F, G, points1, points2) -> float:
+    """Largest difference of two batches of matrices of pixels in Hartley's coordinates."""
+    return up_to_sign(in_hartley(F, points1, points2), in_hartley(G, points1, points2))
+
+
 def signless(F: Tensor) -> Tensor:
     """Smooth numbers of unit matrices that do not see the sign; a gradient check must not trip on it."""
     return (F.flatten(-2) @ uniform(9, 4, low=-1, seed=9).to(F)).square()
+
+
+def _wrong_correspondences() -> list[tuple]:
+    """Points, weights, and the error that every function of correspondences raises for them."""
+    points, ones = uniform(2, 8, 2), torch.ones(2, 8)
+    wrong = [
+        (points.long(), points, None, TypeError, "points1 must be .* got torch.int64"),
+        (points, points.int(), None, TypeError, "points2 must be .* got torch.int32"),
+        (points.half(), points.half(), None, TypeError, "float32 or float64 tensor, got torch.float16"),
+        (points.numpy(), points, None, TypeError, "points1 must be .* got <class 'numpy.ndarray'>"),
+        (points, None, None, TypeError, "points2 must be .* got <class 'NoneType'>"),
+        (points.float(), points, None, TypeError, "one dtype, got torch.float32 and torch.float64"),
+        (points, points.to("meta"), None, ValueError, "must be on one device, got cpu and meta"),
+        (points, points, -0.25 * ones, ValueError, r"weights must not be negative, got a minimum of -0\.25"),
+        (points, points, ones.bool(), TypeError, "floating-point tensor, got torch.bool; a boolean tensor is a mask"),
+        (points, points, [[1.0] * 8] * 2, TypeError, "weights must be a floating-point tensor, got <class 'list'>"),
+    ]
+    for shape in ([8, 2], [2, 8, 3], [2, 8, 1], [1, 2, 8, 2]):
+        message = str(shape).replace("[", r"\[")
+        wrong += [(x, torch.zeros(shape), None, ShapeError, message) for x in (torch.zeros(shape), points.float())]
+    for shape in ([2, 9, 2], [3, 8, 2], [1, 8, 2]):
+        message = rf"pair up, got shapes \[2, 8, 2\] and \{shape}"
+        wrong.append((points, points.new_zeros(shape), None, ValueError, message))
+    for shape in ([8], [2, 9], [2, 8, 1]):
+        message = rf"weights must have shape \[2, 8\], got \{shape}"
+        wrong.append((points, points, torch.ones(shape), ValueError, message))
+    for number in (0, 1, 7):
+        few = points[:, :number]
+        wrong.append((few, few, None, ValueError, f"at least 8 correspondences are needed, got {number}"))
+    for value in (torch.nan, torch.inf, -torch.inf):
+        for k, (name, count) in enumerate([("points1", 2), ("points2", 2), ("weights", 1)]):
+            values = [points.clone(), points.clone(), ones.clone()]
+            values[k][1, 3] = value
+            wrong.append((*values, ValueError, f"{name} must be finite, got {count} NaN or infinite"))
+    return wrong
+
+
+WRONG_CORRESPONDENCES = _wrong_correspondences()
+WRONG_MATRICES = [  # with two sets of points
+    (None, TypeError, "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
+    (torch.ones(2, 3, 3, dtype=torch.int64), TypeError, "F_mat must be .* got torch.int64"),
+    (torch.ones(3, 3), ShapeError, r"\[3, 3\]"),
+    (torch.ones(2, 3, 2), ShapeError, r"\[2, 3, 2\]"),
+    (torch.ones(3, 3, 3), ValueError, "got 3 matrices and 2 sets"),
+    (torch.full((2, 3, 3), torch.nan), ValueError, "F_mat must be finite, got 18 NaN"),
+    (torch.full((2, 3, 3), torch.inf), ValueError, "F_mat must be finite, got 18 NaN or infinite"),
+    (torch.stack([torch.eye(3), torch.zeros(3, 3)]), ValueError, "F_mat must not be zero, got 1 zero"),
+]

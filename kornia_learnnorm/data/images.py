@@ -27,12 +27,7 @@ QUARTER_TURNS = (5, 6, 7, 8)  # orientations that swap width and height
 
 
 def import_cv2() -> Any:
-    """Return the module ``cv2``.
-
-    Raises:
-        ImportError: if OpenCV is not installed; the message names the extra that installs it.
-
-    """
+    """Return the module ``cv2``; the ImportError names the extra that installs it."""
     return import_extra("cv2", "images", "matching images")
 
 
@@ -59,11 +54,10 @@ def read_image(path: str | Path) -> npt.NDArray[np.uint8]:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"image {path} does not exist")
-    if path.is_dir():
-        raise ValueError(f"image {path} is a folder, expected an image file")
     size = path.stat().st_size
-    if size == 0:
-        raise ValueError(f"image {path} is empty (0 bytes), expected an image file")
+    if path.is_dir() or size == 0:
+        got = "a folder" if path.is_dir() else "empty (0 bytes)"
+        raise ValueError(f"image {path} is {got}, expected an image file")
     Image = _pillow()
     try:
         with _opened(path) as image:
@@ -92,21 +86,9 @@ def _grey_values(image: Any) -> npt.NDArray[np.uint8]:
 
 
 def read_frame(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Return a frame as it is matched: grey, undistorted, resized.
+    """Return the grey values (H, W) of a frame as it is matched: undistorted, of ``frame.matched_size``.
 
     Undistortion keeps the camera matrix; pixels without a source in the file become black.
-
-    Args:
-        frame: the image file and its camera.
-
-    Returns:
-        grey values of ``frame.matched_size``, (H, W) uint8.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a readable image, not of ``frame.size``, or distorted by an unknown camera.
-        ImportError: if OpenCV or Pillow is not installed.
-
     """
     cv2 = import_cv2()
     image = read_image(frame.path)
@@ -123,20 +105,8 @@ def read_frame(frame: Frame) -> npt.NDArray[np.uint8]:
 
 
 def image_size(path: str | Path) -> Size:
-    """Return the size of an image, turned as its EXIF orientation says, from its header alone.
-
-    Args:
-        path: an image file.
-
-    Returns:
-        (width, height), pixels; (0, 0) where it cannot be read.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ImportError: if Pillow is not installed; the message names the extra that installs it.
-
-    """
-    _pillow()
+    """Return (width, height) of an image from its header, turned by EXIF; (0, 0) where it cannot be read."""
+    _pillow()  # outside of the try block, which would hide that it is missing
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no image at {path}")

@@ -13,25 +13,11 @@ def fundamental_from_motion(K1: Tensor, K2: Tensor, R: Tensor, t: Tensor) -> Ten
 
     .. math:: F = K_2^{-\top} [t]_\times R K_1^{-1}, \quad \lVert F \rVert = 1, \quad x_2^\top F x_1 = 0
 
-    Args:
-        K1: camera matrices of the first view with shape :math:`(*, 3, 3)`, pixels.
-        K2: camera matrices of the second view with shape :math:`(*, 3, 3)`, pixels.
-        R: rotations with shape :math:`(*, 3, 3)`.
-        t: translations with shape :math:`(*, 3)`, any unit.
-
-    Returns:
-        fundamental matrices with shape :math:`(*, 3, 3)`; NaN where :math:`t = 0`, a camera matrix is singular or an
-        argument is NaN.
+    The cameras, pixels, and the rotations have shape :math:`(*, 3, 3)`, the translations :math:`(*, 3)`. The result is
+    NaN where :math:`t = 0`, a camera matrix is singular or an argument is NaN.
 
     Reference:
         R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2nd edition, equations 9.2 and 9.12.
-
-    Example:
-        >>> import torch
-        >>> fundamental_from_motion(torch.eye(3), torch.eye(3), torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
-        tensor([[ 0.0000,  0.0000,  0.0000],
-                [ 0.0000,  0.0000,  0.7071],
-                [ 0.0000, -0.7071,  0.0000]])
 
     """
     F_mat: Tensor = fundamental_from_essential(cross_product_matrix(t) @ R, K1, K2)

@@ -39,6 +39,10 @@ class Samples(NamedTuple):
         """Return the samples of the given rows (indices or mask)."""
         return Samples(*(field[rows] for field in self))
 
+    def with_residual_below(self, max_residual: float | None) -> Samples:
+        """Return the samples whose :func:`plain_residual` is below a limit in pixels; None keeps all."""
+        return self if max_residual is None else self.select(plain_residual(self.points1, self.points2) < max_residual)
+
 
 def draw_samples(
     store: CorrespondenceStore,
@@ -95,9 +99,7 @@ def draw_samples(
     drawable = passing > size
     rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]
     samples = Samples(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)
-    if max_residual is None:
-        return samples
-    return samples.select(plain_residual(samples.points1, samples.points2) < max_residual)
+    return samples.with_residual_below(max_residual)
 
 
 def _draw_heldout(
@@ -132,10 +134,8 @@ def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = BATCH_SIZ
         pixels with shape (S,), float64.
 
     """
-    residuals = [
-        symmetric_epipolar_distance(x1, x2, find_fundamental(x1, x2, normalizer=Identity())).mean(-1)
-        for x1, x2 in zip(
-            torch.split(points1.double(), batch_size), torch.split(points2.double(), batch_size), strict=True
-        )
-    ]
-    return torch.cat(residuals) if residuals else points1.new_zeros(0, dtype=torch.float64)
+    identity, residuals = Identity(), []
+    for x1, x2 in zip(*(torch.split(points.double(), batch_size) for points in (points1, points2)), strict=True):
+        F_mat = find_fundamental(x1, x2, normalizer=identity)
+        residuals.append(symmetric_epipolar_distance(x1, x2, F_mat).mean(-1))
+    return torch.cat(residuals)

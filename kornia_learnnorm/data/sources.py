@@ -31,24 +31,14 @@ SCENES_PER_BLOCK = 8192
 
 
 class Block(NamedTuple):
-    """The size of a block before samples are filtered.
-
-    Attributes:
-        samples: number of samples.
-        pairs: number of image pairs with a sample.
-    """
+    """Numbers of samples, and of image pairs with a sample, of a block before samples are filtered."""
 
     samples: int
     pairs: int
 
 
 def block_generator(*key: int) -> torch.Generator:
-    """Return a random generator for a key, for example the seed of a draw and the number of a block.
-
-    Args:
-        key: integers of 0 or more; different keys give independent generators.
-
-    """
+    """Return a random generator for a key of integers from 0, for example the seed of a draw and a block's number."""
     # torch's generator on the CPU uses 32 bits of its seed
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
 
@@ -117,7 +107,9 @@ class StoreSamples:
         """Return the samples of a block; ``pair`` counts the pairs of all stores in their order."""
         generator = block_generator(seed, block)
         size = self._size(generator)
-        pairs, parts = self._pairs(seed)[block], []
+        pairs = self._pairs(seed)[block]
+        points, heldout = torch.zeros(0, size, 2), torch.zeros(0, self.num_heldout, 2)
+        parts = [Samples(points, points, heldout, heldout, torch.zeros(0, dtype=torch.int64))]
         for store, first, stop in zip(self.stores, self._first, self._first[1:], strict=False):
             own = pairs[(pairs >= first) & (pairs < stop)]
             held = store.read((own - first).tolist()) if len(own) else None
@@ -125,13 +117,10 @@ class StoreSamples:
                 if held is not None and passing[own].max() >= size:
                     part = draw_samples(held, generator, size, ratio, self.num_heldout)
                     parts.append(part._replace(pair=torch.from_numpy(own)[part.pair]))
-        if not parts:
-            empty = torch.zeros(0, size, 2), torch.zeros(0, self.num_heldout, 2)
-            return Samples(empty[0], empty[0], empty[1], empty[1], torch.zeros(0, dtype=torch.int64))
         samples = Samples(*map(torch.cat, zip(*parts, strict=True)))
-        if self.max_residual is None:
-            return samples
-        return samples.select(self._kept(samples, self.max_residual, seed, block))
+        if self.cache is None or self.max_residual is None:
+            return samples.with_residual_below(self.max_residual)
+        return samples.select(self._kept(self.cache, samples, self.max_residual, seed, block))
 
     def _pairs(self, seed: int) -> list[NDArray[np.int64]]:
         """Return the sorted indices of the image pairs of each block."""
@@ -144,17 +133,15 @@ class StoreSamples:
         low, high = self.sizes
         return low if low == high else int(torch.randint(low, high + 1, (), generator=generator))
 
-    def _kept(self, samples: Samples, max_residual: float, seed: int, block: int) -> Tensor:
-        """Return the mask (S,) of the samples that the residual filter keeps."""
-        if self.cache is None:
-            return plain_residual(samples.points1, samples.points2) < max_residual
+    def _kept(self, cache: Path, samples: Samples, max_residual: float, seed: int, block: int) -> Tensor:
+        """Return the mask (S,) of the samples that the residual filter keeps, from the cache or computed and cached."""
         files = [(str(s.path.resolve()), s.path.stat().st_mtime_ns, s.offsets[[0, -1]].tolist()) for s in self.stores]
         about = [files, self.max_ratios, self.sizes, self.num_heldout, max_residual, self.block_pairs, seed, block]
-        path = self.cache / f"{sha256(json.dumps(about).encode()).hexdigest()[:32]}.npy"
+        path = cache / f"{sha256(json.dumps(about).encode()).hexdigest()[:32]}.npy"
         if path.is_file():
             return torch.from_numpy(np.load(path))
         kept = plain_residual(samples.points1, samples.points2) < max_residual
-        self.cache.mkdir(parents=True, exist_ok=True)
+        cache.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary:
             np.save(temporary, kept.numpy())
         return kept
@@ -204,10 +191,8 @@ class SyntheticSamples:
         sizes = [self.size, self.num_heldout]
         points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
         points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
-        samples = Samples(points1, points2, heldout1, heldout2, block * SCENES_PER_BLOCK + torch.arange(number))
-        if self.max_residual is None:
-            return samples
-        return samples.select(plain_residual(points1, points2) < self.max_residual)
+        pair = block * SCENES_PER_BLOCK + torch.arange(number)
+        return Samples(points1, points2, heldout1, heldout2, pair).with_residual_below(self.max_residual)
 
 
 def _expand(path: str) -> str:

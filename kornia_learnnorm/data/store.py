@@ -23,10 +23,20 @@ from kornia_learnnorm.optional import import_extra
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["FORMAT", "LAYOUT", "VERSION", "CorrespondenceStore", "StoreReader", "read_store"]
+__all__ = [
+    "FORMAT",
+    "LAYOUT",
+    "VERSION",
+    "CorrespondenceStore",
+    "StoreReader",
+    "open_hdf5",
+    "own_dataset",
+    "read_store",
+]
 
 FORMAT = "correspondences"  # attribute of the file
 VERSION = 1  # attribute of the file
+READING = "reading HDF5 files"  # what needs h5py, in messages
 COUNT_BLOCK = 4096  # pairs whose ratios are in memory at once while matches are counted
 # name: shape behind the first axis, dtype, and the first axis: "M" correspondences or "P" pairs
 LAYOUT: dict[str, tuple[tuple[int, ...], str, str]] = {
@@ -82,16 +92,7 @@ class CorrespondenceStore:
         return len(self.offsets) - 1
 
     def select(self, first: int, stop: int) -> CorrespondenceStore:
-        """Return a store of the pairs ``first`` to ``stop - 1``.
-
-        Args:
-            first: index of the first pair.
-            stop: index after the last pair.
-
-        Raises:
-            ValueError: if the range is empty or not within the store.
-
-        """
+        """Return a store of the pairs ``first`` to ``stop - 1``, one or more."""
         _check_range(first, stop, len(self))
         rows = slice(int(self.offsets[first]), int(self.offsets[stop]))
         cut: dict[str, Any] = {
@@ -102,16 +103,7 @@ class CorrespondenceStore:
         return replace(self, offsets=offsets, names=self.names[first:stop], **cut)
 
     def rows(self, pair: int, max_ratio: float | None = None) -> NDArray[np.int64]:
-        """Return the rows of a pair in ``points1``, ``points2`` and ``ratio``.
-
-        Args:
-            pair: index of the pair.
-            max_ratio: keep rows with Lowe's ratio below this; None keeps all.
-
-        Returns:
-            indices in increasing order, (N,).
-
-        """
+        """Return the rows (N,) of a pair, in increasing order; arguments as for :meth:`matches`."""
         rows = np.arange(self.offsets[pair], self.offsets[pair + 1])
         return rows if max_ratio is None else rows[self.ratio[rows] < max_ratio]
 
@@ -180,7 +172,7 @@ class StoreReader:
             named = part or "@" not in self.path.name
             hint = "" if named else "; write some pairs of a store as FILE.h5@FIRST:STOP, for example s.h5@3:10"
             raise FileNotFoundError(f"no store at {self.path}{hint}")
-        with self._open() as file:
+        with open_hdf5(self.path) as file:
             offsets = _check(self.path, file)
         first, stop = (int(part[2]), int(part[3])) if part else (0, len(offsets) - 1)
         _check_range(first, stop, len(offsets) - 1, f"{self.path}: ")
@@ -192,10 +184,7 @@ class StoreReader:
         return len(self.offsets) - 1
 
     def read(self, pairs: Sequence[int]) -> CorrespondenceStore:
-        """Return a store of some pairs, in the order given.
-
-        Args:
-            pairs: indices of the pairs; a range is read fastest, then increasing indices.
+        """Return a store of some pairs, in the order given; a range is read fastest, then increasing indices.
 
         Raises:
             IndexError: if an index is negative or too large.
@@ -209,7 +198,7 @@ class StoreReader:
             "M": [slice(int(self.offsets[a]), int(self.offsets[b])) for a, b in runs],
             "P": [slice(a + self._first, b + self._first) for a, b in runs],
         }
-        with self._open() as file:
+        with open_hdf5(self.path) as file:
             arrays: dict[str, Any] = {
                 name: np.concatenate([np.zeros((0, *tail), dtype), *(file[name][part] for part in rows[axis])])
                 for name, (tail, dtype, axis) in LAYOUT.items()
@@ -229,7 +218,7 @@ class StoreReader:
         if max_ratio is None:
             return np.diff(self.offsets)
         counts = np.zeros(len(self), np.int64)
-        with self._open() as file:
+        with open_hdf5(self.path) as file:
             for first in range(0, len(self), COUNT_BLOCK):
                 offsets = self.offsets[first : first + COUNT_BLOCK + 1]
                 passes = file["ratio"][int(offsets[0]) : int(offsets[-1])] < max_ratio
@@ -237,15 +226,25 @@ class StoreReader:
                 counts[first : first + COUNT_BLOCK] = np.diff(total[offsets - offsets[0]])
         return counts
 
-    @contextmanager
-    def _open(self) -> Iterator[h5py.File]:
-        h5py = import_extra("h5py", "images", "reading stores")
-        try:
-            with h5py.File(self.path, "r") as file:
-                yield file
-        except (OSError, RuntimeError) as error:
-            text = f"{self.path} is not a readable HDF5 file (truncated or of another kind): {error}"
-            raise ValueError(text) from error
+
+@contextmanager
+def open_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file to read; its errors, also those of the block, become a ValueError that names the file."""
+    h5py = import_extra("h5py", "images", READING)
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, KeyError) as error:
+        raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
+
+
+def own_dataset(group: h5py.Group, name: str) -> h5py.Dataset | None:
+    """Return a dataset that the file itself holds; None for none, a group, a link, or data in other files."""
+    h5py = import_extra("h5py", "images", READING)
+    if group.get(name, getclass=True, getlink=True) is not h5py.HardLink:
+        return None
+    data = group[name]
+    return None if not hasattr(data, "shape") or data.external or data.is_virtual else data
 
 
 def _runs(pairs: Sequence[int]) -> list[tuple[int, int]]:
@@ -261,29 +260,19 @@ def _check(path: Path, file: h5py.File) -> NDArray[np.int64]:
     if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
         got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')}"
         raise ValueError(f"{path} is not a store: expected format={FORMAT!r}, version={VERSION}, got {got}")
-    h5py = import_extra("h5py", "images", "reading stores")
-    missing = [name for name in (*LAYOUT, "offsets", "names") if not _is_own_dataset(h5py, file, name)]
+    missing = [name for name in (*LAYOUT, "offsets", "names") if own_dataset(file, name) is None]
     if missing:
         raise ValueError(f"{path} lacks the datasets {', '.join(missing)} (links to other files are not followed)")
     offsets = np.asarray(file["offsets"][:], np.int64)
     if offsets.ndim != 1 or len(offsets) < 2 or offsets[0] != 0 or (np.diff(offsets) < 0).any():
-        raise ValueError(
-            f"{path}: offsets must start at 0 and not decrease, with one pair or more, got {offsets[:4]}..."
-        )
+        expected = "start at 0 and not decrease, with one pair or more"
+        raise ValueError(f"{path}: offsets must {expected}, got {offsets[:4]}...")
     rows = {"M": int(offsets[-1]), "P": len(offsets) - 1}
     for name, (tail, dtype, axis) in {**LAYOUT, "names": ((2,), "O", "P")}.items():
         if file[name].shape != (rows[axis], *tail):
             raise ValueError(f"{path}: {name} must have shape {(rows[axis], *tail)}, got {file[name].shape}")
         if file[name].dtype.kind != np.dtype(dtype).kind:
             raise ValueError(f"{path}: {name} must be {dtype}, got {file[name].dtype}")
-    if h5py.check_string_dtype(file["names"].dtype) is None:
+    if import_extra("h5py", "images", READING).check_string_dtype(file["names"].dtype) is None:
         raise ValueError(f"{path}: names must be strings, got {file['names'].dtype.metadata}")
     return offsets
-
-
-def _is_own_dataset(h5py: Any, file: h5py.File, name: str) -> bool:
-    """Return whether a file holds a dataset itself: no link, and no data in other files."""
-    if file.get(name, getclass=True, getlink=True) is not h5py.HardLink:
-        return False
-    data = file[name]
-    return hasattr(data, "shape") and not (data.external or data.is_virtual)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,17 +43,9 @@ def write_store(path: str | Path, store: CorrespondenceStore) -> None:
 
 
 def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provenance: dict[str, Any]) -> None:
-    """Write the pairs of several stores to one HDF5 file, completely or not at all; one store is in memory at a time.
+    """Write the pairs of one or more stores as :func:`write_store` does; one store is in memory at a time.
 
-    Args:
-        path: the file to write; an existing one is replaced.
-        stores: one store or more; ``dataset``, ``pairs`` and ``detector`` are those of the first.
-        provenance: the provenance of the new store.
-
-    Raises:
-        ValueError: if there is no store.
-        OSError: if the folder does not exist or cannot be written, or the disk is full.
-
+    ``dataset``, ``pairs`` and ``detector`` are those of the first store.
     """
     h5py = import_extra("h5py", "images", "writing stores")
     with atomic_write(path) as temporary:
@@ -90,16 +82,7 @@ def _append(dataset: h5py.Dataset, rows: NDArray[Any]) -> None:
 
 
 def check_target(path: str | Path) -> None:
-    """Raise an error if no store can be written to a path; nothing is written.
-
-    Args:
-        path: the store to write.
-
-    Raises:
-        FileNotFoundError: if its folder does not exist.
-        ValueError: if the path is not a regular file, or ``<path>.parts`` is not a folder.
-
-    """
+    """Raise FileNotFoundError or ValueError if no store can be written to a path; nothing is written."""
     path, folder = Path(path), _folder(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist")
@@ -113,25 +96,13 @@ class StoreWriter:
     """Write the pairs of a store one by one, in any order.
 
     Each pair becomes a store of its own, a part, in the folder ``<path>.parts``. A later run finds the parts of a run
-    that was killed, and refuses them if its options differ. :meth:`finish` joins the parts in the order of their places
-    and removes the folder.
-
-    Args:
-        path: the store to write, an HDF5 file.
-        options: options that the store depends on, values of JSON's types. ``frames`` is a hash, which messages do not
-            quote.
+    that was killed; parts, or a complete store, of other options or of another program are a ValueError.
+    :meth:`finish` joins the parts in the order of their places and removes the folder. The options are all that the
+    store depends on, values of JSON's types.
 
     Attributes:
-        path: the store to write.
-        folder: the folder of the parts.
         complete: whether the store exists, made with the same options.
         skipped: the pairs that a complete store leaves out, and why; empty while it is not complete.
-
-    Raises:
-        FileNotFoundError: if the folder of the store does not exist.
-        OSError: if it cannot be written.
-        ValueError: if the store or parts of it exist, but were made with other options or by another program, or
-            cannot be read.
     """
 
     def __init__(self, path: str | Path, options: dict[str, Any]) -> None:
@@ -142,16 +113,16 @@ class StoreWriter:
         check_target(self.path)
         self.complete = self.path.exists()
         if self.complete:
-            self._check_complete()
-        elif any(self._parts()):
-            _refuse(self.folder, _read_options(self.folder / OPTIONS), self.options)
+            provenance = read_store(self.path).provenance
+            _refuse(self.path, provenance.get("options"), self.options)
+            self.skipped = dict(provenance.get("skipped", {}))
+        elif self._parts():
+            had = None
+            with suppress(FileNotFoundError, ValueError):
+                had = json.loads((self.folder / OPTIONS).read_text(encoding="utf-8"))
+            _refuse(self.folder, had, self.options)
         else:
             self._begin()
-
-    def _check_complete(self) -> None:
-        provenance = read_store(self.path).provenance
-        _refuse(self.path, provenance.get("options"), self.options)
-        self.skipped = dict(provenance.get("skipped", {}))
 
     def _begin(self) -> None:
         try:
@@ -172,55 +143,32 @@ class StoreWriter:
         return {int(part.stem) for part in self._parts()}
 
     def add(self, place: int, pair: CorrespondenceStore) -> None:
-        """Write a pair.
-
-        Args:
-            place: index of the pair in the finished store, with skipped pairs counted too.
-            pair: a store of one pair.
-
-        Raises:
-            ValueError: if ``pair`` does not hold one pair, or ``place`` is negative.
-            OSError: if the part cannot be written, as on a full disk.
-
-        """
+        """Write a store of one pair; ``place`` is its index in the finished store, with skipped pairs counted too."""
         if len(pair) != 1 or place < 0:
             raise ValueError(f"one pair and a place of 0 or more expected, got {len(pair)} pairs and place {place}")
         write_store(self.folder / f"{place:08d}.h5", pair)
 
     def finish(self, provenance: dict[str, Any]) -> None:
-        """Write the store and remove the parts.
+        """Write the store and remove the parts, which stay if it cannot be written.
 
-        Args:
-            provenance: versions and skipped pairs, values of JSON's types; the options are added.
-
-        Raises:
-            ValueError: if no pair was added, or a part is no longer readable.
-            OSError: if the store cannot be written; the parts stay.
-
+        ``provenance`` gives versions and skipped pairs, values of JSON's types; the options are added.
         """
         join_stores(self.path, map(read_store, self._parts()), {**provenance, "options": self.options})
         shutil.rmtree(self.folder)
 
     def close(self) -> None:
         """Remove the folder of the parts if it holds no part, so that a run that failed early leaves no files."""
-        if not any(self._parts()):
+        if not self._parts():
             with suppress(OSError):  # the folder is gone, or holds files of others
                 (self.folder / OPTIONS).unlink(missing_ok=True)
                 self.folder.rmdir()
 
-    def _parts(self) -> Iterator[Path]:
-        return iter(sorted(self.folder.glob("[0-9]*.h5")))
+    def _parts(self) -> list[Path]:
+        return sorted(self.folder.glob("[0-9]*.h5"))
 
 
 def _folder(path: Path) -> Path:
     return path.with_name(path.name + ".parts")
-
-
-def _read_options(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
-        return None
 
 
 def _refuse(path: Path, had: Any, options: dict[str, Any]) -> None:

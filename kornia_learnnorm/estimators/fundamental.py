@@ -80,17 +80,7 @@ def find_fundamental(
 def solve_fundamental(
     problem: LinearProblem, normalizer: Normalizer, rank2: Literal["projection", "optimal"] = "projection"
 ) -> Tensor:
-    """Return the fundamental matrices of a problem; see :func:`find_fundamental`.
-
-    Args:
-        problem: the correspondences.
-        normalizer: a module or function.
-        rank2: how the singularity constraint is enforced.
-
-    Returns:
-        matrices with shape :math:`(B, 3, 3)` in the dtype of the problem.
-
-    """
+    """Return the fundamental matrices of a problem; see :func:`find_fundamental`."""
     if rank2 == "optimal" and problem.x1.shape[1] == 8:
         return correct_rank2(problem, problem.null_matrix)
     return solve_in_coordinates(problem, *normalizing_transforms(normalizer, problem), rank2)
@@ -99,18 +89,7 @@ def solve_fundamental(
 def solve_in_coordinates(
     problem: LinearProblem, T1: Tensor, T2: Tensor, rank2: Literal["projection", "optimal"] = "projection"
 ) -> Tensor:
-    """Return the fundamental matrices of a problem under known normalising transforms.
-
-    Args:
-        problem: the correspondences.
-        T1: transforms of pixels of the first view with shape :math:`(B, 3, 3)`, invertible.
-        T2: transforms of pixels of the second view.
-        rank2: how the singularity constraint is enforced.
-
-    Returns:
-        matrices with shape :math:`(B, 3, 3)` in the dtype of the problem.
-
-    """
+    """Return the fundamental matrices of a problem under known transforms :math:`(B, 3, 3)` of the pixels."""
     F_hat = problem.null_matrix_in(T1, T2)
     if rank2 == "projection":
         return unit_fundamental(transform_fundamental(rank2_projection(F_hat), T1, T2))

@@ -100,13 +100,7 @@ def _complain_about_values(points1: Tensor, points2: Tensor, weights: Tensor | N
 
 
 def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> None:
-    """Raise a clear error for a mask that does not fit correspondences ``(B, N, 2)`` and weights ``(B, N)``.
-
-    Raises:
-        TypeError: if the mask is not boolean.
-        ValueError: if its shape is not ``(B, N)``, or the weights' is not.
-
-    """
+    """Raise a clear error for a mask that does not fit correspondences ``(B, N, 2)`` and weights ``(B, N)``."""
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         raise TypeError(f"mask must be a boolean tensor, got {getattr(mask, 'dtype', type(mask))}")
     shapes = {"points1": points1.shape[:-1], "points2": points2.shape[:-1]}
@@ -117,14 +111,7 @@ def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor |
 
 
 def check_fundamental(F_mat: Tensor, points: Tensor) -> None:
-    """Raise a clear error for anything but finite matrices ``(B, 3, 3)`` other than zero, as many as sets of points.
-
-    Raises:
-        TypeError: if it is not a floating-point tensor.
-        ShapeError: if it is not ``(B, 3, 3)``.
-        ValueError: if the batch sizes differ, a value is not finite, or a matrix is zero.
-
-    """
+    """Raise a clear error for anything but finite matrices ``(B, 3, 3)`` other than zero, as many as sets of points."""
     check_tensor("F_mat", F_mat, ["B", "3", "3"])
     if len(F_mat) != len(points):
         raise ValueError(f"one matrix per set of points is needed, got {len(F_mat)} matrices and {len(points)} sets")
@@ -136,12 +123,7 @@ def check_fundamental(F_mat: Tensor, points: Tensor) -> None:
 
 
 def check_rank2(rank2: object) -> None:
-    """Raise a clear error for anything but a way to enforce the singularity constraint.
-
-    Raises:
-        ValueError: if ``rank2`` is neither ``"projection"`` nor ``"optimal"``.
-
-    """
+    """Raise a ValueError for anything but ``"projection"`` and ``"optimal"``."""
     if rank2 not in RANK2:
         raise ValueError(f"rank2 must be 'projection' or 'optimal', got {rank2!r}")
 

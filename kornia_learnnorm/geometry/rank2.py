@@ -106,17 +106,7 @@ def optimal_rank2(
 
 
 def correct_rank2(problem: LinearProblem, F_hat: Tensor, iterations: int = ITERATIONS) -> Tensor:
-    """Return the optimal correction of matrices in Hartley's coordinates; see :func:`optimal_rank2`.
-
-    Args:
-        problem: the correspondences.
-        F_hat: matrices in Hartley's coordinates with shape :math:`(B, 3, 3)`, any scale but zero.
-        iterations: number of steps.
-
-    Returns:
-        fundamental matrices in pixels with shape :math:`(B, 3, 3)`, of rank 2 and unit Frobenius norm.
-
-    """
+    """Return the optimal correction of matrices in Hartley's coordinates; see :func:`optimal_rank2`."""
     u = normalize(F_hat.flatten(-2), dim=-1)
     if iterations:
         u = _correct(u, _covariance(u, problem), iterations)

@@ -61,19 +61,7 @@ class ProblemNormalizer(nn.Module):
 
 
 def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
-    """Call a normaliser on a problem: its ``transforms`` where it has that method, else the contract.
-
-    Args:
-        normalizer: a module or function.
-        problem: the correspondences.
-
-    Returns:
-        whatever it returns.
-
-    Raises:
-        TypeError: if it cannot be called.
-
-    """
+    """Call a normaliser on a problem: its method ``transforms`` where it has one, else the contract."""
     if isinstance(normalizer, type) or not callable(normalizer):
         raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
     if hasattr(normalizer, "transforms"):

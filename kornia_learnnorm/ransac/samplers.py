@@ -21,13 +21,7 @@ class Sampler(Protocol):
         """Return the indices of the next ``count`` minimal samples, (count, 8) int64."""
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
-        """Return the probability that a sample holds no outlier.
-
-        Args:
-            inliers: which correspondences are inliers of the best matrix so far, (M,) boolean.
-            rows: which correspondences these are, (M,) int64 or a slice.
-
-        """
+        """Return the probability that a sample holds no outlier, from the inliers (M,) among ``rows``."""
 
 
 def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tensor:

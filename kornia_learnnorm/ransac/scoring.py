@@ -105,25 +105,14 @@ class PairScorer:
         return transform_fundamental(F_mat, self.T1, self.T2)
 
     def best(self, F_mat: Tensor, number: int) -> Hypotheses:
-        r"""Return the matrices of highest score, at most so many, of those with an inlier.
-
-        Args:
-            F_mat: matrices, any scale, with shape :math:`(K, 3, 3)`; without inliers where zero or not finite.
-            number: largest number of matrices.
-
-        """
+        r"""Return the matrices of highest score, at most so many, of those with an inlier."""
         scores = self._scores(F_mat, self.terms)
         score, order = scores.topk(min(number, len(scores)))
         positive = int((score > 0).sum())
         return Hypotheses(F_mat[order[:positive]], score[:positive])
 
     def shortlist(self, F_mat: Tensor) -> Tensor:
-        """Return the 64 matrices of highest score on the first 512 correspondences that count; all if it saves little.
-
-        Args:
-            F_mat: matrices, any scale, with shape :math:`(K, 3, 3)`.
-
-        """
+        """Return the 64 matrices that score best on the first 512 correspondences; all if it saves little."""
         if self.terms.shape[-1] < 2 * PRESCORED or len(F_mat) <= SHORTLIST:
             return F_mat
         return F_mat[self._scores(F_mat, self.terms[:, :PRESCORED]).topk(SHORTLIST).indices]
@@ -157,17 +146,7 @@ class PairScorer:
 
 
 def finite_and_bounded(points1: Tensor, points2: Tensor, threshold: float) -> Tensor:
-    r"""Return which correspondences are finite and not so far from all others that powers of them would overflow.
-
-    Args:
-        points1: pixels in the first image with shape :math:`(N, 2)`.
-        points2: pixels in the second image with shape :math:`(N, 2)`.
-        threshold: largest distance of an inlier, pixels.
-
-    Returns:
-        booleans with shape :math:`(N,)`.
-
-    """
+    r"""Return which correspondences are finite and not so far from all others that powers of them would overflow."""
     kept = (points1.isfinite() & points2.isfinite()).all(-1)
     if not bool(kept.any()):
         return kept

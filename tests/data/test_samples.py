@@ -3,43 +3,30 @@ import pytest
 import torch
 
 from kornia_learnnorm.data.samples import draw_samples, plain_residual
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
-
-
-@pytest.fixture(scope="module")
-def store():
-    return synthetic_store(pairs=3, points=101, seed=2)
 
 
 def seeded(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def rows_of(store, points1, points2):
-    """Row of each correspondence in the store, found by its coordinates."""
-    index = {tuple(row): i for i, row in enumerate(np.c_[store.points1, store.points2].tolist())}
-    return [index[tuple(row)] for row in torch.cat([points1, points2], -1).reshape(-1, 4).tolist()]
-
-
-def test_every_correspondence_is_used_at_most_once(store):
+def test_every_correspondence_is_used_at_most_once(store, rows_of):
     samples = draw_samples(store, seeded(), max_ratio=None)
-    rows = rows_of(store, samples.points1, samples.points2)
-    assert len(rows) == len(set(rows)) == 9 * (101 // 8) * 8
-    pair = np.searchsorted(store.offsets, np.array(rows), side="right") - 1
-    assert (pair.reshape(-1, 8) == samples.pair.numpy()[:, None]).all()
+    rows, pairs = rows_of(samples.points1, samples.points2)
+    assert rows.size == len(np.unique(rows)) == 9 * (101 // 8) * 8
+    assert (pairs == samples.pair.numpy()[:, None]).all()
 
 
-def test_ratio_test(store):
+def test_ratio_test(store, rows_of):
     samples = draw_samples(store, seeded(), max_ratio=0.8)
-    assert store.ratio[rows_of(store, samples.points1, samples.points2)].max() < 0.8
+    assert store.ratio[rows_of(samples.points1, samples.points2)[0]].max() < 0.8
 
 
-def test_heldout_are_others_of_the_pair_that_pass_the_ratio_test(store):
+def test_heldout_are_others_of_the_pair_that_pass_the_ratio_test(store, rows_of):
     samples = draw_samples(store, seeded(), max_ratio=None, num_heldout=16)
-    own = np.array(rows_of(store, samples.points1, samples.points2)).reshape(-1, 8)
-    rest = np.array(rows_of(store, samples.heldout1, samples.heldout2)).reshape(-1, 16)
+    own, _ = rows_of(samples.points1, samples.points2)
+    rest, pairs = rows_of(samples.heldout1, samples.heldout2)
     assert not (own[:, :, None] == rest[:, None, :]).any()
-    assert (np.searchsorted(store.offsets, rest, side="right") - 1 == samples.pair.numpy()[:, None]).all()
+    assert (pairs == samples.pair.numpy()[:, None]).all()
     assert store.ratio[rest].max() < 0.8
 
 
@@ -68,7 +55,12 @@ def test_filter_agrees_with_numpy(store):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"), [({"size": 7}, "size=7"), ({"max_ratio": 0.1}, "no pair of the store")]
+    ("arguments", "message"),
+    [
+        ({"size": 7}, "size=7"),
+        ({"max_ratio": 0.1}, "no pair of the store"),
+        ({"size": 96, "max_ratio": None, "num_heldout": 4}, "held-out correspondences: a pair has only"),
+    ],
 )
 def test_bad_arguments(store, arguments, message):
     with pytest.raises(ValueError, match=message):

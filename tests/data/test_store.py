@@ -1,3 +1,5 @@
+"""Stores: what is written comes back, some pairs of it, and what a broken file says."""
+
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,29 +12,39 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
+ARRAYS = ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t")
+
 
 @pytest.fixture
 def store():
-    return synthetic_store(pairs=2, points=30, seed=1)
+    """Six pairs with their rows given to them unevenly; one pair has none."""
+    made = synthetic_store(pairs=2, points=30, seed=1)
+    return replace(made, offsets=np.array([0, 10, 10, 50, 90, 150, 180]))
 
 
-def test_round_trip(store, tmp_path):
-    path = tmp_path / "store.h5"
-    write_store(path, store)
-    again = read_store(path)
-    assert len(again) == 6
-    for name in ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t"):
-        expected, got = getattr(store, name), getattr(again, name)
-        assert got.dtype == expected.dtype or name == "image_size"
-        np.testing.assert_array_equal(got, expected)
-    assert (again.names, again.dataset, again.detector) == (store.names, store.dataset, store.detector)
-    assert [p.name for p in tmp_path.iterdir()] == ["store.h5"]
+@pytest.fixture
+def path(store, tmp_path):
+    write_store(tmp_path / "store.h5", store)
+    return tmp_path / "store.h5"
 
 
-def test_file_follows_the_format(store, tmp_path):
+def same(got, expected):
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
+    for name in ("names", "dataset", "pairs", "detector"):
+        assert getattr(got, name) == getattr(expected, name)
+
+
+def test_round_trip(store, path):
+    got = read_store(path)
+    same(got, store)
+    assert len(got) == 6
+    assert all(getattr(got, name).dtype == getattr(store, name).dtype for name in ARRAYS)
+    assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
+
+
+def test_file_follows_the_format(path):
     """The format's own description: dataset names, shapes, dtypes, attributes."""
-    path = tmp_path / "store.h5"
-    write_store(path, store)
     with h5py.File(path) as file:
         assert file.attrs["format"] == "correspondences"
         assert file.attrs["version"] == 1
@@ -45,31 +57,21 @@ def test_file_follows_the_format(store, tmp_path):
     assert shapes["names"][0] == (6, 2)
 
 
-def test_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no store at"):
-        read_store(tmp_path / "none.h5")
+@pytest.mark.parametrize("pairs", ["", "@0:2"])
+def test_missing_file(tmp_path, pairs):
+    with pytest.raises(FileNotFoundError, match=f"no store at {re.escape(str(tmp_path / 'none.h5'))}"):
+        read_store(f"{tmp_path / 'none.h5'}{pairs}")
 
 
-def test_not_hdf5(tmp_path):
-    path = tmp_path / "text.h5"
-    path.write_text("not a store")
+@pytest.mark.parametrize("change", [lambda data: b"not a store", lambda data: data[:3000]])
+def test_not_hdf5(path, change):
+    path.write_bytes(change(path.read_bytes()))
     with pytest.raises(ValueError, match="not a readable HDF5 file"):
         read_store(path)
 
 
-def test_truncated(store, tmp_path):
-    path = tmp_path / "store.h5"
-    write_store(path, store)
-    path.write_bytes(path.read_bytes()[:3000])
-    with pytest.raises(ValueError, match="not a readable HDF5 file"):
-        read_store(path)
-
-
-def _change(path, name, value):
-    with h5py.File(path, "r+") as file:
-        del file[name]
-        if value is not None:
-            file[name] = value
+def of_integers(file):
+    file.create_dataset("names", (6, 2), h5py.vlen_dtype(np.int32))
 
 
 @pytest.mark.parametrize(
@@ -85,12 +87,16 @@ def _change(path, name, value):
         ("ratio", np.full(180, np.nan), "ratio holds NaN or infinite"),
         ("points1", np.zeros((180, 2), int), "points1 must be float32, got int64"),
         ("points1", np.full((180, 2), b"a"), "points1 must be float32"),
+        ("names", of_integers, "names must be strings"),
     ],
 )
-def test_inconsistent_arrays(store, tmp_path, name, value, message):
-    path = tmp_path / "store.h5"
-    write_store(path, store)
-    _change(path, name, value)
+def test_inconsistent_arrays(path, name, value, message):
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        if callable(value):
+            value(file)
+        elif value is not None:
+            file[name] = value
     with pytest.raises(ValueError, match=message):
         read_store(path)
 
@@ -111,9 +117,8 @@ def virtual(path):
         lambda file, other: file.create_virtual_dataset("ratio", virtual(other)),
     ],
 )
-def test_a_group_or_a_link_in_place_of_a_dataset(store, tmp_path, change):
-    path, other = tmp_path / "store.h5", tmp_path / "other.h5"
-    write_store(path, store)
+def test_a_group_or_a_link_in_place_of_a_dataset(path, change):
+    other = path.with_name("other.h5")
     other.write_bytes(path.read_bytes())
     with h5py.File(path, "r+") as file:
         del file["ratio"]
@@ -122,120 +127,69 @@ def test_a_group_or_a_link_in_place_of_a_dataset(store, tmp_path, change):
         read_store(path)
 
 
-def test_names_that_are_not_strings(store, tmp_path):
-    path = tmp_path / "store.h5"
-    write_store(path, store)
-    with h5py.File(path, "r+") as file:
-        del file["names"]
-        file.create_dataset("names", (6, 2), h5py.vlen_dtype(np.int32))
-    with pytest.raises(ValueError, match="names must be strings"):
-        read_store(path)
-
-
-def test_other_format_and_version(store, tmp_path):
-    path = tmp_path / "store.h5"
-    write_store(path, store)
+def test_other_version(path):
     with h5py.File(path, "r+") as file:
         file.attrs["version"] = 2
     with pytest.raises(ValueError, match=r"expected format='correspondences', version=1, got .*version=.*2"):
         read_store(path)
 
 
-def test_no_folder_to_write_in(store, tmp_path):
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        write_store(tmp_path / "nowhere" / "store.h5", store)
-
-
-def test_a_failed_write_leaves_the_old_file(store, tmp_path):
-    path = tmp_path / "store.h5"
-    write_store(path, store)
+def test_a_failed_write_leaves_the_old_file(store, path):
     before = path.read_bytes()
     broken = CorrespondenceStore(**{**vars(store), "K": "not an array"})
     with pytest.raises(ValueError, match="could not convert"):
         write_store(path, broken)
     assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["store.h5"]
+    assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
 
 
 def test_ground_truth_of_the_synthetic_store(store):
     """Residuals of the inliers by NumPy: noise of 0.5 px leaves them within a few pixels of their epipolar lines."""
-    rows = slice(0, 30)
-    x1 = np.c_[store.points1[rows], np.ones(30)].astype(float)
-    x2 = np.c_[store.points2[rows], np.ones(30)].astype(float)
+    x1, x2 = (np.c_[points[:30], np.ones(30)].astype(float) for points in (store.points1, store.points2))
     line = x1 @ store.F[0].T
     distance = np.abs((x2 * line).sum(1)) / np.hypot(line[:, 0], line[:, 1])
     assert np.sort(distance)[:24].max() < 4
 
 
-ARRAYS = ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t")
-
-
-@pytest.fixture
-def ragged(store):
-    """The same rows, given to the six pairs unevenly; one pair has none."""
-    return replace(store, offsets=np.array([0, 10, 10, 50, 90, 150, 180]))
-
-
-def same(got, expected):
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
-    for name in ("names", "dataset", "pairs", "detector"):
-        assert getattr(got, name) == getattr(expected, name)
-
-
-@pytest.mark.parametrize(("first", "stop"), [(0, 1), (0, 3), (1, 2), (2, 5), (5, 6)])
-def test_select(ragged, first, stop):
-    part = ragged.select(first, stop)
+@pytest.mark.parametrize(("first", "stop"), [(0, 1), (0, 3), (1, 2), (2, 5), (5, 6), (0, 6)])
+def test_select(store, first, stop):
+    part = store.select(first, stop)
     assert len(part) == stop - first
     assert part.offsets[0] == 0
-    assert part.names == ragged.names[first:stop]
-    assert (part.dataset, part.pairs, part.detector) == (ragged.dataset, ragged.pairs, ragged.detector)
+    assert part.names == store.names[first:stop]
+    assert (part.dataset, part.pairs, part.detector) == (store.dataset, store.pairs, store.detector)
     for new, old in enumerate(range(first, stop)):
         for name in ("points1", "points2", "ratio"):
-            np.testing.assert_array_equal(getattr(part, name)[part.rows(new)], getattr(ragged, name)[ragged.rows(old)])
+            np.testing.assert_array_equal(getattr(part, name)[part.rows(new)], getattr(store, name)[store.rows(old)])
         for name in ("image_size", "F", "K", "R", "t"):
-            np.testing.assert_array_equal(getattr(part, name)[new], getattr(ragged, name)[old])
+            np.testing.assert_array_equal(getattr(part, name)[new], getattr(store, name)[old])
     assert len(part.points1) == len(part.points2) == len(part.ratio) == part.offsets[-1]
-    same(part.select(0, len(part)), part)
 
 
-def test_matches_of_a_pair(ragged):
-    assert ragged.rows(2).tolist() == list(range(10, 50))
-    assert [len(ragged.rows(pair)) for pair in range(6)] == [10, 0, 40, 40, 60, 30]
-    rows = ragged.rows(2, 0.8)
-    assert rows.tolist() == [row for row in range(10, 50) if ragged.ratio[row] < 0.8]
+def test_matches_of_a_pair(store):
+    assert [len(store.rows(pair)) for pair in range(6)] == [10, 0, 40, 40, 60, 30]
+    assert store.rows(2).tolist() == list(range(10, 50))
+    assert store.rows(2, 0.8).tolist() == [row for row in range(10, 50) if store.ratio[row] < 0.8]
     for limit in (None, 0.8):
-        for part, name in zip(ragged.matches(2, limit), ("points1", "points2", "ratio"), strict=True):
-            np.testing.assert_array_equal(part, getattr(ragged, name)[ragged.rows(2, limit)])
-    assert [len(part) for part in ragged.matches(1)] == [0, 0, 0]
+        for part, name in zip(store.matches(2, limit), ("points1", "points2", "ratio"), strict=True):
+            np.testing.assert_array_equal(part, getattr(store, name)[store.rows(2, limit)])
+    assert [len(part) for part in store.matches(1)] == [0, 0, 0]
 
 
-def test_select_everything(ragged):
-    same(ragged.select(0, 6), ragged)
-
-
-def test_read_some_pairs(ragged, tmp_path):
-    path = tmp_path / "store.h5"
-    write_store(path, ragged)
-    for part in (read_store(f"{path}@2:5"), read_store(Path(f"{path}@2:5"))):
-        same(part, ragged.select(2, 5))
-    same(read_store(f"{path}@0:6"), ragged)
-    same(read_store(f"{path}@03:04"), ragged.select(3, 4))
-    write_store(tmp_path / "part.h5", part)
-    same(read_store(tmp_path / "part.h5"), part)
+@pytest.mark.parametrize(("text", "pairs"), [("2:5", (2, 5)), ("0:6", (0, 6)), ("03:04", (3, 4))])
+def test_read_some_pairs(store, path, text, pairs):
+    part = read_store(Path(f"{path}@{text}"))
+    same(part, store.select(*pairs))
+    same(read_store(f"{path}@{text}"), part)
+    write_store(path.with_name("part.h5"), part)
+    same(read_store(path.with_name("part.h5")), part)
 
 
 @pytest.mark.parametrize(("first", "stop"), [(0, 0), (6, 6), (4, 2), (0, 7), (6, 9), (-1, 2), (-2, -1)])
-def test_pairs_that_are_not_there(store, tmp_path, first, stop):
+def test_pairs_that_are_not_there(store, path, first, stop):
     message = f"pairs {first}:{stop} were asked for, the store has 0:6"
     with pytest.raises(ValueError, match=message):
         store.select(first, stop)
     if first >= 0:
-        write_store(tmp_path / "store.h5", store)
         with pytest.raises(ValueError, match=message):
-            read_store(f"{tmp_path / 'store.h5'}@{first}:{stop}")
-
-
-def test_missing_file_with_pairs(tmp_path):
-    with pytest.raises(FileNotFoundError, match=f"no store at {re.escape(str(tmp_path / 'none.h5'))}"):
-        read_store(f"{tmp_path / 'none.h5'}@0:2")
+            read_store(f"{path}@{first}:{stop}")

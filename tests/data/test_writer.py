@@ -48,87 +48,85 @@ def test_order_and_stops_leave_no_trace(tmp_path_factory, order, stop):
     assert StoreWriter(path, OPTIONS).complete
 
 
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "store.h5"
+
+
 class TestParts:
     @pytest.mark.parametrize("size", [0, 100, 5000])
-    def test_broken_part_is_made_again(self, tmp_path, size):
-        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+    def test_broken_part_is_made_again(self, path, size):
+        writer = StoreWriter(path, OPTIONS)
         for place in range(3):
             writer.add(place, pair(place))
         part = writer.folder / "00000001.h5"
         part.write_bytes(part.read_bytes()[:size])
-        assert StoreWriter(tmp_path / "store.h5", OPTIONS).done() == {0, 2}
+        assert StoreWriter(path, OPTIONS).done() == {0, 2}
         assert not part.exists()
 
-    def test_of_other_options(self, tmp_path):
-        StoreWriter(tmp_path / "store.h5", OPTIONS).add(0, pair(0))
-        with pytest.raises(ValueError, match=r"store\.h5\.parts was made .* num_features was 200 and is 300"):
-            StoreWriter(tmp_path / "store.h5", {**OPTIONS, "num_features": 300})
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"num_features": 300}, r"store\.h5\.parts was made .* num_features was 200 and is 300"),
+            ({"frames": "3500"}, r"other data, remove .* the images, .* have changed since$"),
+            ({"frames": "3500", "num_features": 300}, r": num_features was 200 and is 300$"),  # without the digests
+        ],
+    )
+    def test_of_other_options_or_images(self, path, options, message):
+        StoreWriter(path, {**OPTIONS, "frames": "48af"}).add(0, pair(0))
+        with pytest.raises(ValueError, match=message):
+            StoreWriter(path, {**OPTIONS, "frames": "48af", **options})
 
-    def test_of_other_images(self, tmp_path):
-        StoreWriter(tmp_path / "store.h5", {**OPTIONS, "frames": "48af"}).add(0, pair(0))
-        with pytest.raises(ValueError, match=r"other data, remove .* the images, .* have changed since$"):
-            StoreWriter(tmp_path / "store.h5", {**OPTIONS, "frames": "3500"})
-        with pytest.raises(ValueError, match=r": num_features was 200 and is 300$"):  # without the digests
-            StoreWriter(tmp_path / "store.h5", {**OPTIONS, "frames": "3500", "num_features": 300})
-
-    def test_folder_goes_if_nothing_is_in_it(self, tmp_path):
-        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+    def test_folder_goes_if_nothing_is_in_it(self, path):
+        writer = StoreWriter(path, OPTIONS)
         (writer.folder / "notes.txt").touch()
         writer.close()
         assert [path.name for path in writer.folder.iterdir()] == ["notes.txt"]
         (writer.folder / "notes.txt").unlink()
         writer.close()
-        assert list(tmp_path.iterdir()) == []
+        assert list(path.parent.iterdir()) == []
 
-    def test_of_other_options_but_none_done(self, tmp_path):
-        StoreWriter(tmp_path / "store.h5", OPTIONS)
-        writer = StoreWriter(tmp_path / "store.h5", {**OPTIONS, "num_features": 300})
+    def test_of_other_options_but_none_done(self, path):
+        StoreWriter(path, OPTIONS)
+        writer = StoreWriter(path, {**OPTIONS, "num_features": 300})
         assert json.loads((writer.folder / "options.json").read_text())["num_features"] == 300
 
     @pytest.mark.parametrize("text", [None, "", "[1]", '{"num_feat'])
-    def test_without_readable_options(self, tmp_path, text):
-        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+    def test_without_readable_options(self, path, text):
+        writer = StoreWriter(path, OPTIONS)
         writer.add(0, pair(0))
         about = writer.folder / "options.json"
         about.unlink() if text is None else about.write_text(text)
         with pytest.raises(ValueError, match=r"store\.h5\.parts exists, but was not made by this command"):
-            StoreWriter(tmp_path / "store.h5", OPTIONS)
+            StoreWriter(path, OPTIONS)
 
-    def test_wrong_arguments(self, tmp_path):
-        writer = StoreWriter(tmp_path / "store.h5", OPTIONS)
+    def test_wrong_arguments(self, path):
+        writer = StoreWriter(path, OPTIONS)
         with pytest.raises(ValueError, match="got 1 pairs and place -1"):
             writer.add(-1, pair(0))
         with pytest.raises(ValueError, match="no pairs to write"):
             writer.finish({})
 
 
-class TestStoreThatIsThere:
-    def test_truncated(self, tmp_path):
-        write_store(tmp_path / "store.h5", pair(0))
-        data = (tmp_path / "store.h5").read_bytes()
-        (tmp_path / "store.h5").write_bytes(data[: len(data) // 2])
-        with pytest.raises(ValueError, match=r"store\.h5 is not a readable HDF5 file"):
-            StoreWriter(tmp_path / "store.h5", OPTIONS)
-
-    def test_of_another_tool(self, tmp_path):
-        write_store(tmp_path / "store.h5", pair(0))
-        with pytest.raises(ValueError, match=r"store\.h5 exists, but was not made by this command"):
-            StoreWriter(tmp_path / "store.h5", OPTIONS)
-
-    def test_folder(self, tmp_path):
-        with pytest.raises(ValueError, match="not a regular file"):
-            StoreWriter(tmp_path, OPTIONS)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: path.write_bytes(b"\x89HDF"), r"store\.h5 is not a readable HDF5 file"),
+        (lambda path: write_store(path, pair(0)), r"store\.h5 exists, but was not made by this command"),
+        (lambda path: path.mkdir(), "not a regular file"),
+        (lambda path: path.with_name("store.h5.parts").touch(), r"store\.h5\.parts, which is not a folder"),
+    ],
+)
+def test_what_is_there_is_refused(path, make, message):
+    make(path)
+    with pytest.raises(ValueError, match=message):
+        StoreWriter(path, OPTIONS)
 
 
 class TestNoRoom:
     def test_missing_folder(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"the folder .*nothing does not exist"):
             StoreWriter(tmp_path / "nothing" / "store.h5", OPTIONS)
-
-    def test_file_where_the_parts_belong(self, tmp_path):
-        (tmp_path / "store.h5.parts").touch()
-        with pytest.raises(ValueError, match=r"store\.h5\.parts, which is not a folder"):
-            StoreWriter(tmp_path / "store.h5", OPTIONS)
 
     def test_no_permission(self, tmp_path, monkeypatch):
         monkeypatch.setattr(os, "access", lambda path, mode: False)

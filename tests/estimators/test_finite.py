@@ -77,6 +77,8 @@ SAMPLES = {
 WEIGHTS = {
     "random": lambda n: uniform(16, n, seed=5),
     "zeros": lambda n: uniform(16, n, seed=5) * (torch.arange(n) % 3 > 0),
+    "one zero": lambda n: uniform(16, n, seed=5) * (torch.arange(n) > 0),
+    "three left": lambda n: uniform(16, n, seed=5) * (torch.arange(n) >= n - 3),
     "all zero": lambda n: torch.zeros(16, n),
     "extreme": lambda n: 10 ** uniform(16, n, low=-6, high=6, seed=5),
 }
@@ -111,9 +113,9 @@ def test_degenerate_and_extreme_samples(name, sample, num_points, dtype):
     check_function(name, points1, points2)
 
 
-@pytest.mark.parametrize("weights", ["random", "zeros", "all zero", "extreme"])
+@pytest.mark.parametrize("weights", WEIGHTS)
 @pytest.mark.parametrize("sample", ["plain", "all points equal", "collinear", "one view collinear", "four places"])
-@pytest.mark.parametrize("name", ["hartley", "reweighted", "learned"])
+@pytest.mark.parametrize("name", ["hartley", "whitening", "reweighted", "learned"])
 def test_with_weights(name, sample, weights, dtype):
     for num_points in (8, 12):
         points1, points2 = (points.to(dtype) for points in SAMPLES[sample](num_points))

@@ -60,28 +60,46 @@ def test_gradients_reach_keypoints_and_scores():
     assert all(score.grad.eq(1).all() for score in scores)
 
 
+FIRST = [torch.tensor([[0, 0]])] * 2  # the first keypoints of both views, in both pairs
+
+
 @pytest.mark.parametrize(
     ("matches", "error", "message"),
     [
-        ([torch.tensor([[0, 0]])], ValueError, "got 1 for 2 and 2 pairs"),
+        (FIRST[:1], ValueError, "got 1 for 2 and 2 pairs"),
         ([torch.zeros(1, 2)] * 2, TypeError, r"matches must be tensors of integers, got torch\.float32"),
+        ([[[0, 0]]] * 2, TypeError, "matches must be tensors of integers, got <class 'list'>"),
         ([torch.zeros(2, dtype=torch.int64)] * 2, ValueError, r"pair 0 must have shape \[S, 2\], got \[2\]"),
         ([torch.tensor([[0, 25]])] * 2, ValueError, "indices of 30 and 25 keypoints"),
         ([torch.tensor([[-1, 2]])] * 2, ValueError, "indices of 30 and 25 keypoints"),
         (torch.zeros(2, 25, dtype=torch.int64), ValueError, r"shape \[2, 30\] or be a list, got \[2, 25\]"),
     ],
 )
-def test_matches_that_do_not_fit(matches, error, message):
+def test_wrong_matches(matches, error, message):
     with pytest.raises(error, match=message):
         correspondences_from_matches(*KEYPOINTS, matches)
 
 
-def test_scores_that_do_not_fit():
-    matches = [torch.tensor([[0, 0]])] * 2
-    with pytest.raises(ValueError, match=r"scores of pair 0 must have shape \[1\], got \[2\]"):
-        correspondences_from_matches(*KEYPOINTS, matches, [torch.rand(2)] * 2)
-    with pytest.raises(ValueError, match=r"shape of the matches, \[2, 30\], got \[2, 3\]"):
-        correspondences_from_matches(*KEYPOINTS, torch.zeros(2, 30, dtype=torch.int64), torch.rand(2, 3))
+@pytest.mark.parametrize(
+    ("matches", "scores", "error", "message"),
+    [
+        (FIRST, [torch.rand(2)] * 2, ValueError, r"scores of pair 0 must have shape \[1\], got \[2\]"),
+        (torch.zeros(2, 30).long(), torch.rand(2, 3), ValueError, r"of the matches, \[2, 30\], got \[2, 3\]"),
+        (FIRST, [torch.rand(1), None], TypeError, "scores must be floating-point tensors, got"),
+        (FIRST, [torch.rand(1)], ValueError, "scores of every pair are needed, got 1 for 2 pairs"),
+        (FIRST, [torch.rand(1), -torch.rand(1)], ValueError, "scores of pair 1 must be finite and not negative"),
+    ],
+)
+def test_wrong_scores(matches, scores, error, message):
+    with pytest.raises(error, match=message):
+        correspondences_from_matches(*KEYPOINTS, matches, scores)
+
+
+def test_wrong_keypoints():
+    with pytest.raises(TypeError, match="keypoints1 must be a tensor"):
+        correspondences_from_matches([[0.0, 0.0]], KEYPOINTS[1], FIRST)
+    with pytest.raises(ShapeError):
+        correspondences_from_matches(KEYPOINTS[0][0], KEYPOINTS[1][0], FIRST[:1])
 
 
 @pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])
@@ -91,22 +109,3 @@ def test_views_without_keypoints(empty):
     assert not correspondences_from_matches(*keypoints, [nothing, nothing]).mask.any()
     by_keypoint = torch.full(keypoints[0].shape[:2], -1)
     assert not correspondences_from_matches(*keypoints, by_keypoint).mask.any()
-
-
-def test_what_is_not_a_tensor():
-    pairs = [torch.tensor([[0, 0]])] * 2
-    with pytest.raises(TypeError, match="matches must be tensors of integers, got <class 'list'>"):
-        correspondences_from_matches(*KEYPOINTS, [[[0, 0]]] * 2)
-    with pytest.raises(TypeError, match="keypoints1 must be a tensor"):
-        correspondences_from_matches([[0.0, 0.0]], KEYPOINTS[1], pairs)
-    with pytest.raises(TypeError, match="scores must be floating-point tensors, got"):
-        correspondences_from_matches(*KEYPOINTS, pairs, [torch.rand(1), None])
-    with pytest.raises(ValueError, match="scores of every pair are needed, got 1 for 2 pairs"):
-        correspondences_from_matches(*KEYPOINTS, pairs, [torch.rand(1)])
-    with pytest.raises(ValueError, match="scores of pair 1 must be finite and not negative"):
-        correspondences_from_matches(*KEYPOINTS, pairs, [torch.rand(1), -torch.rand(1)])
-
-
-def test_keypoints_of_one_pair():
-    with pytest.raises(ShapeError):
-        correspondences_from_matches(KEYPOINTS[0][0], KEYPOINTS[1][0], [torch.tensor([[0, 0]])])

@@ -113,28 +113,20 @@ class TestDetermined:
         points1, points2 = correspondences("random", 200)
         assert are_determined(*coordinates(points1, points2), 0.01).float().mean() > 0.98
 
-    def test_coincident(self):
-        points1, points2 = correspondences("handheld", 20)
-        for points in (points1, points2):
-            points[:, 5] = points[:, 2]
-        assert not are_determined(*coordinates(points1, points2), 0.01).any()
-
-    def test_on_a_line(self):
-        along = torch.linspace(0, 300, 8, dtype=torch.float64)
-        points1 = torch.stack([along, 2 * along + 5], -1)[None]
-        points2 = uniform(1, 8, 2, high=500)
-        points2[..., 1] = 3 * points2[..., 0]
-        assert not are_determined(*coordinates(points1, points2), 0.01).any()
-
-    def test_on_a_plane(self):
-        H = torch.tensor([[1.1, 0.02, 30], [0.01, 0.95, -12], [1e-4, 2e-5, 1]], dtype=torch.float64)
-        points1 = uniform(50, 8, 2, high=500)
-        x2 = torch.cat([points1, torch.ones(50, 8, 1)], -1) @ H.mT
-        assert not are_determined(*coordinates(points1, x2[..., :2] / x2[..., 2:]), 0.01).any()
-
-    def test_seven_on_a_plane(self):
-        H = torch.tensor([[1.0, 0, 30], [0, 1, -12], [0, 0, 1]], dtype=torch.float64)
-        points1 = uniform(50, 8, 2, high=500)
-        points2 = (torch.cat([points1, torch.ones(50, 8, 1)], -1) @ H.mT)[..., :2]
-        points2[:, 7] += 20
+    @pytest.mark.parametrize("kind", ["coincident", "on a line", "on a plane", "seven on a plane"])
+    def test_degenerate_samples(self, kind):
+        points1, points2 = correspondences("handheld", 50)
+        if kind == "coincident":
+            points1[:, 5], points2[:, 5] = points1[:, 2], points2[:, 2]
+        elif kind == "on a line":
+            along = torch.linspace(0, 300, 8, dtype=torch.float64)
+            points1 = torch.stack([along, 2 * along + 5], -1).repeat(50, 1, 1)
+            points2[..., 1] = 3 * points2[..., 0]
+        elif kind == "on a plane":
+            H = torch.tensor([[1.1, 0.02, 30], [0.01, 0.95, -12], [1e-4, 2e-5, 1]], dtype=torch.float64)
+            x2 = torch.cat([points1, torch.ones(50, 8, 1)], -1) @ H.mT
+            points2 = x2[..., :2] / x2[..., 2:]
+        else:
+            points2 = points1 + torch.tensor([30.0, -12.0])
+            points2[:, 7] += 20
         assert not are_determined(*coordinates(points1, points2), 0.01).any()

@@ -9,12 +9,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.core.exceptions import ShapeError
 from torch.autograd import gradcheck
 from two_view import (
     SCENES,
     correspondences,
     epipolar_distances,
+    hartley_difference,
     homogeneous,
     in_hartley,
     numpy_hartley,
@@ -35,10 +35,7 @@ from kornia_learnnorm.estimators.robust_losses import (
     squared_loss,
 )
 
-DISTANCES = {
-    "sampson": ("sampson", sampson_distance),
-    "symmetric": ("symmetric", symmetric_epipolar_distance),
-}
+DISTANCES = {"sampson": sampson_distance, "symmetric": symmetric_epipolar_distance}
 LOSSES = [squared_loss, Huber(0.5), Cauchy(0.5), GemanMcClure(2.0), Truncated(3.0)]
 
 
@@ -78,19 +75,11 @@ def gauss_newton(F, points1, points2, kind: str = "sampson", iterations: int = 3
 
 class TestRefineFundamental:
     @pytest.mark.parametrize("batch_size", [0, 1, 5])
-    @pytest.mark.parametrize("num_points", [8, 20, 500])
-    @pytest.mark.parametrize("weighted", [False, True])
-    def test_smoke(self, batch_size, num_points, weighted, device, dtype):
-        points1, points2 = (uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1))
-        weights = uniform(batch_size, num_points, seed=2).to(device, dtype) if weighted else None
-        found = refine_fundamental(points1, points2, uniform(batch_size, 3, 3).to(device), weights, max_iterations=5)
-        assert found.F_mat.shape == (batch_size, 3, 3)
-        assert found.F_mat.dtype == found.cost.dtype == found.cost_before.dtype == dtype
-        assert all(value.shape == (batch_size,) for value in found[1:])
-        assert found.iterations.dtype == torch.int64
-        assert found.converged.dtype == torch.bool
-        assert found.F_mat.device.type == device.type
-        assert torch.isfinite(found.F_mat).all()
+    def test_what_it_returns_beside_the_matrix(self, batch_size, device, dtype):
+        points = [uniform(batch_size, 20, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
+        found = refine_fundamental(*points, uniform(batch_size, 3, 3).to(device), max_iterations=5)
+        assert [value.dtype for value in found] == [dtype, dtype, dtype, torch.int64, torch.bool]
+        assert all(value.shape == (batch_size,) and value.device.type == device.type for value in found[1:])
 
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
     @pytest.mark.parametrize("kind", DISTANCES)
@@ -98,7 +87,7 @@ class TestRefineFundamental:
     def test_agrees_with_numpy(self, name, kind, num_points):
         points1, points2 = correspondences(name, 3, num_points, noise=0.5)
         F0 = find_fundamental(points1, points2)
-        found = refine_fundamental(points1, points2, F0, distance=DISTANCES[kind][0], max_iterations=200)
+        found = refine_fundamental(points1, points2, F0, distance=kind, max_iterations=200)
         arguments = zip(F0.numpy(), points1.numpy(), points2.numpy(), strict=True)
         expected = [gauss_newton(*values, kind) for values in arguments]
         assert found.converged.all()
@@ -109,38 +98,36 @@ class TestRefineFundamental:
     def test_costs_are_those_of_the_matrices(self, kind, loss):
         points1, points2 = correspondences("handheld", 10, 15)
         weights, F0 = uniform(10, 15), find_fundamental(points1, points2)
-        factor, distance = DISTANCES[kind]
-        found = refine_fundamental(points1, points2, F0, weights, factor, loss)
+        found = refine_fundamental(points1, points2, F0, weights, kind, loss)
         for F_mat, cost in ((F0, found.cost_before), (found.F_mat, found.cost)):
-            expected = (weights * loss(distance(points1, points2, F_mat).square())[0]).sum(-1)
+            expected = (weights * loss(DISTANCES[kind](points1, points2, F_mat).square())[0]).sum(-1)
             np.testing.assert_allclose(cost.numpy(), expected.numpy(), rtol=1e-8)
 
     @pytest.mark.parametrize("kind", DISTANCES)
     @pytest.mark.parametrize("loss", LOSSES)
     def test_nothing_near_the_optimum_costs_less(self, kind, loss):
         points1, points2 = correspondences("orbit", 10, 30, noise=0.5)
-        factor, _ = DISTANCES[kind]
-        found = refine_fundamental(points1, points2, find_fundamental(points1, points2), None, factor, loss, 300)
+        found = refine_fundamental(points1, points2, find_fundamental(points1, points2), None, kind, loss, 300)
         assert found.converged.all()
         T1, T2 = (torch.from_numpy(numpy_hartley(points)) for points in (points1, points2))
         F_hat = torch.from_numpy(in_hartley(found.F_mat, points1, points2))
         for seed in range(20):
             near = T2.mT @ (F_hat + 1e-3 * uniform(10, 3, 3, low=-1, seed=seed)) @ T1
-            cost = refine_fundamental(points1, points2, near, None, factor, loss, 0).cost
+            cost = refine_fundamental(points1, points2, near, None, kind, loss, 0).cost
             assert (cost > found.cost * (1 - 1e-9)).all()
 
     @pytest.mark.parametrize("kind", DISTANCES)
     @pytest.mark.parametrize("num_points", [8, 20])
     def test_the_truth_of_exact_points_is_left_alone(self, kind, num_points):
         scene = scenes("orbit", 20, num_points, noise=0.0)
-        found = refine_fundamental(scene.points1, scene.points2, scene.F_mat, distance=DISTANCES[kind][0])
+        found = refine_fundamental(scene.points1, scene.points2, scene.F_mat, distance=kind)
         assert (found.cost < 1e-20).all()
         assert up_to_sign(found.F_mat, scene.F_mat) < 1e-9
         # From a start nearby, too, to zero residuals.
         T1, T2 = (torch.from_numpy(numpy_hartley(points)) for points in scene[:2])
         F_hat = torch.from_numpy(in_hartley(scene.F_mat, scene.points1, scene.points2))
         F0 = T2.mT @ (F_hat + 1e-4 * uniform(20, 3, 3, low=-1)) @ T1
-        found = refine_fundamental(scene.points1, scene.points2, F0, distance=DISTANCES[kind][0], max_iterations=200)
+        found = refine_fundamental(scene.points1, scene.points2, F0, distance=kind, max_iterations=200)
         assert found.converged.all()
         assert (found.cost < 1e-16).all()
 
@@ -175,7 +162,7 @@ class TestRefineFundamental:
     def test_cost_never_rises_and_rank_two_holds(self, seed, num_points, name, kind, loss, max_iterations):
         points1, points2 = correspondences(name, 5, num_points, seed)
         F0 = find_fundamental(points1, points2)
-        found = refine_fundamental(points1, points2, F0, None, DISTANCES[kind][0], loss, max_iterations)
+        found = refine_fundamental(points1, points2, F0, None, kind, loss, max_iterations)
         assert (found.cost <= found.cost_before).all()
         assert (found.iterations <= max_iterations).all()
         assert np.linalg.norm(found.F_mat.numpy(), axis=(1, 2)) == pytest.approx(1, abs=1e-14)
@@ -197,46 +184,14 @@ class TestRefineFundamental:
         assert (second.iterations <= 2).all()
         assert up_to_sign(first.F_mat, second.F_mat) < 1e-6
 
-    @pytest.mark.parametrize("kind", DISTANCES)
-    def test_swapped_views_give_the_transpose(self, kind):
-        points1, points2 = correspondences("orbit", 20, 12)
-        weights, F0, factor = uniform(20, 12), find_fundamental(points1, points2), DISTANCES[kind][0]
-        found = refine_fundamental(points1, points2, F0, weights, factor, max_iterations=5)
-        mirrored = refine_fundamental(points2, points1, F0.mT, weights, factor, max_iterations=5)
-        F_mat, transpose = (in_hartley(F, points1, points2) for F in (found.F_mat, mirrored.F_mat.mT))
-        assert up_to_sign(F_mat, transpose) < 1e-7
-
-    @given(st.integers(0, 2**31), st.sampled_from([9, 17]), st.sampled_from(["orbit", "handheld"]), st.randoms())
-    def test_order_does_not_matter(self, seed, num_points, name, random):
-        points1, points2 = correspondences(name, 4, num_points, seed)
-        F0, order = find_fundamental(points1, points2), random.sample(range(num_points), num_points)
-        F_mat, shuffled = (
-            refine_fundamental(points1[:, p], points2[:, p], F0, max_iterations=5).F_mat for p in (slice(None), order)
+    @given(st.floats(-3, 3), st.sampled_from([8, 15]))
+    def test_cost_is_in_square_pixels(self, log_scale, num_points):
+        points, scale = correspondences("orbit", 4, num_points), 10**log_scale
+        found, expected = (
+            refine_fundamental(*p, find_fundamental(*p), max_iterations=5).cost.numpy()
+            for p in ([scale * x for x in points], points)
         )
-        assert up_to_sign(in_hartley(F_mat, points1, points2), in_hartley(shuffled, points1, points2)) < 1e-6
-
-    @given(st.floats(-3, 3), st.sampled_from([-7.0, 1e-3, 1e6]), st.sampled_from([8, 15]))
-    def test_scales_of_pixels_and_of_the_matrix_do_not_matter(self, log_scale, factor, num_points):
-        points1, points2 = correspondences("orbit", 4, num_points)
-        F0, scale = find_fundamental(points1, points2), 10**log_scale
-        S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
-        start = factor * S.inverse() @ F0 @ S.inverse()
-        found = refine_fundamental(scale * points1, scale * points2, start, max_iterations=5)
-        expected = refine_fundamental(points1, points2, F0, max_iterations=5)
-        F_mat, wanted = (in_hartley(F, points1, points2) for F in (S @ found.F_mat @ S, expected.F_mat))
-        assert up_to_sign(F_mat, wanted) < 1e-7
-        np.testing.assert_allclose(found.cost.numpy(), scale**2 * expected.cost.numpy(), rtol=1e-5)
-
-    @pytest.mark.parametrize("loss", LOSSES)
-    def test_zero_weight_means_absent(self, loss):
-        points1, points2 = correspondences("orbit", 5, 20)
-        weights, F0 = uniform(5, 20, low=0.5), find_fundamental(points1, points2)
-        junk1, junk2 = (uniform(5, 4, 2, low=-5000, high=5000, seed=seed) for seed in (3, 4))
-        every = [torch.cat(pair, 1) for pair in ((points1, junk1), (points2, junk2), (weights, torch.zeros(5, 4)))]
-        found = refine_fundamental(*every[:2], F0, every[2], loss=loss, max_iterations=5)
-        expected = refine_fundamental(points1, points2, F0, weights, loss=loss, max_iterations=5)
-        F_mat, wanted = (in_hartley(result.F_mat, points1, points2) for result in (found, expected))
-        assert up_to_sign(F_mat, wanted) < 1e-8
+        np.testing.assert_allclose(found, scale**2 * expected, rtol=1e-5)
 
     def test_batch_is_many_single_calls(self):
         points1, points2 = correspondences("driving", 6, 12)
@@ -258,7 +213,7 @@ class TestRefineFundamental:
         ]
         shared = refine_fundamental(*points, F0, weights, loss=Cauchy(1.0), max_iterations=8)
         copied = refine_fundamental(*many[:2], F0, many[2], loss=Cauchy(1.0), max_iterations=8)
-        assert up_to_sign(in_hartley(shared.F_mat, *many[:2]), in_hartley(copied.F_mat, *many[:2])) < 1e-7
+        assert hartley_difference(shared.F_mat, copied.F_mat, *many[:2]) < 1e-7
         np.testing.assert_allclose(shared.cost_before.numpy(), copied.cost_before.numpy())
         assert torch.equal(shared.iterations, copied.iterations)
 
@@ -284,34 +239,6 @@ class TestRefineFundamental:
         assert loose.iterations.sum() < 0.5 * tight.iterations.sum()
         assert (loose.cost <= tight.cost * 1.002).double().mean() > 0.9
 
-    @pytest.mark.parametrize("degenerate", ["coincident", "collinear", "planar", "absent", "same", "epipole"])
-    @pytest.mark.parametrize("kind", DISTANCES)
-    @pytest.mark.parametrize("loss", LOSSES)
-    def test_degenerate_points_are_finite_in_value_and_gradient(self, degenerate, kind, loss):
-        points1, points2 = correspondences("handheld", 5, 12)
-        weights = torch.ones(5, 12, dtype=torch.float64)
-        F0 = find_fundamental(points1, points2)
-        if degenerate == "coincident":
-            points1, points2 = points1[:, :1].repeat(1, 12, 1), points2[:, :1].repeat(1, 12, 1)
-        elif degenerate == "collinear":
-            points1 = torch.linspace(0, 500, 12, dtype=torch.float64)[None, :, None].repeat(5, 1, 2)
-        elif degenerate == "planar":
-            points2 = 0.9 * points1 + 20
-        elif degenerate == "absent":
-            weights = torch.zeros_like(weights)
-        elif degenerate == "same":
-            points2 = points1.clone()
-        else:
-            F0 = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=torch.float64).expand(5, 3, 3)
-            points1, points2 = points1.clone(), points2.clone()
-            points1[:, 0] = points2[:, 1] = points1[:, 2] = points2[:, 2] = 0.0
-        values = [value.clone().requires_grad_() for value in (points1, points2, weights)]
-        found = refine_fundamental(*values[:2], F0, values[2], DISTANCES[kind][0], loss)
-        assert torch.isfinite(found.F_mat).all()
-        assert (found.cost <= found.cost_before).all()
-        for gradient in torch.autograd.grad(signless(found.F_mat).sum(), values):
-            assert torch.isfinite(gradient).all()
-
     def test_returns_the_start_where_no_step_is_possible(self):
         points1, points2 = correspondences("handheld", 5, 12)
         F0 = find_fundamental(points1, points2)
@@ -324,13 +251,6 @@ class TestRefineFundamental:
         assert torch.equal(found.cost, found.cost_before)
         assert not found.converged.any()
 
-    def test_float32_is_float64_rounded(self):
-        points1, points2 = (points.float() for points in correspondences("orbit", 20, 20))
-        F0 = find_fundamental(points1, points2)
-        single = refine_fundamental(points1, points2, F0)
-        double = refine_fundamental(points1.double(), points2.double(), F0.double())
-        assert up_to_sign(single.F_mat, double.F_mat) < 1e-6
-
 
 class TestGradients:
     @pytest.mark.parametrize("kind", DISTANCES)
@@ -339,13 +259,13 @@ class TestGradients:
         scene = scenes("orbit", 1, 14, noise=1.0)
         points = [(points / 300 - 1).requires_grad_() for points in scene[:2]]
         F0 = find_fundamental(*points).detach()
-        optimum = refine_fundamental(*points, F0, distance=DISTANCES[kind][0], loss=loss, max_iterations=500)
+        optimum = refine_fundamental(*points, F0, distance=kind, loss=loss, max_iterations=500)
         assert optimum.converged.all()
         start = optimum.F_mat.detach()
         weights = uniform(1, 14, low=0.9, high=1.1, seed=3).requires_grad_()
 
         def refined(points1, points2, weights):
-            return signless(refine_fundamental(points1, points2, start, weights, DISTANCES[kind][0], loss, 500).F_mat)
+            return signless(refine_fundamental(points1, points2, start, weights, kind, loss, 500).F_mat)
 
         # A central difference of the iteration stops within 1e-7 of the gradient's zero.
         assert gradcheck(refined, [*points, weights], eps=1e-5, atol=1e-3, rtol=1e-3, fast_mode=True)
@@ -390,40 +310,17 @@ class TestObjectives:
             kind("1")
 
 
-class TestExceptions:
-    def test_options(self):
-        points, F_mat = uniform(1, 10, 2), uniform(1, 3, 3)
-        with pytest.raises(TypeError, match=r"loss must be a function or an instance .* got 'huber'"):
-            refine_fundamental(points, points, F_mat, loss="huber")
-        with pytest.raises(TypeError, match=r"max_iterations must be a whole number, got 2.5"):
-            refine_fundamental(points, points, F_mat, max_iterations=2.5)
-
-    @pytest.mark.parametrize(
-        ("F_mat", "error", "message"),
-        [
-            (None, TypeError, "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
-            (torch.ones(3, 3), ShapeError, r"\[3, 3\]"),
-            (torch.ones(1, 3, 3), ValueError, "got 1 matrices and 2 sets"),
-            (torch.full((2, 3, 3), torch.inf), ValueError, "F_mat must be finite, got 18 NaN or infinite"),
-            (torch.zeros(2, 3, 3), ValueError, "F_mat must not be zero, got 2 zero matrices"),
-        ],
-    )
-    def test_matrix(self, F_mat, error, message):
-        with pytest.raises(error, match=message):
-            refine_fundamental(torch.rand(2, 8, 2), torch.rand(2, 8, 2), F_mat)
-
-    def test_points_weights_and_iterations(self):
-        eye, points = torch.eye(3).expand(2, 3, 3), torch.rand(2, 8, 2)
-        with pytest.raises(ValueError, match="at least 8 correspondences are needed, got 7"):
-            refine_fundamental(points[:, :7], points[:, :7], eye)
-        with pytest.raises(ValueError, match="points1 must be finite, got 32 NaN"):
-            refine_fundamental(points * torch.nan, points, eye)
-        with pytest.raises(ValueError, match="weights must not be negative"):
-            refine_fundamental(points, points, eye, -torch.ones(2, 8))
-        for options, message in (
-            ({"max_iterations": -1}, "must be >= 0, got -1 and 1e-07"),
-            ({"tolerance": -0.5}, "must be >= 0, got 50 and -0.5"),
-            ({"tolerance": float("nan")}, "must be >= 0, got 50 and nan"),
-        ):
-            with pytest.raises(ValueError, match=f"max_iterations and tolerance {message}"):
-                refine_fundamental(points, points, eye, **options)
+@pytest.mark.parametrize(
+    ("option", "error", "message"),
+    [
+        ({"loss": "huber"}, TypeError, "loss must be a function or an instance .* got 'huber'"),
+        ({"max_iterations": 2.5}, TypeError, "max_iterations must be a whole number, got 2.5"),
+        ({"max_iterations": -1}, ValueError, "max_iterations and tolerance must be >= 0, got -1 and 1e-07"),
+        ({"tolerance": -0.5}, ValueError, "max_iterations and tolerance must be >= 0, got 50 and -0.5"),
+        ({"tolerance": float("nan")}, ValueError, "max_iterations and tolerance must be >= 0, got 50 and nan"),
+    ],
+)
+def test_wrong_options(option, error, message):
+    """Of the points, weights and matrices see test_contract.py."""
+    with pytest.raises(error, match=message):
+        refine_fundamental(uniform(1, 10, 2), uniform(1, 10, 2), uniform(1, 3, 3), **option)

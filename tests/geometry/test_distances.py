@@ -18,10 +18,11 @@ from kornia_learnnorm import (
     symmetric_epipolar_distance,
     symmetric_scale,
 )
-from kornia_learnnorm.geometry.distances import find_scale, scale_value
+from kornia_learnnorm.geometry.distances import find_scale, line_norms, scale_value
 
 ALL = [symmetric_epipolar_distance, sampson_distance, algebraic_distance]
 ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x2^T F x1 = y1 - y2
+POINTS, MATRICES = uniform(2, 8, 2), uniform(2, 3, 3)
 
 
 def numpy_sampson(points1, points2, F):
@@ -43,8 +44,8 @@ REFERENCES = {
 }
 
 
+@pytest.mark.parametrize("distance", ALL)
 class TestAll:
-    @pytest.mark.parametrize("distance", ALL)
     @pytest.mark.parametrize("shape", [(0, 8), (1, 1), (3, 20)])
     def test_smoke(self, distance, shape, device, dtype):
         points1, points2 = (uniform(*shape, 2, high=600, seed=k).to(device, dtype) for k in (0, 1))
@@ -54,7 +55,6 @@ class TestAll:
         assert found.device.type == device.type
         assert (found >= 0).all()
 
-    @pytest.mark.parametrize("distance", ALL)
     @pytest.mark.parametrize("name", SCENES)
     def test_agrees_with_numpy(self, distance, name, device):
         scene = scenes(name, 20, 30)
@@ -62,7 +62,6 @@ class TestAll:
         expected = REFERENCES[distance](scene.points1, scene.points2, scene.F_mat)
         np.testing.assert_allclose(found.numpy(), expected, rtol=1e-8, atol=1e-10)
 
-    @pytest.mark.parametrize("distance", ALL)
     @given(st.integers(0, 2**31), st.sampled_from([1e-6, -1.0, 3.0, 1e6]))
     def test_scale_of_the_matrix_does_not_matter(self, distance, seed, factor):
         points1, points2, F_mat = (uniform(2, *s, seed=seed + k) for k, s in enumerate([(5, 2), (5, 2), (3, 3)]))
@@ -70,14 +69,12 @@ class TestAll:
         assert torch.allclose(distance(points1, points2, factor * F_mat), expected, rtol=1e-9)
         assert torch.allclose(distance(points2, points1, F_mat.mT), expected, rtol=1e-9)  # views swapped
 
-    @pytest.mark.parametrize("distance", ALL)
     def test_one_pair_without_batch(self, distance):
         scene = scenes("handheld", 2, 10)
         alone = distance(scene.points1[0], scene.points2[0], scene.F_mat[0])
         assert alone.shape == (10,)
         assert torch.allclose(alone, distance(scene.points1, scene.points2, scene.F_mat)[0])
 
-    @pytest.mark.parametrize("distance", ALL)
     def test_exact_correspondences_have_none_and_no_gradient(self, distance):
         points1 = torch.tensor([[[1.0, 5.0], [2.0, 7.0]]]).requires_grad_()
         points2 = torch.tensor([[[9.0, 5.0], [-2.0, 7.0]]]).requires_grad_()
@@ -87,37 +84,25 @@ class TestAll:
         for gradient in torch.autograd.grad(found.sum(), [points1, points2, F_mat]):
             assert gradient.count_nonzero() == 0
 
-    @pytest.mark.parametrize("distance", ALL)
     def test_gradcheck(self, distance):
         values = [uniform(2, *s, low=-1, seed=k).requires_grad_() for k, s in enumerate([(5, 2), (5, 2), (3, 3)])]
         assert gradcheck(distance, values)
 
-    @pytest.mark.parametrize("distance", ALL)
-    def test_shape_errors(self, distance):
-        points, F_mat = torch.rand(2, 8, 2), torch.rand(2, 3, 3)
-        for wrong in [
-            (torch.rand(2, 8, 3), points, F_mat),
-            (points, torch.rand(8), F_mat),
-            (points, points, F_mat[:, 0]),
-        ]:
-            with pytest.raises(ShapeError):
-                distance(*wrong)
-
-    @pytest.mark.parametrize("distance", ALL)
-    def test_views_that_do_not_pair_up(self, distance):
-        with pytest.raises(ValueError, match=r"must pair up, got shapes \[2, 8, 2\] and \[2, 1, 2\]"):
-            distance(torch.rand(2, 8, 2), torch.rand(2, 1, 2), torch.rand(2, 3, 3))
-
-    @pytest.mark.parametrize("distance", ALL)
-    def test_type_errors(self, distance):
-        points, F_mat = torch.rand(2, 8, 2), torch.rand(2, 3, 3)
-        for wrong, message in [
-            ((points.long(), points, F_mat), "points1 must be a floating-point tensor, got torch.int64"),
-            ((points, points.numpy(), F_mat), "points2 must be a floating-point tensor, got .*numpy"),
-            ((points, points, None), "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
-        ]:
-            with pytest.raises(TypeError, match=message):
-                distance(*wrong)
+    @pytest.mark.parametrize(
+        ("points1", "points2", "F_mat", "error", "message"),
+        [
+            (torch.rand(2, 8, 3), POINTS, MATRICES, ShapeError, r"\[2, 8, 3\]"),
+            (POINTS, torch.rand(8), MATRICES, ShapeError, r"\[8\]"),
+            (POINTS, POINTS, MATRICES[:, 0], ShapeError, r"\[2, 3\]"),
+            (POINTS, POINTS[:, :1], MATRICES, ValueError, r"pair up, got shapes \[2, 8, 2\] and \[2, 1, 2\]"),
+            (POINTS.long(), POINTS, MATRICES, TypeError, "points1 must be a floating-point tensor, got torch.int64"),
+            (POINTS, POINTS.numpy(), MATRICES, TypeError, "points2 must be a floating-point tensor, got .*numpy"),
+            (POINTS, POINTS, None, TypeError, "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
+        ],
+    )
+    def test_exceptions(self, distance, points1, points2, F_mat, error, message):
+        with pytest.raises(error, match=message):
+            distance(points1, points2, F_mat)
 
 
 class TestSymmetricEpipolarDistance:
@@ -127,18 +112,6 @@ class TestSymmetricEpipolarDistance:
         # l2 = F (x, y, 1) = (0, 1, x - y), l1 = F^T (u, v, 1) = (1, -1, v); x2^T F x1 = v + x - y.
         found = symmetric_epipolar_distance(torch.tensor([[[4.0, 1.0]]]), torch.tensor([[[7.0, 2.0]]]), F_mat)
         assert found.item() == pytest.approx(5 + 5 / 2**0.5)
-
-    def test_is_what_opencv_measures(self):
-        cv2 = pytest.importorskip("cv2")
-        scene = scenes("driving", 5, 20)
-        found = symmetric_epipolar_distance(scene.points1, scene.points2, scene.F_mat)
-        for p1, p2, F, distances in zip(scene.points1, scene.points2, scene.F_mat, found, strict=True):
-            lines2 = cv2.computeCorrespondEpilines(p1.numpy(), 1, F.numpy())[:, 0]  # of unit normals
-            lines1 = cv2.computeCorrespondEpilines(p2.numpy(), 2, F.numpy())[:, 0]
-            expected = np.abs((lines2 * homogeneous(p2.numpy())).sum(-1)) + np.abs(
-                (lines1 * homogeneous(p1.numpy())).sum(-1)
-            )
-            np.testing.assert_allclose(distances.numpy(), expected, rtol=1e-3, atol=1e-3)  # lines in float32
 
     def test_is_infinite_on_the_epipole_without_gradient(self):
         F_mat = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]]).requires_grad_()
@@ -205,3 +178,28 @@ class TestDistanceScales:
             find_scale("huber")
         with pytest.raises(TypeError, match="'sampson', 'symmetric' or a function, got 3"):
             find_scale(3)
+
+
+class TestLineNorms:
+    def test_agrees_with_numpy(self, dtype):
+        F_mat = uniform(5, 3, 3, low=-1, dtype=dtype)
+        x1, x2 = (uniform(5, 8, 3, low=-1, seed=seed, dtype=dtype) for seed in (1, 2))
+        first, second = line_norms(x1, x2, F_mat)
+        for found, lines in ((first, x2.numpy() @ F_mat.numpy()), (second, x1.numpy() @ F_mat.mT.numpy())):
+            norms = np.linalg.norm(lines[..., :2], axis=-1)
+            np.testing.assert_allclose(found.numpy(), norms + 1e-3 * norms.mean(1, keepdims=True), rtol=1e-5)
+
+    def test_absent_points_have_no_part_in_the_mean(self):
+        F_mat, weights = uniform(1, 3, 3, low=-1), torch.tensor([[1.0, 2.0, 0.0]], dtype=torch.float64)
+        x1, x2 = uniform(1, 3, 3), uniform(1, 3, 3, seed=1)
+        norms = np.linalg.norm((x2 @ F_mat).numpy()[0, :, :2], axis=-1)
+        expected = norms + 0.5 * (norms[0] + 2 * norms[1]) / 3
+        np.testing.assert_allclose(line_norms(x1, x2, F_mat, weights, floor=0.5)[0][0].numpy(), expected)
+
+    def test_is_positive_on_the_epipole(self):
+        F_mat = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])  # epipoles at the origin
+        x = torch.tensor([[[0.0, 0.0, 1.0], [3.0, 4.0, 1.0]]])
+        for norms in line_norms(x, x, F_mat):  # lines (0, 0), (4, -3): mean 2.5
+            np.testing.assert_allclose(norms[0].numpy(), [0.0025, 5.0025], rtol=1e-5)
+        for norms in line_norms(x[:, :1], x[:, :1], F_mat):
+            assert (norms > 0).all()

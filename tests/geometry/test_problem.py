@@ -9,16 +9,15 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.autograd import gradcheck
 from torch.overrides import TorchFunctionMode
-from two_view import correspondences, homogeneous, numpy_hartley, signless, uniform, up_to_sign
+from two_view import correspondences, homogeneous, null_matrices, numpy_hartley, signless, uniform, up_to_sign
 
-from kornia_learnnorm import EightPoint, LearnedNormalizer, ReweightedWhitening, Whitening, find_fundamental
+from kornia_learnnorm import EightPoint, LearnedNormalizer, ReweightedWhitening, find_fundamental
 from kornia_learnnorm.geometry import checks
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import affine_transform, unit_fundamental
 
-READS = {"__bool__", "item", "__int__", "__float__", "tolist", "nonzero", "is_nonzero", "__len__"} - {"__len__"}
+READS = {"__bool__", "item", "__int__", "__float__", "tolist", "nonzero", "is_nonzero"}
 
 
 class Calls(TorchFunctionMode):
@@ -31,14 +30,6 @@ class Calls(TorchFunctionMode):
     def __torch_function__(self, function, types, args=(), kwargs=None):
         self.names[getattr(function, "__name__", str(function))] += 1
         return function(*args, **(kwargs or {}))
-
-
-def null_matrices(points1, points2, T1, T2) -> np.ndarray:
-    """The last right singular vectors of the design matrices, solved in the coordinates of the transforms."""
-    x1 = homogeneous(points1.numpy()) @ np.asarray(T1).swapaxes(-1, -2)
-    x2 = homogeneous(points2.numpy()) @ np.asarray(T2).swapaxes(-1, -2)
-    A = (x2[..., :, None] * x1[..., None, :]).reshape(*x1.shape[:2], 9)
-    return np.linalg.svd(A, full_matrices=True)[2][:, -1].reshape(-1, 3, 3)
 
 
 class TestLinearProblem:
@@ -61,18 +52,8 @@ class TestLinearProblem:
         if torch.linalg.cond(linear) > 10:
             return
         move = affine_transform(linear, torch.full((2,), shift, dtype=torch.float64))
-        T1, T2 = move @ problem.T1, move.flip(0, 1).mT.triu() @ problem.T2
-        T2 = move.inverse() @ problem.T2
+        T1, T2 = move @ problem.T1, move.inverse() @ problem.T2
         assert up_to_sign(problem.null_matrix_in(T1, T2), null_matrices(*points, T1, T2)) < 1e-7
-
-    @pytest.mark.parametrize("num_points", [8, 12])
-    def test_gradcheck(self, num_points):
-        def in_whitened(x1, x2):
-            problem = LinearProblem.from_points(x1, x2)
-            return signless(problem.null_matrix_in(*Whitening().transforms(problem)))
-
-        points = [p.requires_grad_() for p in correspondences("handheld", 2, num_points)]
-        assert gradcheck(in_whitened, points, eps=1e-6, atol=1e-5, rtol=1e-3)
 
     def test_gap_of_a_noisy_plane(self):
         """A rank test passes a plane with noise; the gap says how little it means."""

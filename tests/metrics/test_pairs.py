@@ -1,4 +1,4 @@
-"""Inlier share, F1 and epipolar error against loops over correspondences; the paired bootstrap against another one."""
+"""Inlier share, F1 and epipolar error against loops over correspondences."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from two_view import scenes
 
-from kornia_learnnorm import bootstrap_interval
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.metrics.bootstrap import paired_bootstrap
 from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
 
 INF, NAN = float("inf"), float("nan")
@@ -92,40 +90,22 @@ class TestAll:
             alone = METRICS[name](points1[k, keep], points2[k, keep], F[k], true[k], 1.0)
             np.testing.assert_allclose(found[k].numpy(), alone.numpy(), rtol=1e-12)
 
-    @given(seed=st.integers(0, 2**31))
-    def test_order_does_not_matter(self, name, seed):
-        points1, points2, F, true = pairs(seed)
+    @given(seed=st.integers(0, 2**31), scale=st.floats(0.01, 100), factor=st.sampled_from([-1.0, 1e-9, -3.0, 1e9]))
+    def test_what_does_not_matter(self, name, seed, scale, factor):
+        """The order, which view is first, the unit of the pixels, scale and sign of the matrices."""
+        metric, (points1, points2, F, true) = METRICS[name], pairs(seed)
         order = torch.randperm(points1.shape[1], generator=torch.Generator().manual_seed(seed))
-        expected = METRICS[name](points1, points2, F, true, 1.0)
-        found = METRICS[name](points1[:, order], points2[:, order], F, true, 1.0)
-        torch.testing.assert_close(found, expected, rtol=1e-12, atol=0, equal_nan=True)
-
-    @given(seed=st.integers(0, 2**31))
-    def test_swapping_the_views_does_not_matter(self, name, seed):
-        points1, points2, F, true = pairs(seed)
-        expected = METRICS[name](points1, points2, F, true, 1.0)
-        found = METRICS[name](points2, points1, F.mT, true.mT, 1.0)
-        torch.testing.assert_close(found, expected, rtol=1e-9, atol=0, equal_nan=True)
-
-    @given(seed=st.integers(0, 2**31), factor=st.floats(0.01, 100))
-    def test_pixels_and_threshold_scale_together(self, name, seed, factor):
-        points1, points2, F, true = pairs(seed)
-        shrink = torch.tensor([1 / factor, 1 / factor, 1.0], dtype=F.dtype).diag()
-        unit = factor if name == "error" else 1.0
-        expected = unit * METRICS[name](points1, points2, F, true, 1.0)
-        F, true = shrink @ F @ shrink, shrink @ true @ shrink
-        found = METRICS[name](factor * points1, factor * points2, F, true, factor)
-        torch.testing.assert_close(found, expected, rtol=1e-7, atol=0, equal_nan=True)
-
-    @given(seed=st.integers(0, 2**31), factor=st.sampled_from([-1.0, 1e-9, -3.0, 1e9]))
-    def test_scale_and_sign_of_the_matrices_do_not_matter(self, name, seed, factor):
-        points1, points2, F, true = pairs(seed)
-        expected = METRICS[name](points1, points2, F, true, 1.0)
-        for found in (
-            METRICS[name](points1, points2, factor * F, true, 1.0),
-            METRICS[name](points1, points2, F, factor * true, 1.0),
+        S = torch.tensor([1 / scale, 1 / scale, 1.0], dtype=F.dtype).diag()
+        scaled = metric(scale * points1, scale * points2, S @ F @ S, S @ true @ S, scale)
+        expected = metric(points1, points2, F, true, 1.0)
+        for found, rtol in (
+            (metric(points1[:, order], points2[:, order], F, true, 1.0), 1e-12),
+            (metric(points2, points1, F.mT, true.mT, 1.0), 1e-9),
+            (scaled / scale if name == "error" else scaled, 1e-7),
+            (metric(points1, points2, factor * F, true, 1.0), 1e-9),
+            (metric(points1, points2, F, factor * true, 1.0), 1e-9),
         ):
-            torch.testing.assert_close(found, expected, rtol=1e-9, atol=0, equal_nan=True)
+            torch.testing.assert_close(found, expected, rtol=rtol, atol=0, equal_nan=True)
 
     @pytest.mark.parametrize("value", [NAN, 0.0])
     def test_failed_estimate(self, name, value):
@@ -224,66 +204,3 @@ class TestRealMatches:
                     assert metric(points1, points2, F, true, 1.0).item() == pytest.approx(expected[name], rel=1e-9)
             assert 0.1 < inlier_share(points1, points2, true, 1.0) < 0.9
             assert 0.1 < epipolar_error(points1, points2, true, true) < 0.6
-
-
-def uneven(effect=0.0, number=30, seed=1):
-    """Differences that agree within pairs of very different sizes."""
-    rng = np.random.default_rng(seed)
-    groups = np.repeat(np.arange(number), rng.geometric(0.1, number))
-    baseline = rng.normal(size=len(groups))
-    return baseline + effect + rng.normal(size=number)[groups], baseline, groups
-
-
-class TestPairedBootstrap:
-    def test_another_bootstrap(self):
-        values, baseline, groups = uneven(0.4)
-        parts = [(values - baseline)[groups == g] for g in range(30)]
-        rng = np.random.default_rng(0)
-        means = np.array([np.concatenate([parts[i] for i in rng.integers(30, size=30)]).mean() for _ in range(4000)])
-        found = paired_bootstrap(*map(torch.tensor, (values, baseline, groups)), draws=4000)
-        assert found.mean == pytest.approx((values - baseline).mean())
-        np.testing.assert_allclose(found[1:3], np.quantile(means, [0.025, 0.975]), atol=0.2 * means.std())
-        assert found.p_value == pytest.approx(2 * min((means <= 0).mean(), (means >= 0).mean()), abs=0.03)
-
-    def test_interval_is_that_of_the_differences(self):
-        values, baseline, groups = map(torch.tensor, uneven(0.2))
-        found = paired_bootstrap(values, baseline, groups, level=0.9, draws=500, seed=3)
-        assert found[1:3] == bootstrap_interval(values - baseline, groups, 0.9, 500, 3)
-
-    @given(st.floats(-1.5, 1.5), st.integers(0, 99))
-    def test_small_exactly_where_the_interval_leaves_zero_out(self, effect, seed):
-        values, baseline, groups = map(torch.tensor, uneven(effect, seed=seed))
-        found = paired_bootstrap(values, baseline, groups, draws=999)
-        outside = not found.low <= 0 <= found.high
-        assert outside == (found.p_value < 0.05) or abs(found.p_value - 0.05) < 0.005  # quantiles interpolate
-
-    def test_swapping_the_methods(self):
-        values, baseline, groups = map(torch.tensor, uneven(0.3))
-        found, swapped = paired_bootstrap(values, baseline, groups), paired_bootstrap(baseline, values, groups)
-        np.testing.assert_allclose(swapped, [-found.mean, -found.high, -found.low, found.p_value], rtol=1e-12)
-
-    def test_extremes(self):
-        values, groups = torch.rand(10), torch.arange(10)
-        assert paired_bootstrap(values, values, groups) == (0.0, 0.0, 0.0, 1.0)
-        assert paired_bootstrap(values + 1, values, groups, draws=99).p_value == 2 / 100
-        better = torch.tensor([True, True, False])
-        assert paired_bootstrap(better, better, groups[:3]).mean == 0  # shares of booleans
-
-    def test_p_values_are_uniform_where_there_is_no_effect(self):
-        found = [paired_bootstrap(*map(torch.tensor, uneven(seed=s)), draws=199).p_value for s in range(400)]
-        for level in (0.1, 0.5):
-            assert np.mean(np.array(found) < level) == pytest.approx(level, abs=0.07)
-
-    @pytest.mark.parametrize(
-        ("values", "baseline", "groups", "message"),
-        [
-            (torch.rand(3), torch.rand(4), torch.arange(3), r"two \(S,\) tensors, got \[3\] and \[4\]"),
-            (torch.rand(3, 1), torch.rand(3, 1), torch.arange(3), r"two \(S,\) tensors, got \[3, 1\]"),
-            (torch.rand(3), torch.rand(3), torch.arange(4), r"got \[3\] and \[4\]"),
-            (torch.rand(3), torch.rand(3), torch.zeros(3).long(), "at least two groups are needed, got 1"),
-            (torch.tensor([1.0, NAN, INF]), torch.rand(3), torch.arange(3), "got 2 NaN or infinite ones of 3"),
-        ],
-    )
-    def test_exceptions(self, values, baseline, groups, message):
-        with pytest.raises(ValueError, match=message):
-            paired_bootstrap(values, baseline, groups)

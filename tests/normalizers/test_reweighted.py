@@ -7,23 +7,19 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.autograd import gradcheck
 from two_view import (
     SCENES,
     correspondences,
     epipolar_distances,
+    hartley_difference,
     homogeneous,
-    in_hartley,
     numpy_hartley,
     numpy_whitening,
     scenes,
     uniform,
-    up_to_sign,
 )
 
-from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening, find_fundamental, symmetric_epipolar_distance
-from kornia_learnnorm.geometry.distances import line_norms
-from kornia_learnnorm.geometry.linear import adjugate
+from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening, find_fundamental
 
 
 def numpy_factor(x1, x2, F):
@@ -32,7 +28,7 @@ def numpy_factor(x1, x2, F):
     return 1 / (first + 1e-3 * first.mean()) + 1 / (second + 1e-3 * second.mean())
 
 
-def numpy_reweighted(points1, points2, iterations, damping=0.1):
+def numpy_reweighted(points1, points2, iterations, damping):
     """Iteratively reweighted least squares for sum |residual| of the rank-2 correction, sample by sample."""
     transforms = []
     H1, H2 = numpy_hartley(points1), numpy_hartley(points2)
@@ -71,33 +67,13 @@ def mean_distances(points1, points2, normalizer):
 class TestReweightedWhitening:
     @pytest.mark.parametrize("name", SCENES)
     @pytest.mark.parametrize("num_points", [8, 9, 50])
-    @pytest.mark.parametrize("iterations", [0, 1, 3])
-    def test_agrees_with_numpy(self, name, num_points, iterations, device):
+    @pytest.mark.parametrize(("iterations", "damping"), [(0, 0.1), (1, 0.1), (3, 0.1), (2, 0.01), (2, 1.0)])
+    def test_agrees_with_numpy(self, name, num_points, iterations, damping, device):
         points1, points2 = correspondences(name, 20, num_points, seed=1)
-        found = ReweightedWhitening(iterations)(points1.to(device), points2.to(device))
-        for T, expected in zip(found, numpy_reweighted(points1, points2, iterations), strict=True):
-            np.testing.assert_allclose(T.cpu().numpy(), expected, rtol=1e-6, atol=1e-8)
-
-    @pytest.mark.parametrize("damping", [0.01, 1.0])
-    def test_damping(self, damping):
-        points1, points2 = correspondences("driving", 20, 8)
-        found = ReweightedWhitening(2, damping)(points1, points2)
-        for T, expected in zip(found, numpy_reweighted(points1, points2, 2, damping), strict=True):
-            np.testing.assert_allclose(T.numpy(), expected, rtol=1e-6, atol=1e-8)
-
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_without_iterations_is_weighted_whitening_of_the_pixels(self, num_points):
-        points1, points2 = correspondences("handheld", 10, num_points)
-        weights = []
-        for p1, p2, h1, h2 in zip(
-            points1.numpy(), points2.numpy(), numpy_hartley(points1), numpy_hartley(points2), strict=True
-        ):
-            x1, x2 = homogeneous(p1) @ h1.T, homogeneous(p2) @ h2.T
-            F0 = np.linalg.svd(np.einsum("ni,nj->nij", x2, x1).reshape(-1, 9))[2][-1].reshape(3, 3)
-            weights.append(numpy_factor(x1, x2, F0))
-        expected = Whitening()(points1, points2, torch.from_numpy(np.stack(weights)))
-        for T, want in zip(ReweightedWhitening(0)(points1, points2), expected, strict=True):
-            np.testing.assert_allclose(T.numpy(), want.numpy(), rtol=1e-8, atol=1e-10)
+        found = ReweightedWhitening(iterations, damping)(points1.to(device), points2.to(device))
+        rtol, atol = (1e-6, 1e-8) if iterations else (1e-8, 1e-10)
+        for T, expected in zip(found, numpy_reweighted(points1, points2, iterations, damping), strict=True):
+            np.testing.assert_allclose(T.cpu().numpy(), expected, rtol=rtol, atol=atol)
 
     def test_more_iterations_lower_the_distance(self):
         points1, points2 = correspondences("random", 1000)
@@ -141,12 +117,7 @@ class TestReweightedWhitening:
         counts = torch.arange(num_points) % 3 + 1
         found = ReweightedWhitening()(points1, points2, counts.double().expand(10, -1))
         repeated = [p.repeat_interleave(counts, 1) for p in (points1, points2)]
-        for T, expected in zip(found, ReweightedWhitening()(*repeated), strict=True):
-            assert torch.allclose(T, expected, rtol=1e-6, atol=1e-9)
-
-    def test_gradcheck(self):
-        points = [uniform(1, 8, 2, low=-1, seed=seed).requires_grad_() for seed in (1, 2)]
-        assert gradcheck(ReweightedWhitening(1), points)
+        torch.testing.assert_close(found, ReweightedWhitening()(*repeated), rtol=1e-6, atol=1e-9)
 
     def test_gradients_of_undetermined_samples_do_not_explode(self):
         """View 1 on a line: the null vector, and with it every weight, is a matter of rounding."""
@@ -162,10 +133,8 @@ class TestReweightedWhitening:
         for points1 in (line, uniform(20, 12, 2, high=600)):
             points2 = uniform(20, 12, 2, high=600, seed=1)
             plain = ReweightedWhitening()(points1, points2)
-            for T, expected in zip(
-                ReweightedWhitening()(points1.clone().requires_grad_(), points2), plain, strict=True
-            ):
-                assert torch.equal(T, expected)
+            found = ReweightedWhitening()(points1.clone().requires_grad_(), points2)
+            torch.testing.assert_close(found, plain, rtol=0, atol=0)
 
     @pytest.mark.parametrize(("iterations", "damping"), [(-1, 0.1), (3, 0.0), (3, -1.0)])
     def test_exceptions(self, iterations, damping):
@@ -190,63 +159,5 @@ class TestTheory:
 
     def test_any_transforms_give_the_same_rank_two_matrix_when_there_is_nothing_to_correct(self):
         scene = scenes("orbit", 20, 8, noise=0.0)
-        F_mats = [
-            find_fundamental(scene.points1, scene.points2, normalizer=n) for n in (Hartley(), ReweightedWhitening())
-        ]
-        points = scene.points1, scene.points2
-        assert up_to_sign(*(in_hartley(F, *points) for F in F_mats)) < 1e-8
-
-
-class TestAdjugate:
-    def test_is_determinant_times_inverse(self, dtype):
-        A = uniform(20, 3, 3, low=-1, dtype=dtype)
-        expected = np.linalg.det(A.numpy())[:, None, None] * np.linalg.inv(A.numpy())
-        np.testing.assert_allclose(adjugate(A).numpy(), expected, atol=2e-6 if dtype == torch.float32 else 1e-14)
-
-    def test_of_singular_matrices(self):
-        """Of rank 2, the product of both null vectors; of rank 1, zero."""
-        F_mat = uniform(20, 3, 2, low=-1) @ uniform(20, 2, 3, low=-1, seed=1)
-        U, s, Vh = np.linalg.svd(F_mat.numpy())
-        expected = (
-            np.linalg.det(U @ Vh)[:, None, None]
-            * (s[:, 0] * s[:, 1])[:, None, None]
-            * Vh[:, 2, :, None]
-            * U[:, None, :, 2]
-        )
-        np.testing.assert_allclose(adjugate(F_mat).numpy(), expected, atol=1e-14)
-        assert adjugate(uniform(20, 3, 1) @ uniform(20, 1, 3, seed=1)).abs().max() < 1e-15
-
-    def test_gradcheck(self):
-        assert gradcheck(adjugate, [uniform(2, 3, 3, low=-1).requires_grad_()])
-
-
-class TestLineNorms:
-    def test_agrees_with_numpy(self, dtype):
-        F_mat = uniform(5, 3, 3, low=-1, dtype=dtype)
-        x1, x2 = (uniform(5, 8, 3, low=-1, seed=seed, dtype=dtype) for seed in (1, 2))
-        first, second = line_norms(x1, x2, F_mat)
-        for found, lines in ((first, x2.numpy() @ F_mat.numpy()), (second, x1.numpy() @ F_mat.mT.numpy())):
-            norms = np.linalg.norm(lines[..., :2], axis=-1)
-            np.testing.assert_allclose(found.numpy(), norms + 1e-3 * norms.mean(1, keepdims=True), rtol=1e-5)
-
-    def test_absent_points_have_no_part_in_the_mean(self):
-        F_mat, weights = uniform(1, 3, 3, low=-1), torch.tensor([[1.0, 2.0, 0.0]], dtype=torch.float64)
-        x1, x2 = uniform(1, 3, 3), uniform(1, 3, 3, seed=1)
-        norms = np.linalg.norm((x2 @ F_mat).numpy()[0, :, :2], axis=-1)
-        expected = norms + 0.5 * (norms[0] + 2 * norms[1]) / 3
-        np.testing.assert_allclose(line_norms(x1, x2, F_mat, weights, floor=0.5)[0][0].numpy(), expected)
-
-    def test_is_positive_on_the_epipole(self):
-        F_mat = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])  # epipoles at the origin
-        x = torch.tensor([[[0.0, 0.0, 1.0], [3.0, 4.0, 1.0]]])
-        for norms in line_norms(x, x, F_mat):  # lines (0, 0), (4, -3): mean 2.5
-            np.testing.assert_allclose(norms[0].numpy(), [0.0025, 5.0025], rtol=1e-5)
-        for norms in line_norms(x[:, :1], x[:, :1], F_mat):
-            assert (norms > 0).all()
-
-
-def test_residuals_agree_with_the_reference():
-    """The references of this file measure what the package measures."""
-    scene = scenes("handheld", 5, 20)
-    expected = symmetric_epipolar_distance(scene.points1, scene.points2, scene.F_mat)
-    np.testing.assert_allclose(epipolar_distances(scene.points1, scene.points2, scene.F_mat), expected, rtol=1e-9)
+        F_mats = [find_fundamental(*scene[:2], normalizer=n) for n in (Hartley(), ReweightedWhitening())]
+        assert hartley_difference(*F_mats, *scene[:2]) < 1e-8

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import permutations
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
@@ -10,7 +10,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from torch import nn
 from torch.autograd import gradcheck
 from two_view import (
     correspondences,
@@ -23,7 +22,7 @@ from two_view import (
     up_to_sign,
 )
 
-from kornia_learnnorm import Hartley, Whitening, symmetric_epipolar_distance
+from kornia_learnnorm import Hartley, Whitening
 from kornia_learnnorm.ransac.soft import expected_loss, sample_minimal_sets
 
 
@@ -219,7 +218,7 @@ class TestExpectedLoss:
         values = expected_loss(*(p.expand(81, -1, -1) for p in points), sets[pairs], target, scale=1.0, threshold=0.1)
         p = logits[0].softmax(-1)
         # A set is drawn where its missing point would come last.
-        last = _probabilities_to_be_last(p)
+        last = probabilities_to_be_last(p)
         exact = (last[pairs[:, 0]] * last[pairs[:, 1]] * values.loss).sum()
         (wanted,) = torch.autograd.grad(exact, logits)
 
@@ -233,49 +232,22 @@ class TestExpectedLoss:
         assert ((gradients.mean(0) - wanted[0]).abs() < 4.5 * error).all()
         assert (wanted[0].abs() > 6 * error).any()
 
-    def test_learns_where_to_sample(self, generator):
-        scene = correspondences("orbit", 1, 40, noise=0.1)
-        points = [p.clone() for p in scene]
-        points[1][:, 20:] = uniform(1, 20, 2, high=400)
-        logits = nn.Parameter(torch.zeros(1, 40, dtype=torch.float64))
-        optimizer = torch.optim.Adam([logits], 0.1)
 
-        def loss(F):
-            held_out = [p[:, None].expand(-1, F.shape[1], -1, -1) for p in scene]
-            return symmetric_epipolar_distance(*held_out, F).clamp(max=10).mean(-1)
-
-        for _ in range(40):
-            samples, log_probs = sample_minimal_sets(logits, 64, generator)
-            optimizer.zero_grad()
-            expected_loss(*points, samples, loss, log_probs).loss.sum().backward()
-            optimizer.step()
-        assert logits[0, :20].mean() > logits[0, 20:].mean() + 1
-
-
-def _probabilities_to_be_last(p):
-    """Probability of each of nine to be drawn last without replacement: by inclusion and exclusion."""
+def probabilities_to_be_last(p):
+    """Probability of each to be drawn last without replacement: by inclusion and exclusion."""
     result = []
-    for last in range(9):
-        others = [i for i in range(9) if i != last]
-        total = 0.0
-        for mask in range(256):
-            chosen = [o for bit, o in enumerate(others) if mask >> bit & 1]
-            total = total + (-1) ** len(chosen) * p[last] / (p[last] + sum(p[i] for i in chosen))
-        result.append(total)
+    for last in range(len(p)):
+        others = [i for i in range(len(p)) if i != last]
+        sets = [chosen for size in range(len(p)) for chosen in combinations(others, size)]
+        result.append(sum((-1) ** len(chosen) * p[last] / (p[last] + sum(p[i] for i in chosen)) for chosen in sets))
     return torch.stack(result)
 
 
 def test_probabilities_to_be_last():
-    p = np.array([0.5, 0.2, 0.2, 0.1])
-    for last in range(4):
+    p = torch.tensor([0.5, 0.2, 0.2, 0.1], dtype=torch.float64)
+    for last, found in enumerate(probabilities_to_be_last(p)):
         orders = [order for order in permutations(range(4)) if order[-1] == last]
-        direct = sum(np.exp(log_probability(p, order[:-1])) for order in orders)
-        others = [i for i in range(4) if i != last]
-        total = 0.0
-        for mask in range(8):
-            chosen = [o for bit, o in enumerate(others) if mask >> bit & 1]
-            total += (-1) ** len(chosen) * p[last] / (p[last] + p[chosen].sum())
-        assert total == pytest.approx(direct)
+        assert found == pytest.approx(sum(np.exp(log_probability(p.numpy(), order[:-1])) for order in orders))
 
 
 class TestExceptions:

@@ -57,22 +57,7 @@ def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
 
 
 def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int = 30) -> Iterator[FramePair]:
-    """Yield the pairs of frames that see enough of the same 3D points of a COLMAP model.
-
-    Args:
-        model: folder with cameras, images and points3D, as ``.bin`` or ``.txt``.
-        frames: frames named as the images of the model.
-        min_points: smallest number of points that both frames of a pair see.
-
-    Yields:
-        the pairs by the name of the first frame, then of the second.
-
-    Raises:
-        FileNotFoundError: if a file of the model is missing.
-        ValueError: if the model is malformed or lacks a frame, or ``min_points`` is not positive.
-        ImportError: if pycolmap is not installed.
-
-    """
+    """Yield the pairs of frames that see at least ``min_points`` 3D points of a COLMAP model in common, by name."""
     if min_points < 1:
         raise ValueError(f"the frames of a pair must share at least 1 point, got min_points {min_points}")
     reconstruction = _reconstruction(Path(model))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -65,14 +66,8 @@ class Frame:
         return np.asarray(scale @ self.camera)
 
 
-@dataclass(frozen=True, eq=False)
-class FramePair:
-    """Two frames.
-
-    Attributes:
-        frame1: the first view.
-        frame2: the second view.
-    """
+class FramePair(NamedTuple):
+    """Two frames, the first and the second view."""
 
     frame1: Frame
     frame2: Frame
@@ -80,9 +75,9 @@ class FramePair:
     @property
     def motion(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return rotation R (3, 3) and translation t (3,) of x2 = R x1 + t, NaN where a pose is unknown."""
-        if not (np.isfinite(self.frame1.pose).all() and np.isfinite(self.frame2.pose).all()):
-            return _unknown(3, 3), _unknown(3)
         pose1, pose2 = self.frame1.pose, self.frame2.pose
+        if not (np.isfinite(pose1).all() and np.isfinite(pose2).all()):
+            return _unknown(3, 3), _unknown(3)
         R = np.linalg.solve(pose2[:3, :3], pose1[:3, :3])
         # The difference first: a camera that stood still has a translation of exactly zero.
         t = np.linalg.solve(pose2[:3, :3], pose1[:3, 3] - pose2[:3, 3])
@@ -98,16 +93,7 @@ class FramePair:
 
 
 def resize_frames(frames: Iterable[Frame], size: Size) -> list[Frame]:
-    """Return the frames with the size that they are resized to before matching; ``K`` follows.
-
-    Args:
-        frames: frames of any size.
-        size: (width, height), pixels.
-
-    Raises:
-        ValueError: if the width or the height is not positive.
-
-    """
+    """Return the frames with the (width, height) that they are resized to before matching; ``K`` follows."""
     if min(size) < 1:
         raise ValueError(f"a size must be a positive width and height, got {size[0]} x {size[1]}")
     return [replace(frame, resized=size) for frame in frames]

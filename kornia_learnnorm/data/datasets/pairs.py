@@ -8,6 +8,7 @@ from pathlib import Path
 
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
+from kornia_learnnorm.data.datasets.textfiles import text_lines
 
 __all__ = ["choose_pairs", "listed_pairs", "pair_frames"]
 
@@ -19,48 +20,28 @@ def choose_pairs(
     model: Path | None = None,
     min_points: int | None = None,
 ) -> tuple[list[FramePair], str]:
-    """Return pairs of frames, and in words how they were chosen.
+    """Return pairs of frames and, in words, how they were chosen: listed, by common points, or by their order.
 
-    Args:
-        frames: frames in their order, sequence after sequence.
-        gap: as for :func:`pair_frames`, which chooses the pairs unless the next arguments say otherwise.
-        listed: file for :func:`listed_pairs`; None for no list.
-        model: COLMAP model for :func:`~kornia_learnnorm.data.datasets.colmap.covisible_pairs`.
-        min_points: points that the frames of a pair share in ``model``; None for pairs by their order.
-
-    Raises:
-        ValueError: if there is no pair, ``min_points`` comes without ``model``, or as the three functions say.
-        FileNotFoundError: if the list or the model is missing.
-
+    ``gap``, of :func:`pair_frames`, decides if there is neither a file with a list of pairs nor a number of points that
+    the frames of a pair share in a COLMAP model.
     """
+    found: Iterable[FramePair]
     if listed is not None:
-        pairs, text = list(listed_pairs(frames, listed)), f"listed in {listed.name}"
+        found, text = listed_pairs(frames, listed), f"listed in {listed.name}"
     elif min_points is not None:
         if model is None:
             raise ValueError(f"min_points {min_points} needs a COLMAP model, got none")
-        pairs, text = list(covisible_pairs(model, frames, min_points)), f"sharing at least {min_points} points"
+        found, text = covisible_pairs(model, frames, min_points), f"sharing at least {min_points} points"
     else:
-        pairs = list(pair_frames(frames, gap))
-        text = "consecutive frames" if gap == 1 else f"frames {gap} apart"
+        found, text = pair_frames(frames, gap), "consecutive frames" if gap == 1 else f"frames {gap} apart"
+    pairs = list(found)
     if not pairs:
         raise ValueError(f"no pairs of frames to match ({text}) among {len(frames)} frames")
     return pairs, text
 
 
 def pair_frames(frames: Iterable[Frame], gap: int = 1) -> Iterator[FramePair]:
-    """Yield each frame with the one ``gap`` later in its sequence.
-
-    Args:
-        frames: frames in their order, sequence after sequence.
-        gap: 1 for consecutive frames.
-
-    Yields:
-        the pairs in the order of their first frames.
-
-    Raises:
-        ValueError: if ``gap`` is not positive.
-
-    """
+    """Yield each frame with the one ``gap`` later in its sequence; the frames come sequence after sequence."""
     if gap < 1:
         raise ValueError(f"the gap between the frames of a pair must be at least 1, got {gap}")
     for _, group in groupby(frames, key=lambda frame: frame.sequence):
@@ -70,40 +51,21 @@ def pair_frames(frames: Iterable[Frame], gap: int = 1) -> Iterator[FramePair]:
 
 
 def listed_pairs(frames: Sequence[Frame], path: str | Path) -> Iterator[FramePair]:
-    """Yield the pairs of frames that a file lists, two names a line as hloc writes them.
+    """Yield the pairs that a file lists as hloc does: two names a line with white space between, no line twice.
 
-    Args:
-        frames: the frames that can be named.
-        path: text file; ``Frame.name`` twice a line, with white space between; empty lines are skipped.
-
-    Yields:
-        the pairs in the order of the lines.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is not text, or a line is not two names, names an unknown frame or one frame twice, or
-            repeats an earlier line; the same names in the other order are another pair.
-
+    Empty lines and comments are skipped; the same names in the other order are another pair.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no list of pairs at {path}")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a text file in UTF-8: {error}") from error
     named = {frame.name: frame for frame in frames}
     first: dict[tuple[str, ...], int] = {}
-    for number, line in enumerate(lines, 1):
+    for number, line in text_lines(path, "list of pairs"):
         names = tuple(line.split())
-        if not names:
-            continue
         if len(names) != 2:
-            raise ValueError(f"{path}, line {number}: two names expected, got {line.strip()!r}")
+            raise ValueError(f"{path}, line {number}: two names expected, got {line!r}")
         if names[0] == names[1]:
             raise ValueError(f"{path}, line {number}: two images expected, got {names[0]!r} with itself")
         if first.setdefault(names, number) != number:
-            raise ValueError(f"{path}, line {number}: {line.strip()!r} is in line {first[names]} already")
+            raise ValueError(f"{path}, line {number}: {line!r} is in line {first[names]} already")
         for name in names:
             if name not in named:
                 some = next(iter(named), "none")

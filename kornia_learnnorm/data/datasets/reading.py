@@ -29,19 +29,10 @@ DATASETS: dict[str, tuple[str, Callable[..., list[Frame]], tuple[str, ...]]] = {
 
 
 def read_dataset(dataset: str, root: str | Path, **options: Any) -> list[Frame]:
-    """Return the frames of a dataset.
+    """Return the frames of a dataset, a key of :data:`DATASETS`; ``root`` of ``colmap`` is the folder of the images.
 
-    Args:
-        dataset: a key of :data:`DATASETS`.
-        root: folder of the dataset; for ``colmap`` the folder of the images.
-        **options: arguments of the dataset's reader, and ``split``, a split of
-            :data:`~kornia_learnnorm.data.datasets.splits.SPLITS`.
-
-    Raises:
-        ValueError: if the dataset is unknown, an option is not one of its reader, ``split`` comes with ``sequences``,
-            or as the reader says.
-        FileNotFoundError: if a folder or a file is missing.
-
+    The options are arguments of the dataset's reader, and ``split`` of
+    :data:`~kornia_learnnorm.data.datasets.splits.SPLITS`.
     """
     if dataset not in DATASETS:
         raise ValueError(f"a dataset must be one of {', '.join(DATASETS)}, got {dataset!r}")
@@ -61,14 +52,7 @@ def read_dataset(dataset: str, root: str | Path, **options: Any) -> list[Frame]:
 
 
 def missing_ground_truth(dataset: str, root: str | Path, frames: Sequence[Frame]) -> list[str]:
-    """Return a line for each file and camera that a dataset lacks, without which pairs have no ground truth.
-
-    Args:
-        dataset: a key of :data:`DATASETS`; for ``folder`` and ``colmap`` there are no lines.
-        root: folder of the dataset.
-        frames: its frames, from :func:`read_dataset`.
-
-    """
+    """Return a line for each file and camera that a dataset lacks, without which pairs have no ground truth."""
     root = Path(root)
     sequences = {frame.sequence: frame for frame in frames}
     wanted: dict[str, Path] = {}

@@ -3,38 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import islice
 from pathlib import Path
 
 __all__ = ["SPLITS", "choose_sequences", "sequence_folders", "split_sequences"]
 
 # Sequences by dataset and split, as B. Fan et al. choose them (A revisit of the normalized eight-point algorithm and a
-# self-supervised deep solution, section 5.1); None for all sequences that no other split names. The scene of Cambridge
-# Landmarks has its own lists of training and test images, which `read_cambridge` reads.
+# self-supervised deep solution, section 5.1); None for all sequences that no other split names. StMarysChurch of
+# Cambridge Landmarks has its own lists of training and test images, which `read_cambridge` reads.
 SPLITS: dict[str, dict[str, tuple[str, ...] | None]] = {
     "kitti": {"train": ("00", "01", "02", "03", "04", "05"), "test": ("06", "07", "08", "09", "10")},
     "tum": {"train": None, "val": ("rgbd_dataset_freiburg3_long_office_household",)},
-    "cambridge": {"train": ("StMarysChurch",), "test": ("StMarysChurch",)},
 }
-MARKERS = {"tum": "rgb.txt", "cambridge": "dataset_train.txt"}  # file that makes a folder a sequence
-MAX_LISTED = 30  # names in a message
+MARKER = "rgb.txt"  # file that makes a folder a sequence of TUM
 
 
 def split_sequences(dataset: str, split: str, root: str | Path) -> list[str]:
-    """Return the names of the sequences of a split that are on disk, for the ``sequences`` of a reader.
-
-    Args:
-        dataset: a key of :data:`SPLITS`.
-        split: a key of its splits.
-        root: as for :func:`sequence_folders`.
-
-    Raises:
-        FileNotFoundError: if there is no sequence of the dataset, or none of the split.
-        ValueError: if there is no such dataset or split.
-
-    """
-    if dataset not in SPLITS:
-        raise ValueError(f"a dataset with splits must be one of {', '.join(SPLITS)}, got {dataset!r}")
+    """Return the names of the sequences of a split of :data:`SPLITS` that are on disk."""
     splits = SPLITS[dataset]
     if split not in splits:
         raise ValueError(f"a split of {dataset} must be one of {', '.join(splits)}, got {split!r}")
@@ -43,51 +27,30 @@ def split_sequences(dataset: str, split: str, root: str | Path) -> list[str]:
     chosen = [name for name in found if (name not in taken if wanted is None else name in wanted)]
     if not chosen:
         expected = f"others than {', '.join(taken)}" if wanted is None else ", ".join(wanted)
-        raise FileNotFoundError(f"no {split} sequence of {dataset} at {root}: expected {expected}, got {_some(found)}")
+        got = ", ".join(found) or "none"
+        raise FileNotFoundError(f"no {split} sequence of {dataset} at {root}: expected {expected}, got {got}")
     return chosen
 
 
 def sequence_folders(dataset: str, root: str | Path) -> dict[str, Path]:
-    """Return the folders of a dataset's sequences by name, sorted.
-
-    Args:
-        dataset: a key of :data:`SPLITS`.
-        root: folder of the dataset; for ``tum`` and ``cambridge`` also the folder of one sequence.
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or no sequence in it.
-
-    """
+    """Return the folders of a dataset's sequences by name, sorted; ``root`` may also be one sequence of TUM."""
     root = Path(root)
     if dataset == "kitti":
         parent = root / "sequences"
         if not parent.is_dir():
             raise FileNotFoundError(f"no folder {parent}, expected the sequences of KITTI in it")
         return {folder.name: folder for folder in sorted(parent.iterdir()) if folder.is_dir()}
-    marker = MARKERS[dataset]
     if not root.is_dir():
         raise FileNotFoundError(f"no folder at {root}")
-    folders = [root] if (root / marker).exists() else sorted(root.iterdir())
-    found = {folder.resolve().name: folder for folder in folders if (folder / marker).exists()}
+    folders = [root] if (root / MARKER).exists() else sorted(root.iterdir())
+    found = {folder.resolve().name: folder for folder in folders if (folder / MARKER).exists()}
     if not found:
-        raise FileNotFoundError(f"no {marker} in {root}, nor in a folder in it")
+        raise FileNotFoundError(f"no {MARKER} in {root}, nor in a folder in it")
     return found
 
 
 def choose_sequences(dataset: str, root: str | Path, sequences: Sequence[str] | None) -> dict[str, Path]:
-    """Return the folders of some sequences by name, in the order given.
-
-    Args:
-        dataset: a key of :data:`SPLITS`.
-        root: as for :func:`sequence_folders`.
-        sequences: names of the sequences; None for all.
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or no sequence in it.
-        ValueError: if a sequence is unknown or named twice, or none is named.
-        TypeError: if ``sequences`` is a string.
-
-    """
+    """Return the folders of some sequences by name, in the order given; None for all."""
     if isinstance(sequences, str):
         raise TypeError(f"sequences must be a list of names, got the string {sequences!r}")
     found = sequence_folders(dataset, root)
@@ -96,9 +59,5 @@ def choose_sequences(dataset: str, root: str | Path, sequences: Sequence[str] | 
         raise ValueError(f"sequences must be one name or more, each once, got {names}")
     for name in names:
         if name not in found:
-            raise ValueError(f"no sequence {name!r} at {root}, there are {_some(found)}")
+            raise ValueError(f"no sequence {name!r} at {root}, there are {', '.join(found)}")
     return {name: found[name] for name in names}
-
-
-def _some(names: dict[str, Path]) -> str:
-    return ", ".join(islice(names, MAX_LISTED)) + (", ..." if len(names) > MAX_LISTED else "") or "none"

@@ -10,14 +10,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from numpy.typing import NDArray
 
-__all__ = [
-    "camera_matrix",
-    "listed_image",
-    "parse_numbers",
-    "rigid_motion",
-    "rotation",
-    "text_lines",
-]
+__all__ = ["camera_matrix", "listed_image", "parse_numbers", "rigid_motion", "rotation", "text_lines"]
 
 Array = NDArray[np.float64]
 

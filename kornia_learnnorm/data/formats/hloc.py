@@ -15,21 +15,19 @@ matches and pairs, for ground truth, and for the texts of a store.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, open_hdf5, own_dataset
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import import_extra
 
 __all__ = ["export_hloc", "import_hloc"]
-
-PURPOSE = "converting hloc's files"
 
 
 class _Image(NamedTuple):
@@ -66,7 +64,7 @@ def export_hloc(store: CorrespondenceStore, features: str | Path, matches: str |
             name, or an image has two sizes.
 
     """
-    h5py = import_extra("h5py", "images", PURPOSE)
+    h5py = import_extra("h5py", "images", "writing hloc's files")
     features, matches = Path(features), Path(matches)
     if features.resolve() == matches.resolve():
         raise ValueError(f"features and matches must be two files, got {features} for both")
@@ -117,10 +115,10 @@ def _check_names(pairs: list[tuple[str, str]]) -> None:
 
 def _keypoints(store: CorrespondenceStore) -> tuple[dict[str, _Image], list[list[NDArray[np.intp]]]]:
     """Return the images, and for each pair and side the keypoint of each match."""
-    places: dict[str, list[tuple[int, int]]] = {}
+    places: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
     for i, names in enumerate(store.names):
         for side, name in enumerate(names):
-            places.setdefault(name, []).append((i, side))
+            places[name].append((i, side))
     images: dict[str, _Image] = {}
     indices = [[np.empty(0, np.intp)] * 2 for _ in store.names]
     for name, found in places.items():
@@ -153,12 +151,15 @@ def import_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStor
 
     """
     features, matches = Path(features), Path(matches)
+    for path in (features, matches):
+        if not path.is_file():
+            raise FileNotFoundError(f"no file of hloc at {path}")
     images = _read_features(features)
-    dashed: dict[str, list[str]] = {}
+    dashed: defaultdict[str, list[str]] = defaultdict(list)
     for name in images:
-        dashed.setdefault(_dashed(name), []).append(name)
+        dashed[_dashed(name)].append(name)
     pairs = []
-    with _opened(matches) as file:
+    with open_hdf5(matches) as file:
         for key in _groups_with_data(file):
             try:
                 pairs.append(_read_pair(file[key or "/"], _names(key, dashed), images))
@@ -176,7 +177,7 @@ def _sort_key(name: str) -> list[str | int]:
 
 
 def _store(pairs: list[_Pair], dataset: str) -> CorrespondenceStore:
-    number = len(pairs)
+    unknown: dict[str, Any] = {name: np.full((len(pairs), *LAYOUT[name][0]), np.nan) for name in "FKRt"}
     return CorrespondenceStore(
         points1=np.concatenate([pair.points1 for pair in pairs]).astype(np.float32),
         points2=np.concatenate([pair.points2 for pair in pairs]).astype(np.float32),
@@ -184,25 +185,11 @@ def _store(pairs: list[_Pair], dataset: str) -> CorrespondenceStore:
         offsets=np.cumsum([0, *(len(pair.ratio) for pair in pairs)], dtype=np.int64),
         image_size=np.stack([pair.image_size for pair in pairs]).astype(np.int32),
         names=[pair.names for pair in pairs],
-        F=np.full((number, 3, 3), np.nan),
-        K=np.full((number, 2, 3, 3), np.nan),
-        R=np.full((number, 3, 3), np.nan),
-        t=np.full((number, 3), np.nan),
+        **unknown,
         dataset=dataset,
         pairs="not known",
         detector="not known",
     )
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    if not path.is_file():
-        raise FileNotFoundError(f"no file of hloc at {path}")
-    try:
-        with import_extra("h5py", "images", PURPOSE).File(path, "r") as file:
-            yield file
-    except (OSError, RuntimeError, KeyError) as error:
-        raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
 
 
 def _groups_with_data(file: Any) -> list[str]:
@@ -219,7 +206,7 @@ def _groups_with_data(file: Any) -> list[str]:
 
 def _read_features(path: Path) -> dict[str, _Image]:
     images = {}
-    with _opened(path) as file:
+    with open_hdf5(path) as file:
         for name in _groups_with_data(file):
             keypoints, size = (_dataset(file[name or "/"], key) for key in ("keypoints", "image_size"))
             if keypoints is None or size is None:
@@ -236,11 +223,9 @@ def _read_features(path: Path) -> dict[str, _Image]:
 
 
 def _dataset(group: Any, key: str) -> NDArray[Any] | None:
-    """Return a dataset of a group; None where there is none, or a link to another file."""
-    h5py = import_extra("h5py", "images", PURPOSE)
-    if group.get(key, getclass=True, getlink=True) is not h5py.HardLink or not hasattr(group[key], "dtype"):
-        return None
-    return np.asarray(group[key][()])
+    """Return the values of a dataset of a group; None where there is none."""
+    data = own_dataset(group, key)
+    return None if data is None else np.asarray(data[()])
 
 
 def _names(key: str, dashed: Mapping[str, list[str]]) -> tuple[str, str]:

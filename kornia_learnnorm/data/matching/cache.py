@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -18,18 +17,14 @@ __all__ = ["FeatureCache"]
 
 
 class FeatureCache:
-    """Keep the features of frames in a folder, each until the last pair of the frame is released.
+    """Keep the features of frames in a folder, each until the last of all ``pairs`` with the frame is released.
 
-    The context manager starts with an empty folder and removes it at the end, also after an error.
-
-    Args:
-        folder: the folder of the files; files that a killed run left there are removed.
-        pairs: all pairs that will ask for features.
+    The context manager starts with an empty folder, without what a killed run left, and removes it at the end.
     """
 
     def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
         self.folder = folder
-        self.uses = Counter(frame.name for pair in pairs for frame in (pair.frame1, pair.frame2))
+        self.uses = Counter(frame.name for pair in pairs for frame in pair)
         self.held: dict[str, Path | str] = {}
 
     def __enter__(self) -> FeatureCache:
@@ -37,23 +32,16 @@ class FeatureCache:
         self.folder.mkdir()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def missing(self, pairs: Sequence[FramePair]) -> list[Frame]:
         """Return the frames of the pairs that have not been put, each once."""
-        frames = {frame.name: frame for pair in pairs for frame in (pair.frame1, pair.frame2)}
+        frames = {frame.name: frame for pair in pairs for frame in pair}
         return [frame for name, frame in frames.items() if name not in self.held]
 
     def put(self, frame: Frame, features: Features | str) -> None:
-        """Keep the features of a frame, or the reason why it has none.
-
-        Raises:
-            OSError: if the features cannot be written, as on a full disk.
-
-        """
+        """Keep the features of a frame, or the reason why it has none; OSError on a full disk."""
         if isinstance(features, str):
             self.held[frame.name] = features
             return
@@ -61,9 +49,8 @@ class FeatureCache:
         try:
             np.savez(path, points=features.points, descriptors=features.descriptors, size=features.size)
         except OSError as error:  # NumPy's message does not name the file
-            raise OSError(
-                f"cannot write the features of {frame.name} to {self.folder}, is the disk full? {error}"
-            ) from error
+            target = f"the features of {frame.name} to {self.folder}"
+            raise OSError(f"cannot write {target}, is the disk full? {error}") from error
         self.held[frame.name] = path
 
     def get(self, pair: FramePair) -> tuple[Features | str, Features | str]:
@@ -80,7 +67,7 @@ class FeatureCache:
 
     def release(self, pair: FramePair) -> None:
         """Mark a pair as done and delete features that no other pair needs."""
-        for frame in (pair.frame1, pair.frame2):
+        for frame in pair:
             self.uses[frame.name] -= 1
             if self.uses[frame.name] == 0:
                 held = self.held.pop(frame.name)

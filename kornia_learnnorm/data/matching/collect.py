@@ -7,9 +7,9 @@ grow with the number of pairs.
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -75,28 +75,13 @@ def match_pair(
     pair: FramePair,
     features1: Features,
     features2: Features,
+    options: MatchOptions,
     place: int = 0,
-    options: MatchOptions | None = None,
-    about: dict[str, str] | None = None,
 ) -> CorrespondenceStore:
-    """Match two frames and return their matches in random order.
+    """Match two frames by their features and return a store of this pair, its matches in random order.
 
-    Args:
-        pair: the frames, for names, cameras and motion.
-        features1: features of the first frame.
-        features2: features of the second frame.
-        place: index of the pair in the store; with the seed it determines the order of the matches.
-        options: options of matching; None for the default ones.
-        about: ``dataset`` and ``pairs`` of the store.
-
-    Returns:
-        a store of this pair.
-
-    Raises:
-        ValueError: if a frame has fewer than two features.
-
+    The index of the pair in the whole store, ``place``, determines the order together with the seed.
     """
-    options = options or MatchOptions()
     points1, points2, ratio = (part.numpy() for part in MATCHERS[options.matcher](features1, features2))
     order = np.random.default_rng([options.seed, place]).permutation(len(ratio))
     if options.max_matches is not None:
@@ -115,9 +100,9 @@ def match_pair(
         K=np.stack([pair.frame1.K, pair.frame2.K])[None],
         R=R[None],
         t=t[None],
+        dataset="",
+        pairs="",
         detector=f"{options.detector}, {options.num_features} features, {options.matcher}",
-        dataset=(about or {}).get("dataset", ""),
-        pairs=(about or {}).get("pairs", ""),
     )
 
 
@@ -169,7 +154,7 @@ def _digest(pairs: Sequence[FramePair]) -> str:
     """Return a hash of the pairs: names, sizes, cameras and poses."""
     digest = sha256()
     for pair in pairs:
-        for frame in (pair.frame1, pair.frame2):
+        for frame in pair:
             digest.update(f"{frame.name}\n{frame.size} {frame.matched_size} {frame.distortion}\n".encode())
             for array in (frame.camera, frame.pose):  # rounded: another machine may differ in the last digit
                 digest.update((array.round(6) + 0.0).tobytes())
@@ -177,13 +162,12 @@ def _digest(pairs: Sequence[FramePair]) -> str:
 
 
 def _versions() -> dict[str, str]:
-    packages = {"kornia_learnnorm": "kornia-learnnorm", "numpy": "numpy", "h5py": "h5py"}
-    versions = {name: version(package) for name, package in packages.items()}
-    return {**versions, "opencv": str(import_cv2().__version__)}
+    packages = {name: version(name) for name in ("kornia_learnnorm", "numpy", "h5py")}
+    return {**packages, "opencv": str(import_cv2().__version__)}
 
 
 def _match_all(
-    pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: dict[str, str], workers: Workers
+    pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: Mapping[str, Any], workers: Workers
 ) -> dict[str, str]:
     """Match the pairs that are not done; continue after a worker was killed. Return the skipped pairs and why."""
     from joblib.externals.loky.process_executor import BrokenProcessPool
@@ -195,12 +179,12 @@ def _match_all(
         while todo := [place for place in range(len(pairs)) if place not in done]:
             before = len(done)
             try:
-                with closing(_match_some(pairs, todo, writer.folder, options, about, workers)) as results:
+                with closing(_match_some(pairs, todo, writer.folder, options, workers)) as results:
                     for place, result in results:
                         if isinstance(result, str):
-                            skipped[f"{pairs[place].frame1.name} {pairs[place].frame2.name}"] = result
+                            skipped[" ".join(frame.name for frame in pairs[place])] = result
                         else:
-                            writer.add(place, result)
+                            writer.add(place, replace(result, **about))
                         done.add(place)
                         bar.update()
             except BrokenProcessPool as error:
@@ -219,12 +203,7 @@ def _progress(total: int, done: int) -> Any:
 
 
 def _match_some(
-    pairs: Sequence[FramePair],
-    todo: Sequence[int],
-    folder: Path,
-    options: MatchOptions,
-    about: dict[str, str],
-    workers: Workers,
+    pairs: Sequence[FramePair], todo: Sequence[int], folder: Path, options: MatchOptions, workers: Workers
 ) -> Generator[tuple[int, CorrespondenceStore | str], None, None]:
     """Yield each place of ``todo`` with the store of its pair, or the reason why there is none."""
     window = WINDOW * workers.number
@@ -235,7 +214,7 @@ def _match_some(
             with workers.results(_detect, ((frame, options) for frame in missing)) as found:
                 for frame, features in zip(missing, found, strict=True):
                     cache.put(frame, features)
-            tasks = ((pairs[i], cache.get(pairs[i]), i, options, about) for i in places)
+            tasks = ((pairs[i], cache.get(pairs[i]), i, options) for i in places)
             with workers.results(_match, tasks) as results:
                 for place, result in zip(places, results, strict=True):
                     yield place, result
@@ -253,11 +232,7 @@ def _detect(frame: Frame, options: MatchOptions) -> Features | str:
 
 
 def _match(
-    pair: FramePair,
-    features: tuple[Features | str, Features | str],
-    place: int,
-    options: MatchOptions,
-    about: dict[str, str],
+    pair: FramePair, features: tuple[Features | str, Features | str], place: int, options: MatchOptions
 ) -> CorrespondenceStore | str:
     """Return the store of a pair, or the reason why there is none."""
     features1, features2 = features
@@ -267,6 +242,6 @@ def _match(
         return features2
     import_cv2().setNumThreads(1)
     try:
-        return match_pair(pair, features1, features2, place, options, about)
+        return match_pair(pair, features1, features2, options, place)
     except ValueError as error:
         return str(error)

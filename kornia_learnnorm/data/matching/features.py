@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from kornia.feature import DISK, KeyNetAffNetHardNet
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2
@@ -65,16 +66,10 @@ def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
 
 
 def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Find SIFT features with square roots of descriptors of unit sum (RootSIFT).
+    """Find SIFT features with square roots of descriptors of unit sum (RootSIFT), float32.
 
-    Their Euclidean distance is the Hellinger distance of SIFT's histograms.
-
-    Args:
-        image: as for :func:`detect_sift`.
-        num_features: largest number of features to keep.
-
-    Returns:
-        as :func:`detect_sift`, descriptors float32.
+    Their Euclidean distance is the Hellinger distance of SIFT's histograms. Arguments, results and errors are otherwise
+    those of :func:`detect_sift`.
 
     References:
         R. Arandjelovic and A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012.
@@ -86,19 +81,9 @@ def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Featu
 
 
 def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Find features with Kornia's DISK, trained with depth.
+    """Find up to ``num_features`` features with Kornia's DISK, trained with depth; descriptors float32, 128 columns.
 
-    Args:
-        image: as for :func:`detect_sift`.
-        num_features: largest number of features to keep.
-
-    Returns:
-        up to ``num_features`` features, descriptors float32 with 128 columns.
-
-    Raises:
-        TypeError: if the image is not an array of uint8.
-        ValueError: if the image does not have two dimensions, or ``num_features`` is below 2.
-        OSError: if the weights cannot be loaded.
+    Arguments and errors are those of :func:`detect_sift`, and OSError if the weights cannot be loaded.
 
     References:
         M. Tyszkiewicz, P. Fua and E. Trulls, DISK: learning local features with policy gradient, NeurIPS 2020.
@@ -106,24 +91,13 @@ def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
     """
     _check(image, num_features)
     with torch.inference_mode():
-        found = _disk()(_tensor(image).expand(-1, 3, -1, -1), num_features, pad_if_not_divisible=True)[0]
+        disk = pretrained("DISK", DISK.from_pretrained)
+        found = disk(_tensor(image).expand(-1, 3, -1, -1), num_features, pad_if_not_divisible=True)[0]
     return Features(found.keypoints.float().numpy(), found.descriptors.numpy(), (image.shape[1], image.shape[0]))
 
 
 def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Find features with Kornia's KeyNet, AffNet and HardNet.
-
-    Args:
-        image: as for :func:`detect_sift`.
-        num_features: largest number of features to keep.
-
-    Returns:
-        up to ``num_features`` features, descriptors float32 with 128 columns.
-
-    Raises:
-        TypeError: if the image is not an array of uint8.
-        ValueError: if the image does not have two dimensions, or ``num_features`` is below 2.
-        OSError: if the weights cannot be loaded.
+    """Find up to ``num_features`` features with Kornia's KeyNet, AffNet and HardNet; results as :func:`detect_disk`.
 
     References:
         A. Barroso-Laguna et al., Key.Net, ICCV 2019; D. Mishkin et al., AffNet, ECCV 2018; A. Mishchuk et al.,
@@ -132,7 +106,8 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
     """
     _check(image, num_features)
     with torch.inference_mode():
-        frames, _, descriptors = _keynet(num_features)(_tensor(image))
+        network = pretrained("KeyNet, AffNet and HardNet", KeyNetAffNetHardNet, num_features)
+        frames, _, descriptors = network(_tensor(image))
     found = frames[0].flatten(1).any(1)  # Kornia pads with zeros
     points, rows = frames[0, found, :, 2].float(), descriptors[0, found].float()
     return Features(points.numpy(), rows.numpy(), (image.shape[1], image.shape[0]))
@@ -147,36 +122,14 @@ DETECTORS: dict[str, Callable[[NDArray[np.uint8], int], Features]] = {
 }
 
 
-def pretrained(name: str, load: Callable[[], Any]) -> Any:
-    """Return the network that ``load`` makes, with a clear error if its weights cannot be loaded.
-
-    Args:
-        name: name of the network in the error.
-        load: function that returns a network of Kornia with its weights.
-
-    Raises:
-        OSError: if the weights are not in the cache of :mod:`torch.hub` and cannot be downloaded.
-
-    """
+@lru_cache(maxsize=2)  # a detector and a matcher
+def pretrained(name: str, load: Callable[..., Any], *args: Any) -> Any:
+    """Return the network of Kornia that ``load(*args)`` makes; OSError if its weights cannot be loaded."""
     try:
-        return load()
+        return load(*args)
     except (OSError, RuntimeError, EOFError, UnpicklingError) as error:  # the last two: a truncated file in the cache
         folder = f"{torch.hub.get_dir()}/checkpoints"
         raise OSError(f"the weights of {name} are not in {folder} and could not be loaded: {error}") from error
-
-
-@lru_cache(maxsize=1)
-def _disk() -> Any:
-    from kornia.feature import DISK
-
-    return pretrained("DISK", DISK.from_pretrained)
-
-
-@lru_cache(maxsize=1)
-def _keynet(num_features: int) -> Any:
-    from kornia.feature import KeyNetAffNetHardNet
-
-    return pretrained("KeyNet, AffNet and HardNet", lambda: KeyNetAffNetHardNet(num_features))
 
 
 def _tensor(image: NDArray[np.uint8]) -> torch.Tensor:

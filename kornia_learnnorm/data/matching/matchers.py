@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from kornia.feature import LightGlue
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -38,19 +38,7 @@ def match_nearest(features1: Features, features2: Features) -> Matches:
     """Match each feature of image 1 to its nearest neighbour in image 2, by brute force.
 
     All matches are returned: keep ``ratio < 0.8`` for Lowe's ratio test. Several features of image 1 may share one
-    feature of image 2.
-
-    Args:
-        features1: features of image 1.
-        features2: features of image 2.
-
-    Returns:
-        as many matches as image 1 has features.
-
-    Raises:
-        ValueError: if an image has fewer than two features, as a blank image, or the descriptors differ in length.
-        ImportError: if OpenCV is not installed.
-
+    feature of image 2. An image of fewer than two features, as a blank one, is a ValueError.
     """
     _check(features1, features2)
     descriptors1, descriptors2 = (features.descriptors.astype(np.float32) for features in (features1, features2))
@@ -68,13 +56,6 @@ def match_lightglue(features1: Features, features2: Features) -> Matches:
     LightGlue gives each match a score instead of a ratio. Here ``ratio`` is 1 - score, so a small one is a confident
     match and the usual limit of 0.8 keeps scores above 0.2.
 
-    Args:
-        features1: features of image 1, from :func:`~kornia_learnnorm.data.matching.features.detect_disk`.
-        features2: features of image 2.
-
-    Returns:
-        the matches of LightGlue; each feature has one at most.
-
     Raises:
         ValueError: if an image has fewer than two features, or the descriptors are not of 128 columns of float32.
         OSError: if the weights cannot be loaded.
@@ -88,9 +69,9 @@ def match_lightglue(features1: Features, features2: Features) -> Matches:
         if features.descriptors.dtype != np.float32 or features.descriptors.shape[1] != 128:
             got = f"{features.descriptors.dtype} with {features.descriptors.shape[1]} columns"
             raise ValueError(f"LightGlue needs the descriptors of DISK, float32 with 128 columns, got {got}")
-    data = {f"image{index}": _lightglue_input(features) for index, features in enumerate((features1, features2))}
     with torch.inference_mode():
-        found = _lightglue()(data)
+        network = pretrained("LightGlue for DISK", _lightglue)
+        found = network({"image0": _lightglue_input(features1), "image1": _lightglue_input(features2)})
     index1, index2 = found["matches"][0].numpy().T
     points1, points2 = torch.from_numpy(features1.points[index1]), torch.from_numpy(features2.points[index2])
     return Matches(points1, points2, (1.0 - found["scores"][0]).clamp(0.0, 1.0).float().clone())
@@ -141,8 +122,5 @@ def _lightglue_input(features: Features) -> dict[str, Tensor]:
     }
 
 
-@lru_cache(maxsize=1)
 def _lightglue() -> Any:
-    from kornia.feature import LightGlue
-
-    return pretrained("LightGlue for DISK", lambda: LightGlue("disk").eval())
+    return LightGlue("disk").eval()

@@ -18,11 +18,7 @@ __all__ = ["Workers", "check_jobs", "open_workers"]
 
 
 class Workers:
-    """Worker processes that call a function with many arguments.
-
-    Args:
-        options: arguments of joblib's ``Parallel``.
-    """
+    """Worker processes that call a function with many arguments; ``options`` are those of joblib's ``Parallel``."""
 
     def __init__(self, **options: Any) -> None:
         self.options = options
@@ -36,15 +32,10 @@ class Workers:
 
     @contextmanager
     def results(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Iterator[Any]]:
-        """Yield the results in order, one at a time; leaving the context cancels the remaining calls.
+        """Yield an iterator over the results in order; leaving the context cancels the remaining calls.
 
-        Args:
-            function: a function of a module, so that a process can import it.
-            arguments: the arguments of each call; they are consumed as processes become free.
-
-        Yields:
-            an iterator over the results; it raises the errors of the calls.
-
+        The function is one of a module, so that a process can import it. Its arguments are consumed as processes
+        become free.
         """
         from joblib import Parallel, delayed
 
@@ -60,29 +51,16 @@ class Workers:
 
 
 def check_jobs(jobs: int) -> None:
-    """Raise an error unless ``jobs`` is a number of processes.
-
-    Raises:
-        ValueError: if ``jobs`` is neither positive nor -1.
-
-    """
+    """Raise ValueError unless ``jobs`` is a number of processes, or -1."""
     if jobs < 1 and jobs != -1:
         raise ValueError(f"jobs must be a number of processes, or -1 for as many as there are cores, got {jobs}")
 
 
 @contextmanager
 def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
-    """Yield worker processes on this machine or, with ``dask``, those of a cluster.
+    """Yield worker processes on this machine, -1 for as many as it has cores, or those of a Dask scheduler's address.
 
-    Args:
-        jobs: processes on this machine; -1 for as many as it has cores.
-        dask: address of a Dask scheduler whose workers are used instead.
-
-    Raises:
-        ValueError: if ``jobs`` is neither positive nor -1, or ``dask`` is not an address.
-        OSError: if the scheduler or its workers cannot be reached, or Dask gives up a task that killed several workers.
-        ImportError: if joblib or, for ``dask``, Dask is not installed.
-
+    The error is an OSError if the cluster cannot be reached, or Dask gives up a task that killed several workers.
     """
     joblib = import_extra("joblib", "images", "matching many pairs")
     check_jobs(jobs)

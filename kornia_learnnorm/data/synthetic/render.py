@@ -25,8 +25,9 @@ __all__ = ["RenderedPair", "render_pair", "write_pair"]
 
 Array = NDArray[np.float64]
 Texture = NDArray[np.float32]
-
-Painter = Callable[[np.random.Generator, Any, Texture], None]
+Pair = tuple[float, float]  # width and height, metres
+Random = np.random.Generator
+Painter = Callable[[Random, Any, Texture], None]
 
 SUPERSAMPLING = 3  # samples per pixel and axis
 
@@ -72,9 +73,6 @@ def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedP
         width: width of the images in pixels.
         height: height of the images in pixels.
 
-    Returns:
-        the images and their geometry.
-
     Raises:
         ImportError: if OpenCV is not installed.
         ValueError: if the seed is negative, or the height is below 64 pixels or above the width.
@@ -109,9 +107,6 @@ def write_pair(folder: str | Path, pair: RenderedPair) -> None:
         folder: folder to write to; created if missing. Existing files of these names are replaced.
         pair: the rendered pair. The ground truth holds ``K``, ``R``, ``t``, ``F_mat``, ``width`` and ``height``.
 
-    Raises:
-        ImportError: if OpenCV is not installed.
-
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -140,7 +135,7 @@ def _rotation(yaw: float, pitch: float, roll: float) -> Array:
     return np.asarray(Rz @ Rx @ Ry)
 
 
-def _room(rng: np.random.Generator, cv2: Any, texels: float) -> list[_Plane]:
+def _room(rng: Random, cv2: Any, texels: float) -> list[_Plane]:
     """Return the planes of the room from back to front, with ``texels`` per pixel of an image 640 pixels wide."""
     wall_z, floor_y = 7.0, 1.35
     wall = _masonry(rng, cv2, (15.0, 6.0), 85 * texels, brick=(0.62, 0.27), shift=0.5)
@@ -178,7 +173,7 @@ def _darken_floor(cv2: Any, floor: _Plane, foot: Array, right: Array) -> None:
     floor.texture[...] *= 1 - cv2.blur(shadow, (int(0.3 * density), int(0.3 * density)))
 
 
-def _noise(rng: np.random.Generator, cv2: Any, shape: tuple[int, int], finest: int) -> Texture:
+def _noise(rng: Random, cv2: Any, shape: tuple[int, int], finest: int) -> Texture:
     """Return noise of all scales from the whole texture to ``finest`` texels, with standard deviation one."""
     total = np.zeros(shape, np.float32)
     cell = max(shape) // 2
@@ -189,14 +184,7 @@ def _noise(rng: np.random.Generator, cv2: Any, shape: tuple[int, int], finest: i
     return np.asarray(total / total.std(), np.float32)
 
 
-def _masonry(
-    rng: np.random.Generator,
-    cv2: Any,
-    size: tuple[float, float],
-    density: float,
-    brick: tuple[float, float],
-    shift: float,
-) -> Texture:
+def _masonry(rng: Random, cv2: Any, size: Pair, density: float, brick: Pair, shift: float) -> Texture:
     """Return bricks or tiles of random tones; every other row is shifted by a share of a brick."""
     rows, columns = (np.arange(int(metres * density)) / density for metres in size[::-1])
     row = rows / brick[1]
@@ -209,7 +197,7 @@ def _masonry(
     return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)
 
 
-def _framed(rng: np.random.Generator, cv2: Any, paint: Painter, size: tuple[float, float], density: float) -> Texture:
+def _framed(rng: Random, cv2: Any, paint: Painter, size: Pair, density: float) -> Texture:
     """Return a painting in a dark frame with a pale mount."""
     width, height = (int(metres * density) for metres in size)
     texture = 0.55 + 0.12 * _noise(rng, cv2, (height, width), finest=4)
@@ -223,7 +211,7 @@ def _framed(rng: np.random.Generator, cv2: Any, paint: Painter, size: tuple[floa
     return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)
 
 
-def _circles(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
+def _circles(rng: Random, cv2: Any, texture: Texture) -> None:
     """Paint rings and discs, large ones first."""
     height, width = texture.shape
     for radius in np.sort(rng.uniform(0.015, 0.16, 70))[::-1] * min(height, width):
@@ -232,7 +220,7 @@ def _circles(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
             cv2.circle(texture, centre, max(1, int(share * radius)), rng.uniform(0.05, 1.0), -1, cv2.LINE_AA)
 
 
-def _polygons(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
+def _polygons(rng: Random, cv2: Any, texture: Texture) -> None:
     """Paint triangles and quadrilaterals, large ones first."""
     height, width = texture.shape
     for radius in np.sort(rng.uniform(0.02, 0.25, 110))[::-1] * min(height, width):
@@ -241,7 +229,7 @@ def _polygons(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
         cv2.fillPoly(texture, [corners.round().astype(np.int32)], rng.uniform(0.05, 1.0), cv2.LINE_AA)
 
 
-def _letters(rng: np.random.Generator, cv2: Any, texture: Texture) -> None:
+def _letters(rng: Random, cv2: Any, texture: Texture) -> None:
     """Set lines of random letters in several sizes on pale paper."""
     height, width = texture.shape
     ink = np.zeros(texture.shape, np.uint8)  # OpenCV writes on eight bits only
@@ -273,7 +261,7 @@ def _render(cv2: Any, planes: list[_Plane], K: Array, R: Array, t: Array, size: 
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _expose(image: Texture, rng: np.random.Generator) -> NDArray[np.uint8]:
+def _expose(image: Texture, rng: Random) -> NDArray[np.uint8]:
     """Return the grey levels of brightness in 0-1, with noise of one level."""
     levels = 235 * image + 8 + rng.standard_normal(image.shape)
     return levels.round().clip(0, 255).astype(np.uint8)

@@ -122,20 +122,7 @@ def handheld(
 ) -> TwoViewScene:
     """Draw scenes of a camera in a hand: VGA, a room of 1-6 m with a floor, a step in any direction.
 
-    Args:
-        batch_size: number of scenes :math:`B`.
-        num_points: correspondences per scene :math:`N`.
-        generator: source of all randomness.
-        noise: standard deviation of the Gaussian noise, pixels per coordinate, in both views.
-        outliers: share of gross outliers, whose second point is uniform in the image.
-
-    Returns:
-        the scenes; the unit of depth is the metre.
-
-    Raises:
-        TypeError: if ``generator`` is not a ``torch.Generator``.
-        ValueError: if ``batch_size`` or ``num_points`` is below one, ``noise`` negative or not finite, or ``outliers``
-            outside of 0-1.
+    Arguments, units and errors are those of :func:`forward_driving`.
 
     Example:
         >>> scene = handheld(2, 100, torch.Generator().manual_seed(0), outliers=0.2)
@@ -162,20 +149,7 @@ def orbit(
 
     The second camera is the first one, rotated about the object's centre :math:`c`: :math:`t = c - R c`.
 
-    Args:
-        batch_size: number of scenes :math:`B`.
-        num_points: correspondences per scene :math:`N`.
-        generator: source of all randomness.
-        noise: standard deviation of the Gaussian noise, pixels per coordinate, in both views.
-        outliers: share of gross outliers, whose second point is uniform in the image.
-
-    Returns:
-        the scenes; the unit of depth is the metre.
-
-    Raises:
-        TypeError: if ``generator`` is not a ``torch.Generator``.
-        ValueError: if ``batch_size`` or ``num_points`` is below one, ``noise`` negative or not finite, or ``outliers``
-            outside of 0-1.
+    Arguments, units and errors are those of :func:`forward_driving`.
 
     Example:
         >>> scene = orbit(2, 100, torch.Generator().manual_seed(0), noise=0.0)

@@ -28,23 +28,10 @@ def synthetic_store(
     outliers: float = 0.2,
     scenes: Sequence[str] = tuple(SCENES),
 ) -> CorrespondenceStore:
-    """Return a store of synthetic scenes, ``pairs`` of each kind.
+    """Return a store of synthetic scenes, ``pairs`` of each kind; the kinds are keys of :data:`SCENES`.
 
-    Lowe's ratio is drawn so that the ratio test of 0.8 keeps all inliers and half of the outliers.
-
-    Args:
-        pairs: image pairs of each kind.
-        points: correspondences per pair.
-        seed: seed of scenes and ratios.
-        noise: standard deviation of the noise, pixels.
-        outliers: share of gross outliers.
-        scenes: kinds of scenes, keys of :data:`SCENES`.
-
-    Returns:
-        the store.
-
-    Raises:
-        ValueError: if a number is out of range or a kind of scene is unknown.
+    Noise is in pixels, ``outliers`` the share of gross outliers. Lowe's ratio is drawn so that the ratio test of 0.8
+    keeps all inliers and half of the outliers.
 
     Example:
         >>> store = synthetic_store(pairs=2, points=30, scenes=["orbit"])

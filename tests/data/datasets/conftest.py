@@ -32,3 +32,8 @@ def tum(written, tmp_path):
 @pytest.fixture
 def cambridge(written, tmp_path):
     return shutil.copytree(written / "cambridge", tmp_path / "Church")
+
+
+@pytest.fixture
+def colmap(written, tmp_path):
+    return shutil.copytree(written / "colmap", tmp_path / "colmap")

@@ -7,29 +7,18 @@ import sys
 
 import numpy as np
 import pytest
+from make_sequences import FOCAL, SIZE, STEP, edit, moved
+from PIL import Image
+
+from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
-
-from make_sequences import FOCAL, FRAMES, SIZE, STEP, metres, write_colmap  # noqa: E402
-
-from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap  # noqa: E402
-from kornia_learnnorm.data.datasets.pairs import listed_pairs  # noqa: E402
-
-NAMES = ["one/0.png", "one/1.png", "two/2.png", "two/3.png"]
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
+def model(written):
     """A model and its images, not to be changed."""
-    folder = tmp_path_factory.mktemp("colmap")
-    write_colmap(folder)
-    return folder
-
-
-@pytest.fixture
-def colmap(written, tmp_path):
-    return shutil.copytree(written, tmp_path / "colmap")
+    return written / "colmap"
 
 
 def read(folder):
@@ -45,28 +34,26 @@ def names(pairs) -> list[tuple[str, str]]:
 
 
 class TestReadColmap:
-    def test_frames(self, written):
-        frames = read(written)
-        assert [frame.name for frame in frames] == NAMES
+    def test_frames(self, model):
+        frames = read(model)
+        assert [frame.name for frame in frames] == ["one/0.png", "one/1.png", "two/2.png", "two/3.png"]
         for number, frame in enumerate(frames):
-            pose = np.eye(4)
-            pose[0, 3] = metres(STEP * number)
-            assert frame.path == written / "images" / frame.name
+            assert frame.path == model / "images" / frame.name
             assert frame.sequence == frame.name[:3]
             assert frame.size == SIZE
             assert frame.distortion == ()
             assert np.allclose(frame.K, [[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1]])
-            assert np.allclose(frame.pose, pose, atol=1e-7)
+            assert np.allclose(frame.pose, moved(STEP * number), atol=1e-7)
 
-    def test_binary_model(self, written, tmp_path):
-        pycolmap.Reconstruction(str(written / "model")).write_binary(str(tmp_path))
-        for text, binary in zip(read(written), read_colmap(str(tmp_path), str(written / "images")), strict=True):
+    def test_binary_model(self, model, tmp_path):
+        pycolmap.Reconstruction(str(model / "model")).write_binary(str(tmp_path))
+        for text, binary in zip(read(model), read_colmap(str(tmp_path), str(model / "images")), strict=True):
             assert text.name == binary.name
             assert np.array_equal(text.K, binary.K)
             assert np.array_equal(text.pose, binary.pose)
 
     @pytest.mark.parametrize(
-        ("model", "distortion"),
+        ("camera", "distortion"),
         [
             ("SIMPLE_PINHOLE 160 120 130 80 60", ()),
             ("PINHOLE 160 120 130 131 80 60", ()),
@@ -75,9 +62,9 @@ class TestReadColmap:
             ("OPENCV 160 120 130 131 80 60 0.1 -0.02 0.003 -0.004", (0.1, -0.02, 0.003, -0.004)),
         ],
     )
-    def test_projection_is_that_of_colmap(self, colmap, model, distortion):
+    def test_projection_is_that_of_colmap(self, colmap, camera, distortion):
         cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
-        set_camera(colmap, model)
+        set_camera(colmap, camera)
         frame = read(colmap)[3]
         assert frame.distortion == distortion
         image = pycolmap.Reconstruction(str(colmap / "model")).find_image_with_name(frame.name)
@@ -89,24 +76,21 @@ class TestReadColmap:
         assert np.allclose(pixels, expected, atol=1e-6)
 
     def test_rotation(self, colmap):
-        path = colmap / "model" / "images.txt"
-        lines = path.read_text().splitlines()
-        lines[1] = "1 0.5 0.5 -0.5 0.5 1 2 3 1 one/0.png"
-        path.write_text("\n".join(lines) + "\n")
+        edit(colmap / "model" / "images.txt", 2, "1 0.5 0.5 -0.5 0.5 1 2 3 1 one/0.png")
         # By hand: w = x = -y = z = 1/2 turns the axes into each other.
         expected = np.array([[0, -1.0, 0, 1], [0, 0, -1, 2], [1, 0, 0, 3], [0, 0, 0, 1]])
         assert np.allclose(np.linalg.inv(read(colmap)[0].pose), expected)
 
-    def test_unsupported_camera(self, colmap):
-        set_camera(colmap, "OPENCV_FISHEYE 160 120 130 130 80 60 0 0 0 0")
-        with pytest.raises(
-            ValueError, match=r"model of one/0\.png must be one of SIMPLE_PINHOLE, .* got OPENCV_FISHEYE"
-        ):
-            read(colmap)
-
-    def test_size(self, colmap):
-        set_camera(colmap, "PINHOLE 320 240 130 130 160 120")
-        with pytest.raises(ValueError, match=r"0\.png must have its camera's size, 320 x 240 pixels, got 160 x 120"):
+    @pytest.mark.parametrize(
+        ("camera", "message"),
+        [
+            ("OPENCV_FISHEYE 160 120 130 130 80 60 0 0 0 0", r"one/0\.png must be one of .* got OPENCV_FISHEYE"),
+            ("PINHOLE 320 240 130 130 160 120", r"0\.png must have its camera's size, 320 x 240 .* got 160 x 120"),
+        ],
+    )
+    def test_wrong_camera(self, colmap, camera, message):
+        set_camera(colmap, camera)
+        with pytest.raises(ValueError, match=message):
             read(colmap)
 
     def test_an_image_that_its_exif_turns(self, colmap):
@@ -155,10 +139,10 @@ class TestReadColmap:
         with pytest.raises(ValueError, match=r"the model .*model has no images"):
             read(colmap)
 
-    def test_without_pycolmap(self, written, monkeypatch):
+    def test_without_pycolmap(self, model, monkeypatch):
         monkeypatch.setitem(sys.modules, "pycolmap", None)
         with pytest.raises(ImportError, match=r"pip install '\.\[colmap\]'"):
-            read(written)
+            read(model)
 
 
 class TestCovisiblePairs:
@@ -172,43 +156,32 @@ class TestCovisiblePairs:
         return {(a, b): len(seen[a] & seen[b]) for a in seen for b in seen if a < b}
 
     @pytest.mark.parametrize("min_points", [1, 30, 88, 96, 97, 500])
-    def test_common_points(self, written, min_points):
-        expected = [pair for pair, count in sorted(self.shared(written).items()) if count >= min_points]
-        assert names(covisible_pairs(written / "model", read(written), min_points)) == expected
+    def test_common_points(self, model, min_points):
+        expected = [pair for pair, count in sorted(self.shared(model).items()) if count >= min_points]
+        assert names(covisible_pairs(model / "model", read(model), min_points)) == expected
 
-    def test_by_name_whatever_the_order_of_the_frames(self, written):
-        frames = read(written)
-        assert names(covisible_pairs(written / "model", frames[::-1])) == names(
-            covisible_pairs(written / "model", frames)
-        )
+    def test_by_name_whatever_the_order_of_the_frames(self, model):
+        frames = read(model)
+        straight, reverse = (names(covisible_pairs(model / "model", some)) for some in (frames, frames[::-1]))
+        assert straight == reverse
 
-    def test_some_frames(self, written):
-        frames = [frame for frame in read(written) if frame.sequence == "two"]
-        assert names(covisible_pairs(str(written / "model"), frames)) == [("two/2.png", "two/3.png")]
+    def test_some_frames(self, model):
+        frames = [frame for frame in read(model) if frame.sequence == "two"]
+        assert names(covisible_pairs(str(model / "model"), frames)) == [("two/2.png", "two/3.png")]
 
     def test_points_without_3d_do_not_count(self, colmap):
-        path = colmap / "model" / "images.txt"
-        lines = path.read_text().splitlines()
-        lines[2] = " ".join(f"{n} {n} -1" for n in range(50))
-        path.write_text("\n".join(lines) + "\n")
+        edit(colmap / "model" / "images.txt", 3, " ".join(f"{n} {n} -1" for n in range(50)))
         (colmap / "model" / "points3D.txt").write_text("")
         frames = read(colmap)
         assert not any("one/0.png" in pair for pair in names(covisible_pairs(colmap / "model", frames, 1)))
 
-    def test_errors(self, written, tmp_path):
-        frames = read(written)
+    def test_errors(self, colmap, tmp_path):
+        frames = read(colmap)
         with pytest.raises(ValueError, match="at least 1 point, got min_points 0"):
-            list(covisible_pairs(written / "model", frames, 0))
+            list(covisible_pairs(colmap / "model", frames, 0))
         with pytest.raises(FileNotFoundError, match="no COLMAP model at"):
             list(covisible_pairs(tmp_path, frames))
-        write_colmap(tmp_path)
-        path = tmp_path / "model" / "images.txt"
+        path = colmap / "model" / "images.txt"
         path.write_text(path.read_text().replace("one/0.png", "one/9.png"))
         with pytest.raises(ValueError, match=r"no image 'one/0\.png' among the 4 of the model"):
-            list(covisible_pairs(tmp_path / "model", frames))
-
-
-def test_pairs_file_names_the_frames(written):
-    assert names(listed_pairs(read(written), written / "pairs.txt")) == [
-        (NAMES[n], NAMES[n + 1]) for n in range(FRAMES - 1)
-    ]
+            list(covisible_pairs(colmap / "model", frames))

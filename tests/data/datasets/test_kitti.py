@@ -67,66 +67,21 @@ def test_frames_are_in_order_of_their_numbers(kitti):
     assert [frame.path.stem for frame in read_kitti(kitti, ["00"])] == ["000001", "000002", "9", "10"]
 
 
-def test_an_unreadable_image_is_kept(kitti):
-    (kitti / "sequences/00/image_0/000001.png").write_bytes(b"")
-    frames = read_kitti(kitti, ["00"])
-    assert [frame.size for frame in frames] == [SIZE, (0, 0), SIZE, SIZE]
-
-
-@pytest.mark.parametrize("text", ["1 2 3", "1 0 0 nan 0 1 0 0 0 0 1 0", "a b", "1 " * 13])
-def test_malformed_pose(kitti, text):
-    edit(kitti / "poses/00.txt", 2, text)
-    with pytest.raises(ValueError, match=rf"00\.txt, line 2: the 12 numbers of a pose expected, got '{text[:3]}"):
-        read_kitti(kitti, ["00"])
-
-
-@pytest.mark.parametrize(("line", "text"), [(FRAMES, None), (FRAMES, "")])
-def test_too_few_poses(kitti, line, text):
-    edit(kitti / "poses/00.txt", line, text)
-    with pytest.raises(ValueError, match=rf"00\.txt has no line {FRAMES}, the pose of .*000003\.png"):
-        read_kitti(kitti, ["00"])
-
-
-def test_calibration(kitti):
-    path = kitti / "sequences/00/calib.txt"
-    edit(path, 2, "P1: 1 2 3")
+def test_calibration_of_other_cameras_does_not_matter(kitti):
+    edit(kitti / "sequences/00/calib.txt", 2, "P1: 1 2 3")
     assert len(read_kitti(kitti, ["00"])) == FRAMES
-    with pytest.raises(ValueError, match=r"calib\.txt, line 2: P1: and 12 numbers expected, got 'P1: 1 2 3'"):
-        read_kitti(kitti, ["00"], "image_1")
-    edit(path, 2, "P1: " + "0 " * 12)
-    with pytest.raises(ValueError, match=r"calib\.txt, line 2: a camera matrix and a fourth column expected"):
-        read_kitti(kitti, ["00"], "image_1")
-    edit(path, 2, None)
-    with pytest.raises(ValueError, match=r"calib\.txt has no line 'P1: 12 numbers'"):
-        read_kitti(kitti, ["00"], "image_1")
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match=r"calib\.txt is not a text file in UTF-8"):
-        read_kitti(kitti, ["00"])
-    path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"no calibration at .*calib\.txt"):
-        read_kitti(kitti, ["00"])
 
 
-def test_images(kitti):
-    folder = kitti / "sequences/00/image_0"
-    (folder / "000003.png").rename(folder / "left3.png")
-    with pytest.raises(ValueError, match=r"left3\.png: an image's name must be its frame's number"):
-        read_kitti(kitti, ["00"])
-    shutil.rmtree(folder)
-    with pytest.raises(FileNotFoundError, match=r"no images \*\.png in .*image_0"):
-        read_kitti(kitti, ["00"])
-
-
-def test_wrong_arguments(written, tmp_path):
-    with pytest.raises(ValueError, match=r"no sequence '07' at .*, there are 00, 06, 11"):
-        read_kitti(written / "kitti", ["07"])
-    with pytest.raises(ValueError, match=r"each once, got \['00', '00'\]"):
-        read_kitti(written / "kitti", ["00", "00"])
-    with pytest.raises(ValueError, match=r"one name or more, each once, got \[\]"):
-        read_kitti(written / "kitti", [])
-    with pytest.raises(TypeError, match="a list of names, got the string '00'"):
-        read_kitti(written / "kitti", "00")
-    with pytest.raises(ValueError, match="image_0 to image_3, got 'image_4'"):
-        read_kitti(written / "kitti", camera="image_4")
-    with pytest.raises(FileNotFoundError, match=r"no folder .*sequences"):
-        read_kitti(tmp_path)
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"sequences": ["07"]}, ValueError, r"no sequence '07' at .*, there are 00, 06, 11"),
+        ({"sequences": ["00", "00"]}, ValueError, r"each once, got \['00', '00'\]"),
+        ({"sequences": []}, ValueError, r"one name or more, each once, got \[\]"),
+        ({"sequences": "00"}, TypeError, "a list of names, got the string '00'"),
+        ({"camera": "image_4"}, ValueError, "image_0 to image_3, got 'image_4'"),
+    ],
+)
+def test_wrong_arguments(written, arguments, error, message):
+    with pytest.raises(error, match=message):
+        read_kitti(**{"root": written / "kitti", **arguments})

@@ -29,9 +29,6 @@ class TestPairFrames:
     def test_gap(self, gap):
         assert names(pair_frames(numbered("x"), gap)) == [(f"x/{n}.png", f"x/{n + gap}.png") for n in range(4 - gap)]
 
-    def test_nothing(self):
-        assert names(pair_frames([])) == []
-
     @pytest.mark.parametrize("gap", [0, -1])
     def test_wrong_gap(self, gap):
         with pytest.raises(ValueError, match=f"at least 1, got {gap}"):
@@ -40,7 +37,7 @@ class TestPairFrames:
 
 class TestListedPairs:
     def test_order_of_the_lines(self, tmp_path):
-        (tmp_path / "pairs.txt").write_text("x/3.png  x/0.png\n\nx/1.png\ty/2.png\n")
+        (tmp_path / "pairs.txt").write_text("# hloc\nx/3.png  x/0.png\n\nx/1.png\ty/2.png\n")
         pairs = listed_pairs(numbered("x", "y"), str(tmp_path / "pairs.txt"))
         assert names(pairs) == [("x/3.png", "x/0.png"), ("x/1.png", "y/2.png")]
 
@@ -50,10 +47,7 @@ class TestListedPairs:
             ("x/0.png x/1.png\nx/0.png\n", r"pairs\.txt, line 2: two names expected, got 'x/0\.png'"),
             ("x/0.png x/1.png x/2.png", r"line 1: two names expected"),
             ("x/0.png x/0.png", r"line 1: two images expected, got 'x/0\.png' with itself"),
-            (
-                "x/0.png x/1.png\nx/1.png x/0.png\n\nx/0.png  x/1.png",
-                r"line 4: 'x/0\.png  x/1\.png' is in line 1 already",
-            ),
+            ("x/0.png x/1.png\nx/1.png x/0.png\n\nx/0.png  x/1.png", r"line 4: .* is in line 1 already"),
             ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
         ],
     )
@@ -62,11 +56,10 @@ class TestListedPairs:
         with pytest.raises(ValueError, match=message):
             list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
 
-    def test_binary(self, tmp_path):
-        (tmp_path / "pairs.txt").write_bytes(b"\x89HDF")
-        with pytest.raises(ValueError, match=r"pairs\.txt is not a text file in UTF-8"):
-            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
-
-    def test_missing(self, tmp_path):
+    def test_not_a_text_file(self, tmp_path):
+        path = tmp_path / "pairs.txt"
         with pytest.raises(FileNotFoundError, match=r"no list of pairs at .*pairs\.txt"):
-            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
+            list(listed_pairs(numbered("x"), path))
+        path.write_bytes(b"\x89HDF")
+        with pytest.raises(ValueError, match=r"pairs\.txt is not a text file in UTF-8"):
+            list(listed_pairs(numbered("x"), path))

@@ -10,9 +10,11 @@ import pytest
 from make_sequences import STEP
 
 from kornia_learnnorm.data.datasets.frames import FramePair
-from kornia_learnnorm.data.datasets.pairs import choose_pairs, pair_frames
+from kornia_learnnorm.data.datasets.pairs import pair_frames
 from kornia_learnnorm.data.datasets.reading import read_dataset
+from kornia_learnnorm.data.datasets.splits import SPLITS
 
+FR1 = "rgbd_dataset_freiburg1_wall"
 FR3 = "rgbd_dataset_freiburg3_long_office_household"
 
 
@@ -24,39 +26,43 @@ def epipoles_agree(pair: FramePair) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("dataset", "options", "count"),
+    ("dataset", "options", "sequence"),
     [
-        ("kitti", {"sequences": ["06"], "camera": "image_3"}, 4),
-        ("kitti", {"split": "test"}, 4),
-        ("tum", {"split": "val"}, 4),
-        ("cambridge", {"split": "test"}, 4),
+        ("kitti", {"sequences": ["06"], "camera": "image_3"}, "06"),
+        ("kitti", {"split": "train"}, "00"),
+        ("kitti", {"split": "test"}, "06"),
+        ("tum", {"split": "train"}, FR1),
+        ("tum", {"split": "val"}, FR3),
+        ("cambridge", {"split": "test"}, "seq2"),
     ],
 )
-def test_ground_truth_fits_the_images(written, dataset, options, count):
+def test_splits_and_ground_truth(written, dataset, options, sequence):
     frames = read_dataset(dataset, written / dataset, **options)
-    assert len(frames) == count
+    assert [frame.sequence for frame in frames] == [sequence] * 4
     if dataset != "tum":  # its wall is turned
         assert all(epipoles_agree(pair) for pair in pair_frames(frames))
 
 
+def test_no_sequence_is_in_two_splits():
+    for splits in SPLITS.values():
+        names = [name for split in splits.values() for name in split or ()]
+        assert len(names) == len(set(names))
+
+
 @pytest.mark.parametrize(
-    ("dataset", "options", "message"),
+    ("dataset", "folder", "options", "error", "message"),
     [
-        ("kiti", {}, "must be one of kitti, tum, cambridge, folder, colmap, got 'kiti'"),
-        ("kitti", {"colour": True}, "colour is for no dataset, got kitti"),
+        ("kiti", "", {}, ValueError, "must be one of kitti, tum, cambridge, folder, colmap, got 'kiti'"),
+        ("kitti", "kitti", {"colour": True}, ValueError, "colour is for no dataset, got kitti"),
+        ("kitti", "kitti", {"split": "val"}, ValueError, "a split of kitti must be one of train, test, got 'val'"),
+        ("tum", f"tum/{FR3}", {"split": "train"}, FileNotFoundError, f"expected others than {FR3}, got {FR3}"),
+        ("tum", f"tum/{FR1}", {"split": "val"}, FileNotFoundError, f"no val sequence of tum .*: expected {FR3}, got"),
+        ("folder", "none", {}, FileNotFoundError, r"no folder at .*none"),
     ],
 )
-def test_wrong_arguments(written, dataset, options, message):
-    with pytest.raises(ValueError, match=message):
-        read_dataset(dataset, written, **options)
-    with pytest.raises(FileNotFoundError, match=r"no folder at .*none"):
-        read_dataset("folder", written / "none")
-
-
-def test_points_in_common_need_a_model(written):
-    frames = read_dataset("kitti", written / "kitti")
-    with pytest.raises(ValueError, match="min_points 5 needs a COLMAP model, got none"):
-        choose_pairs(frames, min_points=5)
+def test_wrong_arguments(written, dataset, folder, options, error, message):
+    with pytest.raises(error, match=message):
+        read_dataset(dataset, written / folder, **options)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
-"""Set networks: what they are blind to, what they see, and what they may answer."""
+"""The cross-view network and its set network: what each depends on, and which answers are possible."""
 
 from __future__ import annotations
 
 import inspect
+from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch.autograd import gradcheck
-from two_view import correspondences, numpy_whitening, prepared, shaken, uniform
+from two_view import numpy_whitening, prepared, shaken, uniform
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer
 from kornia_learnnorm.normalizers.networks import crossview as networks
@@ -52,22 +53,6 @@ class TestSetNetwork:
         assert net.point_stem.weight.shape == (16, 4)
         assert net.set_stem.weight.shape == (16, 6)
         assert net.head[-1].weight.shape == (5, 16)
-
-    def test_order_does_not_matter(self):
-        net, points, whole = set_network(), uniform(3, 10, 4), uniform(3, 6, seed=1)
-        order = torch.randperm(10)
-        assert torch.allclose(net(points[:, order], whole), net(points, whole), rtol=1e-12)
-
-    def test_zero_weight_is_absence(self):
-        net, points, whole = set_network(), uniform(3, 10, 4), uniform(3, 6, seed=1)
-        weights = uniform(3, 10, low=0.1, seed=2)
-        junk, zeros = torch.full((3, 5, 4), 1e3).double(), torch.zeros(3, 5).double()
-        extended = net(torch.cat([junk, points], 1), whole, torch.cat([zeros, weights], 1))
-        assert torch.allclose(extended, net(points, whole, weights), rtol=1e-10)
-
-    def test_equal_weights_are_none(self):
-        net, points, whole = set_network(), uniform(3, 10, 4), uniform(3, 6, seed=1)
-        assert torch.allclose(net(points, whole, torch.full((3, 10), 0.25).double()), net(points, whole), rtol=1e-12)
 
     def test_weights_that_are_all_zero_are_finite(self):
         net, points = set_network(), uniform(3, 10, 4).requires_grad_()
@@ -138,13 +123,6 @@ class TestFeatures:
             assert not torch.isclose(moved, before, atol=1e-4).all(-1).any()
 
     @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
-    def test_gradient_of_the_other_view(self, features, sees):
-        net, points = network(features=features), [p.requires_grad_() for p in whitened()]
-        for params, others in zip(net(*points), points[::-1], strict=True):
-            (gradient,) = torch.autograd.grad(params.sum(), others, retain_graph=True)
-            assert (gradient.flatten(1).any(1) == sees).all()
-
-    @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
     def test_who_corresponds_to_whom(self, features, sees):
         net, (points1, points2) = network(features=features), whitened()
         for found, expected in zip(net(points1, points2.roll(1, 1)), net(points1, points2), strict=True):
@@ -152,18 +130,9 @@ class TestFeatures:
 
     @pytest.mark.parametrize(("features", "solves"), [("own", False), ("both", False), ("epipolar", True)])
     def test_only_epipolar_features_need_the_null_vector(self, features, solves, monkeypatch):
-        class Solved(Exception):  # noqa: N818
-            pass
-
-        def solve(*_):
-            raise Solved
-
         net, points = network(features=features), whitened()
-        monkeypatch.setattr(networks, "null_vector", solve)
-        if solves:
-            with pytest.raises(Solved):
-                net(*points)
-        else:
+        monkeypatch.setattr(networks, "null_vector", None)
+        with pytest.raises(TypeError, match="not callable") if solves else nullcontext():
             net(*points)
 
     @pytest.mark.parametrize(("features", "numbers"), [("own", (2, 1)), ("both", (4, 1)), ("epipolar", (13, 10))])
@@ -175,16 +144,6 @@ class TestFeatures:
     def test_unknown(self, name):
         with pytest.raises(ValueError, match=f"features must be one of own, both, epipolar, got {name!r}"):
             CrossViewNetwork(features=name)
-
-    @pytest.mark.parametrize("features", FEATURES)
-    def test_files_keep_them(self, features, tmp_path):
-        saved = shaken(LearnedNormalizer(network=CrossViewNetwork(width=8, depth=1, features=features)))
-        saved.save_pretrained(tmp_path / "weights.safetensors")
-        loaded = LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
-        assert loaded.network.features == features
-        points = correspondences("driving", 5, 9)
-        for T, expected in zip(loaded(*points), saved(*points), strict=True):
-            assert torch.equal(T, expected)
 
     def test_files_from_before_them_have_epipolar_ones(self, tmp_path):
         saved, file = LearnedNormalizer(network=CrossViewNetwork(width=8, depth=1)), tmp_path / "weights.safetensors"

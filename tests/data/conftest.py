@@ -1,0 +1,27 @@
+"""A small store, and where its correspondences lie in it."""
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+
+
+@pytest.fixture(scope="session")
+def store():
+    """Nine pairs of 101 correspondences, not to be changed."""
+    return synthetic_store(pairs=3, points=101, seed=2)
+
+
+@pytest.fixture(scope="session")
+def rows_of(store):
+    """Return the row of each correspondence in the store, found by its coordinates, and its pair."""
+    index = {tuple(row): i for i, row in enumerate(np.c_[store.points1, store.points2].tolist())}
+
+    def find(points1, points2):
+        joined = torch.cat([points1, points2], -1)
+        rows = [index[tuple(row)] for row in joined.reshape(-1, 4).tolist()]
+        rows = np.array(rows).reshape(joined.shape[:-1])
+        return rows, np.searchsorted(store.offsets, rows, side="right") - 1
+
+    return find

@@ -1,0 +1,257 @@
+"""What every estimate of F promises: shapes, no dependence on order, scale or absent points, finite values, errors."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from two_view import (
+    SCENES,
+    WRONG_CORRESPONDENCES,
+    WRONG_MATRICES,
+    correspondences,
+    hartley_difference,
+    in_hartley,
+    scenes,
+    signless,
+    uniform,
+    up_to_sign,
+)
+
+from kornia_learnnorm import (
+    EightPoint,
+    Hartley,
+    Identity,
+    ReweightedWhitening,
+    Whitening,
+    find_fundamental,
+    refine_fundamental,
+)
+from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated, squared_loss
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.rank2 import optimal_rank2
+from kornia_learnnorm.geometry.transforms import transform_fundamental
+
+NORMALIZERS = [Identity(), Hartley(), Whitening(), ReweightedWhitening()]
+LOSSES = [squared_loss, Huber(0.5), Cauchy(0.5), GemanMcClure(2.0), Truncated(3.0)]
+
+
+def rank_three(points1, points2, weights=None):
+    """The DLT's solution before any correction, in pixels."""
+    problem = LinearProblem.from_points(points1, points2, weights)
+    return transform_fundamental(problem.null_matrix, problem.T1, problem.T2)
+
+
+def corrected(points1, points2, weights=None):
+    return optimal_rank2(rank_three(points1, points2, weights), points1, points2, weights)
+
+
+def refined(points1, points2, weights=None, **options):
+    """Five steps of Levenberg-Marquardt from the linear solution."""
+    F_mat = find_fundamental(points1, points2, weights)
+    return refine_fundamental(points1, points2, F_mat, weights, max_iterations=5, **options).F_mat
+
+
+ALL = {
+    "projection": find_fundamental,
+    "optimal": partial(find_fundamental, rank2="optimal"),
+    "corrected": corrected,
+    "refined": refined,
+    "refined, symmetric": partial(refined, distance="symmetric"),
+}
+
+
+PROJECTIONS = [partial(find_fundamental, normalizer=normalizer) for normalizer in NORMALIZERS]
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("batch_size", [0, 1, 5])
+@pytest.mark.parametrize("num_points", [8, 9, 50, 500])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_smoke(name, batch_size, num_points, weighted, device, dtype):
+    points = [uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
+    weights = uniform(batch_size, num_points, seed=2).to(device, dtype) if weighted else None
+    F_mat = ALL[name](*points, weights)
+    assert (F_mat.shape, F_mat.dtype, F_mat.device.type) == ((batch_size, 3, 3), dtype, device.type)
+    assert torch.isfinite(F_mat).all()
+
+
+@pytest.mark.parametrize("solve", [*PROJECTIONS, ALL["optimal"], corrected])
+@pytest.mark.parametrize("num_points", [8, 20, 50])
+def test_finds_the_truth_without_noise(solve, num_points):
+    scene = scenes("orbit", 50, num_points, noise=0.0)
+    F_mat = solve(scene.points1, scene.points2)
+    assert up_to_sign(F_mat, scene.F_mat) < 1e-7
+    assert hartley_difference(F_mat, scene.F_mat, *scene[:2]) < 1e-7
+
+
+@pytest.mark.parametrize("solve", [*PROJECTIONS, ALL["optimal"], corrected])
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("num_points", [8, 20])
+def test_rank_and_norm(solve, name, num_points, dtype):
+    points, eps = [p.to(dtype) for p in correspondences(name, 50, num_points)], torch.finfo(dtype).eps
+    F_mat = solve(*points)
+    assert np.linalg.norm(F_mat.double().numpy(), axis=(1, 2)) == pytest.approx(1, abs=4 * eps)
+    assert (np.linalg.svd(F_mat.double().numpy())[1][:, 2] < 10 * eps).all()
+    if dtype == torch.float64:  # two values apart from zero where all entries count
+        values = np.linalg.svd(in_hartley(F_mat, *points))[1]
+        assert (values[:, 1] > 1e-4).all()
+        assert (values[:, 2] < 1e-12).all()
+
+
+@pytest.mark.parametrize("num_points", [8, 20])
+@pytest.mark.parametrize("solve", [*PROJECTIONS, ALL["optimal"], refined])
+def test_float32_is_float64_rounded(solve, num_points):
+    points = [p.float() for p in correspondences("orbit", 50, num_points)]
+    single = solve(*points)
+    assert single.dtype == torch.float32
+    assert up_to_sign(single, solve(*(p.double() for p in points))) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "scene", "bound"),
+    [
+        *((name, "driving", 1e-10) for name in ("projection", "optimal", "corrected")),
+        *((name, "orbit", 1e-7) for name in ("refined", "refined, symmetric")),
+    ],
+)
+def test_swapped_views_give_the_transpose(name, scene, bound):
+    points, weights = correspondences(scene, 20, 12), uniform(20, 12)
+    F_mat, mirrored = ALL[name](*points, weights), ALL[name](*points[::-1], weights)
+    assert hartley_difference(mirrored.mT, F_mat, *points) < bound
+
+
+@pytest.mark.parametrize(("name", "bound"), [("projection", 1e-12), ("optimal", 1e-10), ("corrected", 1e-10)])
+def test_batch_is_many_single_calls(name, bound):
+    points = correspondences("random", 6, 12)
+    alone = [ALL[name](*(p[k : k + 1] for p in points)) for k in range(6)]
+    assert up_to_sign(ALL[name](*points), torch.cat(alone)) < bound
+
+
+@pytest.mark.parametrize(
+    ("name", "scenes", "bound"),
+    [
+        ("projection", [*SCENES], 1e-7),
+        ("optimal", [*SCENES], 1e-6),
+        ("corrected", [*SCENES], 1e-6),
+        ("refined", ["handheld", "orbit"], 1e-6),
+    ],
+)
+@given(seed=st.integers(0, 2**31), num_points=st.sampled_from([8, 9, 17]), random=st.randoms(), data=st.data())
+def test_order_does_not_matter(name, scenes, bound, seed, num_points, random, data):
+    points = correspondences(data.draw(st.sampled_from(scenes)), 4, num_points, seed)
+    order = random.sample(range(num_points), num_points)
+    assert hartley_difference(ALL[name](*(p[:, order] for p in points)), ALL[name](*points), *points) < bound
+
+
+@pytest.mark.parametrize("name", ["optimal", "corrected", "refined", "refined, symmetric"])
+@given(log_scale=st.floats(-3, 3), num_points=st.sampled_from([8, 15]))
+def test_moves_with_the_scale_of_the_pixels(name, log_scale, num_points):
+    points, scale = correspondences("orbit", 4, num_points), 10**log_scale
+    S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
+    assert hartley_difference(S @ ALL[name](*(scale * p for p in points)) @ S, ALL[name](*points), *points) < 1e-7
+
+
+@pytest.mark.parametrize("factor", [-7.0, 1e-3, 1e6])
+def test_scale_of_the_start_does_not_matter(factor):
+    points = correspondences("orbit", 4, 15)
+    start = rank_three(*points)
+    assert hartley_difference(optimal_rank2(factor * start, *points), corrected(*points), *points) < 1e-7
+    found, expected = (refine_fundamental(*points, F, max_iterations=5).F_mat for F in (factor * start, start))
+    assert hartley_difference(found, expected, *points) < 1e-7
+
+
+@pytest.mark.parametrize("num_points", [8, 20])
+@pytest.mark.parametrize(
+    ("solve", "bound"),
+    [(ALL["optimal"], 1e-7), (corrected, 1e-7), *((partial(refined, loss=loss), 1e-8) for loss in LOSSES)],
+)
+def test_zero_weight_means_absent(solve, bound, num_points):
+    """Of the projection see test_fundamental.py, where the gradients are compared too."""
+    points, weights = correspondences("orbit", 5, num_points), uniform(5, num_points, low=0.5)
+    junk = [uniform(5, 4, 2, low=-5000, high=5000, seed=seed) for seed in (3, 4)]
+    every = [torch.cat(pair, 1) for pair in zip((*points, weights), (*junk, torch.zeros(5, 4)), strict=True)]
+    assert hartley_difference(solve(*every), solve(*points, weights), *points) < bound
+
+
+@pytest.mark.parametrize(("name", "bound"), [("projection", 1e-8), ("optimal", 1e-9), ("corrected", 1e-9)])
+@given(seed=st.integers(0, 2**31), counts=st.lists(st.integers(0, 3), min_size=12, max_size=12))
+def test_whole_weights_are_repetitions(name, bound, seed, counts):
+    counts = torch.tensor([2, 1, 3, 1, 1, 1, 1, 1, 1, *counts])  # at least nine are present
+    points = correspondences("handheld", 3, 21, seed)
+    repeated = [p.repeat_interleave(counts, 1) for p in points]
+    found, expected = ALL[name](*points, counts.double().expand(3, -1)), ALL[name](*repeated)
+    assert hartley_difference(found, expected, *repeated) < bound
+
+
+def refined_by(distance, loss):
+    def refine(F_mat, points1, points2, weights):
+        found = refine_fundamental(points1, points2, F_mat.detach(), weights, distance, loss)
+        assert (found.cost <= found.cost_before).all()
+        return found.F_mat
+
+    return refine
+
+
+@pytest.mark.parametrize("kind", ["coincident", "collinear", "planar", "absent", "same", "on the epipoles", "all zero"])
+@pytest.mark.parametrize(
+    "correct",
+    [optimal_rank2, *(refined_by(distance, loss) for distance in ("sampson", "symmetric") for loss in LOSSES)],
+)
+def test_degenerate_points_are_finite_in_value_and_gradient(kind, correct):
+    points1, points2 = correspondences("handheld", 5, 12)
+    weights, F_mat = torch.ones(5, 12, dtype=torch.float64), rank_three(points1, points2)
+    if kind == "coincident":
+        points1, points2 = points1[:, :1].repeat(1, 12, 1), points2[:, :1].repeat(1, 12, 1)
+    elif kind == "collinear":
+        points1 = torch.linspace(0, 500, 12, dtype=torch.float64)[None, :, None].repeat(5, 1, 2)
+    elif kind == "planar":
+        points2 = 0.9 * points1 + 20
+    elif kind == "absent":
+        weights = torch.zeros_like(weights)
+    elif kind == "same":
+        points2 = points1.clone()
+    elif kind == "on the epipoles":
+        F_mat = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=torch.float64).repeat(5, 1, 1)
+        points1[:, 0] = points2[:, 1] = points1[:, 2] = points2[:, 2] = 0.0
+    else:
+        F_mat = torch.tensor([[1e-3, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64).repeat(5, 1, 1)
+        points1, points2 = torch.zeros_like(points1), torch.zeros_like(points2)
+    values = [value.clone().requires_grad_() for value in (F_mat, points1, points2, weights)]
+    found = correct(*values)
+    assert torch.isfinite(found).all()
+    assert (torch.linalg.svdvals(found)[:, 2] < 1e-10).all()
+    for gradient in torch.autograd.grad(signless(found).sum(), values, allow_unused=True):
+        assert gradient is None or torch.isfinite(gradient).all()
+
+
+EYE = torch.eye(3).expand(2, 3, 3)
+
+
+class TestExceptions:
+    @pytest.mark.parametrize(
+        "estimate",
+        [
+            find_fundamental,
+            EightPoint(),
+            lambda *points: optimal_rank2(EYE, *points),
+            lambda points1, points2, weights: refine_fundamental(points1, points2, EYE, weights),
+        ],
+        ids=["find_fundamental", "EightPoint", "optimal_rank2", "refine_fundamental"],
+    )
+    @pytest.mark.parametrize(("points1", "points2", "weights", "error", "message"), WRONG_CORRESPONDENCES)
+    def test_correspondences(self, estimate, points1, points2, weights, error, message):
+        with pytest.raises(error, match=message):
+            estimate(points1, points2, weights)
+
+    @pytest.mark.parametrize(("F_mat", "error", "message"), WRONG_MATRICES)
+    def test_matrices(self, F_mat, error, message):
+        points = torch.rand(2, 8, 2)
+        with pytest.raises(error, match=message):
+            optimal_rank2(F_mat, points, points)
+        with pytest.raises(error, match=message):
+            refine_fundamental(points, points, F_mat)

@@ -1,0 +1,141 @@
+"""The linear algebra of the design matrix against NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from kornia.core.exceptions import ShapeError
+from torch.autograd import gradcheck, gradgradcheck
+from two_view import SCENES, correspondences, homogeneous, numpy_hartley, signless, uniform
+
+from kornia_learnnorm import design_matrix, null_vector
+from kornia_learnnorm.geometry.linear import adjugate, smallest_right_singular_vector
+
+
+class TestDesignMatrix:
+    def test_is_the_kronecker_product(self, dtype):
+        x1, x2 = uniform(3, 5, 3, dtype=dtype), uniform(3, 5, 3, seed=1, dtype=dtype)
+        A = design_matrix(x1, x2)
+        expected = [[np.kron(b, a) for a, b in zip(*pair, strict=True)] for pair in zip(x1, x2, strict=True)]
+        assert A.dtype == dtype
+        np.testing.assert_array_equal(A.numpy(), np.array(expected))
+
+    def test_shape(self):
+        with pytest.raises(ShapeError):
+            design_matrix(torch.rand(8, 2), torch.rand(8, 3))
+
+
+class TestNullVector:
+    @pytest.mark.parametrize("num_points", [8, 9, 40])
+    def test_is_the_last_right_singular_vector(self, num_points):
+        A = uniform(10, num_points, 9, low=-1)
+        expected = np.linalg.svd(A.numpy(), full_matrices=True)[2][:, -1]
+        sign = np.sign((expected * null_vector(A).numpy()).sum(-1, keepdims=True))
+        np.testing.assert_allclose(null_vector(A).numpy(), sign * expected, atol=1e-12)
+
+    @pytest.mark.parametrize("name", SCENES)
+    @pytest.mark.parametrize("noise", [True, False])
+    def test_eight_rows_are_solved_exactly(self, name, noise):
+        points1, points2 = (
+            correspondences(name, 200) if noise or name == "random" else correspondences(name, 200, noise=0.0)
+        )
+        x1 = homogeneous(points1.numpy()) @ numpy_hartley(points1).swapaxes(1, 2)
+        x2 = homogeneous(points2.numpy()) @ numpy_hartley(points2).swapaxes(1, 2)
+        A = design_matrix(torch.from_numpy(x1), torch.from_numpy(x2))
+        h = null_vector(A)
+        assert (A @ h[..., None]).abs().max() < 1e-13
+        assert (h.norm(dim=-1) - 1).abs().max() < 1e-14
+
+    def test_is_exact_whatever_the_scales_of_eight_rows(self):
+        A = uniform(10, 8, 9, low=-1)
+        scaled = A * 10.0 ** uniform(10, 8, 1, low=-3, high=3, seed=1)
+        h, expected = null_vector(scaled), null_vector(A)
+        assert torch.minimum((h - expected).norm(dim=-1), (h + expected).norm(dim=-1)).max() < 1e-8
+
+    def test_weights_of_eight_rows_do_not_matter(self):
+        A, weights = uniform(10, 8, 9, low=-1), uniform(10, 8, low=0.01)
+        assert torch.equal(null_vector(A, weights), null_vector(A))
+
+    @pytest.mark.parametrize("num_points", [8, 12])
+    def test_gradients(self, num_points):
+        A = uniform(2, num_points, 9, low=-1).requires_grad_()
+        outer = lambda A: signless(null_vector(A).unflatten(-1, (3, 3)))  # noqa: E731
+        assert gradcheck(outer, [A])
+        assert gradgradcheck(outer, [A[:1].detach().requires_grad_()])
+
+    def test_any_batch_shape(self):
+        assert null_vector(uniform(8, 9)).shape == (9,)
+        assert null_vector(uniform(2, 3, 8, 9)).shape == (2, 3, 9)
+        assert null_vector(uniform(2, 3, 10, 9), uniform(2, 3, 10)).shape == (2, 3, 9)
+
+
+class TestSmallestRightSingularVector:
+    def test_weighted_minimum(self):
+        A, weights = uniform(20, 7, 4, low=-1), uniform(20, 7, low=0.1)
+        v = smallest_right_singular_vector(A, weights).numpy()
+        values, vectors = np.linalg.eigh(np.einsum("bmi,bm,bmj->bij", A, weights, A))
+        assert np.abs((vectors[..., 0] * v).sum(-1)) == pytest.approx(1, abs=1e-12)
+        np.testing.assert_allclose(np.einsum("bm,bm->b", weights, np.einsum("bmi,bi->bm", A, v) ** 2), values[:, 0])
+
+    def test_small_values_keep_their_digits(self):
+        """Singular values 1 to 1e-9: the square of the condition number would leave nothing of the last ones."""
+        rng = np.random.default_rng(0)
+        U, V = (np.linalg.qr(rng.normal(size=(5, 4, 4)))[0] for _ in range(2))
+        A = torch.from_numpy(U @ np.diag([1, 1e-3, 1e-6, 1e-9]) @ V.swapaxes(1, 2))
+        v = smallest_right_singular_vector(A).numpy()
+        sign = np.sign((V[..., -1] * v).sum(-1, keepdims=True))
+        np.testing.assert_allclose(v, sign * V[..., -1], atol=1e-8)
+
+    def test_gradients_where_other_values_coincide(self):
+        A = torch.diag(torch.tensor([2.0, 2.0, 0.5], dtype=torch.float64)).requires_grad_()
+        direction = uniform(3, 2, low=-1)
+        square = lambda A: (smallest_right_singular_vector(A) @ direction).square()  # noqa: E731
+        assert gradcheck(square, [A])
+        assert gradgradcheck(square, [A])
+
+    @pytest.mark.parametrize("values", [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    def test_no_gradient_where_the_last_is_not_simple(self, values):
+        A = torch.diag(torch.tensor(values, dtype=torch.float64)).requires_grad_()
+        v = smallest_right_singular_vector(A)
+        (gradient,) = torch.autograd.grad(v @ uniform(3), [A])
+        assert v.norm().item() == pytest.approx(1)
+        assert torch.isfinite(gradient).all()
+        if values[0] == values[1]:
+            assert gradient.abs().max() < 1e-12
+
+    def test_gradient_at_zero_weight(self):
+        A, weights = uniform(2, 7, 4, low=-1), uniform(2, 7, low=0.1, seed=1)
+        weights[:, 0] = 0
+        values = [A.requires_grad_(), weights.requires_grad_()]
+        square = lambda A, w: (smallest_right_singular_vector(A, w) @ uniform(4, 2, low=-1, seed=2)).square()  # noqa: E731
+        gradient = torch.autograd.grad(square(*values).sum(), values)[1]
+        # From one side only: a weight cannot be negative.
+        step = torch.zeros(2, 7, dtype=torch.float64)
+        step[:, 0] = 1e-6
+        with torch.no_grad():
+            slope = (square(A, weights + step) - square(A, weights)).sum(-1) / 1e-6
+        assert gradient[:, 0].numpy() == pytest.approx(slope.numpy(), rel=1e-3)
+
+
+class TestAdjugate:
+    def test_is_determinant_times_inverse(self, dtype):
+        A = uniform(20, 3, 3, low=-1, dtype=dtype)
+        expected = np.linalg.det(A.numpy())[:, None, None] * np.linalg.inv(A.numpy())
+        np.testing.assert_allclose(adjugate(A).numpy(), expected, atol=2e-6 if dtype == torch.float32 else 1e-14)
+
+    def test_of_singular_matrices(self):
+        """Of rank 2, the product of both null vectors; of rank 1, zero."""
+        F_mat = uniform(20, 3, 2, low=-1) @ uniform(20, 2, 3, low=-1, seed=1)
+        U, s, Vh = np.linalg.svd(F_mat.numpy())
+        expected = (
+            np.linalg.det(U @ Vh)[:, None, None]
+            * (s[:, 0] * s[:, 1])[:, None, None]
+            * Vh[:, 2, :, None]
+            * U[:, None, :, 2]
+        )
+        np.testing.assert_allclose(adjugate(F_mat).numpy(), expected, atol=1e-14)
+        assert adjugate(uniform(20, 3, 1) @ uniform(20, 1, 3, seed=1)).abs().max() < 1e-15
+
+    def test_gradcheck(self):
+        assert gradcheck(adjugate, [uniform(2, 3, 3, low=-1).requires_grad_()])

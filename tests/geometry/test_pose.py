@@ -1,0 +1,156 @@
+"""Relative poses against ground truth and triangulation in NumPy."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from two_view import SCENES, homogeneous, scenes
+
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.metrics.poses import pose_error
+
+INF, NAN = float("inf"), float("nan")
+
+
+def pair(name="handheld", *args, **options):
+    """What relative_pose takes, of scenes whose second camera has pixels of half the size, and the true pose."""
+    scene = scenes(name, *args, **options)
+    double = torch.tensor([2.0, 2.0, 1.0], dtype=torch.float64).diag()
+    F = double.inverse() @ scene.F_mat
+    return (F, scene.K1, double @ scene.K2, scene.points1, 2 * scene.points2), (scene.R, scene.t)
+
+
+def triangulated_pose(F, K1, K2, points1, points2):
+    """Try all four poses: linear triangulation of each correspondence, count of positive depths."""
+    U, _, Vh = np.linalg.svd(K2.T @ F @ K1)
+    U, Vh = U * np.sign(np.linalg.det(U)), Vh * np.sign(np.linalg.det(Vh))
+    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    rays1, rays2 = (homogeneous(p) @ np.linalg.inv(K).T for p, K in ((points1, K1), (points2, K2)))
+    best = (-1, None, None)
+    for R in (U @ W @ Vh, U @ W.T @ Vh):
+        for t in (U[:, 2], -U[:, 2]):
+            P, count = np.column_stack([R, t]), 0
+            for a, b in zip(rays1, rays2, strict=True):
+                rows = [a[0] * np.eye(4)[2] - np.eye(4)[0], a[1] * np.eye(4)[2] - np.eye(4)[1]]
+                X = np.linalg.svd(np.stack([*rows, b[0] * P[2] - P[0], b[1] * P[2] - P[1]]))[2][-1]
+                count += X[2] / X[3] > 0 and P[2] @ X / X[3] > 0
+            best = max(best, (count, R, t), key=lambda found: found[0])
+    return best[1:]
+
+
+class TestRelativePose:
+    @pytest.mark.parametrize("name", SCENES)
+    def test_exact_correspondences(self, name, device):
+        arguments, truth = pair(name, 20, 30)
+        R, t = relative_pose(*(value.to(device) for value in arguments))
+        assert pose_error(R.cpu(), t.cpu(), *truth).max() < 1e-6
+        assert torch.allclose(t.norm(dim=-1).cpu(), torch.ones(20).double())
+        assert torch.allclose(torch.linalg.det(R).cpu(), torch.ones(20).double())
+
+    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
+    def test_noise_and_outliers_against_triangulation(self, name):
+        arguments, _ = pair(name, 8, 50, noise=0.5, outliers=0.3)
+        R, t = relative_pose(*arguments)
+        for k in range(8):
+            expected = triangulated_pose(*(value[k].numpy() for value in arguments))
+            np.testing.assert_allclose(R[k].numpy(), expected[0], atol=1e-8)
+            np.testing.assert_allclose(t[k].numpy(), expected[1], atol=1e-8)
+
+    @given(st.integers(0, 2**31), st.sampled_from([-1.0, 1e-9, -1e9]))
+    def test_what_does_not_matter(self, seed, factor):
+        (F, *rest), _ = pair("handheld", 4, 25, seed, noise=1.0, outliers=0.4)
+        K1, K2, points1, points2 = rest
+        R, t = relative_pose(F, *rest)
+        order = torch.randperm(25, generator=torch.Generator().manual_seed(seed))
+        for found in (relative_pose(factor * F, *rest), relative_pose(F, K1, K2, points1[:, order], points2[:, order])):
+            torch.testing.assert_close(found, (R, t), rtol=0, atol=1e-8, equal_nan=True)
+        back = relative_pose(F.mT, K2, K1, points2, points1)  # the way from the second camera to the first
+        expected = (R.mT, -(R.mT @ t[..., None])[..., 0])
+        torch.testing.assert_close(back, expected, rtol=0, atol=1e-8, equal_nan=True)
+
+    def test_mask(self):
+        arguments, truth = pair("handheld", 6, 40)
+        arguments[4][:, :30] = arguments[4][:, :30].flip(1) + 300  # three quarters are wrong
+        mask = torch.arange(40).expand(6, 40) >= 30
+        assert pose_error(*relative_pose(*arguments, mask=mask), *truth).max() < 1e-6
+        arguments[4][:, :30] = NAN
+        assert pose_error(*relative_pose(*arguments, mask=mask), *truth).max() < 1e-6
+        assert torch.cat([v.flatten() for v in relative_pose(*arguments, mask=mask & False)]).isnan().all()
+
+    def test_failures_leave_the_others_alone(self):
+        (F, *rest), truth = pair("orbit", 6, 20)
+        vector = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
+        F[0], F[1], F[2], F[3, 0, 0] = NAN, 0.0, vector @ vector.mT, INF
+        mask = torch.ones(6, 20, dtype=torch.bool)
+        mask[4] = False
+        R, t = relative_pose(F, *rest, mask=mask)
+        assert R[:5].isnan().all()
+        assert t[:5].isnan().all()
+        error = pose_error(R, t, *truth)
+        assert (error[:5] == INF).all()
+        assert error[5] < 1e-6
+
+    def test_a_tie_is_no_pose(self):
+        """Points seen after a step forward and after one back have the same epipolar lines."""
+        X = torch.rand(1, 9, 3, generator=torch.Generator().manual_seed(0)).double() + torch.tensor([0.0, 0.0, 5.0])
+        t = torch.tensor([[0.1, 0.2, 1.0]]).double()
+        seen = [(Y / Y[..., 2:])[..., :2] for Y in (X, X + t, X - t)]
+        points1, points2 = torch.cat([seen[0], seen[0]], 1), torch.cat(seen[1:], 1)
+        K = torch.eye(3).double()[None]
+        F = torch.tensor([[[0.0, -1.0, 0.2], [1.0, 0.0, -0.1], [-0.2, 0.1, 0.0]]]).double()  # [t]x
+        assert relative_pose(F, K, K, points1, points2)[1].isnan().all()
+        for number, sign in ((10, 1.0), (9, 1.0), (-9, -1.0), (-10, -1.0)):
+            part = slice(0, number) if number > 0 else slice(number, None)
+            R, found = relative_pose(F, K, K, points1[:, part], points2[:, part])
+            assert pose_error(R, found, K, sign * t) < 1e-6
+
+    def test_float32(self):
+        arguments, truth = pair("orbit", 6, 20)
+        R, t = relative_pose(*(value.float() for value in arguments))
+        assert R.dtype == t.dtype == torch.float32
+        assert pose_error(R.double(), t.double(), *truth).max() < 0.05
+
+    @pytest.mark.parametrize("batch_size", [0, 1])
+    def test_small_batches(self, batch_size):
+        arguments, _ = pair("orbit", 1, 20)
+        R, t = relative_pose(*(value[:batch_size] for value in arguments))
+        assert R.shape == (batch_size, 3, 3)
+        assert t.shape == (batch_size, 3)
+
+    @pytest.mark.parametrize(
+        ("change", "error", "message"),
+        [
+            (lambda F, K1, K2, a, b: (F.int(), K1, K2, a, b), TypeError, "F_mat must be .* got torch.int32"),
+            (lambda F, K1, K2, a, b: (F, K1, K2, a.tolist(), b), TypeError, "points1 must be .* <class 'list'>"),
+            (lambda F, K1, K2, a, b: (F[0], K1, K2, a, b), ShapeError, "shape"),
+            (lambda F, K1, K2, a, b: (F, K1[:, :2], K2, a, b), ShapeError, "shape"),
+            (lambda F, K1, K2, a, b: (F, K1, K2, a[:, :9], b), ValueError, "must pair up"),
+            (lambda F, K1, K2, a, b: (F, K1[:1], K2, a, b), ValueError, "one batch, got {'F_mat': 3, 'K1': 1"),
+            (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[..., 0]), TypeError, "mask must be a boolean tensor"),
+            (lambda F, K1, K2, a, b: (F, K1, K2, a, b, a[0] > 0), ValueError, r"shape \[3, 10\] .*got \[10, 2\]"),
+            (lambda F, K1, K2, a, b: (F, 0 * K1, K2, a, b), torch.linalg.LinAlgError, "singular"),
+        ],
+    )
+    def test_exceptions(self, change, error, message):
+        with pytest.raises(error, match=message):
+            relative_pose(*change(*pair("orbit", 3, 10)[0]))
+
+    def test_real_correspondences(self):
+        folder = os.environ.get("LEARNNORM_DATA")
+        if not folder:
+            pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
+        store = read_store(f"{folder}/correspondences/kitti_06.h5@0:10")
+        truth = [torch.tensor(value) for value in (store.R, store.t)]
+        for i in range(len(store)):
+            rows = slice(store.offsets[i], store.offsets[i + 1])
+            F, K1, K2 = (torch.tensor(value)[None] for value in (store.F[i], store.K[i, 0], store.K[i, 1]))
+            points1, points2 = (torch.tensor(value[rows])[None] for value in (store.points1, store.points2))
+            R, t = relative_pose(F, K1, K2, points1, points2)
+            assert pose_error(R, t, *(value[i : i + 1] for value in truth)) < 1e-3

@@ -1,0 +1,191 @@
+"""The bootstrap against another one and against the normal law, alone and of paired differences."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kornia_learnnorm.metrics.bootstrap import bootstrap_interval, paired_bootstrap
+
+INF, NAN = float("inf"), float("nan")
+
+
+def uneven_groups(number=40, seed=1):
+    """Groups of very different sizes, the larger ones with larger values: means of samples and of groups differ."""
+    rng = np.random.default_rng(seed)
+    sizes = rng.geometric(0.1, number)
+    groups = np.repeat(np.arange(number), sizes)
+    return rng.normal(sizes[groups] / 10, 1.0), groups
+
+
+def resampled_means(values, groups):
+    """Means of 4,000 draws of whole groups with replacement."""
+    parts, rng = [values[groups == group] for group in np.unique(groups)], np.random.default_rng(0)
+    return np.array(
+        [np.concatenate([parts[i] for i in rng.integers(len(parts), size=len(parts))]).mean() for _ in range(4000)]
+    )
+
+
+def interval(values, groups, **options):
+    return np.array(bootstrap_interval(torch.tensor(values), torch.tensor(groups), **options))
+
+
+def width(*args, **options):
+    low, high = interval(*args, **options)
+    return high - low
+
+
+class TestBootstrapInterval:
+    """Ends scatter by about 0.04 standard errors at 4,000 draws."""
+
+    @pytest.mark.parametrize("level", [0.5, 0.95])
+    def test_another_bootstrap(self, level):
+        values, groups = uneven_groups()
+        means = resampled_means(values, groups)
+        expected = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+        np.testing.assert_allclose(
+            interval(values, groups, level=level, draws=4000), expected, atol=0.2 * np.std(means)
+        )
+
+    @pytest.mark.parametrize("level", [0.5, 0.9, 0.99])
+    def test_independent_samples_follow_the_normal_law(self, level):
+        values = np.random.default_rng(2).normal(3, 2, 200)
+        error = values.std() / np.sqrt(200)
+        end = NormalDist().inv_cdf((1 + level) / 2) * error
+        found = interval(values, np.arange(200), level=level, draws=4000)
+        np.testing.assert_allclose(found, values.mean() + np.array([-end, end]), atol=0.2 * error)
+
+    def test_all_draws_of_two_groups(self):
+        """Twice the first, one of each in either order, twice the second: a quarter, a half, a quarter."""
+        values, groups = [1.0, 1.0, 1.0, 0.0], [5, 5, 5, 2]
+        for level, expected in [(0.4, (0.75, 0.75)), (0.6, (0.0, 1.0))]:
+            assert bootstrap_interval(torch.tensor(values), torch.tensor(groups), level) == expected
+
+    def test_agreement_within_pairs_widens_it(self):
+        """Eight equal samples are worth one: the interval is wider by the root of eight."""
+        values, groups = np.repeat(np.random.default_rng(3).normal(size=100), 8), np.repeat(np.arange(100), 8)
+        mixed = np.random.default_rng(4).permutation(values)
+        ratio = width(values, groups, draws=4000) / width(mixed, groups, draws=4000)
+        assert ratio == pytest.approx(np.sqrt(8), rel=0.2)
+
+    def test_seed_decides(self):
+        values, groups = uneven_groups()
+        state = torch.get_rng_state()
+        assert (interval(values, groups, seed=3) == interval(values, groups, seed=3)).all()
+        assert (interval(values, groups, seed=3) != interval(values, groups, seed=4)).all()
+        assert torch.equal(torch.get_rng_state(), state)
+
+    @given(st.integers(0, 2**31))
+    def test_order_of_the_samples_does_not_matter(self, seed):
+        values, groups = uneven_groups()
+        order = np.random.default_rng(seed).permutation(len(values))
+        found = interval(values[order], groups[order], draws=200)
+        np.testing.assert_allclose(found, interval(values, groups, draws=200), rtol=1e-12)
+
+    def test_labels_of_the_groups_do_not_matter(self):
+        """In the same order they give the same draws, in another order other draws of the same law."""
+        values, groups = uneven_groups()
+        expected = interval(values, groups, draws=4000)
+        assert (interval(values, 7 * groups - 100, draws=4000) == expected).all()
+        np.testing.assert_allclose(interval(values, 39 - groups, draws=4000), expected, atol=0.05 * np.ptp(expected))
+
+    @given(st.lists(st.tuples(st.floats(-1e3, 1e3), st.integers(0, 4)), min_size=2, max_size=20), st.floats(0.01, 0.99))
+    def test_lies_among_the_values(self, pairs, level):
+        values, groups = torch.tensor([a for a, _ in pairs], dtype=torch.float64), torch.tensor([b for _, b in pairs])
+        if len(groups.unique()) == 1:
+            groups[0] += 1
+        low, high = bootstrap_interval(values, groups, level, draws=50)
+        assert values.min() - 1e-9 <= low <= high <= values.max() + 1e-9
+
+    @pytest.mark.parametrize("kind", [torch.bool, torch.int64, torch.float32])
+    def test_kinds_of_numbers(self, kind):
+        values, groups = torch.tensor([1, 0, 0, 1, 1, 0]), torch.tensor([0, 0, 1, 1, 2, 3])
+        found = bootstrap_interval(values.to(kind), groups)
+        assert found == bootstrap_interval(values.double(), groups)
+        assert [type(end) for end in found] == [float, float]
+
+    def test_equal_values_leave_no_width(self):
+        assert bootstrap_interval(torch.full((6,), 0.5), torch.tensor([0, 0, 0, 1, 1, 2])) == (0.5, 0.5)
+
+    @pytest.mark.parametrize(
+        ("values", "groups", "level", "message"),
+        [
+            (torch.rand(3), torch.arange(4), 0.95, r"two \(S,\) tensors, got \[3\] and \[4\]"),
+            (torch.rand(2, 2), torch.ones(2, 2).long(), 0.95, r"two \(S,\) tensors, got \[2, 2\] and \[2, 2\]"),
+            (torch.tensor(1.0), torch.tensor(1), 0.95, r"two \(S,\) tensors, got \[\] and \[\]"),
+            (torch.rand(3), torch.arange(3), 0.0, r"level must be between 0 and 1, got 0\.0"),
+            (torch.rand(3), torch.arange(3), 1.0, r"level must be between 0 and 1, got 1\.0"),
+            (torch.rand(3), torch.arange(3), 95, "level must be between 0 and 1, got 95"),
+            (torch.rand(3), torch.arange(3), NAN, "level must be between 0 and 1, got nan"),
+            (torch.rand(3), torch.full((3,), 7), 0.95, "at least two groups are needed, got 1"),
+            (torch.rand(0), torch.arange(0), 0.95, "at least two groups are needed, got 0"),
+        ],
+    )
+    def test_exceptions(self, values, groups, level, message):
+        with pytest.raises(ValueError, match=message):
+            bootstrap_interval(values, groups, level)
+
+
+def uneven(effect=0.0, number=30, seed=1):
+    """Differences that agree within pairs of very different sizes."""
+    rng = np.random.default_rng(seed)
+    groups = np.repeat(np.arange(number), rng.geometric(0.1, number))
+    baseline = rng.normal(size=len(groups))
+    return baseline + effect + rng.normal(size=number)[groups], baseline, groups
+
+
+class TestPairedBootstrap:
+    def test_another_bootstrap(self):
+        values, baseline, groups = uneven(0.4)
+        means = resampled_means(values - baseline, groups)
+        found = paired_bootstrap(*map(torch.tensor, (values, baseline, groups)), draws=4000)
+        assert found.mean == pytest.approx((values - baseline).mean())
+        assert found.p_value == pytest.approx(2 * min((means <= 0).mean(), (means >= 0).mean()), abs=0.03)
+
+    def test_interval_is_that_of_the_differences(self):
+        values, baseline, groups = map(torch.tensor, uneven(0.2))
+        found = paired_bootstrap(values, baseline, groups, level=0.9, draws=500, seed=3)
+        assert found[1:3] == bootstrap_interval(values - baseline, groups, 0.9, 500, 3)
+
+    @given(st.floats(-1.5, 1.5), st.integers(0, 99))
+    def test_small_exactly_where_the_interval_leaves_zero_out(self, effect, seed):
+        values, baseline, groups = map(torch.tensor, uneven(effect, seed=seed))
+        found = paired_bootstrap(values, baseline, groups, draws=999)
+        outside = not found.low <= 0 <= found.high
+        assert outside == (found.p_value < 0.05) or abs(found.p_value - 0.05) < 0.005  # quantiles interpolate
+
+    def test_swapping_the_methods(self):
+        values, baseline, groups = map(torch.tensor, uneven(0.3))
+        found, swapped = paired_bootstrap(values, baseline, groups), paired_bootstrap(baseline, values, groups)
+        np.testing.assert_allclose(swapped, [-found.mean, -found.high, -found.low, found.p_value], rtol=1e-12)
+
+    def test_extremes(self):
+        values, groups = torch.rand(10), torch.arange(10)
+        assert paired_bootstrap(values, values, groups) == (0.0, 0.0, 0.0, 1.0)
+        assert paired_bootstrap(values + 1, values, groups, draws=99).p_value == 2 / 100
+        better = torch.tensor([True, True, False])
+        assert paired_bootstrap(better, better, groups[:3]).mean == 0  # shares of booleans
+
+    def test_p_values_are_uniform_where_there_is_no_effect(self):
+        found = [paired_bootstrap(*map(torch.tensor, uneven(seed=s)), draws=199).p_value for s in range(400)]
+        for level in (0.1, 0.5):
+            assert np.mean(np.array(found) < level) == pytest.approx(level, abs=0.07)
+
+    @pytest.mark.parametrize(
+        ("values", "baseline", "groups", "message"),
+        [
+            (torch.rand(3), torch.rand(4), torch.arange(3), r"two \(S,\) tensors, got \[3\] and \[4\]"),
+            (torch.rand(3, 1), torch.rand(3, 1), torch.arange(3), r"two \(S,\) tensors, got \[3, 1\]"),
+            (torch.rand(3), torch.rand(3), torch.arange(4), r"got \[3\] and \[4\]"),
+            (torch.rand(3), torch.rand(3), torch.zeros(3).long(), "at least two groups are needed, got 1"),
+            (torch.tensor([1.0, NAN, INF]), torch.rand(3), torch.arange(3), "got 2 NaN or infinite ones of 3"),
+        ],
+    )
+    def test_exceptions(self, values, baseline, groups, message):
+        with pytest.raises(ValueError, match=message):
+            paired_bootstrap(values, baseline, groups)

@@ -1,0 +1,116 @@
+"""What every normaliser promises: shapes, no dependence on the view or absent points, finite values, errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.epipolar import normalize_points
+from two_view import WRONG_CORRESPONDENCES, correspondences, shaken, uniform
+
+from kornia_learnnorm import (
+    CrossViewNetwork,
+    Hartley,
+    Identity,
+    LearnedNormalizer,
+    PaperNetwork,
+    PerView,
+    ReweightedWhitening,
+    Whitening,
+    paper_transform,
+)
+
+CLOSED_FORM = {
+    "identity": Identity,
+    "hartley": Hartley,
+    "whitening": Whitening,
+    "kornia": lambda: PerView(normalize_points),
+    "reweighted": ReweightedWhitening,
+}
+LEARNED = {
+    "learned": lambda: shaken(LearnedNormalizer(Whitening(), CrossViewNetwork(width=16, depth=2))),
+    "paper": lambda: shaken(LearnedNormalizer(Hartley(), PaperNetwork(16, 3), paper_transform)),
+}
+ALL = CLOSED_FORM | LEARNED
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("batch_size", [0, 1, 4])
+@pytest.mark.parametrize("num_points", [8, 30])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_smoke(name, batch_size, num_points, weighted, device, dtype):
+    points = [uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
+    weights = uniform(batch_size, num_points, low=0.1, seed=2).to(device, dtype) if weighted else None
+    for T in ALL[name]().to(device)(*points, weights):
+        assert (T.shape, T.dtype, T.device.type) == ((batch_size, 3, 3), dtype, device.type)
+        assert torch.isfinite(T).all()
+        assert torch.equal(T[:, 2].cpu(), torch.tensor([[0, 0, 1]], dtype=dtype).expand(batch_size, 3))  # affine
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_swapped_views_give_swapped_transforms(name):
+    points1, points2 = correspondences("driving", 10, 12)
+    normalizer, weights = ALL[name]().double(), uniform(10, 12, low=0.1)
+    T1, T2 = normalizer(points1, points2, weights)
+    torch.testing.assert_close(normalizer(points2, points1, weights), (T2, T1), rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if name != "identity"])
+def test_zero_weight_is_absence(name):
+    normalizer, bound = ALL[name]().double(), 1e-8 if name in ("reweighted", "learned") else 1e-12  # null vectors
+    points, weights = correspondences("handheld", 10, 9), uniform(10, 9, low=0.1)
+    junk = uniform(10, 3, 2, low=-1e4, high=1e4)
+    extended = [torch.cat(pair, 1) for pair in zip((*points, weights), (junk, -junk, 0 * junk[..., 0]), strict=True)]
+    torch.testing.assert_close(normalizer(*extended), normalizer(*points, weights), rtol=bound, atol=bound)
+
+
+@pytest.mark.parametrize("name", ["hartley", "whitening"])
+def test_weights_that_are_all_zero_are_equal_weights(name):
+    points, zeros = correspondences("handheld", 10, 9), torch.zeros(10, 9, dtype=torch.float64)
+    torch.testing.assert_close(ALL[name]()(*points, zeros), ALL[name]()(*points), rtol=1e-12, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["hartley", "whitening", "reweighted", *LEARNED])
+def test_float32_is_solved_in_float64(name):
+    normalizer, points = ALL[name](), [p.float() + 1e4 for p in correspondences("handheld", 20, 8)]  # far away
+    expected = tuple(T.float() for T in normalizer(*(p.double() for p in points)))
+    torch.testing.assert_close(normalizer(*points), expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", CLOSED_FORM)
+def test_has_no_state(name):
+    assert not ALL[name]().state_dict()
+
+
+@pytest.mark.parametrize("name", ["hartley", "whitening"])
+@pytest.mark.parametrize("num_points", [8, 9, 100])
+@pytest.mark.parametrize("value", [0.0, 5.0, 320.1, 1e6 / 3])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_coincident_points_keep_their_scale(name, num_points, value, weighted, dtype):
+    points = torch.full((1, num_points, 2), value, dtype=dtype)  # of which no sum need be exact
+    weights = 10 ** uniform(1, num_points, low=-6, high=6, dtype=dtype) if weighted else None
+    for T in ALL[name]()(points, points, weights):
+        np.testing.assert_allclose(T[0].numpy(), [[1, 0, -value], [0, 1, -value], [0, 0, 1]], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["hartley", "whitening"])
+@pytest.mark.parametrize("kind", ["coincident", "horizontal", "diagonal", "two places"])
+def test_degenerate_points(name, kind, dtype):
+    t = uniform(4, 9, 1, dtype=dtype)
+    points = {
+        "coincident": torch.full((4, 9, 2), 320.0, dtype=dtype),
+        "horizontal": 600 * torch.cat([t, torch.zeros_like(t)], -1),
+        "diagonal": 600 * torch.cat([t, 0.3 * t], -1) + 17,
+        "two places": 600 * (t > 0.5).to(dtype).repeat(1, 1, 2),
+    }[kind].requires_grad_()
+    weights = uniform(4, 9, dtype=dtype).requires_grad_()
+    T1, T2 = ALL[name]()(points, points, weights)
+    gradients = torch.autograd.grad((T1 * uniform(3, 3, dtype=dtype)).sum() + T2.sum(), [points, weights])
+    assert all(torch.isfinite(value).all() for value in (T1, T2, *gradients))
+
+
+@pytest.mark.parametrize("name", ["reweighted", *LEARNED])
+@pytest.mark.parametrize(("points1", "points2", "weights", "error", "message"), WRONG_CORRESPONDENCES)
+def test_exceptions(name, points1, points2, weights, error, message):
+    with pytest.raises(error, match=message):
+        ALL[name]()(points1, points2, weights)
