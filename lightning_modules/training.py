@@ -72,16 +72,7 @@ def _state_dict(path: str) -> dict[str, Tensor]:
 
 
 def run(args: list[str] | None) -> None:
-    """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict``.
-
-    Args:
-        args: command line without the program's name; ``sys.argv`` when not given.
-
-    Raises:
-        ValueError: if the configuration or the checkpoint is wrong.
-        OSError: if a file is missing or cannot be written.
-
-    """
+    """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict``; ``args`` is ``sys.argv`` when None."""
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")  # Lightning's own call of torch
     TrainingCLI(
         NormalizerTask,

@@ -48,13 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm robust``.
-
-    Raises:
-        FileNotFoundError: if a store or weights are missing.
-        ValueError: if an option, a store or weights are wrong, or the folder holds a run of other options.
-
-    """
+    """Record a run of robust estimators and minimal solvers."""
     stores = dict(zip(names_of(args.stores), args.stores, strict=True))
     options = {name: getattr(args, name) for name in DEFAULT_OPTIONS}
     record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo)

@@ -34,12 +34,7 @@ WIDE = 1.8  # width over height from which two images are stacked
 
 
 def import_matplotlib() -> Any:
-    """Return the package ``matplotlib`` with its modules ``collections``, ``colors`` and ``figure``.
-
-    Raises:
-        ImportError: if Matplotlib is not installed; the message names the extra that installs it.
-
-    """
+    """Return the package ``matplotlib`` with its modules ``collections``, ``colors`` and ``figure``."""
     matplotlib = import_extra("matplotlib", "report", "drawing pictures")
     for name in ("collections", "colors", "figure"):
         importlib.import_module(f"matplotlib.{name}")
@@ -47,17 +42,7 @@ def import_matplotlib() -> Any:
 
 
 def draw_line(axes: Axes, line: npt.NDArray[np.float64], **style: Any) -> Line2D | None:
-    r"""Draw the line :math:`a x + b y + c = 0` across axes.
-
-    Args:
-        axes: Matplotlib axes.
-        line: :math:`(a, b, c)`, any scale.
-        style: options of :meth:`matplotlib.axes.Axes.axline`.
-
-    Returns:
-        the line; None for the line at infinity, :math:`a = b = 0`, which is not drawn.
-
-    """
+    """Draw the line a x + b y + c = 0 across axes, at any scale of (a, b, c); nothing for the line at infinity."""
     norm = np.linalg.norm(line[:2])
     if not norm > 0:
         return None
@@ -68,15 +53,7 @@ def draw_line(axes: Axes, line: npt.NDArray[np.float64], **style: Any) -> Line2D
 def draw_matches(
     axes: Axes, points1: npt.NDArray[np.float64], points2: npt.NDArray[np.float64], inliers: npt.NDArray[np.bool_]
 ) -> None:
-    """Draw the matches in image 1: inliers as dots with their motion to image 2, outliers as crosses.
-
-    Args:
-        axes: Matplotlib axes.
-        points1: pixels in image 1 with shape (N, 2).
-        points2: pixels in image 2 with shape (N, 2).
-        inliers: mask of the inliers with shape (N,).
-
-    """
+    """Draw the matches (N, 2) in image 1: inliers as dots with their motion to image 2, outliers as crosses."""
     motion = np.stack([points1, points2], 1)[inliers]
     lines = import_matplotlib().collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8)
     axes.add_collection(lines)
@@ -99,8 +76,8 @@ def draw_pair(
     images are stacked, other images stand side by side.
 
     Args:
-        image1: grey values with shape :math:`(H_1, W_1)`, uint8.
-        image2: grey values with shape :math:`(H_2, W_2)`, uint8.
+        image1: grey values with shape (H1, W1), uint8.
+        image2: grey values with shape (H2, W2), uint8.
         estimate: the estimate of these images.
         path: the picture to write; its suffix decides the format.
         num_lines: number of epipolar lines; fewer if there are fewer inliers.
@@ -111,7 +88,6 @@ def draw_pair(
         ValueError: if the images do not have the sizes in ``estimate``, ``num_lines`` is negative, or the suffix is not
             a format of Matplotlib.
         ImportError: if Matplotlib is not installed.
-
     """
     for image, size in ((image1, estimate.size1), (image2, estimate.size2)):
         if image.shape != size[::-1]:

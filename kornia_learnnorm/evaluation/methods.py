@@ -48,13 +48,7 @@ UNKNOWN = "not known"  # training data
 
 
 def default_methods(weights: Sequence[str] = SHIPPED) -> tuple[str, ...]:
-    """Return the closed forms, weights, and the search as the limit of them all.
-
-    Example:
-        >>> default_methods(["mine.safetensors"])
-        ('none', 'Hartley', 'whitening', 'reweighted', 'mine.safetensors', 'searched')
-
-    """
+    """Return the closed forms, weights, and the search as the limit of them all."""
     *closed_forms, search = CLOSED_FORMS
     return (*closed_forms, *weights, search)
 
@@ -112,13 +106,7 @@ def find_method(name: str) -> Method:
 
 
 def base_name(name: str) -> str:
-    """Return a method's name without suffix, the name of its normalisation.
-
-    Example:
-        >>> base_name("Hartley+LM")
-        'Hartley'
-
-    """
+    """Return a method's name without suffix, the name of its normalisation."""
     return name.removesuffix(REFINED if name.endswith(REFINED) else OPTIMAL)
 
 

@@ -249,17 +249,7 @@ def _check_chance(matches: int, inliers: int, threshold: float, shape: tuple[int
 
 
 def write_json(path: str | Path, estimate: PairEstimate) -> None:
-    """Write an estimate as a JSON file, whole or not at all.
-
-    Args:
-        path: the file to write.
-        estimate: the estimate of :func:`estimate_pair`.
-
-    Raises:
-        OSError: if the folder does not exist or is not writable.
-        ValueError: if ``path`` is a folder or a device.
-
-    """
+    """Write an estimate as a JSON file, whole or not at all."""
     content = {
         "F": estimate.F_mat.tolist(),
         "convention": "x2^T F x1 = 0, x = (column, row, 1) in pixels, unit Frobenius norm",

@@ -28,16 +28,11 @@ Predictions = Mapping[str, Mapping[str, Tensor]]
 
 
 def method_rows(predictions: Predictions) -> list[list[str]]:
-    """Return a row per method: better rates, mean and median residual, ground-truth residual and its better rate.
+    """Return a row per method in the order of :data:`HEADER`, from the errors of each sample, pixels, (S,).
 
-    Args:
-        predictions: by method, ``own``, the mean symmetric epipolar distance of each sample's points, and ``truth``,
-            the median one of the ground-truth inliers of its pair, NaN where there are none; pixels, (S,) each.
-
-    Returns:
-        cells as text, in the order of :data:`HEADER`. The mean leaves out samples whose residual is infinite for any
-        method (a point on an epipole). Without Hartley or whitening among the methods, their rates are empty.
-
+    ``own`` is the mean symmetric epipolar distance of a sample's points, ``truth`` the median one of its pair's
+    ground-truth inliers, NaN where there are none. The mean leaves out samples whose residual is infinite for any
+    method (a point on an epipole). Without Hartley or whitening among the methods, their rates are empty.
     """
     finite = torch.stack([errors["own"] for errors in predictions.values()]).isfinite().all(0)
     rows = []
@@ -58,15 +53,7 @@ def _rate(predictions: Predictions, name: str, baseline: str, quantity: str) -> 
 
 
 def diagnostic_rows(predictions: Predictions) -> list[list[str]]:
-    """Return a row per method: the medians of its diagnostics.
-
-    Args:
-        predictions: by method, (S,) each, the diagnostics that a run keeps.
-
-    Returns:
-        cells as text, in the order of :data:`DIAGNOSTICS`.
-
-    """
+    """Return a row per method in the order of :data:`DIAGNOSTICS`: the medians of the diagnostics of a run."""
     rows = []
     for name, found in predictions.items():
         numbers = [median(found[key]).item() for key in ("condition_number", "rho", "distance1", "distance2")]

@@ -30,12 +30,7 @@ TEXTS = {
 
 
 def hypothesis_tables(run: RobustRun) -> list[Table]:
-    """Return all tables of the hypotheses of minimal solvers.
-
-    Args:
-        run: results of minimal solvers.
-
-    """
+    """Return all tables of the hypotheses of minimal solvers."""
     cells = [cell for cell in run.cells if cell.hypotheses]
     return [table for cell in cells for table in (_values(cell, "best"), _values(cell, "picked"), *_tests(cell))]
 
@@ -104,15 +99,7 @@ def _test(cell: RobustCell, name: str, kind: str, number: int) -> str:
 
 @report_style()
 def hypothesis_figures(run: RobustRun) -> list[Picture]:
-    """Draw the errors of each store's hypotheses against their number.
-
-    Args:
-        run: results of minimal solvers.
-
-    Raises:
-        ImportError: if Matplotlib is not installed.
-
-    """
+    """Draw the errors of each store's hypotheses against their number."""
     colors = method_colors(run.about["solvers"])
     pictures = []
     for place, store in enumerate(run.about["stores"], 1):

@@ -23,14 +23,7 @@ MOTIONS = {
 
 
 def by_motion(cell: Cell, run: Run, learned: str) -> Table:
-    """Return the better rates of a method in two halves of the image pairs, split at the median of each motion.
-
-    Args:
-        cell: predictions of one store and protocol.
-        run: the run of these predictions.
-        learned: the method.
-
-    """
+    """Return the better rates of a method in two halves of the image pairs, split at the median of each motion."""
     rows, left_out = [], []
     truth = ~cell.predictions[BASELINE]["truth"].isnan()
     for key, name in MOTIONS.items():
@@ -75,14 +68,7 @@ def _distinct(middle: Tensor, values: Tensor) -> str:
 
 
 def worst_failures(cell: Cell, run: Run, learned: str) -> Table:
-    """Return the samples with the largest ratio of a method's ground-truth error to the baseline's.
-
-    Args:
-        cell: predictions of one store and protocol.
-        run: the run of these predictions.
-        learned: the method.
-
-    """
+    """Return the samples with the largest ratio of a method's ground-truth error to the baseline's."""
     mine, other = cell.predictions[learned], cell.predictions[BASELINE]
     ratio = (mine["truth"] / other["truth"]).nan_to_num(nan=-1.0, posinf=torch.inf)
     worst = ratio.argsort(descending=True)[:MAX_FAILURES]

@@ -26,19 +26,7 @@ TRUTH = "ground truth"
 
 @report_style()
 def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
-    """Draw the example image pair of a run. The images are not drawn: stores do not contain them.
-
-    Args:
-        run: predictions.
-        colors: colours by method.
-
-    Returns:
-        the picture; an empty list if the run has no example yet or no sample of it.
-
-    Raises:
-        ImportError: if Matplotlib is not installed.
-
-    """
+    """Draw the example image pair of a run, without the images; nothing where the run has no sample of it."""
     pair = run.example
     place = (str(pair["store"]), "filtered") if pair else ("", "")
     cell = next((cell for cell in run.cells if (cell.store, cell.protocol) == place), None)
@@ -69,12 +57,7 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
 
 
 def example_inliers(pair: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return a mask of the matches of the example image pair within 1 px of the ground truth, boolean (M,).
-
-    Args:
-        pair: from :func:`~kornia_learnnorm.evaluation.runs.example.random_pair`.
-
-    """
+    """Return a mask of the matches of the example image pair within 1 px of the ground truth, boolean (M,)."""
     points1, points2, F_mat = (torch.from_numpy(pair[key]) for key in ("points1", "points2", "F"))
     near: NDArray[np.bool_] = (symmetric_epipolar_distance(points1, points2, F_mat) < INLIER_THRESHOLD).numpy()
     return near

@@ -13,16 +13,7 @@ __all__ = ["print_tables"]
 
 
 def print_tables(tables: Sequence[Table], elsewhere: Path) -> None:
-    """Print the tables that fit the width of the terminal, and the titles of the tables that do not.
-
-    Args:
-        tables: the tables.
-        elsewhere: the file that has all tables.
-
-    Raises:
-        ImportError: if rich is not installed.
-
-    """
+    """Print the tables that fit the terminal, and the titles of those that do not, which are in ``elsewhere``."""
     console, wide = import_extra("rich.console", "report", "printing tables").Console(), []
     unlimited = console.options.update_width(10**6)
     for table in tables:

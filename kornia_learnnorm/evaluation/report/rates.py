@@ -18,18 +18,7 @@ TESTS = (("kitti_06", "kitti_07", "kitti_08", "kitti_09", "kitti_10"), ("tum",))
 
 
 def with_baseline(run: Run) -> Run:
-    """Return a run without the stores and protocols that lack predictions of Hartley's normalisation.
-
-    Args:
-        run: predictions.
-
-    Returns:
-        the run; ``missing`` names what was left out.
-
-    Raises:
-        ValueError: if no store and protocol is left.
-
-    """
+    """Return a run without the stores and protocols that lack Hartley's normalisation; ``missing`` names them."""
     cells = [cell for cell in run.cells if BASELINE in cell.predictions]
     if not cells:
         found = sorted({name for cell in run.cells for name in cell.predictions})
@@ -42,12 +31,7 @@ def with_baseline(run: Run) -> Run:
 
 
 def rate_tables(run: Run) -> list[Table]:
-    """Return the tables of rates against Hartley and, where the run has it, whitening.
-
-    Args:
-        run: predictions with ``Hartley`` in every store and protocol.
-
-    """
+    """Return the tables of rates against Hartley and, where the run has it, whitening."""
     tables = []
     for baseline in (BASELINE, "whitening"):
         for protocol in PROTOCOLS:

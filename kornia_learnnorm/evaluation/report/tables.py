@@ -30,12 +30,7 @@ MIN_DISTANCE = 1e-6  # pixels; smaller distances are clamped before the logarith
 
 
 def report_tables(run: Run) -> list[Table]:
-    """Return all tables of a run of predictions.
-
-    Args:
-        run: predictions with ``Hartley`` in every store and protocol.
-
-    """
+    """Return all tables of a run with predictions of Hartley's normalisation in every store and protocol."""
     tables = rate_tables(run)
     for cell in run.cells:
         tables += [_accuracy(cell), _consensus(cell), _tests(cell)]

@@ -42,32 +42,16 @@ class Matches(NamedTuple):
 
 
 def even_pairs(total: int, number: int | None) -> list[int]:
-    """Return the indices of evenly spaced image pairs.
-
-    Args:
-        total: number of pairs.
-        number: largest number of indices; None for all.
-
-    Example:
-        >>> even_pairs(51, 3), even_pairs(2, None)
-        ([0, 25, 50], [0, 1])
-
-    """
+    """Return the indices of at most ``number`` evenly spaced image pairs of ``total``; all of them for 0."""
     if number is None or number >= total:
         return list(range(total))
     return [int(place) for place in np.linspace(0, total - 1, number).round()]
 
 
 def draw_matches(store: CorrespondenceStore, pair: int, protocol: str, seed: int, order: int = 0) -> Matches:
-    """Return the correspondences of an image pair.
+    """Return the correspondences of an image pair; ``order`` is a second seed of their order.
 
-    Args:
-        store: correspondences of image pairs.
-        pair: index of the pair.
-        protocol: ``filtered`` for at most 1,000 random matches that pass the ratio test, ``unfiltered`` for all.
-        seed: seed of the random matches and of their order.
-        order: second seed of the order.
-
+    The protocol ``filtered`` draws at most 1,000 matches that pass the ratio test, ``unfiltered`` takes all.
     """
     rows = np.arange(store.offsets[pair], store.offsets[pair + 1])
     max_ratio = PROTOCOLS[protocol]
@@ -81,17 +65,10 @@ def draw_matches(store: CorrespondenceStore, pair: int, protocol: str, seed: int
 
 
 def measure(matches: Matches, F_mat: Tensor, threshold: float) -> dict[str, float]:
-    """Return the metrics of an estimate, NaN where the pair lacks the ground truth.
+    """Return ``inliers``, ``f1``, ``error`` (px), ``rotation_error`` and ``translation_error`` (degrees) of a matrix.
 
-    Args:
-        matches: the correspondences that the estimator got.
-        F_mat: estimated matrix (3, 3), float64; zero or NaN for a failure.
-        threshold: inlier threshold, pixels.
-
-    Returns:
-        ``inliers`` and ``f1`` at the threshold, ``error`` in pixels, and ``rotation_error`` and ``translation_error``
-        in degrees. The inliers of the estimate within 1 px decide between the four poses of the matrix.
-
+    They are NaN where the pair lacks the ground truth. A failed estimate is zero or NaN. The inliers of the estimate
+    within 1 px decide between the four poses of the matrix.
     """
     x1, x2 = matches.points1, matches.points2
     near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD

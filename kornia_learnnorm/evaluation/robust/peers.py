@@ -96,28 +96,12 @@ def _import(name: str) -> Any:
 
 
 def find_peer(name: str) -> Peer:
-    """Return an estimator of another package.
-
-    Args:
-        name: one of the names in ``PEERS``.
-
-    Raises:
-        ImportError: if the package is not installed.
-
-    """
+    """Return an estimator of another package by its name in ``PEERS``."""
     return partial(PEERS[name].estimate, _import(name))
 
 
 def peer_version(name: str) -> str:
-    """Return the package of an estimator and its version.
-
-    Args:
-        name: one of the names in ``PEERS``.
-
-    Raises:
-        ImportError: if the package is not installed.
-
-    """
+    """Return the package of an estimator and its version."""
     package = PEERS[name].distribution
     if package == "opencv":  # several distributions provide the module
         return f"opencv {_import(name).__version__}"

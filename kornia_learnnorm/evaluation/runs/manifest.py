@@ -29,20 +29,7 @@ About = dict[str, Any]
 
 
 def read_section(folder: Path, section: str) -> About | None:
-    """Return what a run was computed from.
-
-    Args:
-        folder: the run.
-        section: ``evaluate`` or ``robust``.
-
-    Returns:
-        the options by name, and by the names in ``JOINED`` what each store, method and so on is; None where the folder
-        holds no such run.
-
-    Raises:
-        ValueError: if another version of the package made it, or ``run.json`` is damaged.
-
-    """
+    """Return the options of a section, ``evaluate`` or ``robust``, and what its parts are; None if it has none."""
     about = _read(folder).get(section)
     if about is None:
         return None
@@ -58,17 +45,8 @@ def read_section(folder: Path, section: str) -> About | None:
 def begin_section(folder: Path, section: str, about: About, redo: Collection[str] = ()) -> None:
     """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
 
-    Args:
-        folder: the run, made if missing.
-        section: ``evaluate`` or ``robust``.
-        about: the options, and by the names in ``JOINED`` what each store, method and so on is; None for one whose
-            package is not installed.
-        redo: names whose description may change.
-
-    Raises:
-        ValueError: if the folder holds a run of other options or of another version of the package.
-        OSError: if it cannot be written.
-
+    ``about`` has the options and, by the names in ``JOINED``, what each store, method and so on is, None for one whose
+    package is not installed. The descriptions of ``redo`` may change.
     """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: expected a folder for the run, or a new name")
@@ -82,14 +60,7 @@ def begin_section(folder: Path, section: str, about: About, redo: Collection[str
 
 
 def leave_out(folder: Path, section: str, names: Collection[str]) -> None:
-    """Remove methods, estimators or solvers from what a run was computed from; their files are the caller's.
-
-    Args:
-        folder: the run.
-        section: ``evaluate`` or ``robust``.
-        names: what to remove.
-
-    """
+    """Remove methods, estimators or solvers from a section; their files are the caller's."""
     about = read_section(folder, section) or {}
     for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
         about[key] = {name: value for name, value in about[key].items() if name not in names}

@@ -19,17 +19,11 @@ QUANTITIES = ("rotation", "forward", "parallax", "inliers")
 
 
 def pair_motions(store: CorrespondenceStore) -> Arrays:
-    """Return a description of each pair's motion; NaN where its ground truth is not known.
+    """Return a description of each pair's motion, arrays (P,); NaN where its ground truth is not known.
 
-    Args:
-        store: correspondences with ground truth.
-
-    Returns:
-        arrays (P,): ``rotation`` in degrees; ``forward``, the share of the translation along the optical axis,
-        :math:`|t_z| / |t|`; ``parallax``, the median displacement of the inliers that the rotation does not explain,
-        pixels; ``inliers``, the share of the matches that pass the ratio test and lie within 1 px (symmetric epipolar
-        distance) of their ground-truth epipolar lines; and ``names``.
-
+    ``rotation`` is in degrees; ``forward`` is the share of the translation along the optical axis, :math:`|t_z| / |t|`;
+    ``parallax`` is the median displacement of the inliers that the rotation does not explain, pixels; ``inliers`` is
+    the share of ground-truth inliers among the matches that pass the ratio test.
     """
     rows = [_motion(store, pair) for pair in range(len(store))]
     return {

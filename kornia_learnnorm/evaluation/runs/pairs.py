@@ -17,14 +17,7 @@ MAX_INLIERS = 200  # of a pair, the first in the store's random order
 
 
 def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
-    """Return the matches of an image pair in both views, pixels, (M, 2) float64 each.
-
-    Args:
-        store: correspondences of image pairs.
-        pair: index of the pair.
-        max_ratio: only matches with Lowe's ratio below; None for all.
-
-    """
+    """Return the matches of an image pair in both views below Lowe's ratio, pixels, (M, 2) float64 each."""
     points1, points2, _ = store.matches(pair, max_ratio)
     return torch.from_numpy(points1).double(), torch.from_numpy(points2).double()
 
@@ -32,13 +25,8 @@ def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None)
 def ground_truth_inliers(store: CorrespondenceStore) -> Tensor:
     """Return each pair's matches that pass the ratio test and lie within 1 px of their ground-truth epipolar lines.
 
-    Args:
-        store: correspondences of image pairs.
-
-    Returns:
-        points (x1, y1, x2, y2) with shape (P, 200, 4), pixels, float64, padded with NaN; all NaN for a pair without
-        ground truth or with fewer than 16 inliers.
-
+    They are points (x1, y1, x2, y2), (P, 200, 4) float64, padded with NaN; all NaN for a pair without ground truth or
+    with fewer than 16 inliers.
     """
     result = torch.full((len(store), MAX_INLIERS, 4), torch.nan, dtype=torch.float64)
     for pair, F_mat in enumerate(torch.from_numpy(store.F)):
@@ -53,15 +41,9 @@ def ground_truth_inliers(store: CorrespondenceStore) -> Tensor:
 
 
 def median_distance(points: Tensor, F_mat: Tensor) -> Tensor:
-    """Return the median symmetric epipolar distance of each set of correspondences.
+    """Return the median symmetric epipolar distance (S,) of each set of correspondences (S, N, 4), pixels.
 
-    Args:
-        points: correspondences (x1, y1, x2, y2) with shape (S, N, 4), pixels; rows of NaN are left out.
-        F_mat: matrices with shape (S, 3, 3).
-
-    Returns:
-        medians with shape (S,), pixels; NaN where a set is empty.
-
+    Rows of NaN are left out; the median of an empty set is NaN.
     """
     known = points.nan_to_num()
     distance = symmetric_epipolar_distance(known[..., :2], known[..., 2:], F_mat)
