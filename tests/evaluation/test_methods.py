@@ -12,7 +12,7 @@ import yaml
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.evaluation.methods import SHIPPED, find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.runs.trained import was_trained_on
+from kornia_learnnorm.evaluation.report.rates import was_trained_on
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.normalizers.learned import WEIGHTS
 
@@ -95,6 +95,8 @@ class TestTrainedOn:
             ("a@1:2", ["a", "b@3:6"], True),
             ("b@6:9", ["a", "b@3:6"], False),
             ("a", [], False),
+            ("tum@10:19", ["tum@0:9"], False),
+            ("tum", ["tum@0:9"], True),
             ("a", ["not known"], False),
         ],
     )

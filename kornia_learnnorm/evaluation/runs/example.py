@@ -30,8 +30,8 @@ def random_pair(stores: Mapping[str, CorrespondenceStore], seed: int) -> Arrays:
     """
     name, store = next(iter(stores.items()))
     truth = ground_truth_inliers(store)
-    passing = np.add.reduceat(store.ratio < RATIO, store.offsets[:-1])
-    suitable = np.flatnonzero((passing >= SIZES[-1]) & truth.isfinite().any(-1).any(-1).numpy())
+    passing = [len(store.rows(pair, RATIO)) for pair in range(len(store))]
+    suitable = np.flatnonzero((np.array(passing) >= SIZES[-1]) & truth.isfinite().any(-1).any(-1).numpy())
     if len(suitable) == 0:
         raise ValueError(f"no pair of {name} has {SIZES[-1]} matches that pass the ratio test and a ground truth")
     pair = int(np.random.default_rng(seed).choice(suitable))
