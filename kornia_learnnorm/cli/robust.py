@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from kornia_learnnorm.evaluation.robust.benchmark import DEFAULT_OPTIONS, record_robust
 from kornia_learnnorm.evaluation.robust.estimators import DEFAULT_ESTIMATORS, DEFAULT_SOLVERS
+from kornia_learnnorm.evaluation.robust.record import DEFAULT_OPTIONS, record_robust
 from kornia_learnnorm.evaluation.tables import names_of
 
 __all__ = ["add_arguments", "run"]
