@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.utilities import rank_zero_info
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.data.sources import Block, block_generator
@@ -70,12 +71,9 @@ class SampleLoader:
         if batch_size < world_size:
             raise ValueError(f"a batch must hold at least one {unit} for each process, got {batch_size}")
         self.source = source
-        self.batch_size = batch_size
-        self.seed = seed
-        self.shuffle = shuffle
-        self.by_pair = by_pair
-        self.workers = workers
-        self.rank, self.world_size = rank, world_size
+        self.batch_size, self.by_pair = batch_size, by_pair
+        self.seed, self.shuffle = seed, shuffle
+        self.workers, self.rank, self.world_size = workers, rank, world_size
         self.epoch, self.batch = 0, 0
         self._drawn: tuple[int, int, Samples] | None = None
         sizes = self._sizes(0)
@@ -140,8 +138,10 @@ class SampleLoader:
         """Yield the blocks of an epoch from ``first`` on."""
         number = len(self.source.blocks(self._seed(epoch)))
         if self.workers and number > first + 1:
-            drawn = _Blocks(self.source, self._seed(epoch))
-            yield from DataLoader(drawn, batch_size=None, sampler=range(first, number), num_workers=self.workers)
+            # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
+            indices: Any = range(first, number)
+            draw = partial(self.source.draw, self._seed(epoch))
+            yield from DataLoader(indices, batch_size=None, collate_fn=draw, num_workers=self.workers)
         else:
             for block in range(first, number):
                 yield self._draw(epoch, block)
@@ -154,16 +154,6 @@ class SampleLoader:
 
     def _seed(self, epoch: int) -> int:
         return self.seed + (epoch if self.shuffle else 0)
-
-
-class _Blocks(Dataset[Samples]):
-    """The blocks of a draw, for the processes of a DataLoader."""
-
-    def __init__(self, source: SampleSource, seed: int) -> None:
-        self.source, self.seed = source, seed
-
-    def __getitem__(self, block: int) -> Samples:
-        return self.source.draw(self.seed, block)
 
 
 class CorrespondenceDataModule(pl.LightningDataModule):

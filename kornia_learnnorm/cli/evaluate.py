@@ -57,7 +57,7 @@ def run_arguments(args: argparse.Namespace, size: int) -> tuple[dict[str, str], 
     """Return the stores by name, the names of the methods and how samples of ``size`` correspondences are drawn."""
     if args.max_samples < 0:
         raise ValueError(f"--max-samples must be 0, for all, or more, got {args.max_samples}")
-    stores = dict(zip(names_of(args.stores), args.stores, strict=True))
+    stores = {name: path for path, name in names_of(args.stores).items()}
     methods = (*args.methods, *(args.weights or ())) if args.methods else default_methods(args.weights or SHIPPED)
     return stores, methods, SampleOptions(size, args.seed, args.max_samples or None, args.max_residual)
 

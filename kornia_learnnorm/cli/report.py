@@ -6,8 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from kornia_learnnorm.evaluation.report.pages import write_report
-from kornia_learnnorm.evaluation.report.printing import print_tables
+from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 
 __all__ = ["add_arguments", "run"]
 

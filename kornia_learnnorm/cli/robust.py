@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Record a run of robust estimators and minimal solvers."""
-    stores = dict(zip(names_of(args.stores), args.stores, strict=True))
+    stores = {name: path for path, name in names_of(args.stores).items()}
     options = {name: getattr(args, name) for name in DEFAULT_OPTIONS}
     record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo)
     print(f"wrote {args.out}; learnnorm report {args.out} makes its tables and pictures")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -82,17 +82,10 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([line(header), rule, *map(line, rows)])
 
 
-def names_of(paths: Sequence[str]) -> list[str]:
-    """Return the short names of files, which tables show.
-
-    Args:
-        paths: as for :func:`~kornia_learnnorm.files.short_name`.
-
-    Raises:
-        ValueError: if two have the same name.
-
-    """
-    names = [short_name(path) for path in paths]
+def names_of(paths: Sequence[str], shorten: Callable[[str], str] = short_name, what: str = "files") -> dict[str, str]:
+    """Return the short names of files, methods or estimators, which tables show; raise ValueError if two are equal."""
+    names = [shorten(path) for path in paths]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: rename one of {', '.join(paths)}")
-    return names
+        text = f"two {what} have the same name, {', '.join(sorted(twice))}"
+        raise ValueError(f"{text}: rename a file or leave out one of {', '.join(paths)}")
+    return dict(zip(paths, names, strict=True))

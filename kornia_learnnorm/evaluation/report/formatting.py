@@ -36,19 +36,12 @@ POSE_HEADER = ("AUC@5", "AUC@10", "AUC@20", "mAA(10)")
 
 
 class Table(NamedTuple):
-    """A table of a report.
-
-    Attributes:
-        title: heading.
-        text: what the table shows and how to read it, Markdown.
-        header: names of the columns.
-        rows: cells as text.
-    """
+    """A table of a report."""
 
     title: str
-    text: str
+    text: str  # what the table shows and how to read it, Markdown
     header: list[str]
-    rows: list[list[str]]
+    rows: list[list[str]]  # cells as text
 
 
 def number_text(value: float, spec: str = ".3f") -> str:

@@ -33,18 +33,11 @@ SETTINGS: dict[str, Any] = {
 
 
 class Picture(NamedTuple):
-    """A picture of a report.
+    """A picture of a report."""
 
-    Attributes:
-        name: file name without suffix.
-        title: heading.
-        text: what the picture shows.
-        svg: the picture as SVG.
-    """
-
-    name: str
+    name: str  # of the file, without suffix
     title: str
-    text: str
+    text: str  # what the picture shows
     svg: str
 
 

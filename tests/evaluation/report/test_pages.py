@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import re
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.evaluation.report.pages import write_report
+from kornia_learnnorm.evaluation.report.formatting import Table
+from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs import example
 
@@ -92,3 +94,16 @@ def test_incomplete_robust_run(robust_copied):
     cells = read_robust(robust_copied).cells
     assert "RANSAC" not in cells[0].estimates
     assert "RANSAC" in cells[1].estimates
+
+
+@pytest.mark.parametrize(("columns", "header"), [(40, "rate of a long name"), (30, "rate of a long")])
+def test_only_tables_that_fit_are_printed(monkeypatch, capsys, columns, header):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    rows = [["mine", *(3 * ["12.3 [10.0, 14.0]"])]]
+    short = Table("Short", "What it shows.", ["method", "rate of a long name"], [row[:2] for row in rows])
+    print_tables([short, Table("Wide", "", ["method", "a", "b", "c"], rows)], Path("report.html"))
+    text = capsys.readouterr().out
+    assert "12.3 [10.0, 14.0]" in text
+    assert f" {header} ┃" in text
+    assert "…" not in text
+    assert text.endswith(f"wider than the {columns} columns of this terminal, see report.html:\n  Wide\n")
