@@ -84,8 +84,8 @@ def diagnose_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> D
     points1, points2 = problem.points1, problem.points2
     x1, x2 = convert_points_to_homogeneous(points1) @ T1.mT, convert_points_to_homogeneous(points2) @ T2.mT
     A, F_hat = design_matrix(x1, x2), problem.null_matrix_in(T1, T2)
-    before = _distance(points1, points2, transform_fundamental(F_hat, T1, T2))
-    after = _distance(points1, points2, transform_fundamental(rank2_projection(F_hat), T1, T2))
+    matrices = (transform_fundamental(F_mat, T1, T2) for F_mat in (F_hat, rank2_projection(F_hat)))
+    before, after = (symmetric_epipolar_distance(points1, points2, F_mat).mean(-1) for F_mat in matrices)
     return Diagnostics(
         condition_number(A),
         singularity_ratio(F_hat),
@@ -125,7 +125,3 @@ def normalized_distance(points: Tensor, T: Tensor) -> Tensor:
     x = convert_points_to_homogeneous(points) @ T.mT
     distances: Tensor = torch.linalg.vector_norm(x[..., :2], dim=-1)
     return distances.mean(-1)
-
-
-def _distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    return symmetric_epipolar_distance(points1, points2, F_mat).mean(-1)

@@ -95,7 +95,9 @@ def draw_pair(
     if num_lines < 0:
         raise ValueError(f"num_lines must not be negative, got {num_lines}")
     figure, (axes1, axes2) = _panels(image1, image2)
-    _draw_counts(axes1, estimate)
+    draw_matches(axes1, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
+    motion, outliers = f"{estimate.num_inliers} inliers and their motion", estimate.num_matches - estimate.num_inliers
+    _caption(axes1, [("image 1", TEXT), (motion, INLIER), (f"{outliers} outliers", OUTLIER)])
     _draw_lines(axes2, estimate, num_lines, seed)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor=figure.get_facecolor())
@@ -124,18 +126,11 @@ def _panels(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8]) -> tup
     return figure, axes
 
 
-def _draw_counts(axes: Axes, estimate: PairEstimate) -> None:
-    """Draw the matches; write the counts of inliers and outliers above."""
-    draw_matches(axes, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
-    outliers = estimate.num_matches - estimate.num_inliers
-    motion_text = f"{estimate.num_inliers} inliers and their motion"
-    _caption(axes, [("image 1", TEXT), (motion_text, INLIER), (f"{outliers} outliers", OUTLIER)])
-
-
 def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -> None:
     """Draw the epipolar lines of some inliers, each with its point; write the error above."""
     hsv_to_rgb = import_matplotlib().colors.hsv_to_rgb
-    chosen = _subset(estimate, num_lines, seed)
+    rows = torch.nonzero(estimate.inliers).flatten().numpy()
+    chosen = np.random.default_rng(seed).permutation(rows)[:num_lines]
     points1, points2 = estimate.points1[chosen].numpy(), estimate.points2[chosen].numpy()
     lines = np.pad(points1, ((0, 0), (0, 1)), constant_values=1.0) @ estimate.F_mat.numpy().T
     hues = np.linspace(0, 1, len(chosen), endpoint=False)
@@ -145,12 +140,6 @@ def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -
     axes.scatter(points2[:, 0], points2[:, 1], s=20, c=rgb, edgecolors="black", linewidths=0.7, zorder=3)
     error = f"median error {estimate.median_distance:.2f} px"
     _caption(axes, [("image 2", TEXT), (f"{len(chosen)} epipolar lines", TEXT), (error, TEXT)])
-
-
-def _subset(estimate: PairEstimate, num_lines: int, seed: int) -> npt.NDArray[np.int64]:
-    """Return the indices of a random subset of the inliers."""
-    rows = torch.nonzero(estimate.inliers).flatten().numpy()
-    return np.random.default_rng(seed).permutation(rows)[:num_lines]
 
 
 def _caption(axes: Axes, parts: list[tuple[str, str]], size: float = 9) -> None:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from kornia_learnnorm.evaluation.drawing import INLIER, WIDE, draw_line, draw_matches
-from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture, report_style
+from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture
 from kornia_learnnorm.evaluation.runs.run import Run
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
@@ -24,7 +24,6 @@ METHODS = ("Hartley", "crossview")
 TRUTH = "ground truth"
 
 
-@report_style()
 def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
     """Draw the example image pair of a run, without the images; nothing where the run has no sample of it."""
     pair = run.example

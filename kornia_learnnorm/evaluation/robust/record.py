@@ -30,7 +30,7 @@ from kornia_learnnorm.evaluation.robust.matches import Matches, draw_matches, ev
 from kornia_learnnorm.evaluation.robust.peers import PEERS
 from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path, result_files
 from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
-from kornia_learnnorm.evaluation.runs.manifest import begin_section, describe_stores, leave_out, package_versions
+from kornia_learnnorm.evaluation.runs.manifest import begin_section, leave_out
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
@@ -83,15 +83,13 @@ def record_robust(
     solve = {solver_names[name]: find_solver(name) for name in solvers}
     read = {name: read_store(path) for name, path in stores.items()}
     about: dict[str, Any] = {
-        "stores": describe_stores(read),
         "estimators": {names[name]: found[name] and identify_estimator(name) for name in estimators},
         "solvers": {solver_names[name]: identify_estimator(name) for name in solvers},
         **options,
         "threads": torch.get_num_threads(),
-        "versions": package_versions(),
     }
     redone = [(names | solver_names)[name] for name in redo]
-    begin_section(folder, "robust", about, redone)
+    begin_section(folder, "robust", read, about, redone)
     for path in result_files(folder, redone):
         path.unlink()
     installed = {names[name]: estimator for name, estimator in found.items() if estimator is not None}

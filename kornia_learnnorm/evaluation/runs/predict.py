@@ -32,23 +32,12 @@ BATCH_SIZE = 2048  # samples solved at once
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """How the samples of a run are drawn.
+    """How the samples of a run are drawn."""
 
-    Attributes:
-        size: correspondences in a sample.
-        seed: seed of the shuffle.
-        max_samples: at most so many samples of each store and protocol, at random; None for all.
-        max_residual: samples whose residual under the un-normalised eight-point algorithm is this or larger are left
-            out, pixels.
-
-    Raises:
-        ValueError: if the size is below 8 or ``max_samples`` is not positive.
-    """
-
-    size: int = 8
-    seed: int = 0
-    max_samples: int | None = 16000
-    max_residual: float = MAX_RESIDUAL
+    size: int = 8  # correspondences in a sample
+    seed: int = 0  # of the shuffle
+    max_samples: int | None = 16000  # at most so many samples of each store and protocol, at random; None for all
+    max_residual: float = MAX_RESIDUAL  # pixels; samples with a larger residual without normalisation are left out
 
     def __post_init__(self) -> None:
         if self.size < 8:

@@ -22,13 +22,7 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
 from kornia_learnnorm.evaluation.runs.example import random_pair, sweep
-from kornia_learnnorm.evaluation.runs.manifest import (
-    begin_section,
-    describe_stores,
-    leave_out,
-    package_versions,
-    read_section,
-)
+from kornia_learnnorm.evaluation.runs.manifest import begin_section, leave_out, read_section
 from kornia_learnnorm.evaluation.runs.pairs import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import SampleOptions, predict
 from kornia_learnnorm.evaluation.runs.run import (
@@ -107,13 +101,11 @@ def record_run(
     recorder = _Recorder(folder, found, {name: read_store(path) for name, path in stores.items()}, options, complete)
     about = {
         **vars(options),
-        "stores": describe_stores(recorder.stores),
         "methods": {names[name]: identify_method(name) for name in methods},
         "trained_on": {name: list(method.trained_on) for name, method in found.items()},
-        "versions": package_versions(),
     }
-    before = (read_section(folder, "evaluate") or about | {"methods": {}})["methods"]
-    begin_section(folder, "evaluate", about)
+    before = (read_section(folder, "evaluate") or {}).get("methods", {})
+    begin_section(folder, "evaluate", recorder.stores, about)
     recorder.record_stores(protocols)
     no_example = recorder.record_sizes() if complete else ""
     if failed := recorder.failed:
