@@ -7,13 +7,16 @@ import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.evaluation.report.formatting import Table
 from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
+from kornia_learnnorm.evaluation.report.pair import draw_example
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs import example
+from kornia_learnnorm.evaluation.runs.run import read_run
 
 matplotlib = pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 
@@ -32,16 +35,14 @@ def test_files(copied, capsys):
         assert "".join(reference) in identifiers
 
 
-def test_without_the_baseline(copied, capsys):
+def test_without_the_baseline(copied, refused):
     for protocol in ("filtered", "unfiltered"):
         (copied / "scenes" / protocol / "Hartley.npz").unlink()
-    assert main(["report", str(copied)]) == 2
-    assert "compares with Hartley, the run has predictions of Hartley+LM, " in capsys.readouterr().err
+    refused(["report", copied], "compares with Hartley, the run has predictions of Hartley+LM, ")
 
 
-def test_not_a_run(tmp_path, capsys):
-    assert main(["report", str(tmp_path)]) == 2
-    assert "no run at" in capsys.readouterr().err
+def test_not_a_run(tmp_path, refused):
+    refused(["report", tmp_path], "no run at")
 
 
 def test_what_is_there_of_a_run(copied, capsys):
@@ -107,3 +108,11 @@ def test_only_tables_that_fit_are_printed(monkeypatch, capsys, columns, header):
     assert f" {header} ┃" in text
     assert "…" not in text
     assert text.endswith(f"wider than the {columns} columns of this terminal, see report.html:\n  Wide\n")
+
+
+def test_without_a_sample_of_the_pair_there_is_no_picture_of_it(run):
+    found = read_run(run)
+    (picture,) = draw_example(found, dict.fromkeys(found.about["methods"], "red"))
+    assert picture.name == "figure-10"
+    found.example["pair"] = np.array(99)
+    assert draw_example(found, {}) == []

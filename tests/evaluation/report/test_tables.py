@@ -1,4 +1,4 @@
-"""Tables of a run of predictions."""
+"""Tables of runs: better rates, accuracy, motion, robust estimators, hypotheses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_tables
-from kornia_learnnorm.evaluation.report.robust import robust_tables
+from kornia_learnnorm.evaluation.report.rates import rate_tables
+from kornia_learnnorm.evaluation.report.robust import PRINTED, robust_tables
 from kornia_learnnorm.evaluation.report.tables import by_motion, report_tables
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs.run import Cell, Run, read_run
@@ -100,3 +101,77 @@ class TestByMotion:
         assert "forward share of the translation, from 0.9995 to 0.9998 in all pairs" in table.text
         table = by_motion(*motion_cell(6 * [0.5], 6 * [1]), "mine")
         assert "forward share of the translation, 0.5 in all pairs" in table.text
+
+
+def test_the_rate_of_known_distributions():
+    """Of exponential variables with means 1 and 1 / 2 the second is smaller with probability 2 / 3."""
+    rng = np.random.default_rng(0)
+    own = {"Hartley": rng.exponential(1.0, 20_000), "crossview": rng.exponential(0.5, 20_000)}
+    predictions = {name: {"own": torch.from_numpy(values)} for name, values in own.items()}
+    cell = Cell("kitti_06", "filtered", torch.arange(20_000) // 100, 20_000, predictions)
+    trained_on = {"Hartley": [], "crossview": ["kitti_06@0:3"]}
+    about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(own, ""), "trained_on": trained_on}
+    (table,) = rate_tables(Run(about, [cell], {}, {}, {}))
+    rate, interval = table.rows[1][2].split(" ", 1)
+    low, high = (float(end) for end in interval.strip("[] *").split(", "))
+    assert table.rows[1][1] == "kitti_06@0:3"
+    assert interval.endswith(" *")
+    assert low < 200 / 3 < high
+    # The half width of independent samples: 1.96 standard deviations of a proportion.
+    assert (high - low) / 2 == pytest.approx(196 * np.sqrt(2 / 9 / 20_000), rel=0.2)
+    assert float(rate) == pytest.approx(200 / 3, abs=1)
+    assert [row[1:] for row in table.rows[2:]] == [
+        ["KITTI 00-05", "86.68"],
+        ["TUM", "84.22"],
+        ["KITTI 00-05 and TUM", "87.05"],
+    ]
+
+
+def test_numbers_of_robust_estimators(robust_run):
+    found = read_robust(robust_run)
+    tables = {table.title: table for table in robust_tables(found)}
+    figures = found.cells[0].estimates["count:whitening"][1.0]
+    rows = {row[0]: row for row in tables["Robust estimation: kitti_06, filtered (Table 2)"].rows}
+    means = 100 * figures["inliers"].mean(0)
+    assert rows["count:whitening"][4] == f"{means.mean():.2f} ± {means.std():.2f}"
+    assert "±" not in rows["RANSAC"][1]  # a single run
+    printed = PRINTED[(("kitti_06", "kitti_07", "kitti_08", "kitti_09", "kitti_10"), "filtered")]
+    assert rows["Fan et al., as printed: LMEDS"][1:3] == list(printed["LMEDS"][:2])
+    pose = {row[0]: row for row in tables["Pose and time: kitti_06, filtered"].rows}
+    assert pose["count:whitening"][6] == "50"
+    assert float(pose["RANSAC"][11]) > 0
+    tests = {row[0]: row for row in tables["Paired tests of robust estimation: kitti_06, filtered"].rows}
+    assert {name: row[1] for name, row in tests.items()} == {
+        "count:whitening": "count:Hartley",
+        "time:whitening": "time:Hartley",
+        "RANSAC": "count:Hartley",
+    }
+    other = found.cells[0].estimates["count:Hartley"][1.0]
+    change = 100 * (figures["inliers"] - other["inliers"]).mean().item()
+    assert tests["count:whitening"][5].startswith(f"{change:+.3f} [")
+
+
+def test_robust_estimators_without_ground_truth(robust_run):
+    found = read_robust(robust_run)
+    for by_threshold in found.cells[0].estimates.values():
+        for figures in by_threshold.values():
+            for key in ("f1", "error", "rotation_error", "translation_error"):
+                figures[key][:] = torch.nan
+    table, pose, tests = robust_tables(found)[:3]
+    assert table.rows[0][1:] == [""] * 7
+    assert pose.rows[0][1:5] == [""] * 4
+    assert tests.rows[0][2:] == [""] * 6
+
+
+def test_numbers_of_hypotheses(robust_run):
+    found = read_robust(robust_run)
+    best, chosen, tests = hypothesis_tables(found)[:3]
+    error = found.cells[0].hypotheses["whitening"]["error"]
+    assert best.rows[1][1] == chosen.rows[1][1] == f"{error.mean():.3f}"
+    assert best.rows[1][4] == f"{error.min(-1).values.mean():.3f}"
+    assert [row[:2] for row in tests.rows[:2]] == [
+        ["whitening", "Best of k hypotheses"],
+        ["whitening", "Hypothesis that MSAC picks among k"],
+    ]
+    change = (error - found.cells[0].hypotheses["Hartley"]["error"]).mean().item()
+    assert re.match(re.escape(f"{change:+.3f} ["), tests.rows[0][2])
