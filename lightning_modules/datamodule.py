@@ -41,19 +41,8 @@ class SampleLoader:
     early where a block has fewer samples than batches. Of several processes each takes its share of every batch, which
     can be empty.
 
-    Args:
-        source: where the samples come from.
-        batch_size: samples in a batch, or image pairs, of all processes together.
-        seed: seed of all draws.
-        shuffle: draw and shuffle anew each epoch (training) or keep one draw in order (evaluation).
-        by_pair: count and shuffle image pairs, each with all its samples, instead of samples.
-        workers: processes that draw the next blocks meanwhile; 0 draws in this one.
-        rank: number of this process.
-        world_size: number of processes.
-
-    Raises:
-        ValueError: if the batch size is not positive or below the number of processes, or a shuffled draw does not fill
-            one batch.
+    ``batch_size`` counts the samples of all processes together, or image pairs, each with all its samples, ``by_pair``.
+    Without ``shuffle`` one draw is kept in order, for evaluation. ``workers`` processes draw the next blocks meanwhile.
     """
 
     def __init__(

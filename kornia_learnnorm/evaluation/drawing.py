@@ -73,21 +73,8 @@ def draw_pair(
 
     Image 1 shows the inliers in blue, each with its motion to image 2, and the outliers in red. Image 2 shows the
     epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10). Wide
-    images are stacked, other images stand side by side.
-
-    Args:
-        image1: grey values with shape (H1, W1), uint8.
-        image2: grey values with shape (H2, W2), uint8.
-        estimate: the estimate of these images.
-        path: the picture to write; its suffix decides the format.
-        num_lines: number of epipolar lines; fewer if there are fewer inliers.
-        seed: seed of the random subset.
-
-    Raises:
-        OSError: if the folder of ``path`` does not exist or is not writable.
-        ValueError: if the images do not have the sizes in ``estimate``, ``num_lines`` is negative, or the suffix is not
-            a format of Matplotlib.
-        ImportError: if Matplotlib is not installed.
+    images are stacked, other images stand side by side. The images are grey, uint8; the suffix of ``path`` decides the
+    format.
     """
     for image, size in ((image1, estimate.size1), (image2, estimate.size2)):
         if image.shape != size[::-1]:

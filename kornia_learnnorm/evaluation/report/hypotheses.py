@@ -102,13 +102,11 @@ def hypothesis_figures(run: RobustRun) -> list[Picture]:
     """Draw the errors of each store's hypotheses against their number."""
     colors = method_colors(run.about["solvers"])
     pictures = []
-    for place, store in enumerate(run.about["stores"], 1):
-        cells = [cell for cell in run.cells if cell.store == store and cell.hypotheses]
-        with_baseline = [cell for cell in cells if BASELINE in cell.hypotheses]
+    for (place, store), relative in product(enumerate(run.about["stores"], 1), (False, True)):
+        found = [cell for cell in run.cells if cell.store == store and cell.hypotheses]
+        cells = [cell for cell in found if BASELINE in cell.hypotheses] if relative else found
         if cells:
-            pictures.append(_draw(cells, f"hypotheses-{place}", colors, relative=False))
-        if with_baseline:
-            pictures.append(_draw(with_baseline, f"hypotheses-{place}-relative", colors, relative=True))
+            pictures.append(_draw(cells, f"hypotheses-{place}{'-relative' * relative}", colors, relative))
     return pictures
 
 

@@ -46,17 +46,7 @@ DEFAULT_ESTIMATORS = (
 
 
 def find_solver(name: str) -> Solver:
-    """Return a minimal solver by its name.
-
-    Args:
-        name: ``seven-point``, which is Kornia's, or a name for
-            :func:`~kornia_learnnorm.evaluation.methods.find_method`.
-
-    Raises:
-        ValueError: if there is no method of this name.
-        FileNotFoundError: if there are no weights of this name.
-
-    """
+    """Return a minimal solver: ``seven-point``, which is Kornia's, or a name for ``find_method``."""
     if name == SEVEN_POINT:
         return Solver(7, run_7point)
     method = find_method(name)
