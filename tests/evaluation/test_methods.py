@@ -11,7 +11,7 @@ import yaml
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
-from kornia_learnnorm.evaluation.methods import SHIPPED, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.methods import SHIPPED, default_methods, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.report.rates import was_trained_on
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.normalizers.learned import WEIGHTS
@@ -68,6 +68,7 @@ def test_names(tmp_path):
     assert short_names([path, path + "+LM", "paper"]) == {path: "mine", path + "+LM": "mine+LM", "paper": "paper"}
     assert identify_method("paper").startswith("paper ")
     assert identify_method("Hartley+LM") == "Hartley+LM"
+    assert default_methods(["my"]) == ("none", "Hartley", "whitening", "reweighted", "my", "searched")
     with pytest.raises(ValueError, match="same name"):
         short_names([path, path])
 

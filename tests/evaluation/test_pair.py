@@ -236,7 +236,7 @@ class TestCommand:
         lines = capsys.readouterr().out.splitlines()
         printed = [[float(value) for value in line.split()] for line in lines[1:4]]
         assert np.allclose(printed, result.F_mat.numpy(), rtol=1e-8)
-        assert re.match(rf"matches +{result.num_matches} ", lines[4])
+        assert re.match(rf"matches +{result.num_matches} \(ratio test 0\.8\)", lines[4])
         assert re.match(rf"inliers +{result.num_inliers} ", lines[5])
         assert f"mean {result.mean_distance:.3f} px, median {result.median_distance:.3f} px" in lines[6]
         assert len(lines) == 7

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from kornia_learnnorm.evaluation.report.formatting import median_text, number_text, paired_text
 from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_tables
 from kornia_learnnorm.evaluation.report.rates import rate_tables
 from kornia_learnnorm.evaluation.report.robust import PRINTED, robust_tables
+from kornia_learnnorm.evaluation.report.style import method_colors
 from kornia_learnnorm.evaluation.report.tables import by_motion, report_tables
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs.run import Cell, Run, read_run
@@ -40,6 +42,14 @@ def test_accuracy_and_tests(run):
     assert tests["Hartley+LM"][1].startswith("-")
     assert len(tables["By motion: scenes, filtered"].rows) == 8
     assert 0 < len(tables["Worst failures: scenes, filtered"].rows) <= 10
+
+
+def test_texts_of_cells():
+    assert [number_text(0.5), number_text(float("nan"))] == ["0.500", ""]
+    assert median_text(torch.tensor([1.0, 4.0, torch.nan])) == "2.500"
+    values = torch.tensor([1.5, 2.5])
+    assert paired_text(values, values - 0.5) == "+0.500 [+0.500, +0.500], < 0.001"
+    assert method_colors(["none", "Hartley"]) == {"none": "#8b8b8b", "Hartley": "#e69f00"}
 
 
 def without_truth(run, robust):
@@ -95,12 +105,17 @@ class TestByMotion:
         assert [row[1:5] for row in table.rows] == [["up to 0.9996", "3", "6", "4"], ["above 0.9996", "3", "6", "2"]]
         assert "Not shown: rotation, degrees, known of 0 of 6 pairs; parallax" in table.text
 
-    def test_what_hardly_differs_has_no_halves(self):
-        table = by_motion(*motion_cell([0.9995, 0.9996, 0.9997, 0.9998, 0.9998, 0.9998], 6 * [1]), "mine")
+    @pytest.mark.parametrize(
+        ("forward", "text"),
+        [
+            ([0.9995, 0.9996, 0.9997, *3 * [0.9998]], "from 0.9995 to 0.9998 in all pairs"),
+            (6 * [0.5], "0.5 in all pairs"),
+        ],
+    )
+    def test_what_hardly_differs_has_no_halves(self, forward, text):
+        table = by_motion(*motion_cell(forward, 6 * [1]), "mine")
         assert table.rows == []
-        assert "forward share of the translation, from 0.9995 to 0.9998 in all pairs" in table.text
-        table = by_motion(*motion_cell(6 * [0.5], 6 * [1]), "mine")
-        assert "forward share of the translation, 0.5 in all pairs" in table.text
+        assert f"forward share of the translation, {text}" in table.text
 
 
 def test_the_rate_of_known_distributions():
@@ -120,11 +135,8 @@ def test_the_rate_of_known_distributions():
     # The half width of independent samples: 1.96 standard deviations of a proportion.
     assert (high - low) / 2 == pytest.approx(196 * np.sqrt(2 / 9 / 20_000), rel=0.2)
     assert float(rate) == pytest.approx(200 / 3, abs=1)
-    assert [row[1:] for row in table.rows[2:]] == [
-        ["KITTI 00-05", "86.68"],
-        ["TUM", "84.22"],
-        ["KITTI 00-05 and TUM", "87.05"],
-    ]
+    printed = {"KITTI 00-05": "86.68", "TUM": "84.22", "KITTI 00-05 and TUM": "87.05"}
+    assert {row[1]: row[2] for row in table.rows[2:]} == printed
 
 
 def test_numbers_of_robust_estimators(robust_run):
@@ -141,11 +153,8 @@ def test_numbers_of_robust_estimators(robust_run):
     assert pose["count:whitening"][6] == "50"
     assert float(pose["RANSAC"][11]) > 0
     tests = {row[0]: row for row in tables["Paired tests of robust estimation: kitti_06, filtered"].rows}
-    assert {name: row[1] for name, row in tests.items()} == {
-        "count:whitening": "count:Hartley",
-        "time:whitening": "time:Hartley",
-        "RANSAC": "count:Hartley",
-    }
+    baselines = {"count:whitening": "count:Hartley", "time:whitening": "time:Hartley", "RANSAC": "count:Hartley"}
+    assert {name: row[1] for name, row in tests.items()} == baselines
     other = found.cells[0].estimates["count:Hartley"][1.0]
     change = 100 * (figures["inliers"] - other["inliers"]).mean().item()
     assert tests["count:whitening"][5].startswith(f"{change:+.3f} [")
@@ -169,9 +178,7 @@ def test_numbers_of_hypotheses(robust_run):
     error = found.cells[0].hypotheses["whitening"]["error"]
     assert best.rows[1][1] == chosen.rows[1][1] == f"{error.mean():.3f}"
     assert best.rows[1][4] == f"{error.min(-1).values.mean():.3f}"
-    assert [row[:2] for row in tests.rows[:2]] == [
-        ["whitening", "Best of k hypotheses"],
-        ["whitening", "Hypothesis that MSAC picks among k"],
-    ]
+    names = ["Best of k hypotheses", "Hypothesis that MSAC picks among k"]
+    assert [row[:2] for row in tests.rows[:2]] == [["whitening", name] for name in names]
     change = (error - found.cells[0].hypotheses["Hartley"]["error"]).mean().item()
     assert re.match(re.escape(f"{change:+.3f} ["), tests.rows[0][2])
