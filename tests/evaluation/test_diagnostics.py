@@ -71,6 +71,22 @@ def test_wrong_shapes(function, shapes, error, message):
         function(*map(torch.rand, shapes))
 
 
+NINE = torch.diag(torch.tensor([7.0, 3.0, 3.0, 9.0, 5.0, 5.0, 4.0, 2.0, 8.0]))
+
+
+@pytest.mark.parametrize(
+    ("function", "matrix", "expected"),
+    [
+        (condition_number, NINE, 3.0),  # 9 / 3: the ninth, 2, is left out
+        (condition_number, NINE[:8], 4.5),  # 9 / 2
+        (singularity_ratio, torch.diag(torch.tensor([100.0, 6.0, 2.0])), 3.0),  # the largest does not count
+        (singularity_ratio, torch.diag(torch.tensor([5.0, 2.0, 0.0])), math.inf),
+    ],
+)
+def test_of_a_diagonal(function, matrix, expected):
+    assert function(matrix).item() == expected
+
+
 class TestConditionNumber:
     @pytest.mark.parametrize("num_rows", [8, 9, 30])
     def test_agrees_with_numpy(self, num_rows, device, dtype):
@@ -81,11 +97,6 @@ class TestConditionNumber:
         np.testing.assert_allclose(
             found.numpy(), np.sqrt(d[:, 0] / d[:, 7]), rtol=1e-4 if found.itemsize == 4 else 1e-8
         )
-
-    def test_of_a_diagonal(self):
-        values = torch.tensor([7.0, 3.0, 3.0, 9.0, 5.0, 5.0, 4.0, 2.0, 8.0])
-        assert condition_number(torch.diag(values)).item() == 3.0  # 9 / 3: the ninth, 2, is left out
-        assert condition_number(torch.diag(values)[:8]).item() == 4.5  # 9 / 2
 
     def test_the_null_vector_does_not_count(self):
         """A ninth singular value does not change it, be it zero or nearly the eighth."""
@@ -111,12 +122,6 @@ class TestSingularityRatio:
         assert found.dtype == dtype
         np.testing.assert_allclose(found.numpy(), s[:, 1] / s[:, 2], rtol=1e-3 if found.itemsize == 4 else 1e-9)
 
-    def test_the_largest_does_not_count(self):
-        assert singularity_ratio(torch.diag(torch.tensor([100.0, 6.0, 2.0]))).item() == 3.0
-
-    def test_singular_is_infinite(self):
-        assert singularity_ratio(torch.diag(torch.tensor([5.0, 2.0, 0.0]))).item() == math.inf
-
 
 class TestNormalizedDistance:
     def test_by_hand(self, device, dtype):
@@ -128,16 +133,12 @@ class TestNormalizedDistance:
 
     @pytest.mark.parametrize("name", SCENES)
     @pytest.mark.parametrize("num_points", [8, 20])
-    def test_of_hartley(self, name, num_points):
+    def test_of_hartley_and_whitening(self, name, num_points):
+        """The mean square of whitening is two, so the mean is less than its root, Hartley's."""
         points = correspondences(name, 20, num_points)
-        for p, T in zip(points, Hartley()(*points), strict=True):
+        for p, T, W in zip(points, Hartley()(*points), Whitening()(*points), strict=True):
             np.testing.assert_allclose(normalized_distance(p, T).numpy(), math.sqrt(2), rtol=1e-12)
-
-    def test_of_whitening(self):
-        """The mean square is two, so the mean is less than its root, Hartley's."""
-        points = correspondences("driving", 20, 20)
-        for p, T in zip(points, Whitening()(*points), strict=True):
-            assert (normalized_distance(p, T) < math.sqrt(2)).all()
+            assert (normalized_distance(p, W) < math.sqrt(2)).all()
 
 
 class TestDiagnose:
@@ -148,9 +149,7 @@ class TestDiagnose:
         found = diagnose(*(p[:batch_size] for p in points), Hartley())
         assert isinstance(found, Diagnostics)
         for values in found:
-            assert values.shape == (batch_size,)
-            assert values.dtype == torch.float64
-            assert values.device.type == device.type
+            assert (values.shape, values.dtype, values.device.type) == ((batch_size,), torch.float64, device.type)
             assert torch.isfinite(values).all()
 
     @pytest.mark.parametrize("name", SCENES)
@@ -198,9 +197,8 @@ class TestDiagnose:
 
     def test_float32_points(self):
         points = [p.float() for p in correspondences("handheld", 5)]
-        doubled = [p.double() for p in points]
-        for single, double in zip(diagnose(*points, Hartley()), diagnose(*doubled, Hartley()), strict=True):
-            assert torch.equal(single, double)
+        single, double = (diagnose(*found, Hartley()) for found in (points, [p.double() for p in points]))
+        assert torch.equal(torch.stack(single), torch.stack(double))
 
     @torch.no_grad()
     def test_learned(self):

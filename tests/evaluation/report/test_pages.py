@@ -35,14 +35,11 @@ def test_files(copied, capsys):
         assert "".join(reference) in identifiers
 
 
-def test_without_the_baseline(copied, refused):
+def test_not_a_run_or_without_the_baseline(tmp_path, copied, refused):
+    refused(["report", tmp_path], "no run at")
     for protocol in ("filtered", "unfiltered"):
         (copied / "scenes" / protocol / "Hartley.npz").unlink()
     refused(["report", copied], "compares with Hartley, the run has predictions of Hartley+LM, ")
-
-
-def test_not_a_run(tmp_path, refused):
-    refused(["report", tmp_path], "no run at")
 
 
 def test_what_is_there_of_a_run(copied, capsys):
@@ -58,7 +55,7 @@ def test_what_is_there_of_a_run(copied, capsys):
     assert "Figure 11" not in (copied / "report.md").read_text()
 
 
-def test_robust_estimators(robust_copied):
+def test_robust_estimators_alone_and_beside_predictions(robust_copied, robust_store, monkeypatch):
     settings = dict(matplotlib.rcParams)
     write_report(robust_copied)
     assert dict(matplotlib.rcParams) == settings
@@ -68,9 +65,6 @@ def test_robust_estimators(robust_copied):
     assert "as printed: Ranftl and Koltun" in text
     assert page.count("<svg") == text.count(".svg)") == 2
     assert {path.stem for path in robust_copied.glob("*.svg")} == {"hypotheses-1", "hypotheses-1-relative"}
-
-
-def test_robust_estimators_beside_predictions(robust_copied, robust_store, monkeypatch):
     monkeypatch.setattr(example, "TRIALS", 5)
     options = ["--methods", "Hartley", "--max-samples", "50"]
     assert main(["evaluate", str(robust_store), "--out", str(robust_copied), *options]) == 0
