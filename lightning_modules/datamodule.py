@@ -184,12 +184,10 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         return [] if self.val is None else self._loader("val", self.val, EVALUATION_SEED, shuffle=False)
 
     def test_dataloader(self) -> SampleLoader:
-        """Return the loader of the test samples."""
+        """Return the loader of the test samples, which ``predict`` uses too."""
         return self._loader("test", self.test, EVALUATION_SEED, shuffle=False)
 
-    def predict_dataloader(self) -> SampleLoader:
-        """Return the loader of the test samples."""
-        return self.test_dataloader()
+    predict_dataloader = test_dataloader
 
     def _loader(self, stage: str, source: SampleSource | None, seed: int, shuffle: bool) -> SampleLoader:
         if source is None:

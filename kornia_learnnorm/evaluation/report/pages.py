@@ -63,10 +63,7 @@ def write_report(folder: str | Path) -> Report:
 
     """
     folder = Path(folder)
-    about: list[str] = []
-    tables: list[Table] = []
-    pictures: list[Picture] = []
-    missing: list[str] = []
+    about, tables, pictures, missing = list[str](), list[Table](), list[Picture](), list[str]()
     robust = read_robust(folder)
     if robust is None or read_section(folder, "evaluate") is not None:
         run = with_baseline(read_run(folder))

@@ -183,11 +183,9 @@ class _Recorder:
             read_arrays(path, keys, rows)
         elif name not in self.failed:
             try:
-                arrays = compute()
+                write_arrays(path, compute())
             except ValueError as error:
                 self.failed[name] = str(error)
-            else:
-                write_arrays(path, arrays)
 
     def forget(self, methods: Collection[str]) -> None:
         """Remove methods from the run, with their files: their code will be another when they come again."""
