@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.utilities import rank_zero_info
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.data.sources import Block, block_generator
@@ -40,19 +41,8 @@ class SampleLoader:
     early where a block has fewer samples than batches. Of several processes each takes its share of every batch, which
     can be empty.
 
-    Args:
-        source: where the samples come from.
-        batch_size: samples in a batch, or image pairs, of all processes together.
-        seed: seed of all draws.
-        shuffle: draw and shuffle anew each epoch (training) or keep one draw in order (evaluation).
-        by_pair: count and shuffle image pairs, each with all its samples, instead of samples.
-        workers: processes that draw the next blocks meanwhile; 0 draws in this one.
-        rank: number of this process.
-        world_size: number of processes.
-
-    Raises:
-        ValueError: if the batch size is not positive or below the number of processes, or a shuffled draw does not fill
-            one batch.
+    ``batch_size`` counts the samples of all processes together, or image pairs, each with all its samples, ``by_pair``.
+    Without ``shuffle`` one draw is kept in order, for evaluation. ``workers`` processes draw the next blocks meanwhile.
     """
 
     def __init__(
@@ -70,12 +60,9 @@ class SampleLoader:
         if batch_size < world_size:
             raise ValueError(f"a batch must hold at least one {unit} for each process, got {batch_size}")
         self.source = source
-        self.batch_size = batch_size
-        self.seed = seed
-        self.shuffle = shuffle
-        self.by_pair = by_pair
-        self.workers = workers
-        self.rank, self.world_size = rank, world_size
+        self.batch_size, self.by_pair = batch_size, by_pair
+        self.seed, self.shuffle = seed, shuffle
+        self.workers, self.rank, self.world_size = workers, rank, world_size
         self.epoch, self.batch = 0, 0
         self._drawn: tuple[int, int, Samples] | None = None
         sizes = self._sizes(0)
@@ -140,8 +127,10 @@ class SampleLoader:
         """Yield the blocks of an epoch from ``first`` on."""
         number = len(self.source.blocks(self._seed(epoch)))
         if self.workers and number > first + 1:
-            drawn = _Blocks(self.source, self._seed(epoch))
-            yield from DataLoader(drawn, batch_size=None, sampler=range(first, number), num_workers=self.workers)
+            # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
+            indices: Any = range(first, number)
+            draw = partial(self.source.draw, self._seed(epoch))
+            yield from DataLoader(indices, batch_size=None, collate_fn=draw, num_workers=self.workers)
         else:
             for block in range(first, number):
                 yield self._draw(epoch, block)
@@ -154,16 +143,6 @@ class SampleLoader:
 
     def _seed(self, epoch: int) -> int:
         return self.seed + (epoch if self.shuffle else 0)
-
-
-class _Blocks(Dataset[Samples]):
-    """The blocks of a draw, for the processes of a DataLoader."""
-
-    def __init__(self, source: SampleSource, seed: int) -> None:
-        self.source, self.seed = source, seed
-
-    def __getitem__(self, block: int) -> Samples:
-        return self.source.draw(self.seed, block)
 
 
 class CorrespondenceDataModule(pl.LightningDataModule):
@@ -205,12 +184,10 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         return [] if self.val is None else self._loader("val", self.val, EVALUATION_SEED, shuffle=False)
 
     def test_dataloader(self) -> SampleLoader:
-        """Return the loader of the test samples."""
+        """Return the loader of the test samples, which ``predict`` uses too."""
         return self._loader("test", self.test, EVALUATION_SEED, shuffle=False)
 
-    def predict_dataloader(self) -> SampleLoader:
-        """Return the loader of the test samples."""
-        return self.test_dataloader()
+    predict_dataloader = test_dataloader
 
     def _loader(self, stage: str, source: SampleSource | None, seed: int, shuffle: bool) -> SampleLoader:
         if source is None:

@@ -152,12 +152,16 @@ class NormalizerTask(pl.LightningModule):
             handle.remove()
 
     def validation_step(self, batch: Samples, batch_idx: int) -> None:
-        """Collect the residuals of a batch."""
-        self._collect(batch)
+        """Collect the residuals of a batch, in the test too."""
+        batch, left_out = _finite(batch)
+        self._left_out += left_out
+        problem = LinearProblem.from_points(batch.points1, batch.points2)
+        learned = self._residuals(problem, self.normalizer)
+        self._log_residuals.append((learned + self.loss.floor).log())
+        for name, normalizer in self.baselines.items():
+            getattr(self, f"better_than_{name}").update(learned, self._residuals(problem, normalizer))
 
-    def test_step(self, batch: Samples, batch_idx: int) -> None:
-        """Collect the residuals of a batch."""
-        self._collect(batch)
+    test_step = validation_step
 
     def predict_step(self, batch: Samples, batch_idx: int) -> dict[str, Tensor]:
         """Return transforms, fundamental matrices and mean residuals of a batch."""
@@ -175,15 +179,6 @@ class NormalizerTask(pl.LightningModule):
     def on_test_epoch_end(self) -> None:
         """Log the metrics of the collected residuals."""
         self._log_metrics("test")
-
-    def _collect(self, batch: Samples) -> None:
-        batch, left_out = _finite(batch)
-        self._left_out += left_out
-        problem = LinearProblem.from_points(batch.points1, batch.points2)
-        learned = self._residuals(problem, self.normalizer)
-        self._log_residuals.append((learned + self.loss.floor).log())
-        for name, normalizer in self.baselines.items():
-            getattr(self, f"better_than_{name}").update(learned, self._residuals(problem, normalizer))
 
     def _residuals(self, problem: LinearProblem, normalizer: Normalizer) -> Tensor:
         """Return the mean symmetric epipolar distance of each sample under a normaliser, (B,)."""

@@ -23,26 +23,11 @@ class TrainingCLI(LightningCLI):
         """Take no configuration from a checkpoint: it could name any class to be made."""
 
     def before_fit(self) -> None:
-        """Check the checkpoint to resume from, where one is given."""
-        self._check_checkpoint(required=False)
-
-    def before_validate(self) -> None:
-        """Check the checkpoint."""
-        self._check_checkpoint(required=True)
-
-    def before_test(self) -> None:
-        """Check the checkpoint."""
-        self._check_checkpoint(required=True)
-
-    def before_predict(self) -> None:
-        """Check the checkpoint."""
-        self._check_checkpoint(required=True)
-
-    def _check_checkpoint(self, required: bool) -> None:
+        """Check the checkpoint; only ``fit`` needs none, without one it begins a new run."""
         self.config_init[self.subcommand]["weights_only"] = True  # nothing that a checkpoint names is run
         path = self.config[self.subcommand].get("ckpt_path")
         if path is None:
-            if required:
+            if self.subcommand != "fit":
                 raise ValueError("give the checkpoint by --ckpt_path; without one the network would be untrained")
             return
         if not Path(path).is_file():
@@ -54,6 +39,8 @@ class TrainingCLI(LightningCLI):
                 f"{path} holds another network than the one configured: repeat the options of its run, or use the"
                 " config.yaml that the run left in lightning_logs"
             )
+
+    before_validate = before_test = before_predict = before_fit
 
 
 def _state_dict(path: str) -> dict[str, Tensor]:
@@ -72,16 +59,7 @@ def _state_dict(path: str) -> dict[str, Tensor]:
 
 
 def run(args: list[str] | None) -> None:
-    """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict``.
-
-    Args:
-        args: command line without the program's name; ``sys.argv`` when not given.
-
-    Raises:
-        ValueError: if the configuration or the checkpoint is wrong.
-        OSError: if a file is missing or cannot be written.
-
-    """
+    """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict``; ``args`` is ``sys.argv`` when None."""
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")  # Lightning's own call of torch
     TrainingCLI(
         NormalizerTask,

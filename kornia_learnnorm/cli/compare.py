@@ -28,13 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm compare``: print a table per comparison, with a row per method and a column per store.
-
-    Raises:
-        FileNotFoundError: if a store or weights are missing.
-        ValueError: if a store, weights or an option are wrong, or two have the same name.
-
-    """
+    """Print a table per comparison, with a row per method and a column per store."""
     cells = temporary_run(*run_arguments(args, size=8), protocols=["filtered"]).cells
     header = ["method", *map(_column, cells)]
     for title, (quantity, baseline) in COMPARISONS.items():

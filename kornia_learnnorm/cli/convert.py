@@ -28,14 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm convert``: write a store, or a folder of hloc's files.
-
-    Raises:
-        FileNotFoundError: if the source is missing.
-        ValueError: if the source is not of the format, or the target exists or cannot hold the store.
-        OSError: if the target cannot be written.
-
-    """
+    """Write a store, or a folder of hloc's files; an existing file is not overwritten."""
     result = _import(Path(args.source), args.target) if args.source_format else _export(args.source, args.target)
     print(f"wrote {args.target}: {result}")
     return 0

@@ -21,13 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm diagnose``: print a table of medians per store and sample size.
-
-    Raises:
-        FileNotFoundError: if a store or weights are missing.
-        ValueError: if a store, weights or an option are wrong, or a size is below 8 or above what every pair has.
-
-    """
+    """Print a table of medians per store and sample size."""
     for size in args.sizes:
         for cell in temporary_run(*run_arguments(args, size), protocols=["filtered"]).cells:
             about = f"medians over {len(cell.pair)} of {cell.drawn} samples of {size}, ratio below {RATIO:g}"

@@ -18,18 +18,7 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf", "
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``learnnorm estimate`` to a parser.
-
-    Args:
-        parser: the parser of the command.
-
-    Example:
-        >>> parser = argparse.ArgumentParser()
-        >>> add_arguments(parser)
-        >>> parser.parse_args(["left.png", "right.png"]).ratio
-        0.8
-
-    """
+    """Add the arguments of ``learnnorm estimate`` to a parser."""
     parser.add_argument("image1", metavar="IMG1", type=Path, help="file of image 1")
     parser.add_argument("image2", metavar="IMG2", type=Path, help="file of image 2")
     parser.add_argument("--out", metavar="PICTURE", type=Path, help="draw matches and epipolar lines to this file")
@@ -45,21 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm estimate``: print the fundamental matrix, write the picture and the JSON file if asked to.
-
-    Args:
-        args: parsed arguments of :func:`add_arguments`.
-
-    Returns:
-        the exit code, 0.
-
-    Raises:
-        OSError: if a file is missing or cannot be written.
-        ValueError: as :func:`~kornia_learnnorm.evaluation.pair.estimate_pair`, or if ``--out`` or ``--json``
-            cannot be used.
-        ImportError: if OpenCV is not installed, or Matplotlib with ``--out``.
-
-    """
+    """Print the fundamental matrix; write the picture and the JSON file if asked to, both or neither."""
     _check_outputs(args)
     with ExitStack() as stack:
         picture = None if args.out is None else stack.enter_context(atomic_write(args.out))

@@ -54,19 +54,10 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_arguments(args: argparse.Namespace, size: int) -> tuple[dict[str, str], tuple[str, ...], SampleOptions]:
-    """Return the stores by name, the names of the methods and how the samples are drawn.
-
-    Args:
-        args: parsed arguments of :func:`add_run_arguments`.
-        size: correspondences in a sample.
-
-    Raises:
-        ValueError: if two stores have the same name or a number is out of range.
-
-    """
+    """Return the stores by name, the names of the methods and how samples of ``size`` correspondences are drawn."""
     if args.max_samples < 0:
         raise ValueError(f"--max-samples must be 0, for all, or more, got {args.max_samples}")
-    stores = dict(zip(names_of(args.stores), args.stores, strict=True))
+    stores = {name: path for path, name in names_of(args.stores).items()}
     methods = (*args.methods, *(args.weights or ())) if args.methods else default_methods(args.weights or SHIPPED)
     return stores, methods, SampleOptions(size, args.seed, args.max_samples or None, args.max_residual)
 
@@ -86,13 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm evaluate``: make a run of predictions and print two tables per store, filtered and unfiltered.
-
-    Raises:
-        FileNotFoundError: if a store or weights are missing.
-        ValueError: if a store, weights or an option are wrong, or the folder holds a run of other options.
-
-    """
+    """Make a run of predictions and print two tables per store, filtered and unfiltered."""
     stores, methods, options = run_arguments(args, args.size)
     if args.out is None:
         _print_tables(temporary_run(stores, methods, options))

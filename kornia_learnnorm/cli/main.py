@@ -33,14 +33,9 @@ TOOLS = {
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run a command, from ``sys.argv`` if None, and return its exit code.
 
-    Args:
-        args: command line without the program's name; ``sys.argv`` when not given.
-
-    Returns:
-        the exit code: 0; 2 after an error, whose message is printed as one line; 130 when interrupted.
-
+    It is 0; 2 after an error, whose message is printed as one line; 130 when interrupted.
     """
     words = list(sys.argv[1:] if args is None else args)
     try:

@@ -69,14 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm match``: write a store; a run that was stopped continues where it was.
-
-    Raises:
-        ValueError: if an argument does not fit the dataset or is out of range, or no pair can be matched.
-        OSError: if a file is missing or cannot be written.
-        ImportError: if an optional package is not installed.
-
-    """
+    """Write a store; a run that was stopped continues where it was."""
     options = MatchOptions(args.detector, args.num_features, args.matcher, args.max_matches or None, args.seed)
     check_target(args.out)
     check_jobs(args.jobs)

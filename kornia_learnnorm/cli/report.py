@@ -6,8 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from kornia_learnnorm.evaluation.report.pages import write_report
-from kornia_learnnorm.evaluation.report.printing import print_tables
+from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 
 __all__ = ["add_arguments", "run"]
 
@@ -18,14 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm report``: write ``report.md``, ``report.html`` and the pictures, print the tables that fit.
-
-    Raises:
-        FileNotFoundError: if the run does not exist or is not complete.
-        ValueError: if a file of the run is damaged.
-        ImportError: if Matplotlib or rich is not installed.
-
-    """
+    """Write ``report.md``, ``report.html`` and the pictures, print the tables that fit."""
     report = write_report(args.folder)
     print_tables(report.tables, args.folder / "report.html")
     if report.missing:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from kornia_learnnorm.evaluation.robust.benchmark import DEFAULT_OPTIONS, record_robust
 from kornia_learnnorm.evaluation.robust.estimators import DEFAULT_ESTIMATORS, DEFAULT_SOLVERS
+from kornia_learnnorm.evaluation.robust.record import DEFAULT_OPTIONS, record_robust
 from kornia_learnnorm.evaluation.tables import names_of
 
 __all__ = ["add_arguments", "run"]
@@ -48,14 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm robust``.
-
-    Raises:
-        FileNotFoundError: if a store or weights are missing.
-        ValueError: if an option, a store or weights are wrong, or the folder holds a run of other options.
-
-    """
-    stores = dict(zip(names_of(args.stores), args.stores, strict=True))
+    """Record a run of robust estimators and minimal solvers."""
+    stores = {name: path for path, name in names_of(args.stores).items()}
     options = {name: getattr(args, name) for name in DEFAULT_OPTIONS}
     record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo)
     print(f"wrote {args.out}; learnnorm report {args.out} makes its tables and pictures")

@@ -24,13 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``learnnorm synthesize``: write ``synthetic.h5`` and a rendered image pair.
-
-    Raises:
-        ValueError: if a number is out of range.
-        OSError: if the folder cannot be written.
-
-    """
+    """Write ``synthetic.h5`` and a rendered image pair."""
     store = synthetic_store(args.pairs, args.points, args.seed, scenes=args.scenes)
     args.folder.mkdir(parents=True, exist_ok=True)
     write_store(args.folder / "synthetic.h5", store)

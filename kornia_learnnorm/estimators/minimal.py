@@ -20,15 +20,6 @@ def are_determined(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
 
     The eight constraints must be independent: each row of the design matrix is farther from the span of the rows before
     it than the least that a shift of the point moves it.
-
-    Args:
-        x1: homogeneous points of view 1 with shape :math:`(K, 8, 3)`, pixels and a third coordinate as large.
-        x2: their counterparts with shape :math:`(K, 8, 3)`.
-        shift: in pixels.
-
-    Returns:
-        booleans with shape :math:`(K,)`.
-
     """
     return _independent(torch.linalg.qr(design_matrix(x1, x2).mT, mode="r")[1], x1, x2, shift)
 

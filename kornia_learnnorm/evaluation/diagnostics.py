@@ -84,8 +84,8 @@ def diagnose_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> D
     points1, points2 = problem.points1, problem.points2
     x1, x2 = convert_points_to_homogeneous(points1) @ T1.mT, convert_points_to_homogeneous(points2) @ T2.mT
     A, F_hat = design_matrix(x1, x2), problem.null_matrix_in(T1, T2)
-    before = _distance(points1, points2, transform_fundamental(F_hat, T1, T2))
-    after = _distance(points1, points2, transform_fundamental(rank2_projection(F_hat), T1, T2))
+    matrices = (transform_fundamental(F_mat, T1, T2) for F_mat in (F_hat, rank2_projection(F_hat)))
+    before, after = (symmetric_epipolar_distance(points1, points2, F_mat).mean(-1) for F_mat in matrices)
     return Diagnostics(
         condition_number(A),
         singularity_ratio(F_hat),
@@ -98,23 +98,8 @@ def diagnose_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> D
 def condition_number(A: Tensor) -> Tensor:
     r"""Return :math:`\kappa(A) = \sqrt{d_1 / d_8}` with the descending eigenvalues :math:`d_i` of :math:`A^\top A`.
 
-    The ninth eigenvalue is left out: it is zero, or the residual (Fan et al., section 3).
-
-    Args:
-        A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
-
-    Returns:
-        condition numbers with shape :math:`(*)`, at least 1; up to rounding, infinite for a matrix of lower rank and
-        NaN for zero.
-
-    Raises:
-        ShapeError: if the shape is wrong.
-        ValueError: if there are fewer than eight rows.
-
-    Example:
-        >>> condition_number(torch.eye(9)[:8])
-        tensor(1.)
-
+    The ninth eigenvalue of design matrices :math:`(*, N, 9)` is left out: it is zero, or the residual (Fan et al.,
+    section 3). Up to rounding, a matrix of lower rank gives infinity and a zero matrix NaN.
     """
     KORNIA_CHECK_SHAPE(A, ["*", "N", "9"])
     if A.shape[-2] < 8:
@@ -124,24 +109,9 @@ def condition_number(A: Tensor) -> Tensor:
 
 
 def singularity_ratio(F_mat: Tensor) -> Tensor:
-    r"""Return :math:`\rho = r_2 / r_3`, the two smaller singular values of matrices before the rank-2 projection.
+    r"""Return :math:`\rho = r_2 / r_3`, the two smaller singular values of matrices :math:`(*, 3, 3)` before rank 2.
 
-    The larger the ratio, the less the projection changes the matrix (Fan et al., section 4).
-
-    Args:
-        F_mat: matrices with shape :math:`(*, 3, 3)`.
-
-    Returns:
-        ratios with shape :math:`(*)`, at least 1; up to rounding, infinite for a matrix of rank 2 and NaN for one of
-        lower rank.
-
-    Raises:
-        ShapeError: if the shape is wrong.
-
-    Example:
-        >>> singularity_ratio(torch.diag(torch.tensor([5.0, 2.0, 0.5])))
-        tensor(4.)
-
+    The larger the ratio, the less the projection to rank 2 changes the matrix (Fan et al., section 4).
     """
     KORNIA_CHECK_SHAPE(F_mat, ["*", "3", "3"])
     s: Tensor = torch.linalg.svdvals(F_mat)
@@ -149,29 +119,9 @@ def singularity_ratio(F_mat: Tensor) -> Tensor:
 
 
 def normalized_distance(points: Tensor, T: Tensor) -> Tensor:
-    r"""Return the mean distance of the normalised points from the origin; Hartley's is always :math:`\sqrt 2`.
-
-    Args:
-        points: pixels with shape :math:`(*, N, 2)`.
-        T: affine transforms with shape :math:`(*, 3, 3)`.
-
-    Returns:
-        mean distances with shape :math:`(*)`, without unit.
-
-    Raises:
-        ShapeError: if a shape is wrong.
-
-    Example:
-        >>> normalized_distance(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.eye(3))
-        tensor(2.5000)
-
-    """
+    r"""Return the mean distance of the points under T from the origin, without unit; Hartley's is :math:`\sqrt 2`."""
     KORNIA_CHECK_SHAPE(points, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(T, ["*", "3", "3"])
     x = convert_points_to_homogeneous(points) @ T.mT
     distances: Tensor = torch.linalg.vector_norm(x[..., :2], dim=-1)
     return distances.mean(-1)
-
-
-def _distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    return symmetric_epipolar_distance(points1, points2, F_mat).mean(-1)

@@ -34,12 +34,7 @@ WIDE = 1.8  # width over height from which two images are stacked
 
 
 def import_matplotlib() -> Any:
-    """Return the package ``matplotlib`` with its modules ``collections``, ``colors`` and ``figure``.
-
-    Raises:
-        ImportError: if Matplotlib is not installed; the message names the extra that installs it.
-
-    """
+    """Return the package ``matplotlib`` with its modules ``collections``, ``colors`` and ``figure``."""
     matplotlib = import_extra("matplotlib", "report", "drawing pictures")
     for name in ("collections", "colors", "figure"):
         importlib.import_module(f"matplotlib.{name}")
@@ -47,17 +42,7 @@ def import_matplotlib() -> Any:
 
 
 def draw_line(axes: Axes, line: npt.NDArray[np.float64], **style: Any) -> Line2D | None:
-    r"""Draw the line :math:`a x + b y + c = 0` across axes.
-
-    Args:
-        axes: Matplotlib axes.
-        line: :math:`(a, b, c)`, any scale.
-        style: options of :meth:`matplotlib.axes.Axes.axline`.
-
-    Returns:
-        the line; None for the line at infinity, :math:`a = b = 0`, which is not drawn.
-
-    """
+    """Draw the line a x + b y + c = 0 across axes, at any scale of (a, b, c); nothing for the line at infinity."""
     norm = np.linalg.norm(line[:2])
     if not norm > 0:
         return None
@@ -68,15 +53,7 @@ def draw_line(axes: Axes, line: npt.NDArray[np.float64], **style: Any) -> Line2D
 def draw_matches(
     axes: Axes, points1: npt.NDArray[np.float64], points2: npt.NDArray[np.float64], inliers: npt.NDArray[np.bool_]
 ) -> None:
-    """Draw the matches in image 1: inliers as dots with their motion to image 2, outliers as crosses.
-
-    Args:
-        axes: Matplotlib axes.
-        points1: pixels in image 1 with shape (N, 2).
-        points2: pixels in image 2 with shape (N, 2).
-        inliers: mask of the inliers with shape (N,).
-
-    """
+    """Draw the matches (N, 2) in image 1: inliers as dots with their motion to image 2, outliers as crosses."""
     motion = np.stack([points1, points2], 1)[inliers]
     lines = import_matplotlib().collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8)
     axes.add_collection(lines)
@@ -96,22 +73,8 @@ def draw_pair(
 
     Image 1 shows the inliers in blue, each with its motion to image 2, and the outliers in red. Image 2 shows the
     epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10). Wide
-    images are stacked, other images stand side by side.
-
-    Args:
-        image1: grey values with shape :math:`(H_1, W_1)`, uint8.
-        image2: grey values with shape :math:`(H_2, W_2)`, uint8.
-        estimate: the estimate of these images.
-        path: the picture to write; its suffix decides the format.
-        num_lines: number of epipolar lines; fewer if there are fewer inliers.
-        seed: seed of the random subset.
-
-    Raises:
-        OSError: if the folder of ``path`` does not exist or is not writable.
-        ValueError: if the images do not have the sizes in ``estimate``, ``num_lines`` is negative, or the suffix is not
-            a format of Matplotlib.
-        ImportError: if Matplotlib is not installed.
-
+    images are stacked, other images stand side by side. The images are grey, uint8; the suffix of ``path`` decides the
+    format.
     """
     for image, size in ((image1, estimate.size1), (image2, estimate.size2)):
         if image.shape != size[::-1]:
@@ -119,7 +82,9 @@ def draw_pair(
     if num_lines < 0:
         raise ValueError(f"num_lines must not be negative, got {num_lines}")
     figure, (axes1, axes2) = _panels(image1, image2)
-    _draw_counts(axes1, estimate)
+    draw_matches(axes1, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
+    motion, outliers = f"{estimate.num_inliers} inliers and their motion", estimate.num_matches - estimate.num_inliers
+    _caption(axes1, [("image 1", TEXT), (motion, INLIER), (f"{outliers} outliers", OUTLIER)])
     _draw_lines(axes2, estimate, num_lines, seed)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor=figure.get_facecolor())
@@ -148,18 +113,11 @@ def _panels(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8]) -> tup
     return figure, axes
 
 
-def _draw_counts(axes: Axes, estimate: PairEstimate) -> None:
-    """Draw the matches; write the counts of inliers and outliers above."""
-    draw_matches(axes, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
-    outliers = estimate.num_matches - estimate.num_inliers
-    motion_text = f"{estimate.num_inliers} inliers and their motion"
-    _caption(axes, [("image 1", TEXT), (motion_text, INLIER), (f"{outliers} outliers", OUTLIER)])
-
-
 def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -> None:
     """Draw the epipolar lines of some inliers, each with its point; write the error above."""
     hsv_to_rgb = import_matplotlib().colors.hsv_to_rgb
-    chosen = _subset(estimate, num_lines, seed)
+    rows = torch.nonzero(estimate.inliers).flatten().numpy()
+    chosen = np.random.default_rng(seed).permutation(rows)[:num_lines]
     points1, points2 = estimate.points1[chosen].numpy(), estimate.points2[chosen].numpy()
     lines = np.pad(points1, ((0, 0), (0, 1)), constant_values=1.0) @ estimate.F_mat.numpy().T
     hues = np.linspace(0, 1, len(chosen), endpoint=False)
@@ -169,12 +127,6 @@ def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -
     axes.scatter(points2[:, 0], points2[:, 1], s=20, c=rgb, edgecolors="black", linewidths=0.7, zorder=3)
     error = f"median error {estimate.median_distance:.2f} px"
     _caption(axes, [("image 2", TEXT), (f"{len(chosen)} epipolar lines", TEXT), (error, TEXT)])
-
-
-def _subset(estimate: PairEstimate, num_lines: int, seed: int) -> npt.NDArray[np.int64]:
-    """Return the indices of a random subset of the inliers."""
-    rows = torch.nonzero(estimate.inliers).flatten().numpy()
-    return np.random.default_rng(seed).permutation(rows)[:num_lines]
 
 
 def _caption(axes: Axes, parts: list[tuple[str, str]], size: float = 9) -> None:

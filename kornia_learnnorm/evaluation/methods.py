@@ -16,6 +16,7 @@ from kornia_learnnorm.estimators.fundamental import solve_in_coordinates
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.files import short_name
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
 from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
@@ -32,6 +33,7 @@ __all__ = [
     "default_methods",
     "find_method",
     "identify_method",
+    "short_name_of",
     "short_names",
 ]
 
@@ -48,13 +50,7 @@ UNKNOWN = "not known"  # training data
 
 
 def default_methods(weights: Sequence[str] = SHIPPED) -> tuple[str, ...]:
-    """Return the closed forms, weights, and the search as the limit of them all.
-
-    Example:
-        >>> default_methods(["mine.safetensors"])
-        ('none', 'Hartley', 'whitening', 'reweighted', 'mine.safetensors', 'searched')
-
-    """
+    """Return the closed forms, weights, and the search as the limit of them all."""
     *closed_forms, search = CLOSED_FORMS
     return (*closed_forms, *weights, search)
 
@@ -63,19 +59,12 @@ DEFAULT_METHODS = (*default_methods(), "Hartley+optimal", "Hartley+LM", "crossvi
 
 
 class Method(NamedTuple):
-    """A normaliser and what follows the direct linear transformation.
+    """A normaliser and what follows the direct linear transformation."""
 
-    Attributes:
-        normalizer: maps ``(points1, points2, weights)`` to two transforms.
-        rank2: how the singularity constraint is enforced.
-        refined: whether Levenberg-Marquardt follows.
-        trained_on: the training data, as in :attr:`~kornia_learnnorm.LearnedNormalizer.trained_on`; ``not known`` of
-            weights that do not say it and of code that is not this package's.
-    """
-
-    normalizer: Normalizer
-    rank2: Literal["projection", "optimal"] = "projection"
-    refined: bool = False
+    normalizer: Normalizer  # maps (points1, points2, weights) to two transforms
+    rank2: Literal["projection", "optimal"] = "projection"  # how the singularity constraint is enforced
+    refined: bool = False  # whether Levenberg-Marquardt follows
+    # As in LearnedNormalizer.trained_on; UNKNOWN of weights that do not say it and of code that is not this package's.
     trained_on: tuple[str, ...] = ()
 
     def estimate(self, points1: Tensor, points2: Tensor) -> Tensor:
@@ -112,13 +101,7 @@ def find_method(name: str) -> Method:
 
 
 def base_name(name: str) -> str:
-    """Return a method's name without suffix, the name of its normalisation.
-
-    Example:
-        >>> base_name("Hartley+LM")
-        'Hartley'
-
-    """
+    """Return a method's name without suffix, the name of its normalisation."""
     return name.removesuffix(REFINED if name.endswith(REFINED) else OPTIMAL)
 
 
@@ -193,18 +176,12 @@ def _source_files(name: str) -> list[Path]:
     return sorted(Path(file) for file in files if file)
 
 
+def short_name_of(name: str) -> str:
+    """Return a method's name for tables and files: for a path, that of the run's folder or of the file."""
+    base = base_name(name)
+    return short_name(base) + name[len(base) :] if Path(base).suffix == ".safetensors" else name
+
+
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return each method's name for tables and files: for a path, that of the run's folder or of the file.
-
-    Raises:
-        ValueError: if two methods have the same name.
-
-    """
-    short = []
-    for name in names:
-        base = base_name(name)
-        is_path = Path(base).suffix == ".safetensors"
-        short.append(names_of([base])[0] + name[len(base) :] if is_path else name)
-    if twice := {name for name in short if short.count(name) > 1}:
-        raise ValueError(f"two methods have the same name, {', '.join(sorted(twice))}: rename a file or leave one out")
-    return dict(zip(names, short, strict=True))
+    """Return the short name of each method; raise ValueError if two are equal."""
+    return names_of(names, short_name_of, "methods")

@@ -34,36 +34,20 @@ MAGSAC_MAX_SAMPLES = 10_000
 
 @dataclass(frozen=True, eq=False)
 class PairEstimate:
-    r"""The fundamental matrix of two images and the correspondences behind it.
+    """The fundamental matrix of two images and the correspondences behind it."""
 
-    Attributes:
-        F_mat: :math:`(3, 3)`, float64, unit Frobenius norm, :math:`x_2^\top F x_1 = 0` in pixels.
-        points1: pixels of the matches in image 1 with shape :math:`(N, 2)`, float64.
-        points2: pixels of the matches in image 2 with shape :math:`(N, 2)`, float64.
-        inliers: mask of the matches with a distance to ``F_mat`` below ``threshold``, shape :math:`(N,)`, bool.
-        mean_distance: mean symmetric epipolar distance of the inliers, pixels.
-        median_distance: median symmetric epipolar distance of the inliers, pixels.
-        path1: file of image 1.
-        path2: file of image 2.
-        size1: width and height of image 1.
-        size2: width and height of image 2.
-        ratio: largest ratio of the nearest to the second-nearest descriptor distance of the matches.
-        threshold: largest symmetric epipolar distance of an inlier, pixels.
-
-    """
-
-    F_mat: Tensor
-    points1: Tensor
-    points2: Tensor
-    inliers: Tensor
-    mean_distance: float
-    median_distance: float
+    F_mat: Tensor  # (3, 3), float64, unit Frobenius norm, x2^T F x1 = 0 in pixels
+    points1: Tensor  # pixels of the matches in image 1, (N, 2), float64
+    points2: Tensor  # pixels of the matches in image 2, (N, 2), float64
+    inliers: Tensor  # mask of the matches with a distance to F_mat below the threshold, (N,), bool
+    mean_distance: float  # mean symmetric epipolar distance of the inliers, pixels
+    median_distance: float  # median symmetric epipolar distance of the inliers, pixels
     path1: Path
     path2: Path
-    size1: tuple[int, int]
-    size2: tuple[int, int]
-    ratio: float
-    threshold: float
+    size1: tuple[int, int]  # width and height of image 1
+    size2: tuple[int, int]  # width and height of image 2
+    ratio: float  # largest ratio of the nearest to the second-nearest descriptor distance of the matches
+    threshold: float  # largest symmetric epipolar distance of an inlier, pixels
 
     @property
     def num_matches(self) -> int:
@@ -200,11 +184,7 @@ def _check_inliers(inliers: Tensor, threshold: float) -> None:
 
 
 def _fit(
-    points1: Tensor,
-    points2: Tensor,
-    inliers: Tensor,
-    normalizer: Normalizer,
-    threshold: float,
+    points1: Tensor, points2: Tensor, inliers: Tensor, normalizer: Normalizer, threshold: float
 ) -> tuple[Tensor, Tensor]:
     """Return F fitted to all inliers and its inliers; refit while the number of inliers grows."""
     F_mat, best = torch.zeros(3, 3, dtype=torch.float64), torch.zeros_like(inliers)
@@ -249,17 +229,7 @@ def _check_chance(matches: int, inliers: int, threshold: float, shape: tuple[int
 
 
 def write_json(path: str | Path, estimate: PairEstimate) -> None:
-    """Write an estimate as a JSON file, whole or not at all.
-
-    Args:
-        path: the file to write.
-        estimate: the estimate of :func:`estimate_pair`.
-
-    Raises:
-        OSError: if the folder does not exist or is not writable.
-        ValueError: if ``path`` is a folder or a device.
-
-    """
+    """Write an estimate as a JSON file, whole or not at all."""
     content = {
         "F": estimate.F_mat.tolist(),
         "convention": "x2^T F x1 = 0, x = (column, row, 1) in pixels, unit Frobenius norm",

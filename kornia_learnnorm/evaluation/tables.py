@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -28,16 +28,11 @@ Predictions = Mapping[str, Mapping[str, Tensor]]
 
 
 def method_rows(predictions: Predictions) -> list[list[str]]:
-    """Return a row per method: better rates, mean and median residual, ground-truth residual and its better rate.
+    """Return a row per method in the order of :data:`HEADER`, from the errors of each sample, pixels, (S,).
 
-    Args:
-        predictions: by method, ``own``, the mean symmetric epipolar distance of each sample's points, and ``truth``,
-            the median one of the ground-truth inliers of its pair, NaN where there are none; pixels, (S,) each.
-
-    Returns:
-        cells as text, in the order of :data:`HEADER`. The mean leaves out samples whose residual is infinite for any
-        method (a point on an epipole). Without Hartley or whitening among the methods, their rates are empty.
-
+    ``own`` is the mean symmetric epipolar distance of a sample's points, ``truth`` the median one of its pair's
+    ground-truth inliers, NaN where there are none. The mean leaves out samples whose residual is infinite for any
+    method (a point on an epipole). Without Hartley or whitening among the methods, their rates are empty.
     """
     finite = torch.stack([errors["own"] for errors in predictions.values()]).isfinite().all(0)
     rows = []
@@ -58,15 +53,7 @@ def _rate(predictions: Predictions, name: str, baseline: str, quantity: str) -> 
 
 
 def diagnostic_rows(predictions: Predictions) -> list[list[str]]:
-    """Return a row per method: the medians of its diagnostics.
-
-    Args:
-        predictions: by method, (S,) each, the diagnostics that a run keeps.
-
-    Returns:
-        cells as text, in the order of :data:`DIAGNOSTICS`.
-
-    """
+    """Return a row per method in the order of :data:`DIAGNOSTICS`: the medians of the diagnostics of a run."""
     rows = []
     for name, found in predictions.items():
         numbers = [median(found[key]).item() for key in ("condition_number", "rho", "distance1", "distance2")]
@@ -95,17 +82,10 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([line(header), rule, *map(line, rows)])
 
 
-def names_of(paths: Sequence[str]) -> list[str]:
-    """Return the short names of files, which tables show.
-
-    Args:
-        paths: as for :func:`~kornia_learnnorm.files.short_name`.
-
-    Raises:
-        ValueError: if two have the same name.
-
-    """
-    names = [short_name(path) for path in paths]
+def names_of(paths: Sequence[str], shorten: Callable[[str], str] = short_name, what: str = "files") -> dict[str, str]:
+    """Return the short names of files, methods or estimators, which tables show; raise ValueError if two are equal."""
+    names = [shorten(path) for path in paths]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"two files have the same name, {', '.join(sorted(twice))}: rename one of {', '.join(paths)}")
-    return names
+        text = f"two {what} have the same name, {', '.join(sorted(twice))}"
+        raise ValueError(f"{text}: rename a file or leave out one of {', '.join(paths)}")
+    return dict(zip(paths, names, strict=True))

@@ -154,16 +154,7 @@ def line_norms(
 
 
 def find_scale(distance: object) -> DistanceScale:
-    """Return the distance scale of a name, or the function that was given.
-
-    Args:
-        distance: ``"sampson"``, ``"symmetric"`` (Fan et al., Eq. 7), or a distance scale.
-
-    Raises:
-        ValueError: if there is no distance of that name.
-        TypeError: if it is neither a name nor a function.
-
-    """
+    """Return the distance scale of a name, or the function that was given."""
     scales: dict[str, DistanceScale] = {"sampson": sampson_scale, "symmetric": symmetric_scale}
     if isinstance(distance, str):
         if distance not in scales:

@@ -69,21 +69,7 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
 
 
 def has_null_vector(A: Tensor, weights: Tensor | None = None, tolerance: float = MIN_GAP) -> Tensor:
-    r"""Return which design matrices have a unique null vector.
-
-    Args:
-        A: design matrices in normalised coordinates with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
-        weights: optional non-negative weights with shape :math:`(*, N)`.
-        tolerance: smallest relative gap, see :func:`solve_null_vector`.
-
-    Returns:
-        booleans with shape :math:`(*)`.
-
-    Example:
-        >>> has_null_vector(torch.stack([torch.eye(9)[:8], torch.ones(8, 9)]))
-        tensor([ True, False])
-
-    """
+    """Return which design matrices :math:`(*, N, 9)` have a unique null vector: a relative gap above the tolerance."""
     return solve_null_vector(A, weights)[1] > tolerance
 
 
@@ -153,15 +139,7 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
 
 
 def smallest_singular_vectors(A: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return the left and right singular vectors of the smallest singular value, twice differentiable.
-
-    Args:
-        A: square matrices with shape :math:`(*, n, n)`.
-
-    Returns:
-        unit vectors :math:`u` and :math:`v` with shape :math:`(*, n)`, signs arbitrary, of one decomposition.
-
-    """
+    r"""Return the left and right singular vectors of the smallest singular value, twice differentiable."""
     with torch.no_grad():
         U, s, Vh = torch.linalg.svd(A)
     return _attach_derivatives(A.mT, None, s, U.mT), _attach_derivatives(A, None, s, Vh)

@@ -53,14 +53,7 @@ class LinearProblem:
 
     @classmethod
     def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> LinearProblem:
-        r"""Return the problem of correspondences, in float64 where the device has it.
-
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, checked.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-
-        """
+        r"""Return the problem of correspondences, in float64 where the device has it."""
         dtype = solve_dtype(points1.device)
         points1, points2, weights = points1.to(dtype), points2.to(dtype), None if weights is None else weights.to(dtype)
         T1, T2 = hartley_transform(points1, weights), hartley_transform(points2, weights)
@@ -90,16 +83,7 @@ class LinearProblem:
         return self.solution
 
     def null_matrix_in(self, T1: Tensor, T2: Tensor) -> Tensor:
-        r"""Return the null matrix in the coordinates :math:`T_i x_i`, unit norm.
-
-        Args:
-            T1: transforms of pixels of the first view with shape :math:`(B, 3, 3)`, invertible.
-            T2: transforms of pixels of the second view.
-
-        Returns:
-            matrices with shape :math:`(B, 3, 3)`, sign arbitrary.
-
-        """
+        r"""Return the null matrix in the coordinates :math:`T_i x_i` of pixels :math:`x_i`, unit norm, (B, 3, 3)."""
         if T1 is self.T1 and T2 is self.T2:
             return self.null_matrix
         if self.points1.shape[1] == 8:
@@ -113,21 +97,11 @@ class LinearProblem:
         return torch.unflatten(null_vector(design_matrix(x1 @ T1.mT, x2 @ T2.mT), self.weights), -1, (3, 3))
 
     def select(self, rows: Tensor) -> LinearProblem:
-        """Return the problem of some of the sets, solved if this one is.
-
-        Args:
-            rows: their indices, or a mask.
-
-        """
+        """Return the problem of some of the sets, by their indices or a mask (B,); solved if this one is."""
         return self._changed(lambda value: value[rows])
 
     def detach(self, rows: Tensor) -> LinearProblem:
-        """Return the same problem, where some of the sets send no gradient.
-
-        Args:
-            rows: which sets, boolean with shape :math:`(B,)`.
-
-        """
+        """Return the same problem, in which the sets marked in ``rows``, (B,) bool, send no gradient."""
         return self._changed(lambda v: torch.where(rows.view(-1, *[1] * (v.ndim - 1)), v.detach(), v))
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> LinearProblem:

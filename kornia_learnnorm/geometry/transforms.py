@@ -24,22 +24,7 @@ __all__ = [
 
 
 def affine_transform(linear: Tensor, origin: Tensor) -> Tensor:
-    r"""Build the transform that moves ``origin`` to zero and then applies ``linear``.
-
-    Args:
-        linear: matrices with shape :math:`(*, 2, 2)`.
-        origin: points with shape :math:`(*, 2)`.
-
-    Returns:
-        homogeneous transforms with shape :math:`(*, 3, 3)`.
-
-    Example:
-        >>> affine_transform(2 * torch.eye(2), torch.tensor([3.0, 4.0]))
-        tensor([[ 2.,  0., -6.],
-                [ 0.,  2., -8.],
-                [ 0.,  0.,  1.]])
-
-    """
+    r"""Build the transform that moves ``origin`` to zero and then applies ``linear``."""
     KORNIA_CHECK_SHAPE(linear, ["*", "2", "2"])
     KORNIA_CHECK_SHAPE(origin, ["*", "2"])
     top = torch.cat([linear, -linear @ origin[..., None]], -1)
@@ -49,17 +34,7 @@ def affine_transform(linear: Tensor, origin: Tensor) -> Tensor:
 
 
 def transform_fundamental(F_mat: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
-    r"""Return :math:`T_2^\top F T_1`: a fundamental matrix of transformed points, brought back to the points.
-
-    Args:
-        F_mat: fundamental matrices of the transformed points with shape :math:`(*, 3, 3)`.
-        T1: transforms of the first view with shape :math:`(*, 3, 3)`.
-        T2: transforms of the second view with shape :math:`(*, 3, 3)`.
-
-    Returns:
-        fundamental matrices with shape :math:`(*, 3, 3)`.
-
-    """
+    r"""Return :math:`T_2^\top F T_1`: a fundamental matrix of transformed points, brought back to the points."""
     return T2.mT @ F_mat @ T1
 
 

@@ -43,43 +43,14 @@ def bootstrap_interval(
 
 
 def percentile_interval(means: Tensor, level: float = 0.95) -> tuple[float, float]:
-    """Return the lower and upper end of the middle share ``level`` of a bootstrap's draws.
-
-    Args:
-        means: what :func:`bootstrap_means` returns.
-        level: share of the draws within the interval.
-
-    Raises:
-        ValueError: if ``level`` is not between 0 and 1.
-
-    Example:
-        >>> percentile_interval(torch.arange(5.0), 0.5)
-        (1.0, 3.0)
-
-    """
+    """Return the lower and upper end of the middle share ``level`` of a bootstrap's draws."""
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1, got {level}")
     return means.quantile((1 - level) / 2).item(), means.quantile((1 + level) / 2).item()
 
 
 def bootstrap_means(values: Tensor, groups: Tensor, draws: int = 2000, seed: int = 0) -> Tensor:
-    """Return the mean of each draw of whole groups with replacement, (draws,) float64.
-
-    Args:
-        values: one value per sample with shape (S,).
-        groups: index of each sample's group with shape (S,), integers.
-        draws: number of draws.
-        seed: seed of the draws.
-
-    Raises:
-        ValueError: if the shapes differ or there are fewer than two groups.
-
-    Example:
-        >>> means = bootstrap_means(torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([0, 0, 1, 1]))
-        >>> means.unique().tolist()
-        [0.0, 0.5, 1.0]
-
-    """
+    """Return the mean over the samples (S,) of each draw of whole groups with replacement, (draws,) float64."""
     if values.shape != groups.shape or values.ndim != 1:
         raise ValueError(f"values and groups must be two (S,) tensors, got {[*values.shape]} and {[*groups.shape]}")
     present, group = torch.unique(groups, return_inverse=True)

@@ -30,20 +30,8 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
     Floyd's algorithm, a column at a time: the :math:`k`-th draws from the first :math:`n - s + k + 1` indices and,
     where it meets one that is there, takes the last of these instead.
 
-    Args:
-        totals: numbers :math:`n \ge s` of indices to draw from, (K,) int64.
-        size: indices in a set, :math:`s`.
-        generator: source of randomness, on the device of ``totals``.
-
-    Returns:
-        indices with shape :math:`(K, s)`.
-
     Reference:
         J. Bentley, R. Floyd, Programming pearls: a sample of brilliance, CACM 1987.
-
-    Example:
-        >>> draw_distinct(torch.tensor([3]), 3, torch.Generator().manual_seed(0)).sort(-1).values
-        tensor([[0, 1, 2]])
 
     """
     last = totals[:, None] - size + torch.arange(size, device=totals.device)

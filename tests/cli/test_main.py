@@ -95,12 +95,8 @@ def together(configs):
 @pytest.mark.parametrize("name", RUNS)
 def test_every_overlay_runs(name, data, tmp_path, monkeypatch):
     monkeypatch.setenv("LEARNNORM_DATA", str(data))
-    small = [
-        *SMALL,
-        "--trainer.max_steps=2",
-        "--data.val.init_args.number=50",
-        f"--trainer.default_root_dir={tmp_path}",
-    ]
+    small = [*SMALL, "--trainer.max_steps=2", "--data.val.init_args.number=50"]
+    small += [f"--trainer.default_root_dir={tmp_path}"]
     if name.endswith("handheld"):
         small += ["--data.train.init_args.number=100"]
     if name == "paper-handheld":
@@ -171,9 +167,8 @@ def test_other_training_data_leave_normalizer_and_loss_alone(name):
 
 def test_unset_variable(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("LEARNNORM_DATA", raising=False)
-    config = next(path for path in CONFIGS if path.stem == "crossview")
-    code = main(["fit", "--config", str(config), *SMALL, f"--trainer.default_root_dir={tmp_path}"])
-    assert code == 2
+    config = FOLDER / "crossview.yaml"
+    assert main(["fit", "--config", str(config), *SMALL, f"--trainer.default_root_dir={tmp_path}"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("learnnorm fit: error: the environment variable LEARNNORM_DATA, named in ")
     assert error.count("\n") == 1
@@ -183,7 +178,7 @@ def test_unset_variable(tmp_path, monkeypatch, capsys):
 def trained(tmp_path_factory):
     """A run of a few steps, and the options that it was made with."""
     folder = tmp_path_factory.mktemp("run")
-    config = next(path for path in CONFIGS if path.stem == "crossview-synthetic")
+    config = FOLDER / "crossview-synthetic.yaml"
     numbers = [f"--data.{stage}.init_args.number=100" for stage in ("train", "val", "test")]
     options = ["--config", str(config), *SMALL, *numbers, f"--trainer.default_root_dir={folder}"]
     with pytest.MonkeyPatch.context() as patch:
@@ -192,36 +187,28 @@ def trained(tmp_path_factory):
     return folder, options
 
 
-@pytest.mark.parametrize("command", ["validate", "test", "predict"])
-def test_a_checkpoint_is_needed(trained, command, capsys):
-    assert main([command, *trained[1]]) == 2
-    assert "give the checkpoint by --ckpt_path" in capsys.readouterr().err
+FOREIGN = "is not a checkpoint of a training run, or not a whole one"
 
 
 @pytest.mark.parametrize(
-    ("file", "message"),
+    ("commands", "options", "message"),
     [
-        ("weights.safetensors", "is not a checkpoint of a training run"),
-        ("text.ckpt", "is not a checkpoint of a training run"),
-        ("none.ckpt", "no checkpoint at"),
-        ("cut.ckpt", "cut.ckpt is not a checkpoint of a training run, or not a whole one"),
+        ("validate test predict", [], "give the checkpoint by --ckpt_path"),
+        ("fit test", ["--ckpt_path=weights.safetensors"], f"weights.safetensors {FOREIGN}"),
+        ("fit test", ["--ckpt_path=text.ckpt"], f"text.ckpt {FOREIGN}"),
+        ("fit test", ["--ckpt_path=cut.ckpt"], f"cut.ckpt {FOREIGN}"),
+        ("fit test", ["--ckpt_path=none.ckpt"], "no checkpoint at none.ckpt"),
+        ("test", ["--ckpt_path=checkpoints/last.ckpt", f"--{NETWORK}.width=32"], "holds another network than the one"),
     ],
 )
-@pytest.mark.parametrize("command", ["fit", "test"])
-def test_wrong_checkpoints(trained, command, file, message, capsys):
-    folder, options = trained
-    (folder / "text.ckpt").write_text("not a checkpoint")
-    whole = (folder / "checkpoints/last.ckpt").read_bytes()
-    (folder / "cut.ckpt").write_bytes(whole[: len(whole) // 2])
-    assert main([command, *options, f"--ckpt_path={folder / file}"]) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_checkpoint_of_another_network(trained, capsys):
-    folder, options = trained
-    other = "--model.normalizer.init_args.network.init_args.width=32"
-    assert main(["test", *options, other, f"--ckpt_path={folder / 'checkpoints/last.ckpt'}"]) == 2
-    assert "holds another network than the one configured" in capsys.readouterr().err
+def test_missing_and_wrong_checkpoints(trained, monkeypatch, capsys, commands, options, message):
+    monkeypatch.chdir(trained[0])
+    Path("text.ckpt").write_text("not a checkpoint")
+    whole = Path("checkpoints/last.ckpt").read_bytes()
+    Path("cut.ckpt").write_bytes(whole[: len(whole) // 2])
+    for command in commands.split():
+        assert main([command, *trained[1], *options]) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_interrupted(monkeypatch, capsys):
@@ -252,10 +239,7 @@ def test_synthesize_evaluate_estimate(tmp_path, capsys):
     [
         (["estimate", "none1.png", "none2.png"], "none1.png"),
         (["synthesize", "folder", "--pairs", "0"], "0"),
-        (
-            ["synthesize", "folder", "--scenes", "moon"],
-            "scenes must be among forward driving, hand-held, orbit, got moon",
-        ),
+        (["synthesize", "folder", "--scenes", "moon"], "among forward driving, hand-held, orbit, got moon"),
     ],
 )
 def test_errors_are_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch, capsys):
@@ -274,11 +258,8 @@ def test_errors_are_one_line_and_exit_code_2(arguments, message, tmp_path, monke
 def test_a_missing_package_is_one_line(blocked, extra, tmp_path, monkeypatch, capsys):
     write_store(tmp_path / "s.h5", synthetic_store(pairs=1, points=40))
     monkeypatch.setitem(sys.modules, blocked, None)
-    commands = [
-        ["evaluate", str(tmp_path / "s.h5")],
-        ["robust", str(tmp_path / "s.h5"), "--out", str(tmp_path / "run")],
-    ]
-    for command in [["fit"]] if extra == "train" else commands:
+    store, out = str(tmp_path / "s.h5"), str(tmp_path / "run")
+    for command in [["fit"]] if extra == "train" else [["evaluate", store], ["robust", store, "--out", out]]:
         assert main(command) == 2
         error = capsys.readouterr().err
         assert f"needs {blocked}" in error

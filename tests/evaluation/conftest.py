@@ -17,6 +17,19 @@ ESTIMATORS = ["kornia-8pt", "count:Hartley", "count:whitening", "time:Hartley", 
 SOLVERS = ["Hartley", "whitening", "seven-point"]
 
 
+@pytest.fixture
+def refused(capsys):
+    """A function that checks that a command fails with a message on one line."""
+
+    def check(command, message):
+        capsys.readouterr()
+        assert main([*map(str, command)]) == 2
+        printed = capsys.readouterr()
+        assert message in printed.err.splitlines()[-1]
+
+    return check
+
+
 @pytest.fixture(scope="session")
 def store(tmp_path_factory):
     path = tmp_path_factory.mktemp("store") / "scenes.h5"
@@ -48,6 +61,12 @@ def run(command, tmp_path_factory):
 @pytest.fixture
 def copied(run, tmp_path):
     return shutil.copytree(run, tmp_path / "run")
+
+
+@pytest.fixture
+def reading(copied, command):
+    """The commands that read a run: the report, and the command that made it."""
+    return ["report", copied], [*command, copied]
 
 
 @pytest.fixture(scope="session")
@@ -90,6 +109,11 @@ def robust_run(robust_command, small_budgets, tmp_path_factory):
 @pytest.fixture
 def robust_copied(robust_run, tmp_path):
     return shutil.copytree(robust_run, tmp_path / "run")
+
+
+@pytest.fixture
+def robust_again(robust_copied, robust_command):
+    return [*robust_command, str(robust_copied)]
 
 
 @pytest.fixture

@@ -80,29 +80,24 @@ class TestDrawPair:
         assert np.array_equal(a, b)
         assert not np.array_equal(a, c)
 
-    def test_images_of_different_shapes(self, tmp_path):
+    def test_images_of_different_shapes_and_no_outliers(self, tmp_path):
         image1, image2, estimate = make_pair(300, 100)
-        estimate = dataclasses.replace(estimate, size2=(70, 100))
-        draw_pair(image1, image2[:, :70], estimate, tmp_path / "pair.png")
-
-    def test_no_outliers(self, tmp_path):
-        image1, image2, estimate = make_pair()
-        draw_pair(image1, image2, dataclasses.replace(estimate, inliers=torch.ones(30, dtype=torch.bool)),
-                  tmp_path / "pair.png", num_lines=1000)  # fmt: skip
+        estimate = dataclasses.replace(estimate, size2=(70, 100), inliers=torch.ones(30, dtype=torch.bool))
+        draw_pair(image1, image2[:, :70], estimate, tmp_path / "pair.png", num_lines=1000)
 
     @pytest.mark.parametrize("suffix", ["jpg", "webp", "tiff", "pdf", "svg"])
     def test_formats(self, tmp_path, suffix):
         draw_pair(*make_pair(), tmp_path / f"pair.{suffix}")
         assert (tmp_path / f"pair.{suffix}").stat().st_size > 1000
 
-    def test_unknown_format_leaves_nothing(self, tmp_path):
-        with pytest.raises(ValueError, match="not supported"):
-            draw_pair(*make_pair(), tmp_path / "pair.xyz")
+    @pytest.mark.parametrize(
+        ("name", "error", "message"),
+        [("pair.xyz", ValueError, "not supported"), ("none/pair.png", FileNotFoundError, "does not exist")],
+    )
+    def test_places_that_are_refused(self, tmp_path, name, error, message):
+        with pytest.raises(error, match=message):
+            draw_pair(*make_pair(), tmp_path / name)
         assert not list(tmp_path.iterdir())
-
-    def test_missing_folder(self, tmp_path):
-        with pytest.raises(FileNotFoundError, match="does not exist"):
-            draw_pair(*make_pair(), tmp_path / "none" / "pair.png")
 
     def test_wrong_arguments(self, tmp_path):
         image1, image2, estimate = make_pair()

@@ -11,8 +11,8 @@ import yaml
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
-from kornia_learnnorm.evaluation.methods import SHIPPED, find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.runs.trained import was_trained_on
+from kornia_learnnorm.evaluation.methods import SHIPPED, default_methods, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.report.rates import was_trained_on
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.normalizers.learned import WEIGHTS
 
@@ -68,6 +68,7 @@ def test_names(tmp_path):
     assert short_names([path, path + "+LM", "paper"]) == {path: "mine", path + "+LM": "mine+LM", "paper": "paper"}
     assert identify_method("paper").startswith("paper ")
     assert identify_method("Hartley+LM") == "Hartley+LM"
+    assert default_methods(["my"]) == ("none", "Hartley", "whitening", "reweighted", "my", "searched")
     with pytest.raises(ValueError, match="same name"):
         short_names([path, path])
 
@@ -76,7 +77,7 @@ class TestTrainedOn:
     @pytest.mark.parametrize(("name", "config"), [("paper", "paper-short"), ("crossview", "crossview")])
     def test_shipped_weights_are_as_configured(self, name, config):
         paths = yaml.safe_load((CONFIGS / f"{config}.yaml").read_text())["data"]["train"]["init_args"]["paths"]
-        assert find_method(name).trained_on == find_method(f"{name}+LM").trained_on == tuple(names_of(paths))
+        assert find_method(name).trained_on == find_method(f"{name}+LM").trained_on == tuple(names_of(paths).values())
 
     def test_shipped_weights(self):
         assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {*SHIPPED}
@@ -95,6 +96,8 @@ class TestTrainedOn:
             ("a@1:2", ["a", "b@3:6"], True),
             ("b@6:9", ["a", "b@3:6"], False),
             ("a", [], False),
+            ("tum@10:19", ["tum@0:9"], False),
+            ("tum", ["tum@0:9"], True),
             ("a", ["not known"], False),
         ],
     )

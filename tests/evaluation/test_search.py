@@ -21,7 +21,7 @@ from kornia_learnnorm import (
     spd_transform,
 )
 
-BASES = {"hartley": Hartley(), "whitening": Whitening(), "reweighted": ReweightedWhitening()}
+BASES = {"hartley": Hartley(), "whitening": Whitening(), "reweighted": ReweightedWhitening(), "learned": shaken()}
 
 
 def mean_distances(points1, points2, normalizer, weights=None) -> np.ndarray:
@@ -33,9 +33,11 @@ def mean_distances(points1, points2, normalizer, weights=None) -> np.ndarray:
 
 @cache
 def searched(base, scene, num_points):
-    """A search and the points that it was made for."""
+    """A search, the points that it was made for, and the mean distances under it and under its base."""
     points = correspondences(scene, 12, num_points)
-    return points, SearchedNormalizer(BASES[base], steps=50)(*points)
+    transforms = SearchedNormalizer(BASES[base], steps=50)(*points)
+    with torch.no_grad():
+        return points, transforms, *(mean_distances(*points, n) for n in (lambda *_: transforms, BASES[base]))
 
 
 def numpy_spd(params) -> np.ndarray:
@@ -56,9 +58,7 @@ class TestSmoke:
         points = [uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
         weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
         for T in SearchedNormalizer(steps=2)(*points, weights):
-            assert T.shape == (batch_size, 3, 3)
-            assert T.dtype == dtype
-            assert T.device.type == device.type
+            assert (T.shape, T.dtype, T.device.type) == ((batch_size, 3, 3), dtype, device.type)
             assert torch.isfinite(T).all()
             assert torch.equal(T[:, 2].cpu(), torch.tensor([[0, 0, 1]], dtype=dtype).expand(batch_size, 3))
 
@@ -88,16 +88,16 @@ class TestSmoke:
             SearchedNormalizer(steps=steps, learning_rate=learning_rate)
 
     @pytest.mark.parametrize(
-        ("points1", "points2", "weights", "error", "message"),
+        ("points1", "weights", "message"),
         [
-            (torch.rand(2, 7, 2), torch.rand(2, 7, 2), None, ValueError, "at least 8 correspondences .* got 7"),
-            (torch.full((2, 8, 2), torch.nan), torch.rand(2, 8, 2), None, ValueError, "points1 must be finite"),
-            (torch.rand(2, 8, 2), torch.rand(2, 8, 2), -torch.ones(2, 8), ValueError, "must not be negative"),
+            (torch.rand(2, 7, 2), None, "at least 8 correspondences .* got 7"),
+            (torch.full((2, 8, 2), torch.nan), None, "points1 must be finite"),
+            (torch.rand(2, 8, 2), -torch.ones(2, 8), "must not be negative"),
         ],
     )
-    def test_wrong_correspondences(self, points1, points2, weights, error, message):
-        with pytest.raises(error, match=message):
-            SearchedNormalizer(steps=1)(points1, points2, weights)
+    def test_wrong_correspondences(self, points1, weights, message):
+        with pytest.raises(ValueError, match=message):
+            SearchedNormalizer(steps=1)(points1, torch.rand_like(points1), weights)
 
 
 class TestSearch:
@@ -105,15 +105,13 @@ class TestSearch:
     @pytest.mark.parametrize("scene", SCENES)
     @pytest.mark.parametrize("num_points", [8, 20])
     def test_never_worse_than_its_base(self, base, scene, num_points):
-        points, transforms = searched(base, scene, num_points)
-        found = mean_distances(*points, lambda *_: transforms)
-        assert (found <= mean_distances(*points, BASES[base]) * (1 + 1e-6) + 1e-6).all()
+        *_, found, expected = searched(base, scene, num_points)
+        assert (found <= expected * (1 + 1e-6) + 1e-6).all()
 
     @pytest.mark.parametrize(("base", "most"), [("hartley", 0.7), ("whitening", 0.8), ("reweighted", 0.98)])
     @pytest.mark.parametrize("scene", ["driving", "handheld"])
     def test_lowers_the_distance(self, base, most, scene):
-        points, transforms = searched(base, scene, 8)
-        found, expected = mean_distances(*points, lambda *_: transforms), mean_distances(*points, BASES[base])
+        *_, found, expected = searched(base, scene, 8)
         assert (found < expected).mean() > 0.9
         assert np.exp(np.log(found / expected).mean()) < most
 
@@ -175,17 +173,11 @@ class TestSearch:
 
     def test_the_result_is_built_from_parameters_and_base(self):
         """Transforms of the five parameters: symmetric positive definite linear parts, upon the base."""
-        points, transforms = searched("hartley", "handheld", 8)
+        points, transforms, *_ = searched("hartley", "handheld", 8)
         for T, H in zip(transforms, Hartley()(*points), strict=True):
             linear = (T.numpy() @ np.linalg.inv(H.numpy()))[:, :2, :2]
             np.testing.assert_allclose(linear, linear.swapaxes(1, 2), atol=1e-9)
             assert (np.linalg.eigvalsh(linear) > 0).all()
-
-    def test_any_base_of_the_contract(self):
-        points = correspondences("handheld", 5)
-        found = mean_distances(*points, SearchedNormalizer(shaken(), steps=10))
-        with torch.no_grad():
-            assert (found <= mean_distances(*points, shaken()) * (1 + 1e-6)).all()
 
 
 class TestInvariances:
@@ -198,15 +190,13 @@ class TestInvariances:
 
     @pytest.mark.parametrize("num_points", [8, 20])
     def test_samples_do_not_influence_each_other(self, num_points):
+        """Alone, or beside a degenerate one."""
         points, normalizer = correspondences("handheld", 6, num_points), SearchedNormalizer(steps=10)
         together = normalizer(*points)
         for k in range(6):
             self.same(normalizer(*(p[k : k + 1] for p in points)), [T[k : k + 1] for T in together])
-
-    def test_a_degenerate_sample_does_not_influence_the_others(self):
-        points, normalizer = correspondences("handheld", 6), SearchedNormalizer(steps=10)
-        spoilt = [torch.cat([torch.ones(1, 8, 2), p]) for p in points]
-        self.same([T[1:] for T in normalizer(*spoilt)], normalizer(*points))
+        spoilt = [torch.cat([torch.ones(1, num_points, 2), p]) for p in points]
+        self.same([T[1:] for T in normalizer(*spoilt)], together)
 
     @settings(max_examples=8)
     @given(st.integers(0, 2**31), st.sampled_from([8, 20]), st.randoms())
@@ -290,6 +280,4 @@ DEGENERATE = {
 def test_finite_on_degenerate_samples(sample, num_points, dtype):
     points = [p[:, :num_points].to(dtype) for p in DEGENERATE[sample]]
     for weights in (None, torch.zeros(4, num_points)):
-        T1, T2 = SearchedNormalizer(steps=5)(*points, weights)
-        assert torch.isfinite(T1).all()
-        assert torch.isfinite(T2).all()
+        assert torch.stack(SearchedNormalizer(steps=5)(*points, weights)).isfinite().all()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
+from kornia.core.exceptions import ShapeError
 from two_view import uniform
 
 from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype, weighted_mean
@@ -26,3 +28,11 @@ class TestCorrespondences:
         """What it refuses is tested with the estimators and normalisers."""
         points = torch.rand(2, 8, 2)
         check_correspondences(points, points, torch.ones(2, 8))
+
+    def test_errors_name_the_argument(self):
+        with pytest.raises(ShapeError, match=r"(?s)Actual shape: \[2, 8, 3\].*points2"):
+            check_correspondences(torch.rand(2, 8, 2), torch.rand(2, 8, 3))
+        with pytest.raises(
+            TypeError, match=r"got <class 'numpy.ndarray'>; torch.from_numpy\(points1\)"
+        ):
+            check_correspondences(np.zeros((2, 8, 2)), torch.rand(2, 8, 2))

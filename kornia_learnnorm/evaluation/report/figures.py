@@ -29,15 +29,7 @@ DASHES = "Dashed: learned."
 
 @report_style()
 def report_figures(run: Run) -> list[Picture]:
-    """Draw all pictures of a run; those of samples use the first store with filtered samples.
-
-    Args:
-        run: predictions.
-
-    Raises:
-        ImportError: if Matplotlib is not installed.
-
-    """
+    """Draw all pictures of a run; those of samples use the first store with filtered samples."""
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
     colors = method_colors(run.about["methods"])
     return [

@@ -36,53 +36,28 @@ POSE_HEADER = ("AUC@5", "AUC@10", "AUC@20", "mAA(10)")
 
 
 class Table(NamedTuple):
-    """A table of a report.
-
-    Attributes:
-        title: heading.
-        text: what the table shows and how to read it, Markdown.
-        header: names of the columns.
-        rows: cells as text.
-    """
+    """A table of a report."""
 
     title: str
-    text: str
+    text: str  # what the table shows and how to read it, Markdown
     header: list[str]
-    rows: list[list[str]]
+    rows: list[list[str]]  # cells as text
 
 
 def number_text(value: float, spec: str = ".3f") -> str:
-    """Return a number as text, empty for NaN.
-
-    Example:
-        >>> number_text(0.5), number_text(float("nan"))
-        ('0.500', '')
-
-    """
+    """Return a number as text, empty for NaN."""
     return "" if math.isnan(value) else format(value, spec)
 
 
 def median_text(values: Tensor, spec: str = ".3f") -> str:
-    """Return the median of the values that are not NaN as text, empty where there are none.
-
-    Example:
-        >>> median_text(torch.tensor([1.0, 4.0, torch.nan]))
-        '2.500'
-
-    """
+    """Return the median of the values that are not NaN as text, empty where there are none."""
     return number_text(median(values.flatten()).item(), spec)
 
 
 def mean_text(values: Tensor, pair: Tensor) -> str:
-    """Return the mean of shares with its 95 % bootstrap interval over image pairs, %.
+    """Return the mean of shares (S,) with its 95 % bootstrap interval over image pairs, %.
 
-    Args:
-        values: shares with shape (S,).
-        pair: image pair of each share with shape (S,).
-
-    Returns:
-        the text; without the interval if all shares are of one pair, empty if there are no shares.
-
+    There is no interval if all shares are of one pair, and no text if there are no shares.
     """
     if len(values) == 0:
         return ""
@@ -94,16 +69,7 @@ def mean_text(values: Tensor, pair: Tensor) -> str:
 
 
 def rate_text(cell: Cell, name: str, baseline: str, quantity: str, rows: Tensor | None = None) -> str:
-    """Return a better rate with its interval, %.
-
-    Args:
-        cell: predictions of one store and protocol.
-        name: the method.
-        baseline: the method to compare with.
-        quantity: the error to compare: ``own``, ``heldout`` or ``truth``.
-        rows: mask of the samples to use with shape (S,); all if not given.
-
-    """
+    """Return a better rate against a baseline with its interval, %, of all samples or of those in the mask ``rows``."""
     rows = torch.ones_like(cell.pair, dtype=torch.bool) if rows is None else rows
     value, other = cell.predictions[name][quantity][rows], cell.predictions[baseline][quantity][rows]
     valid = comparable(value, other)
@@ -118,22 +84,10 @@ def paired_text(
     show: Callable[[float], str] = "{:+.3f}".format,
     with_p_value: bool = True,
 ) -> str:
-    """Return the mean difference of two methods with its 95 % interval and p-value, from a paired bootstrap.
+    """Return the mean difference of two methods with its 95 % interval and p-value, from a paired bootstrap over pairs.
 
-    Args:
-        values: numbers of one method with shape (S,).
-        baseline: numbers of the other method with shape (S,).
-        pair: image pair of each number with shape (S,); if not given, each number is of its own pair.
-        show: formats the mean and the ends of the interval.
-        with_p_value: whether the p-value is part of the text.
-
-    Returns:
-        the text; empty if fewer than two pairs have a finite difference.
-
-    Example:
-        >>> paired_text(torch.tensor([1.5, 2.5]), torch.tensor([1.0, 2.0]))
-        '+0.500 [+0.500, +0.500], < 0.001'
-
+    Without ``pair`` each number is of its own pair. ``show`` formats the mean and the ends of the interval. The text is
+    empty if fewer than two pairs have a finite difference.
     """
     pair = torch.arange(len(values)) if pair is None else pair
     valid = (values - baseline).isfinite()
@@ -146,15 +100,9 @@ def paired_text(
 
 
 def pose_texts(rotation_error: Tensor, translation_error: Tensor) -> list[str]:
-    """Return AUC at 5, 10 and 20 degrees and mAA(10) of relative poses, %, the columns of :data:`POSE_HEADER`.
+    """Return AUC at 5, 10 and 20 degrees and mAA(10) of relative poses, %; empty texts if no true pose is known.
 
-    Args:
-        rotation_error: degrees, infinite for a failure, NaN where the true pose is not known.
-        translation_error: degrees, in the same order.
-
-    Returns:
-        four texts, empty if no true pose is known.
-
+    Both errors are in degrees, infinite for a failure and NaN where the true pose is not known.
     """
     error = torch.maximum(rotation_error, translation_error)
     error = error[~error.isnan()]

@@ -30,12 +30,7 @@ TEXTS = {
 
 
 def hypothesis_tables(run: RobustRun) -> list[Table]:
-    """Return all tables of the hypotheses of minimal solvers.
-
-    Args:
-        run: results of minimal solvers.
-
-    """
+    """Return all tables of the hypotheses of minimal solvers."""
     cells = [cell for cell in run.cells if cell.hypotheses]
     return [table for cell in cells for table in (_values(cell, "best"), _values(cell, "picked"), *_tests(cell))]
 
@@ -104,24 +99,14 @@ def _test(cell: RobustCell, name: str, kind: str, number: int) -> str:
 
 @report_style()
 def hypothesis_figures(run: RobustRun) -> list[Picture]:
-    """Draw the errors of each store's hypotheses against their number.
-
-    Args:
-        run: results of minimal solvers.
-
-    Raises:
-        ImportError: if Matplotlib is not installed.
-
-    """
+    """Draw the errors of each store's hypotheses against their number."""
     colors = method_colors(run.about["solvers"])
     pictures = []
-    for place, store in enumerate(run.about["stores"], 1):
-        cells = [cell for cell in run.cells if cell.store == store and cell.hypotheses]
-        with_baseline = [cell for cell in cells if BASELINE in cell.hypotheses]
+    for (place, store), relative in product(enumerate(run.about["stores"], 1), (False, True)):
+        found = [cell for cell in run.cells if cell.store == store and cell.hypotheses]
+        cells = [cell for cell in found if BASELINE in cell.hypotheses] if relative else found
         if cells:
-            pictures.append(_draw(cells, f"hypotheses-{place}", colors, relative=False))
-        if with_baseline:
-            pictures.append(_draw(with_baseline, f"hypotheses-{place}-relative", colors, relative=True))
+            pictures.append(_draw(cells, f"hypotheses-{place}{'-relative' * relative}", colors, relative))
     return pictures
 
 

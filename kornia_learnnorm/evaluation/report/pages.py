@@ -1,4 +1,4 @@
-"""Report of a run as Markdown and as a self-contained HTML page; reads results and runs no model."""
+"""Report of a run as Markdown, as a self-contained HTML page and in the terminal; reads results and runs no model."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from kornia_learnnorm.evaluation.runs.manifest import read_section
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["Report", "write_report"]
+__all__ = ["Report", "print_tables", "write_report"]
 
 GREY = "#808890"  # lines and letters of a picture in its own file: legible on white and on black
 PAGE_STYLE = """
@@ -40,15 +41,10 @@ svg { width: 100%; height: auto; font-family: system-ui, sans-serif; }
 
 
 class Report(NamedTuple):
-    """A written report.
-
-    Attributes:
-        tables: all tables.
-        missing: results that the run does not have yet.
-    """
+    """A written report."""
 
     tables: list[Table]
-    missing: list[str]
+    missing: list[str]  # results that the run does not have yet
 
 
 def write_report(folder: str | Path) -> Report:
@@ -67,10 +63,7 @@ def write_report(folder: str | Path) -> Report:
 
     """
     folder = Path(folder)
-    about: list[str] = []
-    tables: list[Table] = []
-    pictures: list[Picture] = []
-    missing: list[str] = []
+    about, tables, pictures, missing = list[str](), list[Table](), list[Picture](), list[str]()
     robust = read_robust(folder)
     if robust is None or read_section(folder, "evaluate") is not None:
         run = with_baseline(read_run(folder))
@@ -165,3 +158,33 @@ def _row(tag: str, cells: Sequence[str]) -> str:
 def _inline(text: str) -> str:
     """Return a text as HTML, with the parts in backticks as code."""
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+
+
+def print_tables(tables: Sequence[Table], elsewhere: Path) -> None:
+    """Print the tables that fit the terminal, and the titles of those that do not, which are in ``elsewhere``."""
+    console, wide = import_extra("rich.console", "report", "printing tables").Console(), []
+    unlimited = console.options.update_width(10**6)
+    for table in tables:
+        grids = (_grid(table, narrow) for narrow in (False, True))
+        grid = next((g for g in grids if console.measure(g, options=unlimited).maximum <= console.width), None)
+        if grid is None:
+            wide.append(table.title)
+        else:
+            console.print(grid)
+    if wide:
+        titles = "\n".join(f"  {title}" for title in wide)
+        print(f"wider than the {console.width} columns of this terminal, see {elsewhere}:\n{titles}")
+
+
+def _grid(table: Table, narrow: bool) -> Any:
+    """Return a table of rich; a narrow one breaks text between words, but no number from its interval."""
+    grid = import_extra("rich.table", "report", "printing tables").Table(
+        title=table.title, title_justify="left", caption=table.text, caption_justify="left"
+    )
+    for place, cells in enumerate(zip(table.header, *table.rows, strict=True)):
+        words = [word for cell in cells for word in ([cell] if "[" in cell else cell.split())]
+        width = max(map(len, words)) if narrow else None
+        grid.add_column(cells[0], justify="right" if place else "left", width=width)
+    for row in table.rows:
+        grid.add_row(*row)
+    return grid

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from kornia_learnnorm.evaluation.drawing import INLIER, WIDE, draw_line, draw_matches
-from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture, report_style
+from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture
+from kornia_learnnorm.evaluation.runs.arrays import Arrays
 from kornia_learnnorm.evaluation.runs.run import Run
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
@@ -24,30 +25,15 @@ METHODS = ("Hartley", "crossview")
 TRUTH = "ground truth"
 
 
-@report_style()
 def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
-    """Draw the example image pair of a run. The images are not drawn: stores do not contain them.
-
-    Args:
-        run: predictions.
-        colors: colours by method.
-
-    Returns:
-        the picture; an empty list if the run has no example yet or no sample of it.
-
-    Raises:
-        ImportError: if Matplotlib is not installed.
-
-    """
+    """Draw the example image pair of a run, without the images; nothing where the run has no sample of it."""
     pair = run.example
     place = (str(pair["store"]), "filtered") if pair else ("", "")
     cell = next((cell for cell in run.cells if (cell.store, cell.protocol) == place), None)
-    if cell is None:
+    if cell is None or not (cell.pair == int(pair["pair"])).any():
         return []
     methods = [name for name in METHODS if name in cell.predictions]
     rows = torch.nonzero(cell.pair == int(pair["pair"])).flatten()
-    if len(rows) == 0:
-        return []
     errors = {name: cell.predictions[name]["truth"] for name in methods}
     middle = rows[errors[methods[0]][rows].argsort()[(len(rows) - 1) // 2]]
     wide = float((pair["size"][:, 0] / pair["size"][:, 1]).min()) > WIDE
@@ -68,25 +54,14 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
     return [make_picture(figure, "figure-10", "Inliers, outliers and epipolar lines (Figure 10)", text)]
 
 
-def example_inliers(pair: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return a mask of the matches of the example image pair within 1 px of the ground truth, boolean (M,).
-
-    Args:
-        pair: from :func:`~kornia_learnnorm.evaluation.runs.example.random_pair`.
-
-    """
+def example_inliers(pair: Arrays) -> NDArray[np.bool_]:
+    """Return a mask of the matches of the example image pair within 1 px of the ground truth, boolean (M,)."""
     points1, points2, F_mat = (torch.from_numpy(pair[key]) for key in ("points1", "points2", "F"))
     near: NDArray[np.bool_] = (symmetric_epipolar_distance(points1, points2, F_mat) < INLIER_THRESHOLD).numpy()
     return near
 
 
-def _draw_lines(
-    axes: Axes,
-    pair: dict[str, NDArray[Any]],
-    near: NDArray[np.bool_],
-    matrices: dict[str, NDArray[Any]],
-    colors: dict[str, str],
-) -> None:
+def _draw_lines(axes: Axes, pair: Arrays, near: NDArray[np.bool_], matrices: Arrays, colors: dict[str, str]) -> None:
     """Draw the epipolar lines of some inliers, and the inliers, in the second view."""
     chosen = np.flatnonzero(near)[_far_apart(pair["points2"][near])]
     points = np.pad(pair["points1"][chosen], ((0, 0), (0, 1)), constant_values=1.0)

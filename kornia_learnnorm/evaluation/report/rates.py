@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import replace
 
 from kornia_learnnorm.evaluation.report.formatting import BASELINE, Table, rate_text
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
-from kornia_learnnorm.evaluation.runs.trained import was_trained_on
 from kornia_learnnorm.metrics.better_rate import better_rate
 from kornia_learnnorm.protocol import PROTOCOLS, RATIO
 
-__all__ = ["TESTS", "rate_tables", "with_baseline"]
+__all__ = ["TESTS", "rate_tables", "was_trained_on", "with_baseline"]
 
 # Fan et al., Table 1: better than Hartley % by training set, on KITTI 06-10 and on TUM at KITTI's size.
 PRINTED = {"KITTI 00-05": ("86.68", "90.04"), "TUM": ("84.22", "89.73"), "KITTI 00-05 and TUM": ("87.05", "91.43")}
@@ -18,18 +19,7 @@ TESTS = (("kitti_06", "kitti_07", "kitti_08", "kitti_09", "kitti_10"), ("tum",))
 
 
 def with_baseline(run: Run) -> Run:
-    """Return a run without the stores and protocols that lack predictions of Hartley's normalisation.
-
-    Args:
-        run: predictions.
-
-    Returns:
-        the run; ``missing`` names what was left out.
-
-    Raises:
-        ValueError: if no store and protocol is left.
-
-    """
+    """Return a run without the stores and protocols that lack Hartley's normalisation; ``missing`` names them."""
     cells = [cell for cell in run.cells if BASELINE in cell.predictions]
     if not cells:
         found = sorted({name for cell in run.cells for name in cell.predictions})
@@ -42,12 +32,7 @@ def with_baseline(run: Run) -> Run:
 
 
 def rate_tables(run: Run) -> list[Table]:
-    """Return the tables of rates against Hartley and, where the run has it, whitening.
-
-    Args:
-        run: predictions with ``Hartley`` in every store and protocol.
-
-    """
+    """Return the tables of rates against Hartley and, where the run has it, whitening."""
     tables = []
     for baseline in (BASELINE, "whitening"):
         for protocol in PROTOCOLS:
@@ -99,3 +84,14 @@ def _rate(cell: Cell, name: str, baseline: str) -> str:
 def _printed(cells: list[Cell], values: tuple[str, str]) -> list[str]:
     both = list(zip(TESTS, values, strict=True))
     return [next((value for names, value in both if cell.store.startswith(names)), "") for cell in cells]
+
+
+def was_trained_on(store: str, trained_on: Iterable[str]) -> bool:
+    """Return whether image pairs of a store are in the training data, going by names such as ``tum@0:9``."""
+    name, first, stop = _pairs_of(store)
+    return any(name == other and first < end and start < stop for other, start, end in map(_pairs_of, trained_on))
+
+
+def _pairs_of(store: str) -> tuple[str, float, float]:
+    match = re.fullmatch(r"(.+)@(\d+):(\d+)", store)
+    return (match[1], float(match[2]), float(match[3])) if match else (store, 0.0, float("inf"))

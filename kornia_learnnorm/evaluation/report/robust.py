@@ -45,12 +45,7 @@ SCALES = {"inliers": 100.0, "f1": 100.0, "error": 1.0}  # shares are printed in 
 
 
 def robust_tables(run: RobustRun) -> list[Table]:
-    """Return all tables of robust estimators of a run.
-
-    Args:
-        run: results of robust estimators.
-
-    """
+    """Return all tables of robust estimators of a run."""
     cells = [cell for cell in run.cells if cell.estimates]
     return [table for cell in cells for table in (_agreement(cell), _pose_and_time(cell), *_tests(cell))]
 

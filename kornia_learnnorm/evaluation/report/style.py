@@ -33,41 +33,23 @@ SETTINGS: dict[str, Any] = {
 
 
 class Picture(NamedTuple):
-    """A picture of a report.
+    """A picture of a report."""
 
-    Attributes:
-        name: file name without suffix.
-        title: heading.
-        text: what the picture shows.
-        svg: the picture as SVG.
-    """
-
-    name: str
+    name: str  # of the file, without suffix
     title: str
-    text: str
+    text: str  # what the picture shows
     svg: str
 
 
 @contextmanager
 def report_style() -> Iterator[None]:
-    """Apply the Matplotlib settings of a report to the figures that are made and saved inside, and restore them.
-
-    Raises:
-        ImportError: if Matplotlib is not installed.
-
-    """
+    """Apply the Matplotlib settings of a report to the figures that are made and saved inside, and restore them."""
     with import_matplotlib().rc_context(SETTINGS):
         yield
 
 
 def method_colors(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each method; they repeat after eleven methods.
-
-    Example:
-        >>> method_colors(["none", "Hartley"])
-        {'none': '#8b8b8b', 'Hartley': '#e69f00'}
-
-    """
+    """Return a colour for each method; they repeat after eleven methods."""
     hues = HUES.split()
     return {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(names)}
 
@@ -78,17 +60,7 @@ def line_style(name: str) -> str:
 
 
 def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, list[Axes]]:
-    """Return a figure with axes in rows and columns, row by row; call it inside :func:`report_style`.
-
-    Args:
-        rows: number of rows.
-        columns: number of columns.
-        height: height in inches; the width is eight inches.
-
-    Raises:
-        ImportError: if Matplotlib is not installed.
-
-    """
+    """Return a figure of eight inches with axes row by row; call it inside :func:`report_style`."""
     figure = import_matplotlib().figure.Figure(figsize=(WIDTH, height), layout="constrained", facecolor="none")
     axes = [figure.add_subplot(rows, columns, place + 1, facecolor="none") for place in range(rows * columns)]
     for one in axes:
@@ -102,16 +74,7 @@ def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, l
 
 
 def make_picture(figure: Figure, name: str, title: str, text: str, legend: bool = True) -> Picture:
-    """Return a figure as SVG, with one legend of all axes above it; call it inside :func:`report_style`.
-
-    Args:
-        figure: from :func:`make_figure`.
-        name: file name without suffix.
-        title: heading.
-        text: what the picture shows.
-        legend: whether to draw the legend.
-
-    """
+    """Return a figure as SVG, with one legend of all axes above it; call it inside :func:`report_style`."""
     if legend:
         entries: dict[str, Any] = {}
         for axes in figure.axes:

@@ -23,29 +23,18 @@ __all__ = ["Estimate", "Estimator", "Solver", "best_of", "minimal_samples", "pee
 
 
 class Estimate(NamedTuple):
-    """A fundamental matrix, its time and its number of samples.
+    """A fundamental matrix, its time and its number of samples."""
 
-    Attributes:
-        F_mat: (3, 3) float64; NaN for a failure.
-        seconds: wall-clock time.
-        samples: number of minimal samples solved; NaN if unknown.
-    """
-
-    F_mat: Tensor
-    seconds: float
-    samples: float
+    F_mat: Tensor  # (3, 3) float64; NaN for a failure
+    seconds: float  # wall-clock time
+    samples: float  # number of minimal samples solved; NaN if unknown
 
 
 class Solver(NamedTuple):
-    """A minimal solver.
+    """A minimal solver."""
 
-    Attributes:
-        size: correspondences in a sample.
-        solve: maps points1 and points2 in pixels, (K, size, 2) float64, to candidate matrices (K, C, 3, 3).
-    """
-
-    size: int
-    solve: Callable[[Tensor, Tensor], Tensor]
+    size: int  # correspondences in a sample
+    solve: Callable[[Tensor, Tensor], Tensor]  # points (K, size, 2) float64 in pixels to candidates (K, C, 3, 3)
 
 
 Estimator = Callable[[Matches, int, Sequence[float]], list[Estimate]]  # matches, seed, thresholds in pixels
@@ -57,18 +46,7 @@ def minimal_samples(total: int, number: int, seed: int) -> Tensor:
 
 
 def run_estimator(estimator: Estimator, matches: Matches, seed: int, thresholds: Sequence[float]) -> list[Estimate]:
-    """Return the estimates of an estimator; failures if there are fewer than eight correspondences.
-
-    Args:
-        estimator: from :func:`~kornia_learnnorm.evaluation.robust.estimators.find_estimator`.
-        matches: the correspondences.
-        seed: seed of the samples.
-        thresholds: inlier thresholds, pixels.
-
-    Returns:
-        one estimate per threshold.
-
-    """
+    """Return one estimate per threshold, in pixels; failures if there are fewer than eight correspondences."""
     if len(matches.points1) < SAMPLE_SIZE:
         return [Estimate(_failure(), 0.0, 0.0) for _ in thresholds]
     return estimator(matches, seed, thresholds)
@@ -78,38 +56,47 @@ def _failure() -> Tensor:
     return torch.full((3, 3), torch.nan, dtype=torch.float64)
 
 
-def peer_estimator(peer: Peer) -> Estimator:
-    """Return an estimator of another package that measures its time.
+def _timed(estimate: Callable[[Matches, int, float], tuple[Tensor | None, float]]) -> Estimator:
+    """Return an estimator that calls a function at each threshold and measures its time; None is a failure."""
 
-    Args:
-        peer: from :func:`~kornia_learnnorm.evaluation.robust.peers.find_peer`.
-
-    """
-
-    def estimate(matches: Matches, seed: int, thresholds: Sequence[float]) -> list[Estimate]:
+    def run(matches: Matches, seed: int, thresholds: Sequence[float]) -> list[Estimate]:
         found = []
         for threshold in thresholds:
             start = time.perf_counter()
-            F_mat = peer(matches.points1.numpy(), matches.points2.numpy(), matches.size, seed, threshold)
+            F_mat, samples = estimate(matches, seed, threshold)
             seconds = time.perf_counter() - start
-            # OpenCV stacks up to three matrices if there are only seven points.
-            good = F_mat is not None and F_mat.shape == (3, 3)
-            F_mat = torch.tensor(np.array(F_mat, float)) if good else _failure()
-            found.append(Estimate(F_mat, seconds, math.nan))
+            found.append(Estimate(_failure() if F_mat is None else F_mat, seconds, samples))
         return found
 
-    return estimate
+    return run
+
+
+def peer_estimator(peer: Peer) -> Estimator:
+    """Return an estimator of another package that measures its time."""
+
+    def estimate(matches: Matches, seed: int, threshold: float) -> tuple[Tensor | None, float]:
+        F_mat = peer(matches.points1.numpy(), matches.points2.numpy(), matches.size, seed, threshold)
+        # OpenCV stacks up to three matrices if there are only seven points.
+        good = F_mat is not None and F_mat.shape == (3, 3)
+        return torch.tensor(np.array(F_mat, float)) if good else None, math.nan
+
+    return _timed(estimate)
+
+
+def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
+    """Return :class:`~kornia_learnnorm.RANSAC` with a normaliser, its default if None, as an estimator."""
+
+    def estimate(matches: Matches, seed: int, threshold: float) -> tuple[Tensor | None, float]:
+        result = RANSAC(normalizer, inl_th=threshold, seed=seed, **options).estimate(matches.points1, matches.points2)
+        return result.F_mat if bool(result.F_mat.any()) else None, result.num_samples
+
+    return _timed(estimate)
 
 
 def best_of(number: int, solver: Solver) -> Estimator:
-    """Return an estimator that picks the matrix of highest MSAC score among a number of minimal samples.
+    """Return an estimator that picks the matrix of highest MSAC score among minimal samples, which all solvers share.
 
     Only the score depends on the threshold: the matrices are computed once for all thresholds.
-
-    Args:
-        number: number of minimal samples, which all solvers share.
-        solver: minimal solver.
-
     """
 
     @torch.no_grad()
@@ -128,29 +115,6 @@ def best_of(number: int, solver: Solver) -> Estimator:
             best = scorer.to_pixels(scorer.best(scorer.from_pixels(kept.flatten(0, 1)), 1).F_mat)
             seconds = shared + time.perf_counter() - start
             found.append(Estimate(best[0] if len(best) else _failure(), seconds, number))
-        return found
-
-    return estimate
-
-
-def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
-    """Return :class:`~kornia_learnnorm.RANSAC` as an estimator.
-
-    Args:
-        normalizer: normaliser; None for the default of RANSAC.
-        options: further arguments of RANSAC.
-
-    """
-
-    def estimate(matches: Matches, seed: int, thresholds: Sequence[float]) -> list[Estimate]:
-        found = []
-        for threshold in thresholds:
-            estimator = RANSAC(normalizer, inl_th=threshold, seed=seed, **options)
-            start = time.perf_counter()
-            result = estimator.estimate(matches.points1, matches.points2)
-            seconds = time.perf_counter() - start
-            F_mat = result.F_mat if bool(result.F_mat.any()) else _failure()
-            found.append(Estimate(F_mat, seconds, result.num_samples))
         return found
 
     return estimate

@@ -8,10 +8,11 @@ from typing import Any
 
 from kornia.geometry.epipolar.fundamental import run_7point
 
-from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.robust.budgets import Estimate, Estimator, Solver, best_of, peer_estimator, ransac
 from kornia_learnnorm.evaluation.robust.matches import Matches
 from kornia_learnnorm.evaluation.robust.peers import PEERS, find_peer, peer_version
+from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 
 __all__ = [
@@ -45,17 +46,7 @@ DEFAULT_ESTIMATORS = (
 
 
 def find_solver(name: str) -> Solver:
-    """Return a minimal solver by its name.
-
-    Args:
-        name: ``seven-point``, which is Kornia's, or a name for
-            :func:`~kornia_learnnorm.evaluation.methods.find_method`.
-
-    Raises:
-        ValueError: if there is no method of this name.
-        FileNotFoundError: if there are no weights of this name.
-
-    """
+    """Return a minimal solver: ``seven-point``, which is Kornia's, or a name for ``find_method``."""
     if name == SEVEN_POINT:
         return Solver(7, run_7point)
     method = find_method(name)
@@ -116,22 +107,13 @@ def identify_estimator(name: str) -> str:
 
 
 def estimator_names(names: Sequence[str]) -> dict[str, str]:
-    """Return short names of estimators or solvers for tables and files, with the folder or file name of own weights.
+    """Return short names of estimators or solvers for tables and files; raise ValueError if two are equal."""
 
-    Args:
-        names: names for :func:`find_estimator` or :func:`find_solver`.
-
-    Raises:
-        ValueError: if two short names are equal.
-
-    """
-    short = {}
-    for name in names:
+    def shorten(name: str) -> str:
         kind, colon, method = _split(name)
-        short[name] = kind + colon + short_names([method])[method]
-    if len(set(short.values())) < len(names):
-        raise ValueError(f"two estimators have the same name: {', '.join(names)}")
-    return short
+        return kind + colon + short_name_of(method)
+
+    return names_of(names, shorten, "estimators")
 
 
 def _split(name: str) -> tuple[str, str, str]:

@@ -32,18 +32,10 @@ def samples_of(solver: str) -> int:
 
 @torch.no_grad()
 def hypothesis_quality(solver: Solver, matches: Matches, number: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Return the errors and MSAC scores of the hypotheses from random minimal samples of an image pair.
+    """Return errors in pixels and MSAC scores at 1 px, (number,) each, of the hypotheses from random minimal samples.
 
-    Args:
-        solver: minimal solver; of its candidates for a sample the one of highest score counts.
-        matches: the correspondences.
-        number: number of samples; a smaller number gives the first of the same samples.
-        seed: seed of the samples.
-
-    Returns:
-        errors in pixels and MSAC scores at 1 px of all correspondences, each (number,); NaN where the pair has no
-        ground truth or fewer than 16 inliers.
-
+    Of a solver's candidates for a sample the one of highest score counts. A smaller number gives the first of the same
+    samples. All are NaN where the pair has no ground truth or fewer than 16 inliers.
     """
     x1, x2 = matches.points1, matches.points2
     inliers = symmetric_epipolar_distance(x1, x2, matches.F_mat) < INLIER_THRESHOLD
@@ -79,28 +71,11 @@ def _measure_block(F_mat: Tensor, h1: Tensor, h2: Tensor, inliers: Tensor) -> tu
 
 
 def expected_best(errors: Tensor, number: int) -> Tensor:
-    r"""Return the exact expectation of the smallest of :math:`k` errors drawn without replacement.
+    r"""Return the exact expectation of the smallest of :math:`k` of the errors (..., n) drawn without replacement.
 
     The :math:`i`-th smallest of :math:`n` errors is the smallest of :math:`k` with probability
-    :math:`\binom{n - i}{k - 1} / \binom{n}{k}`. The expectation is an unbiased estimate for :math:`k` new samples.
-
-    Args:
-        errors: (..., n).
-        number: :math:`k`, from one to :math:`n`.
-
-    Returns:
-        expectations with shape (...).
-
-    Raises:
-        ValueError: if ``number`` is below one or above the number of errors.
-
-    Reference:
-        M. Chen et al., Evaluating Large Language Models Trained on Code, 2021, section 2.1.
-
-    Example:
-        >>> expected_best(torch.tensor([3.0, 1.0, 2.0]), 2)  # of the pairs (3, 1), (3, 2), (1, 2)
-        tensor(1.3333)
-
+    :math:`\binom{n - i}{k - 1} / \binom{n}{k}`. The expectation is an unbiased estimate for :math:`k` new samples
+    (M. Chen et al., Evaluating Large Language Models Trained on Code, 2021, section 2.1).
     """
     total = errors.shape[-1]
     if not 1 <= number <= total:
@@ -112,23 +87,9 @@ def expected_best(errors: Tensor, number: int) -> Tensor:
 
 
 def picked(errors: Tensor, scores: Tensor, number: int) -> Tensor:
-    """Return the mean error of the hypotheses of highest score in disjoint groups of samples.
+    """Return the mean error of the hypotheses of highest score in disjoint groups of ``number`` samples.
 
-    Args:
-        errors: (..., n).
-        scores: (..., n).
-        number: size of a group, from one to n; samples at the end that do not fill a group are left out.
-
-    Returns:
-        means with shape (...).
-
-    Raises:
-        ValueError: if ``number`` is below one or above the number of errors.
-
-    Example:
-        >>> picked(torch.tensor([3.0, 1.0, 2.0, 5.0]), torch.tensor([9.0, 8.0, 4.0, 7.0]), 2)  # 3 and 5
-        tensor(4.)
-
+    Errors and scores have shape (..., n); samples at the end that do not fill a group are left out.
     """
     groups = errors.shape[-1] // max(1, number)
     if number < 1 or groups < 1:

@@ -26,19 +26,12 @@ Peer = Callable[[Array, Array, Sizes, int, float], Any]
 
 
 class PeerPackage(NamedTuple):
-    """An estimator of another package.
+    """An estimator of another package."""
 
-    Attributes:
-        estimate: takes the imported module and the arguments of ``Peer``.
-        module: name of the module to import.
-        distribution: name of the distribution, whose version a run keeps.
-        extra: the extra of this package that installs it.
-    """
-
-    estimate: Callable[..., Any]
-    module: str
-    distribution: str
-    extra: str = "robust"
+    estimate: Callable[..., Any]  # takes the imported module and the arguments of Peer
+    module: str  # name of the module to import
+    distribution: str  # name of the distribution, whose version a run keeps
+    extra: str = "robust"  # the extra of this package that installs it
 
 
 def _opencv(method: str, cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float) -> Any:
@@ -96,28 +89,12 @@ def _import(name: str) -> Any:
 
 
 def find_peer(name: str) -> Peer:
-    """Return an estimator of another package.
-
-    Args:
-        name: one of the names in ``PEERS``.
-
-    Raises:
-        ImportError: if the package is not installed.
-
-    """
+    """Return an estimator of another package by its name in ``PEERS``."""
     return partial(PEERS[name].estimate, _import(name))
 
 
 def peer_version(name: str) -> str:
-    """Return the package of an estimator and its version.
-
-    Args:
-        name: one of the names in ``PEERS``.
-
-    Raises:
-        ImportError: if the package is not installed.
-
-    """
+    """Return the package of an estimator and its version."""
     package = PEERS[name].distribution
     if package == "opencv":  # several distributions provide the module
         return f"opencv {_import(name).__version__}"

@@ -1,4 +1,7 @@
-"""Run robust estimators and minimal solvers on stores, and keep their results."""
+"""Run robust estimators and minimal solvers on stores, and keep their results.
+
+Results that exist are not computed again, and a run of other options is refused.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,100 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
-from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.evaluation.robust.budgets import Estimate, Estimator, Solver, run_estimator
-from kornia_learnnorm.evaluation.robust.estimators import is_slow, is_timed
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.robust.budgets import Estimator, Solver, run_estimator
+from kornia_learnnorm.evaluation.robust.estimators import (
+    DEFAULT_ESTIMATORS,
+    estimator_names,
+    find_estimator,
+    find_solver,
+    identify_estimator,
+    is_slow,
+    is_timed,
+)
 from kornia_learnnorm.evaluation.robust.hypotheses import hypothesis_quality, samples_of
 from kornia_learnnorm.evaluation.robust.matches import Matches, draw_matches, even_pairs, measure
-from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path
+from kornia_learnnorm.evaluation.robust.peers import PEERS
+from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path, result_files
 from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
+from kornia_learnnorm.evaluation.runs.manifest import begin_section, leave_out
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
-__all__ = ["record_missing"]
+__all__ = ["DEFAULT_OPTIONS", "record_robust"]
 
+DEFAULT_OPTIONS = {
+    "pairs": 48,  # image pairs of each store for the estimators; 0 for all
+    "hypotheses": 12,  # image pairs of each store for the minimal solvers; 0 for all
+    "seeds": 5,  # runs on each pair
+    "slow_seeds": 1,  # runs of the slow estimators on each pair
+    "seed": 0,  # the first seed
+}
 Draw = Callable[..., Matches]
+
+
+def record_robust(
+    folder: str | Path,
+    stores: Mapping[str, str],
+    estimators: Sequence[str] = DEFAULT_ESTIMATORS,
+    solvers: Sequence[str] = (),
+    options: Mapping[str, int] | None = None,
+    redo: Sequence[str] = (),
+) -> None:
+    """Compute the missing results of a run, with a progress bar.
+
+    An estimator whose package is not installed is left out, and the run records that.
+
+    Args:
+        folder: the run, created if it does not exist.
+        stores: paths of the stores by their names in tables.
+        estimators: names for :func:`~kornia_learnnorm.evaluation.robust.estimators.find_estimator`.
+        solvers: names for :func:`~kornia_learnnorm.evaluation.robust.estimators.find_solver`.
+        options: options that differ from :data:`DEFAULT_OPTIONS`.
+        redo: estimators or solvers whose results are computed again.
+
+    Raises:
+        ValueError: if the folder holds a run of other options, an option, a store or an estimator is wrong, an existing
+            file is damaged, or, at the end, if an estimator or solver has failed.
+        OSError: if a file is missing or cannot be written.
+
+    """
+    folder, options = Path(folder), {**DEFAULT_OPTIONS, **(options or {})}
+    for name, value in options.items():
+        if value < (least := 1 if name in ("seeds", "slow_seeds") else 0):
+            raise ValueError(f"{name.replace('_', '-')} must be {least} or more, got {value}")
+    if unknown := {*redo} - {*estimators, *solvers}:
+        raise ValueError(f"--redo {' '.join(sorted(unknown))}: not among the estimators and solvers of this command")
+    names, solver_names = estimator_names(estimators), estimator_names(solvers)
+    found = {name: _find(name) for name in estimators}
+    solve = {solver_names[name]: find_solver(name) for name in solvers}
+    read = {name: read_store(path) for name, path in stores.items()}
+    about: dict[str, Any] = {
+        "estimators": {names[name]: found[name] and identify_estimator(name) for name in estimators},
+        "solvers": {solver_names[name]: identify_estimator(name) for name in solvers},
+        **options,
+        "threads": torch.get_num_threads(),
+    }
+    redone = [(names | solver_names)[name] for name in redo]
+    begin_section(folder, "robust", read, about, redone)
+    for path in result_files(folder, redone):
+        path.unlink()
+    installed = {names[name]: estimator for name, estimator in found.items() if estimator is not None}
+    if failed := _record_missing(folder, read, installed, solve, options):
+        leave_out(folder, "robust", [name for name in failed if not result_files(folder, [name])])
+        raise ValueError(f"{'; '.join(dict.fromkeys(failed.values()))}. All others are in {folder}")
+
+
+def _find(name: str) -> Estimator | None:
+    """Return an estimator; None if it is from another package that is not installed."""
+    try:
+        return find_estimator(name)
+    except ImportError:
+        if name in PEERS:
+            return None
+        raise
 
 
 class _Job(NamedTuple):
@@ -34,36 +117,24 @@ class _Job(NamedTuple):
     paths: dict[float, Path]
 
 
-def record_missing(
+def _record_missing(
     folder: Path,
     stores: Mapping[str, CorrespondenceStore],
     estimators: Mapping[str, Estimator],
     solvers: Mapping[str, Solver],
     options: Mapping[str, int],
 ) -> dict[str, str]:
-    """Compute what a run does not have yet; a step of the bar is a run on an image pair, or a solver on one.
+    """Compute what a run does not have yet; return why estimators and solvers failed, by name: all others go on.
 
-    Args:
-        folder: the run.
-        stores: stores by name.
-        estimators: robust estimators by name.
-        solvers: minimal solvers by name.
-        options: ``pairs``, ``hypotheses``, ``seeds``, ``slow_seeds`` and ``seed``, as for the command.
-
-    Returns:
-        why estimators and solvers failed, by name; all others go on.
-
-    Raises:
-        ValueError: if a file is damaged.
-
+    A step of the bar is a run on an image pair, or a solver on one.
     """
     tqdm = import_extra("tqdm", "images", "the progress bar of robust estimation").tqdm
     failed = dict[str, str]()
     runs = {name: min(options["seeds"], options["slow_seeds"] if is_slow(name) else 10**9) for name in estimators}
     # What depends on time takes turns, so that the load of the machine is the same for all.
     groups = [[name] for name in estimators if not is_timed(name)] + [[name for name in estimators if is_timed(name)]]
-    chosen = {name: even_pairs(len(store), options["pairs"] or None) for name, store in stores.items()}
-    few = {name: even_pairs(len(store), options["hypotheses"] or None) for name, store in stores.items()}
+    chosen = {name: even_pairs(len(store), options["pairs"]) for name, store in stores.items()}
+    few = {name: even_pairs(len(store), options["hypotheses"]) for name, store in stores.items()}
     steps = sum(len(chosen[name]) * sum(runs.values()) + len(few[name]) * len(solvers) for name in stores)
     with tqdm(total=steps * len(PROTOCOLS), unit="run", disable=None) as bar:
         for (name, store), protocol in product(stores.items(), PROTOCOLS):
@@ -114,7 +185,8 @@ def _record_estimates(jobs: Sequence[_Job], draw: Draw, pairs: Sequence[int], fa
                 failed[job.name] = str(error)
                 continue
             for (threshold, path), estimate in zip(job.paths.items(), estimates, strict=True):
-                for key, value in _describe(matches, estimate, threshold).items():
+                values = measure(matches, estimate.F_mat, threshold) | estimate._asdict()
+                for key, value in values.items():
                     empty = np.full((len(pairs), job.runs, *np.shape(value)), np.nan)
                     results[path].setdefault(key, empty)[place, seed] = value
             bar.update()
@@ -122,11 +194,6 @@ def _record_estimates(jobs: Sequence[_Job], draw: Draw, pairs: Sequence[int], fa
         if job.name not in failed:
             for path in job.paths.values():
                 write_arrays(path, {"pair": np.array(pairs), **results[path]})
-
-
-def _describe(matches: Matches, estimate: Estimate, threshold: float) -> dict[str, Any]:
-    measured = measure(matches, estimate.F_mat, threshold)
-    return {**measured, "F_mat": estimate.F_mat.numpy(), "seconds": estimate.seconds, "samples": estimate.samples}
 
 
 def _record_hypotheses(

@@ -6,7 +6,7 @@ The results of an estimator are in ``robust/STORE/PROTOCOL/THRESHOLD/ESTIMATOR.n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,30 +15,22 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.runs.arrays import file_name, read_arrays
-from kornia_learnnorm.evaluation.runs.manifest import begin_section, read_section
-from kornia_learnnorm.evaluation.runs.manifest import leave_out as remove
+from kornia_learnnorm.evaluation.runs.manifest import read_section
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
-__all__ = ["RobustCell", "RobustRun", "begin_run", "estimate_path", "hypotheses_path", "leave_out", "read_robust"]
+__all__ = ["RobustCell", "RobustRun", "estimate_path", "hypotheses_path", "read_robust", "result_files"]
 
 Results = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
 class RobustCell:
-    """The results of one store and protocol.
+    """The results of one store and protocol."""
 
-    Attributes:
-        store: name of the store.
-        protocol: ``filtered`` or ``unfiltered``.
-        estimates: results (pairs, seeds) by estimator, then by threshold.
-        hypotheses: ``error`` and ``score`` of minimal samples, (pairs, samples), by solver.
-    """
-
-    store: str
-    protocol: str
-    estimates: dict[str, dict[float, Results]]
-    hypotheses: dict[str, Results]
+    store: str  # its name
+    protocol: str  # filtered or unfiltered
+    estimates: dict[str, dict[float, Results]]  # results (pairs, seeds) by estimator, then by threshold
+    hypotheses: dict[str, Results]  # error and score of minimal samples, (pairs, samples), by solver
 
     @property
     def title(self) -> str:
@@ -48,17 +40,11 @@ class RobustCell:
 
 @dataclass(frozen=True)
 class RobustRun:
-    """A run of robust estimation.
+    """A run of robust estimation."""
 
-    Attributes:
-        about: what the run was computed from, its section of ``run.json``.
-        cells: stores and protocols.
-        missing: what has not been computed yet.
-    """
-
-    about: dict[str, Any]
+    about: dict[str, Any]  # what the run was computed from, its section of run.json
     cells: list[RobustCell]
-    missing: list[str]
+    missing: list[str]  # what has not been computed yet
 
 
 def estimate_path(folder: Path, store: str, protocol: str, threshold: float, name: str) -> Path:
@@ -71,39 +57,10 @@ def hypotheses_path(folder: Path, store: str, protocol: str, name: str) -> Path:
     return folder / "hypotheses" / store / protocol / f"{file_name(name)}.npz"
 
 
-def begin_run(folder: Path, about: dict[str, Any], redo: Sequence[str] = ()) -> None:
-    """Write what the run is computed from, or refuse a folder of another run; remove the files of ``redo``.
-
-    Args:
-        folder: the run, made if missing.
-        about: as for :func:`~kornia_learnnorm.evaluation.runs.manifest.begin_section`.
-        redo: estimators and solvers to compute again.
-
-    Raises:
-        ValueError: if the folder holds a run of other options.
-
-    """
-    begin_section(folder, "robust", about, redo)
-    for name in redo:
-        for path in _files(folder, name):
-            path.unlink()
-
-
-def leave_out(folder: Path, names: Sequence[str]) -> None:
-    """Remove estimators and solvers that have no files from what a run is computed from.
-
-    Args:
-        folder: the run.
-        names: of estimators and solvers.
-
-    """
-    remove(folder, "robust", [name for name in names if not _files(folder, name)])
-
-
-def _files(folder: Path, name: str) -> list[Path]:
-    """Return the files of an estimator or solver."""
-    path = f"{file_name(name)}.npz"
-    return [*folder.glob(f"robust/*/*/*/{path}"), *folder.glob(f"hypotheses/*/*/{path}")]
+def result_files(folder: Path, names: Iterable[str]) -> list[Path]:
+    """Return the files of estimators and solvers."""
+    patterns = ("robust/*/*/*", "hypotheses/*/*")
+    return [path for name in names for p in patterns for path in folder.glob(f"{p}/{file_name(name)}.npz")]
 
 
 def read_robust(folder: str | Path) -> RobustRun | None:
@@ -128,26 +85,20 @@ def read_robust(folder: str | Path) -> RobustRun | None:
 
 
 def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, missing: list[str]) -> RobustCell:
-    estimates = {
-        name: {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
-        for name, identity in about["estimators"].items()
-        if identity is not None
-    }
-    hypotheses = {name: hypotheses_path(folder, store, protocol, name) for name in about["solvers"]}
-    lacking = [name for name, paths in estimates.items() if not all(path.is_file() for path in paths.values())]
-    unsolved = [name for name, path in hypotheses.items() if not path.is_file()]
-    missing += [f"{name} ({store}, {protocol})" for name in lacking]
-    missing += [f"hypotheses of {name} ({store}, {protocol})" for name in unsolved]
-    return RobustCell(
-        store,
-        protocol,
-        {
-            name: {threshold: _results(path) for threshold, path in paths.items()}
-            for name, paths in estimates.items()
-            if name not in lacking
-        },
-        {name: _results(path) for name, path in hypotheses.items() if name not in unsolved},
-    )
+    estimates, hypotheses = {}, {}
+    for name, identity in about["estimators"].items():
+        paths = {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
+        if all(path.is_file() for path in paths.values()):
+            estimates[name] = {threshold: _results(path) for threshold, path in paths.items()}
+        elif identity is not None:  # its package is installed
+            missing.append(f"{name} ({store}, {protocol})")
+    for name in about["solvers"]:
+        path = hypotheses_path(folder, store, protocol, name)
+        if path.is_file():
+            hypotheses[name] = _results(path)
+        else:
+            missing.append(f"hypotheses of {name} ({store}, {protocol})")
+    return RobustCell(store, protocol, estimates, hypotheses)
 
 
 def _results(path: Path) -> Results:

@@ -19,13 +19,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def file_name(name: str) -> str:
-    """Return the name of the file of a method, an estimator or a solver, without suffix.
-
-    Example:
-        >>> file_name("package.module:Name+LM")
-        'package.module_Name+LM'
-
-    """
+    """Return the name of the file of a method, an estimator or a solver, without suffix."""
     return "".join(letter if letter.isalnum() or letter in "+-._" else "_" for letter in name)
 
 
@@ -37,18 +31,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> Arrays:
-    """Return the arrays in a file of a run.
-
-    Args:
-        path: the file.
-        keys: arrays that must be there.
-        rows: first dimension that these must have.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, or its arrays are others.
-
-    """
+    """Return the arrays in a file of a run; raise ValueError if it lacks ``keys``, or these have not ``rows`` rows."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing: call the command that began the run again, it completes it")
     try:

@@ -22,25 +22,16 @@ TRIALS = 1000  # samples of each size
 
 
 def random_pair(stores: Mapping[str, CorrespondenceStore], seed: int) -> Arrays:
-    """Return a random pair of the first store, among those with enough matches.
+    """Return a random pair of the first store, among those with enough matches and a ground truth.
 
-    Args:
-        stores: stores by name.
-        seed: seed of the choice.
-
-    Returns:
-        ``store``, its name; ``pair``, its index, and ``names``; ``points1`` and ``points2``, the matches that pass the
-        ratio test, pixels, (M, 2); ``truth``, some of its ground-truth inliers (x1, y1, x2, y2), padded with NaN;
-        ``F``, the true matrix (3, 3); ``size``, (width, height) of both images.
-
-    Raises:
-        ValueError: if no pair has enough matches and ground truth.
-
+    ``points1`` and ``points2`` (M, 2), pixels, are the matches that pass the ratio test; ``truth`` are some of the
+    ground-truth inliers (x1, y1, x2, y2), padded with NaN; ``F`` is the true matrix and ``size`` (width, height) of
+    both images.
     """
     name, store = next(iter(stores.items()))
     truth = ground_truth_inliers(store)
-    passing = np.add.reduceat(store.ratio < RATIO, store.offsets[:-1])
-    suitable = np.flatnonzero((passing >= SIZES[-1]) & truth.isfinite().any(-1).any(-1).numpy())
+    passing = [len(store.rows(pair, RATIO)) for pair in range(len(store))]
+    suitable = np.flatnonzero((np.array(passing) >= SIZES[-1]) & truth.isfinite().any(-1).any(-1).numpy())
     if len(suitable) == 0:
         raise ValueError(f"no pair of {name} has {SIZES[-1]} matches that pass the ratio test and a ground truth")
     pair = int(np.random.default_rng(seed).choice(suitable))
@@ -59,17 +50,10 @@ def random_pair(stores: Mapping[str, CorrespondenceStore], seed: int) -> Arrays:
 
 @torch.no_grad()
 def sweep(method: Method, example: Arrays, seed: int) -> Arrays:
-    """Compute median errors of random samples of growing size from one pair.
+    """Return the median errors of random samples of growing ``size`` from the pair of :func:`random_pair`.
 
-    Args:
-        method: what solves the samples.
-        example: the pair, from :func:`random_pair`.
-        seed: seed of the samples.
-
-    Returns:
-        ``size``, correspondences in a sample; ``own``, median over samples of the mean distance of a sample's points;
-        ``truth``, median over samples of the median distance of the ground-truth inliers, pixels.
-
+    ``own`` is the median over samples of the mean distance of a sample's points, ``truth`` that of the median distance
+    of the ground-truth inliers, pixels.
     """
     points1, points2, truth = (torch.from_numpy(example[key]) for key in ("points1", "points2", "truth"))
     generator = torch.Generator().manual_seed(seed)

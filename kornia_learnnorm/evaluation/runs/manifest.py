@@ -11,7 +11,7 @@ from typing import Any
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import atomic_write
 
-__all__ = ["About", "begin_section", "describe_stores", "leave_out", "package_versions", "read_section"]
+__all__ = ["About", "begin_section", "leave_out", "read_section"]
 
 FORMAT = 3  # of the folder; runs of another format are refused
 # Parts of a section that may grow: what each is, by its name.
@@ -29,20 +29,7 @@ About = dict[str, Any]
 
 
 def read_section(folder: Path, section: str) -> About | None:
-    """Return what a run was computed from.
-
-    Args:
-        folder: the run.
-        section: ``evaluate`` or ``robust``.
-
-    Returns:
-        the options by name, and by the names in ``JOINED`` what each store, method and so on is; None where the folder
-        holds no such run.
-
-    Raises:
-        ValueError: if another version of the package made it, or ``run.json`` is damaged.
-
-    """
+    """Return the options of a section, ``evaluate`` or ``robust``, and what its parts are; None if it has none."""
     about = _read(folder).get(section)
     if about is None:
         return None
@@ -55,21 +42,21 @@ def read_section(folder: Path, section: str) -> About | None:
     return about
 
 
-def begin_section(folder: Path, section: str, about: About, redo: Collection[str] = ()) -> None:
+def begin_section(
+    folder: Path, section: str, stores: Mapping[str, CorrespondenceStore], about: About, redo: Collection[str] = ()
+) -> None:
     """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
 
-    Args:
-        folder: the run, made if missing.
-        section: ``evaluate`` or ``robust``.
-        about: the options, and by the names in ``JOINED`` what each store, method and so on is; None for one whose
-            package is not installed.
-        redo: names whose description may change.
-
-    Raises:
-        ValueError: if the folder holds a run of other options or of another version of the package.
-        OSError: if it cannot be written.
-
+    ``about`` has the options and, by the names in ``JOINED``, what each method, estimator and so on is, None for one
+    whose package is not installed. The descriptions of ``redo`` may change.
     """
+    about = about | {
+        "stores": {
+            name: f"{store.dataset or 'no description'}, {len(store)} pairs, {store.offsets[-1]} matches"
+            for name, store in stores.items()
+        },
+        "versions": {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")},
+    }
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: expected a folder for the run, or a new name")
     joined, had = JOINED[section], read_section(folder, section) or about
@@ -82,31 +69,11 @@ def begin_section(folder: Path, section: str, about: About, redo: Collection[str
 
 
 def leave_out(folder: Path, section: str, names: Collection[str]) -> None:
-    """Remove methods, estimators or solvers from what a run was computed from; their files are the caller's.
-
-    Args:
-        folder: the run.
-        section: ``evaluate`` or ``robust``.
-        names: what to remove.
-
-    """
+    """Remove methods, estimators or solvers from a section; their files are the caller's."""
     about = read_section(folder, section) or {}
     for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
         about[key] = {name: value for name, value in about[key].items() if name not in names}
     _write(folder, section, about)
-
-
-def describe_stores(stores: Mapping[str, CorrespondenceStore]) -> dict[str, str]:
-    """Return what each store of a run is, by its name."""
-    return {
-        name: f"{store.dataset or 'no description'}, {len(store)} pairs, {store.offsets[-1]} matches"
-        for name, store in stores.items()
-    }
-
-
-def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that the numbers of a run depend on."""
-    return {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")}
 
 
 def _changes(had: About, now: About, redo: Collection[str]) -> list[str]:

@@ -12,22 +12,19 @@ from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method
 from kornia_learnnorm.evaluation.runs.arrays import Arrays
-from kornia_learnnorm.evaluation.runs.consensus import consensus
-from kornia_learnnorm.evaluation.runs.pairs import ground_truth_inliers, median_distance
+from kornia_learnnorm.evaluation.runs.pairs import ground_truth_inliers, median_distance, pair_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.metrics.poses import rotation_error, translation_error
 from kornia_learnnorm.normalizers.contract import normalizing_transforms
-from kornia_learnnorm.protocol import MAX_RESIDUAL
+from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
 
-__all__ = ["AGREEMENT", "ERRORS", "SampleOptions", "predict"]
+__all__ = ["AGREEMENT", "DIAGNOSTICS", "ERRORS", "SampleOptions", "consensus", "predict"]
 
 # What a run keeps of each sample, by name.
-ERRORS = (
-    *("F_mat", "own", "heldout", "truth", "rotation_error", "translation_error"),
-    *("condition_number", "rho", "distance1", "distance2", "rank2_share"),
-)
+DIAGNOSTICS = ("condition_number", "rho", "distance1", "distance2", "rank2_share")  # in the order of Diagnostics
+ERRORS = ("F_mat", "own", "heldout", "truth", "rotation_error", "translation_error", *DIAGNOSTICS)
 AGREEMENT = ("inliers", "f1")  # takes longer than all others together
 NUM_HELDOUT = 16  # held-out matches of a sample
 BATCH_SIZE = 2048  # samples solved at once
@@ -35,23 +32,12 @@ BATCH_SIZE = 2048  # samples solved at once
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """How the samples of a run are drawn.
+    """How the samples of a run are drawn."""
 
-    Attributes:
-        size: correspondences in a sample.
-        seed: seed of the shuffle.
-        max_samples: at most so many samples of each store and protocol, at random; None for all.
-        max_residual: samples whose residual under the un-normalised eight-point algorithm is this or larger are left
-            out, pixels.
-
-    Raises:
-        ValueError: if the size is below 8 or ``max_samples`` is not positive.
-    """
-
-    size: int = 8
-    seed: int = 0
-    max_samples: int | None = 16000
-    max_residual: float = MAX_RESIDUAL
+    size: int = 8  # correspondences in a sample
+    seed: int = 0  # of the shuffle
+    max_samples: int | None = 16000  # at most so many samples of each store and protocol, at random; None for all
+    max_residual: float = MAX_RESIDUAL  # pixels; samples with a larger residual without normalisation are left out
 
     def __post_init__(self) -> None:
         if self.size < 8:
@@ -63,14 +49,6 @@ class SampleOptions:
         """Return samples of a store, before the filter on the residual.
 
         The held-out points are NaN for the samples of pairs that have no match to hold out.
-
-        Args:
-            store: correspondences.
-            max_ratio: only those with Lowe's ratio below; None for all.
-
-        Raises:
-            ValueError: if no pair fills a sample.
-
         """
         generator = torch.Generator().manual_seed(self.seed)
         samples = draw_samples(store, generator, self.size, max_ratio, NUM_HELDOUT, require_heldout=False)
@@ -84,21 +62,10 @@ class SampleOptions:
 def predict(
     method: Method, samples: Samples, store: CorrespondenceStore, max_ratio: float | None, agreement: bool = True
 ) -> Arrays:
-    """Return a method's matrices of samples, their errors and diagnostics.
+    """Return a method's matrices of the samples of a store, their errors and diagnostics, arrays (S, ...).
 
-    Args:
-        method: what solves them.
-        samples: samples of the store.
-        store: where they come from.
-        max_ratio: only matches with Lowe's ratio below count for the shares of inliers; None for all.
-        agreement: compute the shares of inliers and F1 too.
-
-    Returns:
-        arrays (S, ...) by the names in :data:`ERRORS`, and in :data:`AGREEMENT` where wanted.
-
-    Raises:
-        ValueError: if the method's normaliser fails.
-
+    Their names are those in :data:`ERRORS`, and in :data:`AGREEMENT` where wanted, for which only matches with Lowe's
+    ratio below ``max_ratio`` count.
     """
     truth = ground_truth_inliers(store)
     parts = [
@@ -115,7 +82,7 @@ def _predict_batch(method: Method, samples: Samples, store: CorrespondenceStore,
     problem = LinearProblem.from_points(samples.points1, samples.points2)
     x1, x2 = problem.points1, problem.points2
     T1, T2 = normalizing_transforms(method.normalizer, problem)
-    F_mat, inside = method.solve(problem, T1, T2), diagnose_in_coordinates(problem, T1, T2)
+    F_mat = method.solve(problem, T1, T2)
     K, R, t = (torch.from_numpy(part)[samples.pair] for part in (store.K, store.R, store.t))
     found = relative_pose(F_mat, K[:, 0], K[:, 1], x1, x2)
     return {
@@ -125,9 +92,32 @@ def _predict_batch(method: Method, samples: Samples, store: CorrespondenceStore,
         "truth": median_distance(truth[samples.pair], F_mat),
         "rotation_error": rotation_error(found[0], R),
         "translation_error": translation_error(found[1], t),
-        "condition_number": inside.condition_number,
-        "rho": inside.singularity_ratio,
-        "distance1": inside.distance1,
-        "distance2": inside.distance2,
-        "rank2_share": inside.rank2_share,
+        **dict(zip(DIAGNOSTICS, diagnose_in_coordinates(problem, T1, T2), strict=True)),
     }
+
+
+def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
+    """Return ``inliers``, a share, and ``f1``, (S, thresholds), of matrices (S, 3, 3) on all matches of their pairs.
+
+    The values are those of :func:`~kornia_learnnorm.metrics.pairs.inlier_share` and
+    :func:`~kornia_learnnorm.metrics.pairs.f1_score`, with the distances computed once for both and for all of
+    :data:`~kornia_learnnorm.protocol.THRESHOLDS`. F1 is NaN where the ground truth has no inliers.
+    """
+    inliers = F_mat.new_full((len(F_mat), len(THRESHOLDS)), torch.nan)
+    f1 = inliers.clone()
+    for index in torch.unique(pair).tolist():
+        rows = torch.nonzero(pair == index).flatten()
+        points1, points2 = pair_matches(store, index, max_ratio)
+        true = _within(points1[None], points2[None], torch.from_numpy(store.F[index : index + 1]))
+        number = len(rows), -1, -1
+        found = _within(points1.expand(*number), points2.expand(*number), F_mat[rows])
+        both, either = (found & true).sum(-1), found.sum(-1) + true.sum(-1)
+        inliers[rows] = found.double().mean(-1)
+        f1[rows] = torch.where(true.any(-1), (2 * both).double() / either, torch.nan)
+    return {"inliers": inliers, "f1": f1}
+
+
+def _within(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+    """Return which points lie within each threshold, (S, thresholds, N); none do under a matrix of NaN."""
+    distance = symmetric_epipolar_distance(points1, points2, F_mat).nan_to_num(nan=torch.inf)
+    return distance[:, None] < distance.new_tensor(THRESHOLDS)[:, None]

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,15 +22,9 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
 from kornia_learnnorm.evaluation.runs.example import random_pair, sweep
-from kornia_learnnorm.evaluation.runs.manifest import (
-    begin_section,
-    describe_stores,
-    leave_out,
-    package_versions,
-    read_section,
-)
-from kornia_learnnorm.evaluation.runs.motion import pair_motions
-from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS, SampleOptions, predict
+from kornia_learnnorm.evaluation.runs.manifest import begin_section, leave_out, read_section
+from kornia_learnnorm.evaluation.runs.pairs import pair_motions
+from kornia_learnnorm.evaluation.runs.predict import SampleOptions, predict
 from kornia_learnnorm.evaluation.runs.run import (
     EXAMPLE,
     PAIRS,
@@ -40,6 +33,7 @@ from kornia_learnnorm.evaluation.runs.run import (
     Run,
     is_swept,
     method_path,
+    prediction_keys,
     read_run,
     sweep_path,
 )
@@ -107,21 +101,17 @@ def record_run(
     recorder = _Recorder(folder, found, {name: read_store(path) for name, path in stores.items()}, options, complete)
     about = {
         **vars(options),
-        "stores": describe_stores(recorder.stores),
         "methods": {names[name]: identify_method(name) for name in methods},
         "trained_on": {name: list(method.trained_on) for name, method in found.items()},
-        "versions": package_versions(),
     }
-    before = (read_section(folder, "evaluate") or about | {"methods": {}})["methods"]
-    begin_section(folder, "evaluate", about)
+    before = (read_section(folder, "evaluate") or {}).get("methods", {})
+    begin_section(folder, "evaluate", recorder.stores, about)
     recorder.record_stores(protocols)
     no_example = recorder.record_sizes() if complete else ""
-    if recorder.failed:
-        recorder.forget(recorder.failed.keys() - before.keys())
+    if failed := recorder.failed:
+        recorder.forget(failed.keys() - before.keys())
         # A normaliser of the user's own is named in its message already.
-        texts = [
-            text if text.startswith(base_name(name)) else f"{name}: {text}" for name, text in recorder.failed.items()
-        ]
+        texts = [text if text.startswith(base_name(name)) else f"{name}: {text}" for name, text in failed.items()]
         raise ValueError("; ".join(texts) + (f". All others are in {folder}" if complete else ""))
     return no_example
 
@@ -140,23 +130,18 @@ class _Recorder:
     def record_stores(self, protocols: Sequence[str]) -> None:
         """Compute the missing motions, samples and predictions of all stores."""
         tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
-        steps = len(self.stores) * len(protocols) * len(self.methods)
+        steps, keys = len(self.stores) * len(protocols) * len(self.methods), prediction_keys(self.complete)
         with tqdm(total=steps, unit="step", disable=None) as bar:
             for name, store in self.stores.items():
                 bar.set_postfix_str(name)
                 _once(self.folder / name / "pairs.npz", partial(pair_motions, store), PAIRS, len(store))
                 for protocol in protocols:
-                    self._record_cell(name, protocol, bar)
-
-    def _record_cell(self, store: str, protocol: str, bar: Any) -> None:
-        """Compute the missing samples and predictions of a store and protocol."""
-        max_ratio = PROTOCOLS[protocol]
-        samples = self._samples(store, protocol)
-        keys = (*ERRORS, *AGREEMENT) if self.complete else ERRORS
-        for name, method in self.methods.items():
-            compute = partial(predict, method, samples, self.stores[store], max_ratio, self.complete)
-            self._attempt(name, method_path(self.folder, store, protocol, name), compute, keys, len(samples.pair))
-            bar.update()
+                    samples = self._samples(name, protocol)
+                    for label, method in self.methods.items():
+                        compute = partial(predict, method, samples, store, PROTOCOLS[protocol], self.complete)
+                        path = method_path(self.folder, name, protocol, label)
+                        self._attempt(label, path, compute, keys, len(samples.pair))
+                        bar.update()
 
     def _samples(self, store: str, protocol: str) -> Samples:
         """Return the samples within the limit on the residual; write all that were drawn."""
@@ -170,8 +155,7 @@ class _Recorder:
             return {"pair": drawn.pair.numpy(), "plain_residual": residual}
 
         path = self.folder / store / protocol / "samples.npz"
-        _once(path, describe, SAMPLES, len(drawn.pair))
-        found = read_arrays(path)
+        found = _once(path, describe, SAMPLES, len(drawn.pair))
         if not np.array_equal(found["pair"], drawn.pair.numpy()):
             raise ValueError(f"{path.parent} is of other samples than the run's seed draws of the store, remove it")
         return drawn.select(torch.from_numpy(found["plain_residual"] < limit))
@@ -199,11 +183,9 @@ class _Recorder:
             read_arrays(path, keys, rows)
         elif name not in self.failed:
             try:
-                arrays = compute()
+                write_arrays(path, compute())
             except ValueError as error:
                 self.failed[name] = str(error)
-            else:
-                write_arrays(path, arrays)
 
     def forget(self, methods: Collection[str]) -> None:
         """Remove methods from the run, with their files: their code will be another when they come again."""
@@ -214,9 +196,8 @@ class _Recorder:
                 path.unlink(missing_ok=True)
 
 
-def _once(path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None) -> None:
-    """Write the computed arrays, or check that an existing file holds such arrays."""
-    if path.is_file():
-        read_arrays(path, keys, rows)
-    else:
+def _once(path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None) -> Arrays:
+    """Return the arrays of a file, after computing and writing them if it does not exist."""
+    if not path.is_file():
         write_arrays(path, compute())
+    return read_arrays(path, keys, rows)

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.runs.arrays import Arrays, file_name, read_arrays
 from kornia_learnnorm.evaluation.runs.manifest import read_section
-from kornia_learnnorm.evaluation.runs.motion import QUANTITIES
+from kornia_learnnorm.evaluation.runs.pairs import MOTIONS
 from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS
 from kornia_learnnorm.protocol import PROTOCOLS
 
 __all__ = ["EXAMPLE", "PAIRS", "SAMPLES", "SWEEP", "Cell", "Run", "is_swept", "method_path", "read_run", "sweep_path"]
 
 # Arrays in the files of a run; read by name, so that a damaged file is recognised before it is used.
-PAIRS = (*QUANTITIES, "names")
+PAIRS = (*MOTIONS, "names")
 SAMPLES = ("pair", "plain_residual")
 EXAMPLE = ("store", "pair", "names", "points1", "points2", "truth", "F", "size")
 SWEEP = ("size", "own", "truth")
@@ -26,21 +26,13 @@ SWEEP = ("size", "own", "truth")
 
 @dataclass(frozen=True)
 class Cell:
-    """The predictions of all methods on the samples of one store and protocol.
+    """The predictions of all methods on the samples of one store and protocol."""
 
-    Attributes:
-        store: name of the store.
-        protocol: ``filtered`` or ``unfiltered``.
-        pair: image pair of each sample, (S,) int64.
-        drawn: number of samples before the filter on the un-normalised residual.
-        predictions: arrays (S, ...) by method and quantity, float64.
-    """
-
-    store: str
-    protocol: str
-    pair: Tensor
-    drawn: int
-    predictions: dict[str, dict[str, Tensor]]
+    store: str  # its name
+    protocol: str  # filtered or unfiltered
+    pair: Tensor  # image pair of each sample, (S,) int64
+    drawn: int  # number of samples before the filter on the un-normalised residual
+    predictions: dict[str, dict[str, Tensor]]  # arrays (S, ...) by method and quantity, float64
 
     @property
     def title(self) -> str:
@@ -50,24 +42,14 @@ class Cell:
 
 @dataclass(frozen=True)
 class Run:
-    """A run of predictions.
+    """A run of predictions."""
 
-    Attributes:
-        about: what the run was computed from, its section of ``run.json``.
-        cells: stores and protocols.
-        pairs: the motion of each store's pairs, (P,) each.
-        sizes: errors by the number of correspondences, by method.
-        example: the image pair of these errors, from
-            :func:`~kornia_learnnorm.evaluation.runs.example.random_pair`; empty where there is none yet.
-        missing: what has not been computed yet.
-    """
-
-    about: dict[str, Any]
+    about: dict[str, Any]  # what the run was computed from, its section of run.json
     cells: list[Cell]
-    pairs: dict[str, Arrays]
-    sizes: dict[str, Arrays]
-    example: Arrays
-    missing: list[str] = field(default_factory=list)
+    pairs: dict[str, Arrays]  # the motion of each store's pairs, (P,) each
+    sizes: dict[str, Arrays]  # errors by the number of correspondences, by method
+    example: Arrays  # the image pair of these errors, from random_pair; empty where there is none yet
+    missing: list[str] = field(default_factory=list)  # what has not been computed yet
 
 
 def method_path(folder: Path, store: str, protocol: str, method: str) -> Path:
@@ -78,6 +60,11 @@ def method_path(folder: Path, store: str, protocol: str, method: str) -> Path:
 def sweep_path(folder: Path, method: str) -> Path:
     """Return the file of a method's errors by the number of correspondences."""
     return folder / "sizes" / f"{file_name(method)}.npz"
+
+
+def prediction_keys(complete: bool) -> tuple[str, ...]:
+    """Return the names of the arrays in the file of a method's predictions."""
+    return (*ERRORS, *AGREEMENT) if complete else ERRORS
 
 
 def is_swept(method: str) -> bool:
@@ -125,7 +112,7 @@ def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, c
     kept = torch.from_numpy(samples["plain_residual"] < about["max_residual"])
     pair = torch.from_numpy(samples["pair"])[kept]
     paths = {name: method_path(folder, store, protocol, name) for name in about["methods"]}
-    keys = (*ERRORS, *AGREEMENT) if complete else ERRORS
+    keys = prediction_keys(complete)
     predictions = {
         name: {key: torch.from_numpy(value) for key, value in read_arrays(path, keys, len(pair)).items()}
         for name, path in paths.items()

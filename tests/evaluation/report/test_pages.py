@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 import re
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.evaluation.report.pages import write_report
+from kornia_learnnorm.evaluation.report.formatting import Table
+from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
+from kornia_learnnorm.evaluation.report.pair import draw_example
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs import example
+from kornia_learnnorm.evaluation.runs.run import read_run
 
 matplotlib = pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 
@@ -30,16 +35,11 @@ def test_files(copied, capsys):
         assert "".join(reference) in identifiers
 
 
-def test_without_the_baseline(copied, capsys):
+def test_not_a_run_or_without_the_baseline(tmp_path, copied, refused):
+    refused(["report", tmp_path], "no run at")
     for protocol in ("filtered", "unfiltered"):
         (copied / "scenes" / protocol / "Hartley.npz").unlink()
-    assert main(["report", str(copied)]) == 2
-    assert "compares with Hartley, the run has predictions of Hartley+LM, " in capsys.readouterr().err
-
-
-def test_not_a_run(tmp_path, capsys):
-    assert main(["report", str(tmp_path)]) == 2
-    assert "no run at" in capsys.readouterr().err
+    refused(["report", copied], "compares with Hartley, the run has predictions of Hartley+LM, ")
 
 
 def test_what_is_there_of_a_run(copied, capsys):
@@ -55,7 +55,7 @@ def test_what_is_there_of_a_run(copied, capsys):
     assert "Figure 11" not in (copied / "report.md").read_text()
 
 
-def test_robust_estimators(robust_copied):
+def test_robust_estimators_alone_and_beside_predictions(robust_copied, robust_store, monkeypatch):
     settings = dict(matplotlib.rcParams)
     write_report(robust_copied)
     assert dict(matplotlib.rcParams) == settings
@@ -65,9 +65,6 @@ def test_robust_estimators(robust_copied):
     assert "as printed: Ranftl and Koltun" in text
     assert page.count("<svg") == text.count(".svg)") == 2
     assert {path.stem for path in robust_copied.glob("*.svg")} == {"hypotheses-1", "hypotheses-1-relative"}
-
-
-def test_robust_estimators_beside_predictions(robust_copied, robust_store, monkeypatch):
     monkeypatch.setattr(example, "TRIALS", 5)
     options = ["--methods", "Hartley", "--max-samples", "50"]
     assert main(["evaluate", str(robust_store), "--out", str(robust_copied), *options]) == 0
@@ -92,3 +89,24 @@ def test_incomplete_robust_run(robust_copied):
     cells = read_robust(robust_copied).cells
     assert "RANSAC" not in cells[0].estimates
     assert "RANSAC" in cells[1].estimates
+
+
+@pytest.mark.parametrize(("columns", "header"), [(40, "rate of a long name"), (30, "rate of a long")])
+def test_only_tables_that_fit_are_printed(monkeypatch, capsys, columns, header):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    rows = [["mine", *(3 * ["12.3 [10.0, 14.0]"])]]
+    short = Table("Short", "What it shows.", ["method", "rate of a long name"], [row[:2] for row in rows])
+    print_tables([short, Table("Wide", "", ["method", "a", "b", "c"], rows)], Path("report.html"))
+    text = capsys.readouterr().out
+    assert "12.3 [10.0, 14.0]" in text
+    assert f" {header} ┃" in text
+    assert "…" not in text
+    assert text.endswith(f"wider than the {columns} columns of this terminal, see report.html:\n  Wide\n")
+
+
+def test_without_a_sample_of_the_pair_there_is_no_picture_of_it(run):
+    found = read_run(run)
+    (picture,) = draw_example(found, dict.fromkeys(found.about["methods"], "red"))
+    assert picture.name == "figure-10"
+    found.example["pair"] = np.array(99)
+    assert draw_example(found, {}) == []

@@ -1,4 +1,4 @@
-"""Tables of a run of predictions."""
+"""Tables of runs: better rates, accuracy, motion, robust estimators, hypotheses."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from kornia_learnnorm.evaluation.report.formatting import median_text, number_text, paired_text
 from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_tables
-from kornia_learnnorm.evaluation.report.robust import robust_tables
-from kornia_learnnorm.evaluation.report.tables import report_tables
+from kornia_learnnorm.evaluation.report.rates import rate_tables
+from kornia_learnnorm.evaluation.report.robust import PRINTED, robust_tables
+from kornia_learnnorm.evaluation.report.style import method_colors
+from kornia_learnnorm.evaluation.report.tables import by_motion, report_tables
 from kornia_learnnorm.evaluation.robust.run import read_robust
-from kornia_learnnorm.evaluation.runs.run import read_run
+from kornia_learnnorm.evaluation.runs.run import Cell, Run, read_run
 
 
 def test_rates_are_those_of_the_samples(run):
@@ -39,6 +42,14 @@ def test_accuracy_and_tests(run):
     assert tests["Hartley+LM"][1].startswith("-")
     assert len(tables["By motion: scenes, filtered"].rows) == 8
     assert 0 < len(tables["Worst failures: scenes, filtered"].rows) <= 10
+
+
+def test_texts_of_cells():
+    assert [number_text(0.5), number_text(float("nan"))] == ["0.500", ""]
+    assert median_text(torch.tensor([1.0, 4.0, torch.nan])) == "2.500"
+    values = torch.tensor([1.5, 2.5])
+    assert paired_text(values, values - 0.5) == "+0.500 [+0.500, +0.500], < 0.001"
+    assert method_colors(["none", "Hartley"]) == {"none": "#8b8b8b", "Hartley": "#e69f00"}
 
 
 def without_truth(run, robust):
@@ -74,3 +85,100 @@ def test_unknown_numbers_are_empty_cells(run, robust_run, change):
     assert len(tables) >= 20
     assert "" in cells
     assert not [cell for cell in cells if re.search("nan|inf", cell)]
+
+
+def motion_cell(forward, truth):
+    """Six pairs of two samples each; the figures other than ``forward`` are not known."""
+    error = torch.tensor(truth, dtype=torch.float64).repeat_interleave(2)
+    errors = {"own": torch.arange(12) + 1.0, "heldout": torch.arange(12) + 1.0, "truth": error}
+    cell = Cell("a", "filtered", torch.arange(6).repeat_interleave(2), 12, {"Hartley": errors, "mine": errors})
+    unknown = np.full(6, np.nan)
+    pairs = {"rotation": unknown, "forward": np.array(forward), "parallax": unknown, "inliers": unknown}
+    return cell, Run({}, [cell], {"a": pairs}, {}, {})
+
+
+class TestByMotion:
+    def test_counts_and_digits(self):
+        """A median of 0.999555 that three digits round to 1, among samples of which some have no truth."""
+        nan = float("nan")
+        table = by_motion(*motion_cell([0.2, 0.4, 0.9995, 0.99961, 0.99962, 0.9997], [1, nan, 1, 1, nan, nan]), "mine")
+        assert [row[1:5] for row in table.rows] == [["up to 0.9996", "3", "6", "4"], ["above 0.9996", "3", "6", "2"]]
+        assert "Not shown: rotation, degrees, known of 0 of 6 pairs; parallax" in table.text
+
+    @pytest.mark.parametrize(
+        ("forward", "text"),
+        [
+            ([0.9995, 0.9996, 0.9997, *3 * [0.9998]], "from 0.9995 to 0.9998 in all pairs"),
+            (6 * [0.5], "0.5 in all pairs"),
+        ],
+    )
+    def test_what_hardly_differs_has_no_halves(self, forward, text):
+        table = by_motion(*motion_cell(forward, 6 * [1]), "mine")
+        assert table.rows == []
+        assert f"forward share of the translation, {text}" in table.text
+
+
+def test_the_rate_of_known_distributions():
+    """Of exponential variables with means 1 and 1 / 2 the second is smaller with probability 2 / 3."""
+    rng = np.random.default_rng(0)
+    own = {"Hartley": rng.exponential(1.0, 20_000), "crossview": rng.exponential(0.5, 20_000)}
+    predictions = {name: {"own": torch.from_numpy(values)} for name, values in own.items()}
+    cell = Cell("kitti_06", "filtered", torch.arange(20_000) // 100, 20_000, predictions)
+    trained_on = {"Hartley": [], "crossview": ["kitti_06@0:3"]}
+    about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(own, ""), "trained_on": trained_on}
+    (table,) = rate_tables(Run(about, [cell], {}, {}, {}))
+    rate, interval = table.rows[1][2].split(" ", 1)
+    low, high = (float(end) for end in interval.strip("[] *").split(", "))
+    assert table.rows[1][1] == "kitti_06@0:3"
+    assert interval.endswith(" *")
+    assert low < 200 / 3 < high
+    # The half width of independent samples: 1.96 standard deviations of a proportion.
+    assert (high - low) / 2 == pytest.approx(196 * np.sqrt(2 / 9 / 20_000), rel=0.2)
+    assert float(rate) == pytest.approx(200 / 3, abs=1)
+    printed = {"KITTI 00-05": "86.68", "TUM": "84.22", "KITTI 00-05 and TUM": "87.05"}
+    assert {row[1]: row[2] for row in table.rows[2:]} == printed
+
+
+def test_numbers_of_robust_estimators(robust_run):
+    found = read_robust(robust_run)
+    tables = {table.title: table for table in robust_tables(found)}
+    figures = found.cells[0].estimates["count:whitening"][1.0]
+    rows = {row[0]: row for row in tables["Robust estimation: kitti_06, filtered (Table 2)"].rows}
+    means = 100 * figures["inliers"].mean(0)
+    assert rows["count:whitening"][4] == f"{means.mean():.2f} ± {means.std():.2f}"
+    assert "±" not in rows["RANSAC"][1]  # a single run
+    printed = PRINTED[(("kitti_06", "kitti_07", "kitti_08", "kitti_09", "kitti_10"), "filtered")]
+    assert rows["Fan et al., as printed: LMEDS"][1:3] == list(printed["LMEDS"][:2])
+    pose = {row[0]: row for row in tables["Pose and time: kitti_06, filtered"].rows}
+    assert pose["count:whitening"][6] == "50"
+    assert float(pose["RANSAC"][11]) > 0
+    tests = {row[0]: row for row in tables["Paired tests of robust estimation: kitti_06, filtered"].rows}
+    baselines = {"count:whitening": "count:Hartley", "time:whitening": "time:Hartley", "RANSAC": "count:Hartley"}
+    assert {name: row[1] for name, row in tests.items()} == baselines
+    other = found.cells[0].estimates["count:Hartley"][1.0]
+    change = 100 * (figures["inliers"] - other["inliers"]).mean().item()
+    assert tests["count:whitening"][5].startswith(f"{change:+.3f} [")
+
+
+def test_robust_estimators_without_ground_truth(robust_run):
+    found = read_robust(robust_run)
+    for by_threshold in found.cells[0].estimates.values():
+        for figures in by_threshold.values():
+            for key in ("f1", "error", "rotation_error", "translation_error"):
+                figures[key][:] = torch.nan
+    table, pose, tests = robust_tables(found)[:3]
+    assert table.rows[0][1:] == [""] * 7
+    assert pose.rows[0][1:5] == [""] * 4
+    assert tests.rows[0][2:] == [""] * 6
+
+
+def test_numbers_of_hypotheses(robust_run):
+    found = read_robust(robust_run)
+    best, chosen, tests = hypothesis_tables(found)[:3]
+    error = found.cells[0].hypotheses["whitening"]["error"]
+    assert best.rows[1][1] == chosen.rows[1][1] == f"{error.mean():.3f}"
+    assert best.rows[1][4] == f"{error.min(-1).values.mean():.3f}"
+    names = ["Best of k hypotheses", "Hypothesis that MSAC picks among k"]
+    assert [row[:2] for row in tests.rows[:2]] == [["whitening", name] for name in names]
+    change = (error - found.cells[0].hypotheses["Hartley"]["error"]).mean().item()
+    assert re.match(re.escape(f"{change:+.3f} ["), tests.rows[0][2])

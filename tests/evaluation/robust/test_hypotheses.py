@@ -40,10 +40,9 @@ def test_picked_by_brute_force():
 
 @pytest.mark.parametrize("number", [0, 4])
 def test_not_so_many(number):
-    with pytest.raises(ValueError, match=f"from 1 to 3, the number of errors, got {number}"):
-        expected_best(torch.rand(3), number)
-    with pytest.raises(ValueError, match=f"from 1 to 3, the number of errors, got {number}"):
-        picked(torch.rand(3), torch.rand(3), number)
+    for function, arguments in ((expected_best, [torch.rand(3)]), (picked, torch.rand(2, 3))):
+        with pytest.raises(ValueError, match=f"from 1 to 3, the number of errors, got {number}"):
+            function(*arguments, number)
 
 
 def test_figures_are_those_of_the_functions(matches):

@@ -11,9 +11,8 @@ import torch
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
-from kornia_learnnorm.evaluation.runs.consensus import consensus
-from kornia_learnnorm.evaluation.runs.motion import pair_motions
-from kornia_learnnorm.evaluation.runs.predict import predict
+from kornia_learnnorm.evaluation.runs.pairs import pair_motions
+from kornia_learnnorm.evaluation.runs.predict import consensus, predict
 from kornia_learnnorm.metrics.pairs import f1_score, inlier_share
 from kornia_learnnorm.protocol import THRESHOLDS
 
@@ -54,9 +53,7 @@ def test_consensus_is_that_of_the_metrics(max_ratio):
     F_mat[3] = torch.nan  # a failed estimate
     found = consensus(F_mat, pair, store, max_ratio)
     for row, index in enumerate(pair.tolist()):
-        rows = slice(store.offsets[index], store.offsets[index + 1])
-        keep = store.ratio[rows] < (max_ratio or np.inf)
-        x1, x2 = (torch.from_numpy(points[rows][keep]).double() for points in (store.points1, store.points2))
+        x1, x2 = (torch.from_numpy(points).double() for points in store.matches(index, max_ratio)[:2])
         true = torch.from_numpy(store.F[index])
         for place, threshold in enumerate(THRESHOLDS):
             share, score = inlier_share(x1, x2, F_mat[row], threshold), f1_score(x1, x2, F_mat[row], true, threshold)

@@ -25,20 +25,14 @@ from kornia_learnnorm.evaluation.runs.run import read_run
 from kornia_learnnorm.normalizers.learned import WEIGHTS
 
 
-def change(folder, **values):
-    """Change values of the section of ``evaluate`` in ``run.json``."""
-    about = json.loads((folder / "run.json").read_text())
-    about["evaluate"] |= values
-    (folder / "run.json").write_text(json.dumps(about))
-
-
 def assert_same(one, other):
-    """The same numbers in two runs, by method, wherever both have the method."""
+    """The second run has the numbers of the first; it may have fewer quantities."""
     for cell, again in zip(one.cells, other.cells, strict=True):
         assert (cell.title, cell.drawn) == (again.title, again.drawn)
-        for name in cell.predictions.keys() & again.predictions.keys():
-            for key in cell.predictions[name].keys() & again.predictions[name].keys():
-                np.testing.assert_array_equal(cell.predictions[name][key], again.predictions[name][key])
+        assert cell.predictions.keys() == again.predictions.keys()
+        for name, found in again.predictions.items():
+            for key, values in found.items():
+                np.testing.assert_array_equal(cell.predictions[name][key], values)
 
 
 def test_predictions_are_those_of_the_functions(run, store):
@@ -56,8 +50,9 @@ def test_predictions_are_those_of_the_functions(run, store):
     np.testing.assert_allclose(found["heldout"], np.median(heldout, axis=1))
 
 
-def test_a_temporary_run_has_the_same_numbers(run, store, methods):
-    found = record.temporary_run({"scenes": str(store)}, methods)
+def test_a_temporary_run_of_methods_in_another_order_has_the_same_numbers(run, store, methods):
+    found = record.temporary_run({"scenes": str(store)}, methods[::-1])
+    assert [*found.about["methods"]] == methods[::-1]
     assert_same(read_run(run), found)
     assert {*found.cells[1].predictions["Hartley+LM"]} == {*ERRORS}
     assert found.about == read_run(run).about
@@ -84,12 +79,13 @@ def test_another_run_computes_nothing_and_adds_what_is_new(copied, command, meth
         ([], "crossview 'crossview 0000', now 'crossview "),
     ],
 )
-def test_a_run_of_other_options_is_refused(copied, command, capsys, options, differs):
+def test_a_run_of_other_options_is_refused(copied, command, refused, options, differs):
     if not options:
-        change(copied, methods={"crossview": "crossview 0000"})
-    assert main([*command, str(copied), *options]) == 2
-    error = capsys.readouterr().err
-    assert f"{copied} is a run of other options, remove it or write elsewhere: {differs}" in error
+        about = json.loads((copied / "run.json").read_text())
+        about["evaluate"]["methods"] = {"crossview": "crossview 0000"}
+        (copied / "run.json").write_text(json.dumps(about))
+    message = f"{copied} is a run of other options, remove it or write elsewhere: {differs}"
+    refused([*command, copied, *options], message)
 
 
 @pytest.mark.parametrize(
@@ -104,37 +100,31 @@ def test_a_run_of_other_options_is_refused(copied, command, capsys, options, dif
         ("run.json", '{"format": 3, "evaluate": {"stores": {}}}', "damaged: methods, trained_on, versions, size, seed"),
     ],
 )
-def test_damaged_or_of_another_version(copied, command, capsys, name, text, message):
+def test_damaged_or_of_another_version(copied, reading, refused, name, text, message):
     (copied / name).write_text(text)
-    for again in (["report", str(copied)], [*command, str(copied)]):
-        assert main(again) == 2
-        assert message in capsys.readouterr().err
+    for again in reading:
+        refused(again, message)
 
 
 @pytest.mark.parametrize("name", ["scenes/filtered/crossview", "scenes/pairs", "sizes/none", "example"])
-def test_damaged_arrays(copied, command, capsys, name):
+def test_damaged_arrays(copied, reading, refused, name):
     path = copied / f"{name}.npz"
     path.write_bytes(path.read_bytes()[:200])
-    for again in (["report", str(copied)], [*command, str(copied)]):
-        assert main(again) == 2
-        assert f"{path.name} is damaged, remove it" in capsys.readouterr().err
+    for again in reading:
+        refused(again, f"{path.name} is damaged, remove it")
 
 
-def test_other_samples(copied, command, capsys):
+def test_other_samples(copied, reading, refused):
     """Files of the unfiltered samples in the place of the filtered ones."""
-    commands, filtered = (["report", str(copied)], [*command, str(copied)]), copied / "scenes/filtered"
+    filtered = copied / "scenes/filtered"
     shutil.copy(copied / "scenes/unfiltered/none.npz", filtered / "none.npz")
-    for again in commands:
-        assert main(again) == 2
-        assert "none.npz is of other samples, remove it: expected" in capsys.readouterr().err
+    for again in reading:
+        refused(again, "none.npz is of other samples, remove it: expected")
     np.savez(filtered / "none.npz", own=np.zeros(3))
-    for again in commands:
-        assert main(again) == 2
-        assert "expected arrays F_mat, heldout" in capsys.readouterr().err
-    shutil.rmtree(filtered)
-    shutil.copytree(copied / "scenes/unfiltered", filtered)
-    assert main(commands[1]) == 2
-    assert "samples.npz is of other samples, remove it" in capsys.readouterr().err
+    for again in reading:
+        refused(again, "expected arrays F_mat, heldout")
+    shutil.copytree(copied / "scenes/unfiltered", filtered, dirs_exist_ok=True)
+    refused(reading[1], "samples.npz is of other samples, remove it")
 
 
 def test_a_store_that_joins_later_changes_no_number(copied, command, tmp_path, few_trials):
@@ -151,22 +141,15 @@ def test_a_store_that_joins_later_changes_no_number(copied, command, tmp_path, f
 
 def test_names_do_not_change_numbers(store, tmp_path):
     """The same weights under exchanged names: the numbers go with the weights."""
-    found = []
-    for first, second in (("crossview", "paper"), ("paper", "crossview")):
-        for name, weights in (("one", first), ("two", second)):
-            shutil.copy(WEIGHTS / f"{weights}.safetensors", tmp_path / f"{name}.safetensors")
-        methods = [str(tmp_path / "one.safetensors"), str(tmp_path / "two.safetensors")]
-        cell = record.temporary_run({"scenes": str(store)}, methods, protocols=["filtered"]).cells[0]
-        found.append({name: errors["own"] for name, errors in cell.predictions.items()})
-    assert torch.equal(found[0]["one"], found[1]["two"])
-    assert torch.equal(found[0]["two"], found[1]["one"])
-    assert not torch.equal(found[0]["one"], found[0]["two"])
-
-
-def test_order_does_not_change_numbers(run, store, methods):
-    found = record.temporary_run({"scenes": str(store)}, methods[::-1])
-    assert [*found.about["methods"]] == methods[::-1]
-    assert_same(read_run(run), found)
+    found, paths = [], [tmp_path / f"{name}.safetensors" for name in ("one", "two")]
+    for weights in (("crossview", "paper"), ("paper", "crossview")):
+        for path, name in zip(paths, weights, strict=True):
+            shutil.copy(WEIGHTS / f"{name}.safetensors", path)
+        cell = record.temporary_run({"scenes": str(store)}, [*map(str, paths)], protocols=["filtered"]).cells[0]
+        found.append([cell.predictions[name]["own"] for name in ("one", "two")])
+    assert torch.equal(found[0][0], found[1][1])
+    assert torch.equal(found[0][1], found[1][0])
+    assert not torch.equal(*found[0])
 
 
 class TestOwnCode:
@@ -261,11 +244,10 @@ def test_pairs_with_few_matches_have_no_example_and_nothing_held_out(tmp_path, c
         (["--max-residual", "0"], "scenes, filtered: none of "),
     ],
 )
-def test_options_that_are_refused(store, tmp_path, monkeypatch, capsys, options, message):
+def test_options_that_are_refused(store, tmp_path, monkeypatch, refused, options, message):
     monkeypatch.chdir(tmp_path)
     Path("FILE").touch()
-    assert main(["evaluate", str(store), "--methods", "none", *options]) == 2
-    assert message in capsys.readouterr().err
+    refused(["evaluate", store, "--methods", "none", *options], message)
     assert not Path("RUN").exists()
 
 

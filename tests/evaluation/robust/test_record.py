@@ -47,46 +47,42 @@ def test_figures_are_those_of_the_estimator(robust_run, robust_store):
         assert figures[key][2, 1].item() == value
 
 
-def test_again_computes_nothing(robust_copied, robust_command, monkeypatch):
+def test_again_computes_nothing(robust_copied, robust_again, monkeypatch):
     before = times(robust_copied)
     monkeypatch.setattr(record, "run_estimator", pytest.fail)
     monkeypatch.setattr(record, "hypothesis_quality", pytest.fail)
-    assert main([*robust_command, str(robust_copied)]) == 0
+    assert main(robust_again) == 0
     assert times(robust_copied) == before
 
 
-def test_resumes_with_what_is_missing(robust_copied, robust_command, robust_run):
-    paths = [
-        robust_copied / "robust/kitti_06/filtered/1px/count_Hartley.npz",
-        robust_copied / "hypotheses/kitti_06/unfiltered/Hartley.npz",
-    ]
-    for path in paths:
-        path.unlink()
-    assert main([*robust_command, str(robust_copied)]) == 0
-    for path in paths:
-        new, old = np.load(path), np.load(robust_run / path.relative_to(robust_copied))
+def test_resumes_with_what_is_missing(robust_copied, robust_again, robust_run):
+    names = ["robust/kitti_06/filtered/1px/count_Hartley.npz", "hypotheses/kitti_06/unfiltered/Hartley.npz"]
+    for name in names:
+        (robust_copied / name).unlink()
+    assert main(robust_again) == 0
+    for name in names:
+        new, old = np.load(robust_copied / name), np.load(robust_run / name)
         for key in {*old.files} - {"seconds"}:
             np.testing.assert_array_equal(new[key], old[key])
 
 
-def test_redo(robust_copied, robust_command):
+def test_redo(robust_copied, robust_again, refused):
     before = times(robust_copied)
     about = json.loads((robust_copied / "run.json").read_text())
     about["robust"]["estimators"]["RANSAC"] = "RANSAC of old"
     (robust_copied / "run.json").write_text(json.dumps(about))
-    assert main([*robust_command, str(robust_copied)]) == 2
-    assert main([*robust_command, str(robust_copied), "--redo", "RANSAC"]) == 0
+    refused(robust_again, "is a run of other options, remove it or write elsewhere: RANSAC 'RANSAC of old'")
+    assert main([*robust_again, "--redo", "RANSAC"]) == 0
     changed = {path.name for path, time in times(robust_copied).items() if time != before[path]}
     assert changed == {"RANSAC.npz"}
-    assert main([*robust_command, str(robust_copied), "--redo", "poselib"]) == 2
+    refused([*robust_again, "--redo", "poselib"], "--redo poselib: not among the estimators and solvers")
 
 
-def test_other_options_are_refused(robust_copied, robust_command, capsys):
+def test_other_options_are_refused(robust_again, refused):
     for option in ("--seeds", "--pairs", "--seed", "--slow-seeds", "--hypotheses"):
-        assert main([*robust_command, str(robust_copied), option, "3"]) == 2
-        assert "is a run of other options" in capsys.readouterr().err
-    assert main([*robust_command, str(robust_copied), "--seeds", "0"]) == 2
-    assert "seeds must be 1 or more, got 0" in capsys.readouterr().err
+        refused([*robust_again, option, "3"], "is a run of other options")
+    refused([*robust_again, "--seeds", "0"], "seeds must be 1 or more, got 0")
+    refused([*robust_again, "--pairs", "-1"], "pairs must be 0 or more, got -1")
 
 
 def test_estimators_and_stores_join(robust_copied, tmp_path):
@@ -107,25 +103,21 @@ def test_a_package_that_is_not_installed(robust_copied, robust_store, monkeypatc
     assert read_robust(robust_copied).about["estimators"]["poselib"] is None
 
 
-def test_damaged(robust_copied, robust_command, capsys):
+def test_damaged(robust_copied, robust_again, refused):
     path = robust_copied / "robust/kitti_06/filtered/1px/RANSAC.npz"
     whole = path.read_bytes()
     for content in (b"", b"bad", whole[:100]):
         path.write_bytes(content)
-        for again in (["report", str(robust_copied)], [*robust_command, str(robust_copied)]):
-            assert main(again) == 2
-            assert f"{path} is damaged, remove it" in capsys.readouterr().err
+        for again in (["report", robust_copied], robust_again):
+            refused(again, f"{path} is damaged, remove it")
     (robust_copied / "run.json").write_text('{"format": 3, "robust": {"stores": {}}}')
-    for again in (["report", str(robust_copied)], [*robust_command, str(robust_copied)]):
-        assert main(again) == 2
-        assert "run.json is damaged: estimators, solvers, versions, pairs" in capsys.readouterr().err
+    for again in (["report", robust_copied], robust_again):
+        refused(again, "run.json is damaged: estimators, solvers, versions, pairs")
 
 
 def test_what_fails_is_left_out_and_others_go_on(robust_store, tmp_path, monkeypatch, capsys):
-    (tmp_path / "own.py").write_text(
-        "from kornia_learnnorm import Hartley\n\nclass Bad:\n"
-        "    def __call__(self, points1, points2, weights):\n        raise RuntimeError('boom')\n"
-    )
+    text = "from kornia_learnnorm import Hartley\ndef Bad(points1, points2, weights):\n    raise RuntimeError('boom')\n"
+    (tmp_path / "own.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     out = tmp_path / "run"
     command = ["robust", str(robust_store), "--pairs", "1", "--seeds", "1", "--out", str(out), "--estimators"]
