@@ -1,4 +1,4 @@
-r"""Estimators: modules from correspondences to a fundamental matrix."""
+r"""The normalised eight-point algorithm as a layer: masks, weights, cameras, and samples that determine no matrix."""
 
 from __future__ import annotations
 

@@ -77,7 +77,9 @@ class LinearProblem:
         return self.gap > MIN_GAP
 
     def _solve(self) -> tuple[Tensor, Tensor]:
-        if self.solution is None:
+        # A solution found under `no_grad` must not cut the derivatives of a later caller.
+        wanted = torch.is_grad_enabled() and self.x1.requires_grad
+        if self.solution is None or (wanted and not self.solution[0].requires_grad):
             h, gap = solve_null_vector(design_matrix(self.x1, self.x2), self.weights)
             self.solution = torch.unflatten(h, -1, (3, 3)), gap
         return self.solution

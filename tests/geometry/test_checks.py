@@ -32,7 +32,5 @@ class TestCorrespondences:
     def test_errors_name_the_argument(self):
         with pytest.raises(ShapeError, match=r"(?s)Actual shape: \[2, 8, 3\].*points2"):
             check_correspondences(torch.rand(2, 8, 2), torch.rand(2, 8, 3))
-        with pytest.raises(
-            TypeError, match=r"got <class 'numpy.ndarray'>; torch.from_numpy\(points1\)"
-        ):
+        with pytest.raises(TypeError, match=r"got <class 'numpy.ndarray'>; torch.from_numpy\(points1\)"):
             check_correspondences(np.zeros((2, 8, 2)), torch.rand(2, 8, 2))

@@ -67,6 +67,12 @@ class TestLinearProblem:
         assert noisy.determined.all()
         assert noisy.gap.max() < 0.1 * scene.gap.median()
 
+    def test_a_solution_without_gradient_is_not_kept(self):
+        problem = LinearProblem.from_points(*(p.requires_grad_() for p in correspondences("handheld", 4, 10)))
+        with torch.no_grad():
+            assert not problem.null_matrix.requires_grad
+        assert problem.null_matrix.requires_grad
+
     def test_select_and_detach(self):
         points = [p.requires_grad_() for p in correspondences("handheld", 4, 10)]
         problem = LinearProblem.from_points(*points, uniform(4, 10, low=0.1))
