@@ -3,7 +3,7 @@ r"""Rendered image pairs with an exact fundamental matrix: two views of a room m
 For a first run without a data set; use real images to compare methods. A back wall, a floor and slanted boards are
 warped into each view by the homographies of their planes, from back to front. The scene is far from planar, so
 :math:`F` is well determined.
-Images need OpenCV (the extra ``kornia-learnnorm[images]``), which is imported on use.
+Images need OpenCV (the extra ``images``), which is imported on use.
 """
 
 from __future__ import annotations
