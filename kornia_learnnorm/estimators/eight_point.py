@@ -22,7 +22,7 @@ from kornia_learnnorm.geometry.checks import (
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
 from kornia_learnnorm.normalizers.closed_form import Hartley
-from kornia_learnnorm.normalizers.contract import Normalizer
+from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
 
 __all__ = ["EightPoint", "TwoViewEstimate"]
 
@@ -50,11 +50,12 @@ class TwoViewEstimate(NamedTuple):
 
 
 class EightPoint(nn.Module):
-    r"""The normalised eight-point algorithm as an nn.Module with finite outputs and gradients for every finite input.
+    r"""The normalised eight-point algorithm as an nn.Module with finite outputs and gradients on degenerate samples too.
 
-    A correspondence that is masked, or of weight zero, counts as absent. A sample that does not determine its matrix is
-    solved with the base normaliser (``normalizer.base`` where there is one, else Hartley's) and sends no gradient,
-    neither to the points nor to the normaliser.
+    They are finite for points within 1e50 of the origin whose mean distance from their centroid is zero or at least
+    1e-50. A correspondence that is masked, or of weight zero, counts as absent. A sample that does not determine its
+    matrix is solved with the base normaliser (``normalizer.base`` where there is one, else Hartley's) and sends no
+    gradient, neither to the points nor to the normaliser.
 
     Do not use it on matches with outliers: it is least squares. :class:`~kornia_learnnorm.RANSAC` rejects them.
 
@@ -64,7 +65,8 @@ class EightPoint(nn.Module):
 
     Raises:
         ValueError: if ``rank2`` is neither ``"projection"`` nor ``"optimal"``.
-        TypeError: if it is compiled by ``torch.jit``; ``torch.compile`` and ``torch.export`` take it.
+        TypeError: if ``normalizer`` is neither a module nor a function, or the layer is compiled by ``torch.jit``;
+            ``torch.compile`` and ``torch.export`` take it.
 
     Example:
         >>> layer = EightPoint()
@@ -81,6 +83,8 @@ class EightPoint(nn.Module):
     ) -> None:
         super().__init__()
         check_rank2(rank2)
+        if normalizer is not None:
+            check_normalizer(normalizer)
         self.normalizer = Hartley() if normalizer is None else normalizer
         self.rank2: Literal["projection", "optimal"] = rank2
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_correspondences, check_rank2
+from kornia_learnnorm.geometry.linear import independence_gap
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2, rank2_projection
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
@@ -51,13 +52,13 @@ def find_fundamental(
         fundamental matrices with shape :math:`(B, 3, 3)` in the dtype of the points, of rank 2 and unit Frobenius norm,
         :math:`x_2^\top F x_1 = 0`, with the sign of :func:`~kornia_learnnorm.geometry.transforms.unit_fundamental`.
         Where the correspondences do not determine :math:`F` (coincident, collinear or coplanar points) it is one of the
-        solutions and its null vector carries no gradient towards the others.
+        solutions and carries no gradient.
 
     Raises:
         TypeError: if the points are not floating-point tensors of one dtype, or the normaliser cannot be called.
         ShapeError: if the shapes do not agree with the above.
         ValueError: if there are fewer than eight correspondences, the views do not pair up, a value is not finite, a
-            weight is negative, the normaliser does not return two finite transforms :math:`(B, 3, 3)`, or ``rank2``
+            weight is negative, the normaliser does not return two finite and invertible transforms :math:`(B, 3, 3)`, or ``rank2``
             is neither ``"projection"`` nor ``"optimal"``.
 
     Reference:
@@ -90,8 +91,11 @@ def solve_in_coordinates(
     problem: LinearProblem, T1: Tensor, T2: Tensor, rank2: Literal["projection", "optimal"] = "projection"
 ) -> Tensor:
     """Return the fundamental matrices of a problem under known transforms :math:`(B, 3, 3)` of the pixels."""
-    F_hat = problem.null_matrix_in(T1, T2)
+    F_hat, gap = problem.solve_in(T1, T2)
     if rank2 == "projection":
-        return unit_fundamental(transform_fundamental(rank2_projection(F_hat), T1, T2))
-    R1, R2 = T1 @ torch.linalg.inv_ex(problem.T1)[0], T2 @ torch.linalg.inv_ex(problem.T2)[0]
-    return correct_rank2(problem, transform_fundamental(F_hat, R1, R2))
+        F_mat = unit_fundamental(transform_fundamental(rank2_projection(F_hat), T1, T2))
+    else:
+        R1, R2 = T1 @ torch.linalg.inv_ex(problem.T1)[0], T2 @ torch.linalg.inv_ex(problem.T2)[0]
+        F_mat = correct_rank2(problem, transform_fundamental(F_hat, R1, R2))
+    # Rounding chose among the solutions; one with an epipole on a point makes the loss as steep as rounding is small.
+    return torch.where((gap > independence_gap(gap.dtype))[:, None, None], F_mat, F_mat.detach())

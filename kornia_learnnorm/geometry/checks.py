@@ -102,7 +102,7 @@ def _complain_about_values(points1: Tensor, points2: Tensor, weights: Tensor | N
 def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> None:
     """Raise a clear error for a mask that does not fit correspondences ``(B, N, 2)`` and weights ``(B, N)``."""
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
-        raise TypeError(f"mask must be a boolean tensor, got {getattr(mask, 'dtype', type(mask))}")
+        raise TypeError(f"mask must be a boolean tensor, got {mask.dtype if isinstance(mask, Tensor) else type(mask)}")
     shapes = {"points1": points1.shape[:-1], "points2": points2.shape[:-1]}
     shapes |= {} if weights is None else {"weights": weights.shape}
     for name, shape in shapes.items():

@@ -10,7 +10,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import solve_dtype
-from kornia_learnnorm.geometry.linear import MIN_GAP, design_matrix, independence_gap, null_vector, solve_null_vector
+from kornia_learnnorm.geometry.linear import MIN_GAP, design_matrix, independence_gap, solve_null_vector
 from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental
 
 __all__ = ["LinearProblem"]
@@ -86,17 +86,21 @@ class LinearProblem:
 
     def null_matrix_in(self, T1: Tensor, T2: Tensor) -> Tensor:
         r"""Return the null matrix in the coordinates :math:`T_i x_i` of pixels :math:`x_i`, unit norm, (B, 3, 3)."""
+        return self.solve_in(T1, T2)[0]
+
+    def solve_in(self, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Return the null matrix in the coordinates :math:`T_i x_i`, (B, 3, 3), and its relative gap, (B,)."""
         if T1 is self.T1 and T2 is self.T2:
-            return self.null_matrix
+            return self._solve()
         if self.points1.shape[1] == 8:
             R1, R2 = self.T1 @ torch.linalg.inv_ex(T1)[0], self.T2 @ torch.linalg.inv_ex(T2)[0]
             F = transform_fundamental(self.null_matrix, R1, R2)
             # A null matrix without gradient must not get one by way of Hartley's transforms either.
             F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
-            carried: Tensor = F / torch.linalg.matrix_norm(F, keepdim=True)
-            return carried
+            return F / torch.linalg.matrix_norm(F, keepdim=True), self.gap
         x1, x2 = convert_points_to_homogeneous(self.points1), convert_points_to_homogeneous(self.points2)
-        return torch.unflatten(null_vector(design_matrix(x1 @ T1.mT, x2 @ T2.mT), self.weights), -1, (3, 3))
+        h, gap = solve_null_vector(design_matrix(x1 @ T1.mT, x2 @ T2.mT), self.weights)
+        return torch.unflatten(h, -1, (3, 3)), gap
 
     def select(self, rows: Tensor) -> LinearProblem:
         """Return the problem of some of the sets, by their indices or a mask (B,); solved if this one is."""

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor, nn
 
 from kornia_learnnorm.geometry.checks import check_correspondences, is_true
 from kornia_learnnorm.geometry.problem import LinearProblem
 
-__all__ = ["ProblemNormalizer", "normalizing_transforms", "transforms_of"]
+__all__ = ["ProblemNormalizer", "check_normalizer", "normalizing_transforms", "transforms_of"]
 
 Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
@@ -60,10 +61,15 @@ class ProblemNormalizer(nn.Module):
         raise NotImplementedError
 
 
-def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
-    """Call a normaliser on a problem: its method ``transforms`` where it has one, else the contract."""
+def check_normalizer(normalizer: object) -> None:
+    """Raise a TypeError for anything but a module or function; a class is neither."""
     if isinstance(normalizer, type) or not callable(normalizer):
         raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
+
+
+def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+    """Call a normaliser on a problem: its method ``transforms`` where it has one, else the contract."""
+    check_normalizer(normalizer)
     if hasattr(normalizer, "transforms"):
         found: tuple[Tensor, Tensor] = normalizer.transforms(problem)
         return found
@@ -82,7 +88,7 @@ def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tu
 
     Raises:
         TypeError: if it cannot be called.
-        ValueError: if it does not return two finite transforms :math:`(B, 3, 3)`.
+        ValueError: if it does not return two finite and invertible transforms :math:`(B, 3, 3)`.
 
     """
     result = transforms_of(normalizer, problem)
@@ -90,7 +96,8 @@ def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tu
     shapes = [tuple(getattr(T, "shape", ())) for T in result] if isinstance(result, tuple | list) else [type(result)]
     if shapes != [expected, expected]:
         raise ValueError(f"a normalizer must return two transforms of shape {expected}, got {shapes}")
-    T1, T2 = result
-    if is_true(~(T1.isfinite().all() & T2.isfinite().all())):
-        raise ValueError(f"the transforms of {type(normalizer).__name__} are not finite")
-    return T1.to(problem.x1), T2.to(problem.x1)
+    T1, T2 = (T.to(problem.x1) for T in result)
+    determinants = torch.linalg.det(torch.stack([T1, T2]).detach())  # not finite where an entry is not
+    if is_true(~(determinants.isfinite() & (determinants != 0)).all()):
+        raise ValueError(f"the transforms of {type(normalizer).__name__} are not finite and invertible")
+    return T1, T2

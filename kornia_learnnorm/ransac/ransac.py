@@ -19,7 +19,7 @@ from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
 from kornia_learnnorm.geometry.manifold import decompose
 from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.normalizers.closed_form import Hartley
-from kornia_learnnorm.normalizers.contract import Normalizer
+from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.ransac.scoring import (
@@ -128,8 +128,8 @@ class RANSAC(nn.Module):
     ) -> None:
         super().__init__()
         _check_numbers(inl_th, max_samples, max_seconds, confidence, seed)
-        if normalizer is not None and (isinstance(normalizer, type) or not callable(normalizer)):
-            raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
+        if normalizer is not None:
+            check_normalizer(normalizer)
         if not callable(sampler):
             raise TypeError(f"sampler must be a function or a class, got {sampler!r}")
         if rank2 is None:

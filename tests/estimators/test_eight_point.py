@@ -94,7 +94,8 @@ class TestEightPoint:
         ("hartley", TypeError, "normalizer must be a module or function, got 'hartley'"),
         (lambda *_: (torch.eye(3), torch.eye(3)), ValueError, r"two transforms of shape \(2, 3, 3\), got \[\(3, 3\)"),
         (lambda *_: torch.zeros(2, 3, 3), ValueError, r"two transforms of shape \(2, 3, 3\), got .*Tensor"),
-        (lambda *_: (torch.full((2, 3, 3), torch.nan),) * 2, ValueError, "the transforms of function are not finite"),
+        (lambda *_: (torch.full((2, 3, 3), torch.nan),) * 2, ValueError, "of function are not finite and invertible"),
+        (lambda *_: (torch.zeros(2, 3, 3),) * 2, ValueError, "of function are not finite and invertible"),
     ],
 )
 def test_a_normaliser_that_breaks_the_contract(normalizer, error, message):
@@ -133,6 +134,7 @@ class TestMask:
         ("mask", "error", "message"),
         [
             (torch.ones(3, 8), TypeError, r"mask must be a boolean tensor, got torch\.float32"),
+            (np.ones((3, 8), bool), TypeError, "mask must be a boolean tensor, got <class 'numpy.ndarray'>"),
             (torch.ones(3, 7, dtype=torch.bool), ValueError, r"shape \[3, 8\] as points1, got \[3, 7\]"),
         ],
     )

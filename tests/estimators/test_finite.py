@@ -122,6 +122,14 @@ def test_with_weights(name, sample, weights, dtype):
         check_function(name, points1, points2, WEIGHTS[weights](num_points).to(dtype))
 
 
+@pytest.mark.parametrize("num_points", [8, 12])
+@pytest.mark.parametrize("size", [1e-50, 1e50])
+@pytest.mark.parametrize("name", NAMES)
+def test_sizes_that_the_layer_promises(name, size, num_points):
+    layer = EightPoint(normalizers()[name])
+    check(layer, layer.parameters(), size * base(num_points) / 600, size * base(num_points, 1) / 600)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_many_correspondences(name, dtype):
     check_function(name, base(5000, 0, 2).to(dtype), base(5000, 1, 2).to(dtype))

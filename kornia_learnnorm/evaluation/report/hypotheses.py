@@ -35,6 +35,11 @@ def hypothesis_tables(run: RobustRun) -> list[Table]:
     return [table for cell in cells for table in (_values(cell, "best"), _values(cell, "picked"), *_tests(cell))]
 
 
+def _has_truth(cell: RobustCell) -> bool:
+    """Return whether there is an error to show: the ground truth of a pair is known."""
+    return any(not found["error"].isnan().all() for found in cell.hypotheses.values())
+
+
 def _errors(kind: str, hypotheses: dict[str, Tensor], number: int, num_samples: int | None = None) -> Tensor:
     """Return the error of each pair with ground truth at k = ``number``, (P,), from the first ``num_samples``."""
     known = ~hypotheses["error"].isnan().any(-1)
@@ -99,11 +104,11 @@ def _test(cell: RobustCell, name: str, kind: str, number: int) -> str:
 
 @report_style()
 def hypothesis_figures(run: RobustRun) -> list[Picture]:
-    """Draw the errors of each store's hypotheses against their number."""
+    """Draw the errors of each store's hypotheses against their number, where it has ground truth."""
     colors = method_colors(run.about["solvers"])
     pictures = []
     for (place, store), relative in product(enumerate(run.about["stores"], 1), (False, True)):
-        found = [cell for cell in run.cells if cell.store == store and cell.hypotheses]
+        found = [cell for cell in run.cells if cell.store == store and _has_truth(cell)]
         cells = [cell for cell in found if BASELINE in cell.hypotheses] if relative else found
         if cells:
             pictures.append(_draw(cells, f"hypotheses-{place}{'-relative' * relative}", colors, relative))

@@ -182,7 +182,7 @@ def _why_not_split(values: Tensor) -> str:
     """Return why image pairs cannot be split at the median of their values; an empty text where they can."""
     known = values[values.isfinite()]
     if len(known) < MIN_PAIRS:
-        return f"known of {len(known)} of {len(values)} pairs"
+        return f"known of {len(known)} of {len(values)} pairs, at least {MIN_PAIRS} are needed"
     low, middle, high = known.quantile(known.new_tensor([0.0, 0.5, 1.0])).tolist()
     if high - low <= MIN_RELATIVE_RANGE * abs(middle) or high == middle:
         return f"from {low:.4g} to {high:.4g} in all pairs" if high > low else f"{low:.4g} in all pairs"

@@ -103,7 +103,7 @@ class TestByMotion:
         nan = float("nan")
         table = by_motion(*motion_cell([0.2, 0.4, 0.9995, 0.99961, 0.99962, 0.9997], [1, nan, 1, 1, nan, nan]), "mine")
         assert [row[1:5] for row in table.rows] == [["up to 0.9996", "3", "6", "4"], ["above 0.9996", "3", "6", "2"]]
-        assert "Not shown: rotation, degrees, known of 0 of 6 pairs; parallax" in table.text
+        assert "Not shown: rotation, degrees, known of 0 of 6 pairs, at least 4 are needed; parallax" in table.text
 
     @pytest.mark.parametrize(
         ("forward", "text"),
