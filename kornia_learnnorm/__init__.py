@@ -22,7 +22,7 @@ from kornia_learnnorm.geometry.distances import (
     symmetric_epipolar_distance,
     symmetric_scale,
 )
-from kornia_learnnorm.geometry.linear import design_matrix, null_vector
+from kornia_learnnorm.geometry.dlt import design_matrix, null_vector
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.rank2 import optimal_rank2, rank2_projection
 from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
@@ -31,11 +31,14 @@ from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate
 from kornia_learnnorm.metrics.bootstrap import PairedDifference, bootstrap_interval, paired_bootstrap
 from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
 from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc, pose_error
-from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, PerView, Whitening
+from kornia_learnnorm.normalizers.contract import PerView
+from kornia_learnnorm.normalizers.hartley import Hartley
+from kornia_learnnorm.normalizers.identity import Identity
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 from kornia_learnnorm.normalizers.networks.paper import PaperNetwork
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
+from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.ransac.soft import SoftChoice, expected_loss, sample_minimal_sets

@@ -20,9 +20,10 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.losses import EpipolarLoss
 from kornia_learnnorm.metrics.modules import BetterRateMetric
-from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
 from kornia_learnnorm.normalizers.contract import Normalizer
+from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.whitening import Whitening
 
 __all__ = ["NormalizerTask"]
 

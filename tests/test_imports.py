@@ -123,10 +123,10 @@ def test_folders_are_small(folder):
 @pytest.mark.parametrize(
     ("importer", "imported", "expected"),
     [
-        ("kornia_learnnorm.geometry.linear", "kornia_learnnorm.normalizers.learned.LearnedNormalizer", True),
+        ("kornia_learnnorm.geometry.dlt", "kornia_learnnorm.normalizers.learned.LearnedNormalizer", True),
         ("kornia_learnnorm.metrics.pairs", "kornia_learnnorm.losses.EpipolarLoss", True),
         ("kornia_learnnorm.data.store", "kornia_learnnorm", True),
-        ("kornia_learnnorm.ransac.ransac", "kornia_learnnorm.geometry.linear.null_vector", False),
+        ("kornia_learnnorm.ransac.ransac", "kornia_learnnorm.geometry.dlt.null_vector", False),
         ("lightning_modules.task", "lightning_modules.datamodule", False),
     ],
 )

@@ -67,7 +67,7 @@ from kornia_learnnorm import (
     paper_transform,
 )
 from kornia_learnnorm.evaluation.diagnostics import condition_number
-from kornia_learnnorm.geometry.linear import null_vector
+from kornia_learnnorm.geometry.dlt import null_vector
 from kornia_learnnorm.geometry.transforms import affine_transform
 
 GRID = [(i, j) for i in range(3) for j in range(3)]

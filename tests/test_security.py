@@ -24,7 +24,7 @@ from kornia_learnnorm.data.sources import StoreSamples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
-from kornia_learnnorm.evaluation.runs.arrays import read_arrays
+from kornia_learnnorm.evaluation.runs.store import read_arrays
 
 ROOT = Path(__file__).parent.parent
 NETWORK = "model.normalizer.init_args.network.init_args"

@@ -25,6 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write ``synthetic.h5`` and a rendered image pair."""
+    if args.folder.exists() and not args.folder.is_dir():
+        raise ValueError(f"{args.folder} is a file: expected a folder, or a new name")
     store = synthetic_store(args.pairs, args.points, args.seed, scenes=args.scenes)
     args.folder.mkdir(parents=True, exist_ok=True)
     write_store(args.folder / "synthetic.h5", store)

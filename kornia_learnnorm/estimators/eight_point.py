@@ -21,8 +21,8 @@ from kornia_learnnorm.geometry.checks import (
 )
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
-from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
+from kornia_learnnorm.normalizers.hartley import Hartley
 
 __all__ = ["EightPoint", "TwoViewEstimate"]
 
@@ -40,7 +40,7 @@ class TwoViewEstimate(NamedTuple):
             (fewer than eight of positive weight, coincident, collinear, coplanar), it is the base normaliser's and
             carries no gradient. It is a rank test: a plane with 0.01 px of noise passes.
         gap: relative gap of the design matrix, from 0 to 1, that ``determined`` is decided on, (B,); see
-            :func:`~kornia_learnnorm.geometry.linear.solve_null_vector`. Errors grow as its inverse.
+            :func:`~kornia_learnnorm.geometry.dlt.solve_null_vector`. Errors grow as its inverse.
     """
 
     F_mat: Tensor
@@ -50,7 +50,7 @@ class TwoViewEstimate(NamedTuple):
 
 
 class EightPoint(nn.Module):
-    r"""The normalised eight-point algorithm as an nn.Module with finite outputs and gradients on degenerate samples too.
+    r"""The normalised eight-point algorithm as an nn.Module, with finite outputs and gradients on degenerate samples.
 
     They are finite for points within 1e50 of the origin whose mean distance from their centroid is zero or at least
     1e-50. A correspondence that is masked, or of weight zero, counts as absent. A sample that does not determine its

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_correspondences, check_rank2
-from kornia_learnnorm.geometry.linear import independence_gap
+from kornia_learnnorm.geometry.dlt import independence_gap
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2, rank2_projection
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
-from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
+from kornia_learnnorm.normalizers.hartley import Hartley
 
 __all__ = ["find_fundamental", "solve_fundamental", "solve_in_coordinates"]
 
@@ -58,8 +58,8 @@ def find_fundamental(
         TypeError: if the points are not floating-point tensors of one dtype, or the normaliser cannot be called.
         ShapeError: if the shapes do not agree with the above.
         ValueError: if there are fewer than eight correspondences, the views do not pair up, a value is not finite, a
-            weight is negative, the normaliser does not return two finite and invertible transforms :math:`(B, 3, 3)`, or ``rank2``
-            is neither ``"projection"`` nor ``"optimal"``.
+            weight is negative, the normaliser does not return two finite and invertible transforms :math:`(B, 3, 3)`,
+            or ``rank2`` is neither ``"projection"`` nor ``"optimal"``.
 
     Reference:
         R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; B. Fan, Y. Dai, Y. Seo, M. He, A revisit of the

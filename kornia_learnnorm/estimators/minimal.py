@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.geometry.linear import cofactors, design_matrix
+from kornia_learnnorm.geometry.dlt import cofactors, design_matrix
 
 __all__ = ["are_determined", "solve_samples"]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_correspondences
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.linear import design_matrix
+from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import rank2_projection
 from kornia_learnnorm.geometry.transforms import transform_fundamental

@@ -18,10 +18,12 @@ from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.files import short_name
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
 from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
+from kornia_learnnorm.normalizers.hartley import Hartley
+from kornia_learnnorm.normalizers.identity import Identity
 from kornia_learnnorm.normalizers.learned import WEIGHTS, LearnedNormalizer
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
+from kornia_learnnorm.normalizers.whitening import Whitening
 
 __all__ = [
     "DEFAULT_METHODS",

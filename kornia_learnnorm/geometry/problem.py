@@ -10,7 +10,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import solve_dtype
-from kornia_learnnorm.geometry.linear import MIN_GAP, design_matrix, independence_gap, solve_null_vector
+from kornia_learnnorm.geometry.dlt import MIN_GAP, design_matrix, independence_gap, solve_null_vector
 from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental
 
 __all__ = ["LinearProblem"]

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, check_tensor
 from kornia_learnnorm.geometry.distances import line_norms
-from kornia_learnnorm.geometry.linear import cofactors, design_matrix, smallest_right_singular_vector
+from kornia_learnnorm.geometry.dlt import cofactors, design_matrix, smallest_right_singular_vector
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
 

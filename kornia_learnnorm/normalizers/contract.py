@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from kornia_learnnorm.geometry.checks import check_correspondences, is_true
 from kornia_learnnorm.geometry.problem import LinearProblem
 
-__all__ = ["ProblemNormalizer", "check_normalizer", "normalizing_transforms", "transforms_of"]
+__all__ = ["PerView", "ProblemNormalizer", "check_normalizer", "normalizing_transforms", "transforms_of"]
 
 Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
@@ -59,6 +59,41 @@ class ProblemNormalizer(nn.Module):
 
         """
         raise NotImplementedError
+
+
+class PerView(nn.Module):
+    """Adapt a per-view callable, such as ``kornia.geometry.epipolar.normalize_points``, to the contract.
+
+    Args:
+        normalize: maps points :math:`(B, N, 2)` (and ``weights=``, where weights are given) to a pair whose second
+            element is the transform :math:`(B, 3, 3)`.
+
+    Example:
+        >>> from kornia.geometry.epipolar import normalize_points
+        >>> T1, T2 = PerView(normalize_points)(torch.rand(2, 8, 2), torch.rand(2, 8, 2))
+        >>> T1.shape
+        torch.Size([2, 3, 3])
+
+    """
+
+    def __init__(self, normalize: Callable[..., tuple[Tensor, Tensor]]) -> None:
+        super().__init__()
+        self.normalize = normalize
+
+    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        r"""Return the callable's transforms of both views.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, handed on unchecked.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            weights: optional weights with shape :math:`(B, N)`.
+
+        Returns:
+            two transforms with shape :math:`(B, 3, 3)`.
+
+        """
+        kwargs = {} if weights is None else {"weights": weights}
+        return self.normalize(points1, **kwargs)[1], self.normalize(points2, **kwargs)[1]
 
 
 def check_normalizer(normalizer: object) -> None:

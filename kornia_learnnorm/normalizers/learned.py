@@ -17,7 +17,7 @@ from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry import transforms
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform, transform_points
-from kornia_learnnorm.normalizers import closed_form, reweighted
+from kornia_learnnorm.normalizers import hartley, identity, reweighted, whitening
 from kornia_learnnorm.normalizers.contract import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.networks import crossview, paper
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
@@ -26,6 +26,7 @@ from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 __all__ = ["LearnedNormalizer"]
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
+BASES = (hartley, identity, reweighted, whitening)  # modules of the bases that a file may name
 FORMAT = "kornia_learnnorm.normalizer.v1"
 MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that a file may name
 
@@ -105,7 +106,7 @@ class LearnedNormalizer(ProblemNormalizer):
         if Path(path).suffix != ".safetensors":
             raise ValueError(f"weights are written to a .safetensors file, got {str(path)!r}")
         architecture = {
-            "base": _describe(self.base, closed_form, reweighted),
+            "base": _describe(self.base, *BASES),
             "network": _describe(self.network, crossview, paper),
             "transform": _name(self.transform, transforms),
         }
@@ -218,7 +219,7 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
         if large:
             raise ValueError(f"numbers can be at most {MAX_ARCHITECTURE_INT}, got {large[0]}")
         return {
-            "base": find(base.pop("name"), closed_form, reweighted)(**base),
+            "base": find(base.pop("name"), *BASES)(**base),
             "network": find(network.pop("name"), crossview, paper)(**network),
             "transform": find(parts["transform"], transforms),
         }

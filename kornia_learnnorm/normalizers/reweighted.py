@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import safe_divisor, weighted_mean
 from kornia_learnnorm.geometry.distances import line_norms
-from kornia_learnnorm.geometry.linear import adjugate, smallest_right_singular_vector
+from kornia_learnnorm.geometry.dlt import adjugate, smallest_right_singular_vector
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, whitening_transform
 from kornia_learnnorm.normalizers.contract import ProblemNormalizer

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.robust_losses import Loss
 from kornia_learnnorm.geometry.distances import DistanceScale, sampson_scale
-from kornia_learnnorm.geometry.linear import cofactors
+from kornia_learnnorm.geometry.dlt import cofactors
 
 __all__ = ["Fit", "constrained_fit"]
 

@@ -18,8 +18,8 @@ from kornia_learnnorm.geometry.checks import check_rank2, check_tensor, solve_dt
 from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
 from kornia_learnnorm.geometry.manifold import decompose
 from kornia_learnnorm.geometry.transforms import unit_fundamental
-from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
+from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.ransac.scoring import (

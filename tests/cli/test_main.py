@@ -232,6 +232,8 @@ def test_synthesize_evaluate_estimate(tmp_path, capsys):
     assert main(["estimate", *pair, "--out", str(tmp_path / "pair.png"), "--json", str(tmp_path / "F.json")]) == 0
     assert (tmp_path / "pair.png").stat().st_size > 10_000
     assert "inliers" in capsys.readouterr().out
+    assert main(["synthesize", str(tmp_path / "F.json")]) == 2
+    assert "F.json is a file: expected a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def scene():
     [
         ("Hartley", kln.Hartley()),
         ("crossview", kln.LearnedNormalizer.from_pretrained()),
-        ("kornia_learnnorm.normalizers.closed_form:Whitening", kln.Whitening()),
+        ("kornia_learnnorm.normalizers.whitening:Whitening", kln.Whitening()),
         ("kornia_learnnorm:Whitening", kln.Whitening()),
     ],
 )

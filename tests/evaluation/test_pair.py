@@ -20,7 +20,8 @@ from kornia_learnnorm.evaluation import pair as module
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
+from kornia_learnnorm.normalizers.hartley import Hartley
+from kornia_learnnorm.normalizers.whitening import Whitening
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 

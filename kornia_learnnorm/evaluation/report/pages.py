@@ -16,8 +16,8 @@ from kornia_learnnorm.evaluation.report.robust import robust_tables
 from kornia_learnnorm.evaluation.report.style import Picture
 from kornia_learnnorm.evaluation.report.tables import report_tables
 from kornia_learnnorm.evaluation.robust.run import RobustRun, read_robust
-from kornia_learnnorm.evaluation.runs.manifest import read_section
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
+from kornia_learnnorm.evaluation.runs.store import read_section
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import import_extra

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.evaluation.drawing import INLIER, WIDE, draw_line, draw_matches
 from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture
-from kornia_learnnorm.evaluation.runs.arrays import Arrays
 from kornia_learnnorm.evaluation.runs.run import Run
+from kornia_learnnorm.evaluation.runs.store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 

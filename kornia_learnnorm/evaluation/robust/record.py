@@ -29,8 +29,7 @@ from kornia_learnnorm.evaluation.robust.hypotheses import hypothesis_quality, sa
 from kornia_learnnorm.evaluation.robust.matches import Matches, draw_matches, even_pairs, measure
 from kornia_learnnorm.evaluation.robust.peers import PEERS
 from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path, result_files
-from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
-from kornia_learnnorm.evaluation.runs.manifest import begin_section, leave_out
+from kornia_learnnorm.evaluation.runs.store import Arrays, begin_section, leave_out, read_arrays, write_arrays
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 

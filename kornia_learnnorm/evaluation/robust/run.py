@@ -14,8 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.runs.arrays import file_name, read_arrays
-from kornia_learnnorm.evaluation.runs.manifest import read_section
+from kornia_learnnorm.evaluation.runs.store import file_name, read_arrays, read_section
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
 __all__ = ["RobustCell", "RobustRun", "estimate_path", "hypotheses_path", "read_robust", "result_files"]

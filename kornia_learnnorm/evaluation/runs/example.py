@@ -9,8 +9,8 @@ import torch
 
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.runs.arrays import Arrays
 from kornia_learnnorm.evaluation.runs.pairs import ground_truth_inliers, median_distance, pair_matches
+from kornia_learnnorm.evaluation.runs.store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import RATIO

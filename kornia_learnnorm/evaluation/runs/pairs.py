@@ -8,7 +8,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.evaluation.runs.arrays import Arrays
+from kornia_learnnorm.evaluation.runs.store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO

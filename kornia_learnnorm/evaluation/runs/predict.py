@@ -11,8 +11,8 @@ from kornia_learnnorm.data.samples import Samples, draw_samples
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.runs.arrays import Arrays
 from kornia_learnnorm.evaluation.runs.pairs import ground_truth_inliers, median_distance, pair_matches
+from kornia_learnnorm.evaluation.runs.store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem

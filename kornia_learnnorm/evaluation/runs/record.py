@@ -20,9 +20,7 @@ import torch
 from kornia_learnnorm.data.samples import Samples, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.runs.arrays import Arrays, read_arrays, write_arrays
 from kornia_learnnorm.evaluation.runs.example import random_pair, sweep
-from kornia_learnnorm.evaluation.runs.manifest import begin_section, leave_out, read_section
 from kornia_learnnorm.evaluation.runs.pairs import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import SampleOptions, predict
 from kornia_learnnorm.evaluation.runs.run import (
@@ -36,6 +34,14 @@ from kornia_learnnorm.evaluation.runs.run import (
     prediction_keys,
     read_run,
     sweep_path,
+)
+from kornia_learnnorm.evaluation.runs.store import (
+    Arrays,
+    begin_section,
+    leave_out,
+    read_arrays,
+    read_section,
+    write_arrays,
 )
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import PROTOCOLS

@@ -9,10 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.runs.arrays import Arrays, file_name, read_arrays
-from kornia_learnnorm.evaluation.runs.manifest import read_section
 from kornia_learnnorm.evaluation.runs.pairs import MOTIONS
 from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS
+from kornia_learnnorm.evaluation.runs.store import Arrays, file_name, read_arrays, read_section
 from kornia_learnnorm.protocol import PROTOCOLS
 
 __all__ = ["EXAMPLE", "PAIRS", "SAMPLES", "SWEEP", "Cell", "Run", "is_swept", "method_path", "read_run", "sweep_path"]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import weighted_mean
-from kornia_learnnorm.geometry.linear import design_matrix, null_vector, smallest_singular_vectors
+from kornia_learnnorm.geometry.dlt import design_matrix, null_vector, smallest_singular_vectors
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from kornia_learnnorm.evaluation.report.formatting import median_text, number_text, paired_text
-from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_tables
+from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_figures, hypothesis_tables
 from kornia_learnnorm.evaluation.report.rates import rate_tables
 from kornia_learnnorm.evaluation.report.robust import PRINTED, robust_tables
 from kornia_learnnorm.evaluation.report.style import method_colors
@@ -182,3 +182,10 @@ def test_numbers_of_hypotheses(robust_run):
     assert [row[:2] for row in tests.rows[:2]] == [["whitening", name] for name in names]
     change = (error - found.cells[0].hypotheses["Hartley"]["error"]).mean().item()
     assert re.match(re.escape(f"{change:+.3f} ["), tests.rows[0][2])
+
+
+def test_no_figures_of_hypotheses_without_ground_truth(robust_run):
+    found = read_robust(robust_run)
+    for hypotheses in [h for cell in found.cells for h in cell.hypotheses.values()]:
+        hypotheses["error"][:] = torch.nan
+    assert hypothesis_figures(found) == []

@@ -10,7 +10,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from two_view import SCENES, correspondences, homogeneous, numpy_hartley, signless, uniform
 
 from kornia_learnnorm import design_matrix, null_vector
-from kornia_learnnorm.geometry.linear import adjugate, smallest_right_singular_vector
+from kornia_learnnorm.geometry.dlt import adjugate, smallest_right_singular_vector
 
 
 class TestDesignMatrix:

@@ -1,17 +1,35 @@
-"""``run.json``: what a run was computed from, in a section for ``evaluate`` and one for ``robust``."""
+"""The files of a run.
+
+``run.json`` tells what the run was computed from, in a section for ``evaluate`` and one for ``robust``; NumPy archives
+hold its arrays and are checked when they are read.
+"""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Collection, Mapping
+import zipfile
+import zlib
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import atomic_write
 
-__all__ = ["About", "begin_section", "leave_out", "read_section"]
+__all__ = [
+    "About",
+    "Arrays",
+    "begin_section",
+    "file_name",
+    "leave_out",
+    "read_arrays",
+    "read_section",
+    "write_arrays",
+]
 
 FORMAT = 3  # of the folder; runs of another format are refused
 # Parts of a section that may grow: what each is, by its name.
@@ -26,6 +44,7 @@ OPTIONS = {
 }
 
 About = dict[str, Any]
+Arrays = dict[str, NDArray[Any]]
 
 
 def read_section(folder: Path, section: str) -> About | None:
@@ -113,3 +132,33 @@ def _write(folder: Path, section: str, about: About) -> None:
     content = {"format": FORMAT, **_read(folder), section: about}
     with atomic_write(folder / "run.json") as temporary:
         temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def file_name(name: str) -> str:
+    """Return the name of the file of a method, an estimator or a solver, without suffix."""
+    return "".join(letter if letter.isalnum() or letter in "+-._" else "_" for letter in name)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays to a compressed ``.npz`` file, whole or not at all; make its folder if missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
+
+
+def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> Arrays:
+    """Return the arrays in a file of a run; raise ValueError if it lacks ``keys``, or these have not ``rows`` rows."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing: call the command that began the run again, it completes it")
+    try:
+        with path.open("rb") as file, np.load(file) as data:
+            found = dict(data)
+    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} is damaged, remove it: {error}") from error
+    if lacks := [key for key in keys if key not in found]:
+        raise ValueError(f"{path} is damaged, remove it: expected arrays {', '.join(lacks)}, got {', '.join(found)}")
+    for key in keys:
+        if rows is not None and found[key].shape[:1] != (rows,):
+            got = f"{key} has shape {found[key].shape}"
+            raise ValueError(f"{path} is of other samples, remove it: expected {rows} rows, {got}")
+    return found

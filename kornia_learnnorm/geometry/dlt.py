@@ -17,7 +17,6 @@ __all__ = [
     "adjugate",
     "cofactors",
     "design_matrix",
-    "has_null_vector",
     "independence_gap",
     "null_vector",
     "smallest_right_singular_vector",
@@ -66,11 +65,6 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
 
     """
     return solve_null_vector(A, weights)[0]
-
-
-def has_null_vector(A: Tensor, weights: Tensor | None = None, tolerance: float = MIN_GAP) -> Tensor:
-    """Return which design matrices :math:`(*, N, 9)` have a unique null vector: a relative gap above the tolerance."""
-    return solve_null_vector(A, weights)[1] > tolerance
 
 
 def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,49 @@
+"""Whitening of each view."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.transforms import whitening_transform
+from kornia_learnnorm.normalizers.contract import ProblemNormalizer
+
+__all__ = ["Whitening"]
+
+
+class Whitening(ProblemNormalizer):
+    r"""Symmetric (ZCA) whitening: centroid to the origin, covariance of each view to the identity.
+
+    :math:`T = [\Sigma^{-1/2}, -\Sigma^{-1/2} o; 0, 1]`, in closed form. Where the points are nearly collinear, the
+    smaller eigenvalue of :math:`\Sigma` is floored.
+
+    Args:
+        floor: smallest ratio of the eigenvalues of :math:`\Sigma`.
+
+    Raises:
+        ValueError: if the floor is not positive.
+
+    Example:
+        >>> import torch
+        >>> points = torch.tensor([[[0.0, 0.0], [4.0, 0.0], [0.0, 2.0], [4.0, 2.0]]])
+        >>> Whitening()(points, points)[0][0].diagonal()
+        tensor([0.5000, 1.0000, 1.0000])
+
+    """
+
+    def __init__(self, floor: float = 1e-6) -> None:
+        super().__init__()
+        if not floor > 0:
+            raise ValueError(f"floor must be positive, got {floor}")
+        self.floor = floor
+
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+        """Return the transforms :math:`(B, 3, 3)` of both views."""
+        return (
+            whitening_transform(problem.points1, problem.weights, self.floor),
+            whitening_transform(problem.points2, problem.weights, self.floor),
+        )
+
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        return f"floor={self.floor:g}"
