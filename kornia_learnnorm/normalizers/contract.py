@@ -132,7 +132,7 @@ def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tu
     if shapes != [expected, expected]:
         raise ValueError(f"a normalizer must return two transforms of shape {expected}, got {shapes}")
     T1, T2 = (T.to(problem.x1) for T in result)
-    determinants = torch.linalg.det(torch.stack([T1, T2]).detach())  # not finite where an entry is not
-    if is_true(~(determinants.isfinite() & (determinants != 0)).all()):
+    both = torch.stack([T1, T2]).detach()
+    if is_true(~(both.isfinite().all() & (torch.linalg.det(both) != 0).all())):
         raise ValueError(f"the transforms of {type(normalizer).__name__} are not finite and invertible")
     return T1, T2

@@ -96,6 +96,11 @@ class TestEightPoint:
         (lambda *_: torch.zeros(2, 3, 3), ValueError, r"two transforms of shape \(2, 3, 3\), got .*Tensor"),
         (lambda *_: (torch.full((2, 3, 3), torch.nan),) * 2, ValueError, "of function are not finite and invertible"),
         (lambda *_: (torch.zeros(2, 3, 3),) * 2, ValueError, "of function are not finite and invertible"),
+        (
+            lambda *_: (torch.tensor([[1, 0, torch.inf], [0, 1, 0], [0, 0, 1]]).expand(2, 3, 3),) * 2,
+            ValueError,
+            "of function are not finite and invertible",
+        ),
     ],
 )
 def test_a_normaliser_that_breaks_the_contract(normalizer, error, message):
