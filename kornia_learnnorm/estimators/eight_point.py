@@ -200,9 +200,9 @@ class EightPoint(nn.Module):
 
     def _solve(self, problem: LinearProblem, determined: Tensor) -> Tensor:
         """Return the matrices: of the normaliser where determined, elsewhere of its base and without gradient."""
-        if is_true(determined.all()):
+        if problem.all_determined:
             return solve_fundamental(problem, self.normalizer, self.rank2)
-        if not _is_concrete(determined):
+        if problem.all_determined is None:
             return self._solve_traced(problem, determined)
         found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
         F_mat = problem.x1.new_empty(len(determined), 3, 3)
@@ -237,17 +237,6 @@ class EightPoint(nn.Module):
 
         """
         raise TypeError("EightPoint cannot be compiled by torch.jit, use torch.compile or torch.export")
-
-
-def _is_concrete(mask: Tensor) -> bool:
-    """Return whether values can be read, which they cannot in ``torch.compile`` and ``torch.func.vmap``."""
-    if torch.compiler.is_compiling():
-        return False
-    try:
-        bool(mask.any())
-    except RuntimeError:
-        return False
-    return True
 
 
 def _rescale(weights: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ __all__ = [
     "check_rank2",
     "check_tensor",
     "is_true",
+    "read_condition",
     "safe_divisor",
     "solve_dtype",
     "weighted_mean",
@@ -128,14 +129,19 @@ def check_rank2(rank2: object) -> None:
         raise ValueError(f"rank2 must be 'projection' or 'optimal', got {rank2!r}")
 
 
-def is_true(condition: Tensor) -> bool:
-    """Return a boolean scalar's value; False where it cannot be read: in ``torch.compile`` and ``torch.func.vmap``."""
+def read_condition(condition: Tensor) -> bool | None:
+    """Return a boolean scalar's value; None where it cannot be read: in ``torch.compile`` and ``torch.func.vmap``."""
     if torch.compiler.is_compiling():
-        return False
+        return None
     try:
         return bool(condition)
     except RuntimeError:
-        return False
+        return None
+
+
+def is_true(condition: Tensor) -> bool:
+    """Return a boolean scalar's value; False where it cannot be read."""
+    return read_condition(condition) is True
 
 
 def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:

@@ -32,6 +32,8 @@ __all__ = [
     "symmetric_scale",
 ]
 
+EPIPOLE_TOLERANCE = 1e-12  # length of an epipolar line's normal over that of its summands; rounding leaves less
+
 DistanceScale = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
@@ -57,7 +59,8 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
         F_mat: fundamental matrices with shape :math:`(*, 3, 3)`, any scale.
 
     Returns:
-        distances in pixels with shape :math:`(*, N)`; infinite for a point on an epipole.
+        distances in pixels with shape :math:`(*, N)`; infinite for a point on an epipole, up to rounding in float64:
+        there both the residual and the line's normal are what rounding leaves of zero.
 
     Raises:
         TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
@@ -72,7 +75,17 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
     """
     _check(points1, points2, F_mat)
     right = left_to_right_epipolar_distance(points1, points2, F_mat)
-    return right + right_to_left_epipolar_distance(points1, points2, F_mat)
+    distance = right + right_to_left_epipolar_distance(points1, points2, F_mat)
+    return torch.where(_on_epipole(points1, F_mat) | _on_epipole(points2, F_mat.mT), torch.inf, distance)
+
+
+@torch.no_grad()
+def _on_epipole(points: Tensor, F_mat: Tensor) -> Tensor:
+    """Return which points :math:`(*, N, 2)` have no epipolar line :math:`F x` but for rounding."""
+    x = convert_points_to_homogeneous(points)
+    normal, summands = (x @ F_mat.mT)[..., :2], (x.abs() @ F_mat.abs().mT)[..., :2]
+    on_epipole: Tensor = normal.norm(dim=-1) <= EPIPOLE_TOLERANCE * summands.norm(dim=-1)
+    return on_epipole
 
 
 def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:

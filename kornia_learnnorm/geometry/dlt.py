@@ -19,12 +19,14 @@ __all__ = [
     "design_matrix",
     "independence_gap",
     "null_vector",
+    "sideways_null_vector",
     "smallest_right_singular_vector",
     "smallest_singular_vectors",
     "solve_null_vector",
 ]
 
 MIN_GAP = 1e-6  # relative gap above which a null vector counts as unique; that of float32 pixels
+MAX_ZERO_VALUE = 1e-10  # relative singular value up to which dependent rows have another null vector
 
 
 def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
@@ -106,6 +108,27 @@ def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor,
 def independence_gap(dtype: torch.dtype) -> float:
     """Return the relative gap up to which rows are linearly dependent but for rounding."""
     return 64 * torch.finfo(dtype).eps
+
+
+@torch.no_grad()
+def sideways_null_vector(A: Tensor) -> Tensor:
+    r"""Return the vector of the null space nearest to the matrix of a sideways motion, for linearly dependent rows.
+
+    A null space of more than one dimension leaves the choice to rounding, and so to the processor. This choice does not
+    depend on the order of the rows, nor on which view comes first.
+
+    Args:
+        A: design matrices with shape :math:`(*, N, 9)`, whose singular values below 1e-10 of the first count as zero.
+
+    Returns:
+        unit vectors with shape :math:`(*, 9)`.
+
+    """
+    _, s, Vh = torch.linalg.svd(A)
+    zero = torch.ones_like(Vh[..., 0], dtype=torch.bool)  # the ninth of eight rows is zero
+    zero[..., :8] = s[..., :8] <= MAX_ZERO_VALUE * s[..., :1]
+    sideways = A.new_tensor([0.0, 0, 0, 0, 0, 1, 0, -1, 0])
+    return normalize(Vh.mT @ (zero * (Vh @ sideways))[..., None], dim=-2).squeeze(-1)
 
 
 def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:

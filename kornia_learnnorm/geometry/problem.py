@@ -9,8 +9,14 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import solve_dtype
-from kornia_learnnorm.geometry.dlt import MIN_GAP, design_matrix, independence_gap, solve_null_vector
+from kornia_learnnorm.geometry.checks import read_condition, solve_dtype
+from kornia_learnnorm.geometry.dlt import (
+    MIN_GAP,
+    design_matrix,
+    independence_gap,
+    sideways_null_vector,
+    solve_null_vector,
+)
 from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental
 
 __all__ = ["LinearProblem"]
@@ -33,6 +39,7 @@ class LinearProblem:
         x1: homogeneous points of the first view in Hartley's coordinates, (B, N, 3).
         x2: homogeneous points of the second view.
         solution: null matrix and relative gap, once solved.
+        all_determined: whether all null matrices are unique, once solved; None where values cannot be read.
 
     Example:
         >>> _ = torch.manual_seed(0)
@@ -50,6 +57,7 @@ class LinearProblem:
     x1: Tensor
     x2: Tensor
     solution: tuple[Tensor, Tensor] | None = None
+    all_determined: bool | None = None
 
     @classmethod
     def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> LinearProblem:
@@ -80,9 +88,19 @@ class LinearProblem:
         # A solution found under `no_grad` must not cut the derivatives of a later caller.
         wanted = torch.is_grad_enabled() and self.x1.requires_grad
         if self.solution is None or (wanted and not self.solution[0].requires_grad):
-            h, gap = solve_null_vector(design_matrix(self.x1, self.x2), self.weights)
-            self.solution = torch.unflatten(h, -1, (3, 3)), gap
+            self.solution, self.all_determined = self._solve_between(self.x1, self.x2)
         return self.solution
+
+    def _solve_between(self, x1: Tensor, x2: Tensor) -> tuple[tuple[Tensor, Tensor], bool | None]:
+        """Return null matrix and gap in some coordinates, and whether all null matrices are unique."""
+        A = design_matrix(x1, x2)
+        h, gap = solve_null_vector(A, self.weights)
+        all_determined = read_condition((gap > MIN_GAP).all())
+        if all_determined is False:
+            rows = (gap <= independence_gap(gap.dtype)).nonzero()[:, 0]
+            A = A[rows] if self.weights is None else A[rows] * self.weights[rows].sqrt()[..., None]
+            h = h.index_copy(0, rows, sideways_null_vector(A))
+        return (torch.unflatten(h, -1, (3, 3)), gap), all_determined
 
     def null_matrix_in(self, T1: Tensor, T2: Tensor) -> Tensor:
         r"""Return the null matrix in the coordinates :math:`T_i x_i` of pixels :math:`x_i`, unit norm, (B, 3, 3)."""
@@ -99,8 +117,7 @@ class LinearProblem:
             F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
             return F / torch.linalg.matrix_norm(F, keepdim=True), self.gap
         x1, x2 = convert_points_to_homogeneous(self.points1), convert_points_to_homogeneous(self.points2)
-        h, gap = solve_null_vector(design_matrix(x1 @ T1.mT, x2 @ T2.mT), self.weights)
-        return torch.unflatten(h, -1, (3, 3)), gap
+        return self._solve_between(x1 @ T1.mT, x2 @ T2.mT)[0]
 
     def select(self, rows: Tensor) -> LinearProblem:
         """Return the problem of some of the sets, by their indices or a mask (B,); solved if this one is."""

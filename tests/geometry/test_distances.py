@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from torch.autograd import gradcheck
-from two_view import SCENES, epipolar_distances, homogeneous, scenes, uniform
+from two_view import SCENES, correspondences, epipolar_distances, homogeneous, scenes, uniform
 
 from kornia_learnnorm import (
     algebraic_distance,
+    find_fundamental,
     sampson_distance,
     sampson_scale,
     symmetric_epipolar_distance,
@@ -121,6 +122,14 @@ class TestSymmetricEpipolarDistance:
         assert found[0].tolist() == [torch.inf, pytest.approx(6 / 5**0.5)]
         for gradient in torch.autograd.grad(found[0, 0], [F_mat, points1]):
             assert gradient.count_nonzero() == 0
+
+    def test_is_infinite_on_the_epipole_up_to_rounding(self):
+        """Three matches that share a point put the epipole on it; which side of it is a matter of rounding."""
+        points1, points2 = correspondences("handheld", 20)
+        points2[:, :3] = points2[:, :1]
+        distance = symmetric_epipolar_distance(points1, points2, find_fundamental(points1, points2))
+        assert distance[:, :3].isinf().all()
+        assert distance[:, 3:].isfinite().all()
 
 
 class TestSampsonDistance:

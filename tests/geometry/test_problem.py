@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch.overrides import TorchFunctionMode
 from two_view import correspondences, homogeneous, null_matrices, numpy_hartley, signless, uniform, up_to_sign
 
-from kornia_learnnorm import EightPoint, LearnedNormalizer, ReweightedWhitening, find_fundamental
+from kornia_learnnorm import EightPoint, LearnedNormalizer, ReweightedWhitening, Whitening, find_fundamental
 from kornia_learnnorm.geometry import checks
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import affine_transform, unit_fundamental
@@ -72,6 +72,19 @@ class TestLinearProblem:
         with torch.no_grad():
             assert not problem.null_matrix.requires_grad
         assert problem.null_matrix.requires_grad
+
+    @pytest.mark.parametrize("num_points", [8, 12])
+    @given(seed=st.integers(0, 2**20))
+    def test_dependent_rows_do_not_leave_the_choice_to_rounding(self, num_points, seed):
+        """One match twice: F is the same in any order of the matches, for Hartley's and for other coordinates."""
+        points = correspondences("handheld", 5, 7)
+        rows = torch.arange(num_points) % 7
+        order = rows[torch.randperm(num_points, generator=torch.Generator().manual_seed(seed))]
+        for normalizer in (None, Whitening()):
+            F_mat, shuffled = (
+                find_fundamental(*(p[:, i] for p in points), normalizer=normalizer) for i in (rows, order)
+            )
+            assert (F_mat - shuffled).abs().max() < 1e-6
 
     def test_select_and_detach(self):
         points = [p.requires_grad_() for p in correspondences("handheld", 4, 10)]
