@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import hypothesis
@@ -46,6 +47,15 @@ def dtype(request):
 def generator():
     """Source of randomness on the CPU, the same in every test."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def real_data():
+    """The folder of real data, without which a test is skipped."""
+    folder = os.environ.get("LEARNNORM_DATA")
+    if not folder:
+        pytest.skip("LEARNNORM_DATA does not name a folder of real data")
+    return Path(folder)
 
 
 @pytest.fixture(autouse=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -165,16 +164,14 @@ def test_unknown_detector(roots, tmp_path, capsys):
         ("tum", ["--max-difference", "0.1"], "tum_fr3_office", 6),
     ],
 )
-def test_real_data_gives_the_stores_that_other_code_made(tmp_path, monkeypatch, reader, args, reference, limit):
-    data = os.environ.get("LEARNNORM_DATA")
-    if data is None:
-        pytest.skip("LEARNNORM_DATA does not name a folder of real data")
+def test_real_data_gives_the_stores_that_other_code_made(
+    real_data, tmp_path, monkeypatch, reader, args, reference, limit
+):
     monkeypatch.setattr(match, "collect_matches", lambda pairs, *rest: collect.collect_matches(pairs[:limit], *rest))
     out = tmp_path / "s.h5"
-    assert (
-        main(["match", reader, f"{data}/{reader}", "--out", str(out), "--jobs", "2", "--max-matches", "0", *args]) == 0
-    )
-    ours, theirs = read_store(out), read_store(f"{data}/correspondences/{reference}.h5@0:{limit}")
+    options = ["--jobs", "2", "--max-matches", "0", *args]
+    assert main(["match", reader, f"{real_data}/{reader}", "--out", str(out), *options]) == 0
+    ours, theirs = read_store(out), read_store(f"{real_data}/correspondences/{reference}.h5@0:{limit}")
     assert [tuple(Path(name).name for name in pair) for pair in ours.names] == theirs.names
     for name in ("F", "K", "R", "t"):
         assert np.allclose(getattr(ours, name), getattr(theirs, name), rtol=0, atol=1e-6)

@@ -298,13 +298,6 @@ class TestCommand:
             assert capsys.readouterr().out == ""
 
 
-def real_data() -> Path:
-    folder = os.environ.get("LEARNNORM_DATA")
-    if not folder:
-        pytest.skip("LEARNNORM_DATA does not name a folder of real images")
-    return Path(folder)
-
-
 def median_true_distance(result: PairEstimate, camera: np.ndarray, world1: np.ndarray, world2: np.ndarray) -> float:
     """Median distance of the inliers under the true F of x2 = R x1 + t, from two camera-to-world poses (3, 4)."""
     R, t = world2[:, :3].T @ world1[:, :3], world2[:, :3].T @ (world1[:, 3] - world2[:, 3])
@@ -314,8 +307,8 @@ def median_true_distance(result: PairEstimate, camera: np.ndarray, world1: np.nd
 
 class TestRealImages:
     @pytest.mark.parametrize(("first", "second"), [(10, 11), (20, 21), (40, 41)])
-    def test_kitti(self, first, second):
-        sequence = real_data() / "kitti" / "sequences" / "06"
+    def test_kitti(self, real_data, first, second):
+        sequence = real_data / "kitti" / "sequences" / "06"
         calibration = (sequence / "calib.txt").read_text().splitlines()
         P0 = next(line for line in calibration if line.startswith("P0"))
         camera = np.array(P0.split()[1:], float).reshape(3, 4)[:, :3]
@@ -327,8 +320,8 @@ class TestRealImages:
         assert median_true_distance(result, camera, poses[first], poses[second]) < 1.0
 
     @pytest.mark.parametrize("first", [0, 12])
-    def test_tum(self, first):
-        folder = real_data() / "tum" / "rgbd_dataset_freiburg3_long_office_household"
+    def test_tum(self, real_data, first):
+        folder = real_data / "tum" / "rgbd_dataset_freiburg3_long_office_household"
         paths = sorted((folder / "rgb").glob("*.png"))[first : first + 2]
         result = estimate_pair(*paths, Hartley())
         track = np.loadtxt(folder / "groundtruth.txt")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 import torch
@@ -142,11 +140,8 @@ class TestRelativePose:
         with pytest.raises(error, match=message):
             relative_pose(*change(*pair("orbit", 3, 10)[0]))
 
-    def test_real_correspondences(self):
-        folder = os.environ.get("LEARNNORM_DATA")
-        if not folder:
-            pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
-        store = read_store(f"{folder}/correspondences/kitti_06.h5@0:10")
+    def test_real_correspondences(self, real_data):
+        store = read_store(f"{real_data}/correspondences/kitti_06.h5@0:10")
         truth = [torch.tensor(value) for value in (store.R, store.t)]
         for i in range(len(store)):
             rows = slice(store.offsets[i], store.offsets[i + 1])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 import torch
@@ -53,13 +51,6 @@ def pairs(seed=0, batch_size=6, num_points=40, jitter=1e-3):
     generator = torch.Generator().manual_seed(seed)
     wrong = 1 + jitter * torch.randn(scene.F_mat.shape, generator=generator, dtype=torch.float64)
     return scene.points1, scene.points2, scene.F_mat * wrong, scene.F_mat
-
-
-def real_pairs():
-    folder = os.environ.get("LEARNNORM_DATA")
-    if not folder:
-        pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
-    return read_store(f"{folder}/correspondences/kitti_06.h5@0:5")
 
 
 @pytest.mark.parametrize("name", METRICS)
@@ -190,8 +181,8 @@ class TestByRows:
 
 
 class TestRealMatches:
-    def test_truth_against_itself_and_an_estimate(self):
-        store = real_pairs()
+    def test_truth_against_itself_and_an_estimate(self, real_data):
+        store = read_store(f"{real_data}/correspondences/kitti_06.h5@0:5")
         for i in range(len(store)):
             rows = slice(store.offsets[i], store.offsets[i + 1])
             points1, points2 = (torch.tensor(v[rows]).double() for v in (store.points1, store.points2))
