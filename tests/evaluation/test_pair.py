@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from make_sequences import texture
+from two_view import epipolar_distances
 
 from kornia_learnnorm.cli import estimate as command_module
 from kornia_learnnorm.cli.estimate import add_arguments, run
@@ -33,12 +35,6 @@ def cross(t: np.ndarray) -> np.ndarray:
     return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
 
 
-def texture(seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    image = sum(cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
-    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-
-
 def warp(image: np.ndarray, R: np.ndarray, t: np.ndarray, depth: float) -> np.ndarray:
     """Image 2 of the plane Z = depth: X2 = R X1 + t gives the homography K (R + t n^T / depth) K^-1."""
     H = K @ (R + np.outer(t, [0, 0, 1]) / depth) @ np.linalg.inv(K)
@@ -52,7 +48,7 @@ class Scene:
         R, t = cv2.Rodrigues(np.array([0.01, -0.03, 0.02]))[0], np.array([0.3, 0.05, 0.1])
         self.R, self.t = R, t
         self.F = np.linalg.inv(K).T @ cross(t) @ R @ np.linalg.inv(K)
-        image, near = texture(0), np.zeros((HEIGHT, WIDTH), np.uint8)
+        image, near = texture(0, WIDTH, HEIGHT), np.zeros((HEIGHT, WIDTH), np.uint8)
         near[:, : WIDTH // 2] = 255
         moved = np.where(warp(near, R, t, 4.0) > 127, warp(image, R, t, 4.0), warp(image, R, t, 9.0))
         noisy = np.clip(image + np.random.default_rng(1).normal(0, 1, image.shape), 0, 255).astype(np.uint8)
@@ -74,24 +70,16 @@ def result(scene) -> PairEstimate:
     return estimate_pair(scene.left, scene.right, Hartley())
 
 
-def distances(F: np.ndarray, points1: np.ndarray, points2: np.ndarray) -> np.ndarray:
-    """Symmetric epipolar distances by NumPy: both points to their lines."""
-    x1, x2 = (np.c_[points, np.ones(len(points))] for points in (points1, points2))
-    lines2, lines1 = x1 @ F.T, x2 @ F
-    residual = np.abs((x2 * lines2).sum(1))
-    return residual / np.hypot(*lines2[:, :2].T) + residual / np.hypot(*lines1[:, :2].T)
-
-
 class TestEstimatePair:
     def test_finds_the_true_geometry(self, scene, result):
-        points1, points2 = result.points1[result.inliers].numpy(), result.points2[result.inliers].numpy()
+        inlying = result.points1[result.inliers], result.points2[result.inliers]
         assert result.num_inliers > 150
         assert result.num_inliers > 0.8 * result.num_matches
-        assert np.median(distances(scene.F, points1, points2)) < 0.3
+        assert np.median(epipolar_distances(*inlying, scene.F)) < 0.3
         # Exact projections of points between and behind the planes, which the estimate has not seen.
         X = np.random.default_rng(2).uniform([-1.5, -1.0, 4.0], [1.5, 1.0, 12.0], (200, 3))
         x1, x2 = X @ K.T, (X @ scene.R.T + scene.t) @ K.T
-        unseen = distances(result.F_mat.numpy(), x1[:, :2] / x1[:, 2:], x2[:, :2] / x2[:, 2:])
+        unseen = epipolar_distances(x1[:, :2] / x1[:, 2:], x2[:, :2] / x2[:, 2:], result.F_mat)
         assert np.median(unseen) < 0.5
 
     def test_fields(self, scene, result):
@@ -104,7 +92,7 @@ class TestEstimatePair:
         assert (result.size1, result.size2) == ((WIDTH, HEIGHT), (WIDTH, HEIGHT))
         assert (result.path1, result.path2) == (scene.left, scene.right)
         assert len(torch.cat([result.points1, result.points2], 1).unique(dim=0)) == result.num_matches
-        d = distances(result.F_mat.numpy(), result.points1.numpy(), result.points2.numpy())
+        d = epipolar_distances(result.points1, result.points2, result.F_mat)
         assert np.array_equal(d < 1.0, result.inliers.numpy())
         assert result.mean_distance == pytest.approx(d[d < 1].mean(), rel=1e-6)
         assert result.median_distance == pytest.approx(np.median(d[d < 1]), rel=1e-6)
@@ -302,7 +290,7 @@ def median_true_distance(result: PairEstimate, camera: np.ndarray, world1: np.nd
     """Median distance of the inliers under the true F of x2 = R x1 + t, from two camera-to-world poses (3, 4)."""
     R, t = world2[:, :3].T @ world1[:, :3], world2[:, :3].T @ (world1[:, 3] - world2[:, 3])
     F = np.linalg.inv(camera).T @ cross(t) @ R @ np.linalg.inv(camera)
-    return np.median(distances(F, *(p[result.inliers].numpy() for p in (result.points1, result.points2))))
+    return np.median(epipolar_distances(*(p[result.inliers] for p in (result.points1, result.points2)), F))
 
 
 class TestRealImages:

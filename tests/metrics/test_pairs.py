@@ -1,4 +1,4 @@
-"""Inlier share, F1 and epipolar error against loops over correspondences."""
+"""Inlier share, F1 and epipolar error against sets of correspondences."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from two_view import scenes
+from two_view import epipolar_distances, scenes
 
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
@@ -22,17 +22,9 @@ METRICS = {
 }
 
 
-def distance(p1, p2, F):
-    """Eq. 7 of one correspondence: line by line, d1 + d2."""
-    a, b = np.array([*p1, 1.0]), np.array([*p2, 1.0])
-    line2, line1 = F @ a, F.T @ b
-    return abs(b @ line2) / np.hypot(line2[0], line2[1]) + abs(a @ line1) / np.hypot(line1[0], line1[1])
-
-
 def by_hand(points1, points2, F, true, threshold):
     """All three of one pair, precision and recall apart."""
-    estimated = [distance(a, b, F) for a, b in zip(points1, points2, strict=True)]
-    actual = [distance(a, b, true) for a, b in zip(points1, points2, strict=True)]
+    estimated, actual = (epipolar_distances(points1, points2, matrix) for matrix in (F, true))
     chosen, right = ({i for i, d in enumerate(ds) if d < threshold} for ds in (estimated, actual))
     hits, f1 = len(chosen & right), NAN
     if right:

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from two_view import homogeneous
 
 from kornia_learnnorm.data.synthetic import (
     TwoViewScene,
@@ -27,10 +28,6 @@ def clean(make, monkeypatch, batch_size=64, num_points=24, seed=0):
         return make(batch_size, num_points, generator(seed), noise=0.0)
     monkeypatch.setattr(scenes, "student_t", lambda shape, generator: torch.zeros(shape, dtype=torch.float64))
     return make(batch_size, num_points, generator(seed))
-
-
-def homogeneous(points):
-    return np.concatenate([points, np.ones_like(points[..., :1])], -1)
 
 
 def triangulated_depths(scene):
