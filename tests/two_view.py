@@ -7,9 +7,16 @@ import torch
 from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
+from kornia_learnnorm import (
+    CrossViewNetwork,
+    Hartley,
+    LearnedNormalizer,
+    PaperNetwork,
+    ReweightedWhitening,
+    Whitening,
+    paper_transform,
+)
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
-from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
 
@@ -28,10 +35,18 @@ def uniform(*shape: int, low: float = 0.0, high: float = 1.0, seed: int = 0, dty
     return torch.empty(shape, dtype=dtype).uniform_(low, high, generator=torch.Generator().manual_seed(seed))
 
 
+def small(base=None) -> LearnedNormalizer:
+    return LearnedNormalizer(base or Whitening(), CrossViewNetwork(width=16, depth=2))
+
+
+def paper() -> LearnedNormalizer:
+    return LearnedNormalizer(Hartley(), PaperNetwork(16, 3), paper_transform)
+
+
 def shaken(normalizer: LearnedNormalizer | None = None, scale: float = 0.3, seed: int = 0) -> LearnedNormalizer:
     """A learned normaliser whose last layer holds random numbers, so that it differs from its base."""
     torch.manual_seed(seed)
-    normalizer = LearnedNormalizer(network=CrossViewNetwork(width=16, depth=2)) if normalizer is None else normalizer
+    normalizer = small(ReweightedWhitening()) if normalizer is None else normalizer
     with torch.no_grad():
         for value in getattr(normalizer.network, "set_network", normalizer.network).head[-1].parameters():
             value.normal_(0, scale)
