@@ -9,6 +9,8 @@ import hypothesis
 import pytest
 import torch
 
+from kornia_learnnorm.cli.main import main
+
 hypothesis.settings.register_profile(
     "package",
     max_examples=25,
@@ -56,6 +58,22 @@ def real_data():
     if not folder:
         pytest.skip("LEARNNORM_DATA does not name a folder of real data")
     return Path(folder)
+
+
+@pytest.fixture
+def refused(capsys):
+    """A function that checks that a command ends with one line, which has a message in it, and prints nothing else."""
+
+    def check(command, message):
+        capsys.readouterr()
+        assert main([*map(str, command)]) == 2
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        assert printed.err.startswith(f"learnnorm {command[0]}: error: ")
+        assert printed.err.count("\n") == 1
+        assert message in printed.err
+
+    return check
 
 
 @pytest.fixture(autouse=True)

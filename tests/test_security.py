@@ -72,13 +72,16 @@ class TestCheckpoints:
     def program(self, monkeypatch):
         monkeypatch.setattr("sys.argv", ["learnnorm"])
 
-    def refused(self, trained, path, capsys, commands=("fit",)):
-        """The commands end with one line."""
-        for command in commands:
-            assert main([command, *trained[1], f"--ckpt_path={path}"]) == 2
-            error = capsys.readouterr().err
-            assert f"{path} is not a checkpoint of a training run" in error
-            assert error.count("\n") == 1
+    @pytest.fixture
+    def rejected(self, trained, refused):
+        """A function that checks that commands refuse a checkpoint."""
+
+        def check(path, *commands):
+            for command in commands:
+                options = [*trained[1], f"--ckpt_path={path}"]
+                refused([command, *options], f"{path} is not a checkpoint of a training run")
+
+        return check
 
     def test_code_is_not_run(self, trained, made, tmp_path, capsys):
         checkpoint = torch.load(trained[0], weights_only=True)
