@@ -76,6 +76,29 @@ def refused(capsys):
     return check
 
 
+@pytest.fixture(scope="session")
+def program():
+    """LightningCLI warns about arguments from Python while pytest's own are on the command line."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["learnnorm"])
+        yield
+
+
+@pytest.fixture(scope="session")
+def trained(program, tmp_path_factory):
+    """The folder of a run of a few steps, and the options that it was made with."""
+    folder = tmp_path_factory.mktemp("run")
+    network = "--model.normalizer.init_args.network.init_args"
+    options = [
+        *("--config", str(TESTS.parent / "configs/crossview-synthetic.yaml"), "--data.batch_size=16"),
+        *(f"--data.{stage}.init_args.number=100" for stage in ("train", "val", "test")),
+        *(f"{network}.width=8", f"{network}.depth=1", "--trainer.max_steps=3"),
+        *("--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={folder}"),
+    ]
+    assert main(["fit", *options]) == 0
+    return folder, options
+
+
 @pytest.fixture(autouse=True)
 def _global_seed():
     """Networks draw their first weights from the global generator."""

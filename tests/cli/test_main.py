@@ -16,6 +16,8 @@ from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
+pytestmark = pytest.mark.usefixtures("program")
+
 FOLDER = Path(__file__).parents[2] / "configs"
 CONFIGS = sorted(FOLDER.glob("*.yaml"))
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
@@ -39,12 +41,6 @@ TABLE1 = {
 }
 STORES = ("kitti_00", "kitti_01", "kitti_03", "kitti_06", "tum_fr3_office")
 RUNS = {"base": BASE, "paper-base": PAPER_BASE} | ABLATIONS | TABLE1
-
-
-@pytest.fixture(autouse=True)
-def program(monkeypatch):
-    """LightningCLI warns about arguments from Python while pytest's own are on the command line."""
-    monkeypatch.setattr("sys.argv", ["learnnorm"])
 
 
 @pytest.fixture(scope="module")
@@ -170,19 +166,6 @@ def test_unset_variable(tmp_path, monkeypatch, refused):
     config = FOLDER / "crossview.yaml"
     command = ["fit", "--config", config, *SMALL, f"--trainer.default_root_dir={tmp_path}"]
     refused(command, "error: the environment variable LEARNNORM_DATA, named in ")
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A run of a few steps, and the options that it was made with."""
-    folder = tmp_path_factory.mktemp("run")
-    config = FOLDER / "crossview-synthetic.yaml"
-    numbers = [f"--data.{stage}.init_args.number=100" for stage in ("train", "val", "test")]
-    options = ["--config", str(config), *SMALL, *numbers, f"--trainer.default_root_dir={folder}"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["learnnorm"])
-        assert main(["fit", *options]) == 0
-    return folder, options
 
 
 FOREIGN = "is not a checkpoint of a training run, or not a whole one"
