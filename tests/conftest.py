@@ -60,6 +60,18 @@ def real_data():
     return Path(folder)
 
 
+@pytest.fixture(scope="session")
+def written(tmp_path_factory):
+    """Sequences on disk in the layouts of all datasets, not to be changed."""
+    pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+    from make_sequences import LAYOUTS
+
+    folder = tmp_path_factory.mktemp("sequences")
+    for name, write in LAYOUTS.items():
+        write(folder / name)
+    return folder
+
+
 @pytest.fixture
 def refused(capsys):
     """A function that checks that a command ends with one line, which has a message in it, and prints nothing else."""
