@@ -21,9 +21,13 @@ from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handh
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
 
 
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
 def scenes(name: str, batch_size: int = 20, num_points: int = 8, seed: int = 0, **options: float) -> TwoViewScene:
     """Scenes of one kind, in float64 on the CPU."""
-    return SCENES[name](batch_size, num_points, torch.Generator().manual_seed(seed), **options)
+    return SCENES[name](batch_size, num_points, seeded(seed), **options)
 
 
 def correspondences(name: str = "handheld", *args, **options) -> tuple[Tensor, Tensor]:
@@ -32,7 +36,7 @@ def correspondences(name: str = "handheld", *args, **options) -> tuple[Tensor, T
 
 
 def uniform(*shape: int, low: float = 0.0, high: float = 1.0, seed: int = 0, dtype=torch.float64) -> Tensor:
-    return torch.empty(shape, dtype=dtype).uniform_(low, high, generator=torch.Generator().manual_seed(seed))
+    return torch.empty(shape, dtype=dtype).uniform_(low, high, generator=seeded(seed))
 
 
 def small(base=None) -> LearnedNormalizer:

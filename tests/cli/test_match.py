@@ -11,14 +11,12 @@ pytest.importorskip("cv2", reason="OpenCV is not installed")
 pytest.importorskip("h5py", reason="h5py is not installed")
 pytest.importorskip("joblib", reason="joblib is not installed")
 
-from make_sequences import LAYOUTS
+from make_sequences import FR3, LAYOUTS
 
 from kornia_learnnorm.cli import match
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.matching import collect
 from kornia_learnnorm.data.store import read_store
-
-FR3 = "rgbd_dataset_freiburg3_long_office_household"
 
 
 def run(reader: str, root: Path, out: Path, *args: str) -> int:

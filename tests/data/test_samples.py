@@ -1,13 +1,9 @@
 import numpy as np
 import pytest
 import torch
-from two_view import eight_point, epipolar_distances
+from two_view import eight_point, epipolar_distances, seeded
 
 from kornia_learnnorm.data.samples import draw_samples, plain_residual
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def test_every_correspondence_is_used_at_most_once(store, rows_of):

@@ -144,8 +144,7 @@ class TestRelativePose:
         store = read_store(f"{real_data}/correspondences/kitti_06.h5@0:10")
         truth = [torch.tensor(value) for value in (store.R, store.t)]
         for i in range(len(store)):
-            rows = slice(store.offsets[i], store.offsets[i + 1])
             F, K1, K2 = (torch.tensor(value)[None] for value in (store.F[i], store.K[i, 0], store.K[i, 1]))
-            points1, points2 = (torch.tensor(value[rows])[None] for value in (store.points1, store.points2))
+            points1, points2 = (torch.tensor(points)[None] for points in store.matches(i)[:2])
             R, t = relative_pose(F, K1, K2, points1, points2)
             assert pose_error(R, t, *(value[i : i + 1] for value in truth)) < 1e-3

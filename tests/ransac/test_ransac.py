@@ -180,8 +180,7 @@ class TestAccuracy:
         store = read_store(real_data / "correspondences" / f"{name}.h5")
         ours, theirs = [], []
         for i in range(2, 17, 2):
-            rows = slice(store.offsets[i], store.offsets[i + 1])
-            points = [torch.from_numpy(p[rows][store.ratio[rows] < 0.8]) for p in (store.points1, store.points2)]
+            points = [torch.from_numpy(p) for p in store.matches(i, 0.8)[:2]]
             F_true = torch.from_numpy(store.F[i])
             for found, ransac in ((ours, RANSAC(seed=0)), (theirs, kornia_ransac.RANSAC("fundamental", 1.0, seed=0))):
                 F_mat = ransac(*points)[0].double()

@@ -5,14 +5,13 @@ from __future__ import annotations
 import shutil
 
 import pytest
-from make_sequences import edit
+from make_sequences import FR1, edit
 
 from kornia_learnnorm.data.datasets.cambridge import read_cambridge
 from kornia_learnnorm.data.datasets.kitti import read_kitti
 from kornia_learnnorm.data.datasets.tum import read_tum
 
 READERS = {"kitti": read_kitti, "tum": read_tum, "cambridge": read_cambridge}
-FR1 = "rgbd_dataset_freiburg1_wall"
 WHOLE = 0  # in place of the number of a line
 
 

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from make_sequences import STEP
+from make_sequences import FR1, FR3, STEP
 
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairs import pair_frames
 from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.data.datasets.splits import SPLITS
-
-FR1 = "rgbd_dataset_freiburg1_wall"
-FR3 = "rgbd_dataset_freiburg3_long_office_household"
 
 
 def epipoles_agree(pair: FramePair) -> bool:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from make_sequences import FRAMES, STEP, TUM_START, moved, rotated
+from make_sequences import FR1, FR3, FRAMES, STEP, TUM_START, moved, rotated
 
 from kornia_learnnorm.data.datasets.tum import read_tum
-
-FR1 = "rgbd_dataset_freiburg1_wall"
-FR3 = "rgbd_dataset_freiburg3_long_office_household"
 
 
 def test_frames(written):
