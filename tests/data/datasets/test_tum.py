@@ -68,9 +68,6 @@ def test_association(tum, stamps, expected):
 
 def test_max_difference(written):
     assert np.isnan(read_tum(written / "tum", max_difference=0.001)[0].pose).all()
-    for wrong in (-0.1, float("nan")):
-        with pytest.raises(ValueError, match=f"zero or more seconds, got {wrong}"):
-            read_tum(written / "tum", max_difference=wrong)
 
 
 @pytest.mark.parametrize("norm", [0.01, 1.0, 100.0])
@@ -97,16 +94,3 @@ def test_no_ground_truth(tum):
     frames = read_tum(tum)
     assert np.isnan([frame.pose for frame in frames[:FRAMES]]).all()
     assert np.isfinite([frame.pose for frame in frames[FRAMES:]]).all()
-
-
-@pytest.mark.parametrize(
-    ("root", "sequences", "error", "message"),
-    [
-        ("tum", ["desk"], ValueError, f"no sequence 'desk' at .*, there are {FR1}, {FR3}"),
-        ("kitti", None, FileNotFoundError, r"no rgb\.txt in .*kitti, nor in a folder in it"),
-        ("none", None, FileNotFoundError, r"no folder at .*none"),
-    ],
-)
-def test_no_sequence(written, root, sequences, error, message):
-    with pytest.raises(error, match=message):
-        read_tum(written / root, sequences)
