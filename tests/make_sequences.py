@@ -142,6 +142,11 @@ def edit(path: Path, line: int, text: str | None) -> None:
     path.write_text("".join(f"{one}\n" for one in lines))
 
 
+def names(pairs) -> list[tuple[str, str]]:
+    """Names of the frames of each pair."""
+    return [(pair.frame1.name, pair.frame2.name) for pair in pairs]
+
+
 def moved(pixels: float, focal: float = FOCAL) -> np.ndarray:
     pose = np.eye(4)
     pose[0, 3] = metres(pixels, focal)
