@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["atomic_write", "short_name"]
+__all__ = ["atomic_write", "short_name", "write_text"]
 
 
 @contextmanager
@@ -55,6 +55,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         raise type(error)(error.errno, f"cannot write {path}: {error.strerror}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in UTF-8 as :func:`atomic_write` does."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def short_name(path: str | Path) -> str:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import hypothesis
 import pytest
 import torch
+
+from kornia_learnnorm.cli.main import main
 
 hypothesis.settings.register_profile(
     "package",
@@ -46,6 +49,66 @@ def dtype(request):
 def generator():
     """Source of randomness on the CPU, the same in every test."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def real_data():
+    """The folder of real data, without which a test is skipped."""
+    folder = os.environ.get("LEARNNORM_DATA")
+    if not folder:
+        pytest.skip("LEARNNORM_DATA does not name a folder of real data")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def written(tmp_path_factory):
+    """Sequences on disk in the layouts of all datasets, not to be changed."""
+    pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+    from make_sequences import LAYOUTS
+
+    folder = tmp_path_factory.mktemp("sequences")
+    for name, write in LAYOUTS.items():
+        write(folder / name)
+    return folder
+
+
+@pytest.fixture
+def refused(capsys):
+    """A function that checks that a command ends with one line, which has a message in it, and prints nothing else."""
+
+    def check(command, message):
+        capsys.readouterr()
+        assert main([*map(str, command)]) == 2
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        assert printed.err.startswith(f"learnnorm {command[0]}: error: ")
+        assert printed.err.count("\n") == 1
+        assert message in printed.err
+
+    return check
+
+
+@pytest.fixture(scope="session")
+def program():
+    """LightningCLI warns about arguments from Python while pytest's own are on the command line."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["learnnorm"])
+        yield
+
+
+@pytest.fixture(scope="session")
+def trained(program, tmp_path_factory):
+    """The folder of a run of a few steps, and the options that it was made with."""
+    folder = tmp_path_factory.mktemp("run")
+    network = "--model.normalizer.init_args.network.init_args"
+    options = [
+        *("--config", str(TESTS.parent / "configs/crossview-synthetic.yaml"), "--data.batch_size=16"),
+        *(f"--data.{stage}.init_args.number=100" for stage in ("train", "val", "test")),
+        *(f"{network}.width=8", f"{network}.depth=1", "--trainer.max_steps=3"),
+        *("--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={folder}"),
+    ]
+    assert main(["fit", *options]) == 0
+    return folder, options
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,8 @@ SIZE, FRAMES, STEP, DEPTH = (160, 120), 4, 6, 4.0  # pixels, -, pixels, metres
 FOCAL = 130.0
 KITTI_K = np.array([[FOCAL, 0, 80.5], [0, FOCAL, 58.0], [0, 0, 1]])
 KITTI_BASELINES = (0.0, 12.0, 2.0, 14.0)  # of cameras 0 to 3, pixels at the wall's depth
-TUM_START, TUM_FOCALS = 1300000000.0, {"freiburg1": 517.3, "freiburg3": 535.4}
+FR1, FR3 = "rgbd_dataset_freiburg1_wall", "rgbd_dataset_freiburg3_long_office_household"
+TUM_START, TUM_FOCALS = 1300000000.0, {FR1: 517.3, FR3: 535.4}
 
 
 def metres(pixels: float, focal: float = FOCAL) -> float:
@@ -68,8 +69,8 @@ def write_kitti(root: Path) -> None:
 
 def write_tum(root: Path) -> None:
     """A sequence of the first and one of the third Kinect; the world is turned by 90 degrees about the optical axis."""
-    for kinect, name in (("freiburg1", "freiburg1_wall"), ("freiburg3", "freiburg3_long_office_household")):
-        folder, focal = root / f"rgbd_dataset_{name}", TUM_FOCALS[kinect]
+    for name, focal in TUM_FOCALS.items():
+        folder = root / name
         listed, poses, half = [], [], np.sqrt(0.5)
         for frame in range(FRAMES):
             time = TUM_START + frame
@@ -139,6 +140,11 @@ def edit(path: Path, line: int, text: str | None) -> None:
     lines = path.read_text().splitlines()
     lines[line - 1 : line] = [] if text is None else [text]
     path.write_text("".join(f"{one}\n" for one in lines))
+
+
+def names(pairs) -> list[tuple[str, str]]:
+    """Names of the frames of each pair."""
+    return [(pair.frame1.name, pair.frame2.name) for pair in pairs]
 
 
 def moved(pixels: float, focal: float = FOCAL) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
 import sys
 from pathlib import Path
@@ -47,13 +46,6 @@ def synthetic(monkeypatch):
     monkeypatch.delenv("LEARNNORM_DATA", raising=False)
 
 
-@pytest.fixture
-def real():
-    pytest.importorskip("h5py")
-    if not os.environ.get("LEARNNORM_DATA"):
-        pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
-
-
 @pytest.mark.parametrize(
     ("name", "steps", "points", "gain"), [("predict_weights", 64, 128, 0.3), ("guided_sampling", 32, 128, 0.5)]
 )
@@ -66,7 +58,7 @@ def test_learns_from_synthetic_pairs(name, steps, points, gain, example, synthet
 
 
 @pytest.mark.parametrize("name", ["predict_weights", "guided_sampling"])
-def test_runs_on_real_pairs(name, example, real):
+def test_runs_on_real_pairs(name, example, real_data):
     before, after = example(name).main(["--steps", "2", "--points", "64", "--pairs", "2"])
     assert 0 < before < 10
     assert 0 < after < 10
@@ -89,7 +81,7 @@ def test_a_learned_normaliser_starts_as_hartleys_and_is_trained(example, synthet
     assert trained["learned"][0] != pytest.approx(trained["hartley"][0], rel=1e-5)
 
 
-def test_weighting_network_on_real_pairs(example, real, capsys):
+def test_weighting_network_on_real_pairs(example, real_data, capsys):
     short = ["--seeds", "0", "--steps", "1", "--last-steps", "1", "--pairs", "2", "--points", "480"]
     results = example("weighting_network").main([*short, "--normalizers", "whitening", "crossview"])
     assert all(0 <= row[0] <= 100 and row[2] > 0 for rows in results.values() for row in rows)

@@ -50,6 +50,7 @@ from two_view import (
     homogeneous,
     in_hartley,
     numpy_hartley,
+    paper,
     shaken,
     uniform,
     up_to_sign,
@@ -59,12 +60,10 @@ from kornia_learnnorm import (
     Hartley,
     Identity,
     LearnedNormalizer,
-    PaperNetwork,
     ReweightedWhitening,
     Whitening,
     design_matrix,
     find_fundamental,
-    paper_transform,
 )
 from kornia_learnnorm.evaluation.diagnostics import condition_number
 from kornia_learnnorm.geometry.dlt import null_vector
@@ -345,7 +344,7 @@ def normalizers():
         "whitening": Whitening(),
         "reweighted": ReweightedWhitening(),
         "learned": LearnedNormalizer.from_pretrained().double(),
-        "paper": shaken(LearnedNormalizer(Hartley(), PaperNetwork(16, 3), paper_transform)).double(),
+        "paper": shaken(paper()).double(),
     }
 
 

@@ -27,7 +27,6 @@ from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.runs.store import read_arrays
 
 ROOT = Path(__file__).parent.parent
-NETWORK = "model.normalizer.init_args.network.init_args"
 
 
 class Touches:
@@ -51,58 +50,44 @@ def made(tmp_path):
     assert not path.exists()
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """The checkpoint of a run of the command, and its options."""
-    folder = tmp_path_factory.mktemp("run")
-    numbers = [f"--data.{stage}.init_args.number=64" for stage in ("train", "val", "test")]
-    options = [
-        *("--config", str(ROOT / "configs/crossview-synthetic.yaml"), *numbers, "--data.batch_size=16"),
-        *("--trainer.max_steps=2", "--trainer.enable_progress_bar=false", f"--{NETWORK}.width=8"),
-        *(f"--{NETWORK}.depth=1", f"--trainer.default_root_dir={folder}"),
-    ]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["learnnorm"])
-        assert main(["fit", *options]) == 0
-    return folder / "checkpoints/last.ckpt", options
-
-
 class TestCheckpoints:
-    @pytest.fixture(autouse=True)
-    def program(self, monkeypatch):
-        monkeypatch.setattr("sys.argv", ["learnnorm"])
+    @pytest.fixture
+    def last(self, trained):
+        return trained[0] / "checkpoints/last.ckpt"
 
-    def refused(self, trained, path, capsys, commands=("fit",)):
-        """The commands end with one line."""
-        for command in commands:
-            assert main([command, *trained[1], f"--ckpt_path={path}"]) == 2
-            error = capsys.readouterr().err
-            assert f"{path} is not a checkpoint of a training run" in error
-            assert error.count("\n") == 1
+    @pytest.fixture
+    def rejected(self, trained, refused):
+        """A function that checks that a command refuses a checkpoint."""
 
-    def test_code_is_not_run(self, trained, made, tmp_path, capsys):
-        checkpoint = torch.load(trained[0], weights_only=True)
-        torch.save(checkpoint | {"callbacks": Touches(made)}, tmp_path / "forged.ckpt")
-        self.refused(trained, tmp_path / "forged.ckpt", capsys, ["fit", "validate", "test", "predict"])
+        def check(path, command="fit"):
+            message = f"{path} is not a checkpoint of a training run"
+            refused([command, *trained[1], f"--ckpt_path={path}"], message)
+
+        return check
+
+    def test_code_is_not_run(self, last, made, tmp_path, rejected):
+        torch.save(torch.load(last, weights_only=True) | {"callbacks": Touches(made)}, tmp_path / "forged.ckpt")
+        for command in ("fit", "validate", "test", "predict"):
+            rejected(tmp_path / "forged.ckpt", command)
         (tmp_path / "plain.ckpt").write_bytes(pickle.dumps(Touches(made)))
-        self.refused(trained, tmp_path / "plain.ckpt", capsys)
+        rejected(tmp_path / "plain.ckpt")
 
-    def test_a_checkpoint_configures_nothing(self, trained, made, tmp_path):
+    def test_a_checkpoint_configures_nothing(self, trained, last, made, tmp_path):
         """Lightning's command takes the model's arguments from a checkpoint, and they can name classes."""
         forged = {"normalizer": {"class_path": "subprocess.Popen", "init_args": {"args": ["touch", str(made)]}}}
-        torch.save(torch.load(trained[0], weights_only=True) | {"hyper_parameters": forged}, tmp_path / "forged.ckpt")
+        torch.save(torch.load(last, weights_only=True) | {"hyper_parameters": forged}, tmp_path / "forged.ckpt")
         assert main(["validate", *trained[1], f"--ckpt_path={tmp_path / 'forged.ckpt'}"]) == 0
 
-    def test_broken(self, trained, tmp_path, capsys):
-        whole = trained[0].read_bytes()
+    def test_broken(self, last, tmp_path, rejected):
+        whole = last.read_bytes()
         for name, content in {"empty": b"", "cut": whole[:-50], "text": b"text", "zip": b"PK\x03\x04"}.items():
             (tmp_path / f"{name}.ckpt").write_bytes(content)
-            self.refused(trained, tmp_path / f"{name}.ckpt", capsys)
+            rejected(tmp_path / f"{name}.ckpt")
         for name, content in {"list": [1], "weights": {"state_dict": [1]}, "text": {"state_dict": {"a": "b"}}}.items():
             torch.save(content, tmp_path / f"{name}.ckpt")
-            self.refused(trained, tmp_path / f"{name}.ckpt", capsys)
+            rejected(tmp_path / f"{name}.ckpt")
 
-    def test_bomb(self, trained, tmp_path, capsys):
+    def test_bomb(self, tmp_path, rejected):
         """A compressed checkpoint, which PyTorch would unfold."""
         path = tmp_path / "bomb.ckpt"
         torch.save({"state_dict": {"a": torch.zeros(10**7)}}, tmp_path / "stored.ckpt")
@@ -111,19 +96,19 @@ class TestCheckpoints:
                 packed.writestr(entry.filename, stored.read(entry))
         assert path.stat().st_size < 10**5
         assert len(torch.load(path, weights_only=True)["state_dict"]["a"]) == 10**7
-        self.refused(trained, path, capsys)
+        rejected(path)
 
-    def test_without_lightning(self, trained, tmp_path):
+    def test_without_lightning(self, last, tmp_path):
         """The lines of docs/training.md, where Lightning cannot be imported, give the weights that were exported."""
         text = (ROOT / "docs/training.md").read_text()
         (lines,) = re.findall(r"## A checkpoint without Lightning.*?```python\n(.*?)```", text, flags=re.DOTALL)
-        lines = lines.replace("runs/crossview/checkpoints/last.ckpt", str(trained[0]))
+        lines = lines.replace("runs/crossview/checkpoints/last.ckpt", str(last))
         lines = lines.replace("kln.CrossViewNetwork()", "kln.CrossViewNetwork(width=8, depth=1)")
         check = f"""
 import sys
 sys.modules["pytorch_lightning"] = sys.modules["lightning"] = None
 {lines}
-exported = kln.LearnedNormalizer.from_pretrained({str(trained[0].parents[1] / "weights.safetensors")!r}).state_dict()
+exported = kln.LearnedNormalizer.from_pretrained({str(last.parents[1] / "weights.safetensors")!r}).state_dict()
 assert exported.keys() == normalizer.state_dict().keys()
 assert all(torch.equal(value, exported[key]) for key, value in normalizer.state_dict().items())
 """

@@ -7,16 +7,27 @@ import torch
 from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
+from kornia_learnnorm import (
+    CrossViewNetwork,
+    Hartley,
+    LearnedNormalizer,
+    PaperNetwork,
+    ReweightedWhitening,
+    Whitening,
+    paper_transform,
+)
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
-from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
 
 
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
 def scenes(name: str, batch_size: int = 20, num_points: int = 8, seed: int = 0, **options: float) -> TwoViewScene:
     """Scenes of one kind, in float64 on the CPU."""
-    return SCENES[name](batch_size, num_points, torch.Generator().manual_seed(seed), **options)
+    return SCENES[name](batch_size, num_points, seeded(seed), **options)
 
 
 def correspondences(name: str = "handheld", *args, **options) -> tuple[Tensor, Tensor]:
@@ -25,13 +36,21 @@ def correspondences(name: str = "handheld", *args, **options) -> tuple[Tensor, T
 
 
 def uniform(*shape: int, low: float = 0.0, high: float = 1.0, seed: int = 0, dtype=torch.float64) -> Tensor:
-    return torch.empty(shape, dtype=dtype).uniform_(low, high, generator=torch.Generator().manual_seed(seed))
+    return torch.empty(shape, dtype=dtype).uniform_(low, high, generator=seeded(seed))
+
+
+def small(base=None) -> LearnedNormalizer:
+    return LearnedNormalizer(base or Whitening(), CrossViewNetwork(width=16, depth=2))
+
+
+def paper() -> LearnedNormalizer:
+    return LearnedNormalizer(Hartley(), PaperNetwork(16, 3), paper_transform)
 
 
 def shaken(normalizer: LearnedNormalizer | None = None, scale: float = 0.3, seed: int = 0) -> LearnedNormalizer:
     """A learned normaliser whose last layer holds random numbers, so that it differs from its base."""
     torch.manual_seed(seed)
-    normalizer = LearnedNormalizer(network=CrossViewNetwork(width=16, depth=2)) if normalizer is None else normalizer
+    normalizer = small(ReweightedWhitening()) if normalizer is None else normalizer
     with torch.no_grad():
         for value in getattr(normalizer.network, "set_network", normalizer.network).head[-1].parameters():
             value.normal_(0, scale)

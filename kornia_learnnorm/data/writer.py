@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.store import FORMAT, LAYOUT, VERSION, CorrespondenceStore, read_store
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.optional import import_extra
 
 if TYPE_CHECKING:
@@ -127,8 +127,7 @@ class StoreWriter:
     def _begin(self) -> None:
         try:
             self.folder.mkdir(exist_ok=True)
-            with atomic_write(self.folder / OPTIONS) as temporary:
-                temporary.write_text(json.dumps(self.options, indent=1), encoding="utf-8")
+            write_text(self.folder / OPTIONS, json.dumps(self.options, indent=1))
         except OSError as error:
             self.close()
             raise type(error)(f"cannot write {self.path}: {error.strerror or error}") from error

@@ -16,7 +16,7 @@ from torch import Tensor
 from kornia_learnnorm.data.images import import_cv2, read_image
 from kornia_learnnorm.data.matching.matchers import match_images
 from kornia_learnnorm.estimators.fundamental import find_fundamental
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.files import write_text
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.normalizers.contract import Normalizer
@@ -241,5 +241,4 @@ def write_json(path: str | Path, estimate: PairEstimate) -> None:
         "ratio": estimate.ratio,
         "threshold_px": estimate.threshold,
     }
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -1,4 +1,6 @@
-"""A small store, and where its correspondences lie in it."""
+"""Small stores, and where correspondences lie in one."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +13,13 @@ from kornia_learnnorm.data.synthetic.stores import synthetic_store
 def store():
     """Nine pairs of 101 correspondences, not to be changed."""
     return synthetic_store(pairs=3, points=101, seed=2)
+
+
+@pytest.fixture
+def uneven():
+    """Six pairs with their rows given to them unevenly; one pair has none."""
+    made = synthetic_store(pairs=2, points=30, seed=1)
+    return replace(made, offsets=np.array([0, 10, 10, 50, 90, 150, 180]))
 
 
 @pytest.fixture(scope="session")

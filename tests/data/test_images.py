@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -116,11 +115,8 @@ class TestReadImage:
                 read(tmp_path / "image.png")
 
     @pytest.mark.parametrize("folder", ["kitti/sequences/06/image_0", "tum"])
-    def test_real_images_as_opencv_reads_them(self, folder):
-        data = os.environ.get("LEARNNORM_DATA")
-        if data is None:
-            pytest.skip("LEARNNORM_DATA does not name a folder of real data")
-        for path in sorted((Path(data) / folder).rglob("*.png"))[:3]:
+    def test_real_images_as_opencv_reads_them(self, real_data, folder):
+        for path in sorted((real_data / folder).rglob("*.png"))[:3]:
             assert np.array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
 
 

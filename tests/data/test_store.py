@@ -1,30 +1,22 @@
 """Stores: what is written comes back, some pairs of it, and what a broken file says."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from two_view import epipolar_distances
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 ARRAYS = ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t")
 
 
 @pytest.fixture
-def store():
-    """Six pairs with their rows given to them unevenly; one pair has none."""
-    made = synthetic_store(pairs=2, points=30, seed=1)
-    return replace(made, offsets=np.array([0, 10, 10, 50, 90, 150, 180]))
-
-
-@pytest.fixture
-def path(store, tmp_path):
-    write_store(tmp_path / "store.h5", store)
+def path(uneven, tmp_path):
+    write_store(tmp_path / "store.h5", uneven)
     return tmp_path / "store.h5"
 
 
@@ -35,11 +27,11 @@ def same(got, expected):
         assert getattr(got, name) == getattr(expected, name)
 
 
-def test_round_trip(store, path):
+def test_round_trip(uneven, path):
     got = read_store(path)
-    same(got, store)
+    same(got, uneven)
     assert len(got) == 6
-    assert all(getattr(got, name).dtype == getattr(store, name).dtype for name in ARRAYS)
+    assert all(getattr(got, name).dtype == getattr(uneven, name).dtype for name in ARRAYS)
     assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
 
 
@@ -134,62 +126,60 @@ def test_other_version(path):
         read_store(path)
 
 
-def test_a_failed_write_leaves_the_old_file(store, path):
+def test_a_failed_write_leaves_the_old_file(uneven, path):
     before = path.read_bytes()
-    broken = CorrespondenceStore(**{**vars(store), "K": "not an array"})
+    broken = CorrespondenceStore(**{**vars(uneven), "K": "not an array"})
     with pytest.raises(ValueError, match="could not convert"):
         write_store(path, broken)
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
 
 
-def test_ground_truth_of_the_synthetic_store(store):
+def test_ground_truth_of_the_synthetic_store(uneven):
     """Residuals of the inliers by NumPy: noise of 0.5 px leaves them within a few pixels of their epipolar lines."""
-    x1, x2 = (np.c_[points[:30], np.ones(30)].astype(float) for points in (store.points1, store.points2))
-    line = x1 @ store.F[0].T
-    distance = np.abs((x2 * line).sum(1)) / np.hypot(line[:, 0], line[:, 1])
+    distance = epipolar_distances(uneven.points1[:30], uneven.points2[:30], uneven.F[0])
     assert np.sort(distance)[:24].max() < 4
 
 
 @pytest.mark.parametrize(("first", "stop"), [(0, 1), (0, 3), (1, 2), (2, 5), (5, 6), (0, 6)])
-def test_select(store, first, stop):
-    part = store.select(first, stop)
+def test_select(uneven, first, stop):
+    part = uneven.select(first, stop)
     assert len(part) == stop - first
     assert part.offsets[0] == 0
-    assert part.names == store.names[first:stop]
-    assert (part.dataset, part.pairs, part.detector) == (store.dataset, store.pairs, store.detector)
+    assert part.names == uneven.names[first:stop]
+    assert (part.dataset, part.pairs, part.detector) == (uneven.dataset, uneven.pairs, uneven.detector)
     for new, old in enumerate(range(first, stop)):
         for name in ("points1", "points2", "ratio"):
-            np.testing.assert_array_equal(getattr(part, name)[part.rows(new)], getattr(store, name)[store.rows(old)])
+            np.testing.assert_array_equal(getattr(part, name)[part.rows(new)], getattr(uneven, name)[uneven.rows(old)])
         for name in ("image_size", "F", "K", "R", "t"):
-            np.testing.assert_array_equal(getattr(part, name)[new], getattr(store, name)[old])
+            np.testing.assert_array_equal(getattr(part, name)[new], getattr(uneven, name)[old])
     assert len(part.points1) == len(part.points2) == len(part.ratio) == part.offsets[-1]
 
 
-def test_matches_of_a_pair(store):
-    assert [len(store.rows(pair)) for pair in range(6)] == [10, 0, 40, 40, 60, 30]
-    assert store.rows(2).tolist() == list(range(10, 50))
-    assert store.rows(2, 0.8).tolist() == [row for row in range(10, 50) if store.ratio[row] < 0.8]
+def test_matches_of_a_pair(uneven):
+    assert [len(uneven.rows(pair)) for pair in range(6)] == [10, 0, 40, 40, 60, 30]
+    assert uneven.rows(2).tolist() == list(range(10, 50))
+    assert uneven.rows(2, 0.8).tolist() == [row for row in range(10, 50) if uneven.ratio[row] < 0.8]
     for limit in (None, 0.8):
-        for part, name in zip(store.matches(2, limit), ("points1", "points2", "ratio"), strict=True):
-            np.testing.assert_array_equal(part, getattr(store, name)[store.rows(2, limit)])
-    assert [len(part) for part in store.matches(1)] == [0, 0, 0]
+        for part, name in zip(uneven.matches(2, limit), ("points1", "points2", "ratio"), strict=True):
+            np.testing.assert_array_equal(part, getattr(uneven, name)[uneven.rows(2, limit)])
+    assert [len(part) for part in uneven.matches(1)] == [0, 0, 0]
 
 
 @pytest.mark.parametrize(("text", "pairs"), [("2:5", (2, 5)), ("0:6", (0, 6)), ("03:04", (3, 4))])
-def test_read_some_pairs(store, path, text, pairs):
+def test_read_some_pairs(uneven, path, text, pairs):
     part = read_store(Path(f"{path}@{text}"))
-    same(part, store.select(*pairs))
+    same(part, uneven.select(*pairs))
     same(read_store(f"{path}@{text}"), part)
     write_store(path.with_name("part.h5"), part)
     same(read_store(path.with_name("part.h5")), part)
 
 
 @pytest.mark.parametrize(("first", "stop"), [(0, 0), (6, 6), (4, 2), (0, 7), (6, 9), (-1, 2), (-2, -1)])
-def test_pairs_that_are_not_there(store, path, first, stop):
+def test_pairs_that_are_not_there(uneven, path, first, stop):
     message = f"pairs {first}:{stop} were asked for, the store has 0:6"
     with pytest.raises(ValueError, match=message):
-        store.select(first, stop)
+        uneven.select(first, stop)
     if first >= 0:
         with pytest.raises(ValueError, match=message):
             read_store(f"{path}@{first}:{stop}")

@@ -17,19 +17,6 @@ ESTIMATORS = ["kornia-8pt", "count:Hartley", "count:whitening", "time:Hartley", 
 SOLVERS = ["Hartley", "whitening", "seven-point"]
 
 
-@pytest.fixture
-def refused(capsys):
-    """A function that checks that a command fails with a message on one line."""
-
-    def check(command, message):
-        capsys.readouterr()
-        assert main([*map(str, command)]) == 2
-        printed = capsys.readouterr()
-        assert message in printed.err.splitlines()[-1]
-
-    return check
-
-
 @pytest.fixture(scope="session")
 def store(tmp_path_factory):
     path = tmp_path_factory.mktemp("store") / "scenes.h5"

@@ -13,9 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from make_sequences import texture
+from two_view import epipolar_distances
 
 from kornia_learnnorm.cli import estimate as command_module
 from kornia_learnnorm.cli.estimate import add_arguments, run
+from kornia_learnnorm.data.datasets.frames import FramePair
+from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.evaluation import pair as module
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
 from kornia_learnnorm.files import atomic_write
@@ -27,16 +31,6 @@ cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
 WIDTH, HEIGHT = 320, 240
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
-
-
-def cross(t: np.ndarray) -> np.ndarray:
-    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-
-
-def texture(seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    image = sum(cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0))
-    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def warp(image: np.ndarray, R: np.ndarray, t: np.ndarray, depth: float) -> np.ndarray:
@@ -51,8 +45,8 @@ class Scene:
     def __init__(self, folder: Path) -> None:
         R, t = cv2.Rodrigues(np.array([0.01, -0.03, 0.02]))[0], np.array([0.3, 0.05, 0.1])
         self.R, self.t = R, t
-        self.F = np.linalg.inv(K).T @ cross(t) @ R @ np.linalg.inv(K)
-        image, near = texture(0), np.zeros((HEIGHT, WIDTH), np.uint8)
+        self.F = np.linalg.inv(K).T @ np.cross(t, np.eye(3)).T @ R @ np.linalg.inv(K)
+        image, near = texture(0, WIDTH, HEIGHT), np.zeros((HEIGHT, WIDTH), np.uint8)
         near[:, : WIDTH // 2] = 255
         moved = np.where(warp(near, R, t, 4.0) > 127, warp(image, R, t, 4.0), warp(image, R, t, 9.0))
         noisy = np.clip(image + np.random.default_rng(1).normal(0, 1, image.shape), 0, 255).astype(np.uint8)
@@ -74,24 +68,16 @@ def result(scene) -> PairEstimate:
     return estimate_pair(scene.left, scene.right, Hartley())
 
 
-def distances(F: np.ndarray, points1: np.ndarray, points2: np.ndarray) -> np.ndarray:
-    """Symmetric epipolar distances by NumPy: both points to their lines."""
-    x1, x2 = (np.c_[points, np.ones(len(points))] for points in (points1, points2))
-    lines2, lines1 = x1 @ F.T, x2 @ F
-    residual = np.abs((x2 * lines2).sum(1))
-    return residual / np.hypot(*lines2[:, :2].T) + residual / np.hypot(*lines1[:, :2].T)
-
-
 class TestEstimatePair:
     def test_finds_the_true_geometry(self, scene, result):
-        points1, points2 = result.points1[result.inliers].numpy(), result.points2[result.inliers].numpy()
+        inlying = result.points1[result.inliers], result.points2[result.inliers]
         assert result.num_inliers > 150
         assert result.num_inliers > 0.8 * result.num_matches
-        assert np.median(distances(scene.F, points1, points2)) < 0.3
+        assert np.median(epipolar_distances(*inlying, scene.F)) < 0.3
         # Exact projections of points between and behind the planes, which the estimate has not seen.
         X = np.random.default_rng(2).uniform([-1.5, -1.0, 4.0], [1.5, 1.0, 12.0], (200, 3))
         x1, x2 = X @ K.T, (X @ scene.R.T + scene.t) @ K.T
-        unseen = distances(result.F_mat.numpy(), x1[:, :2] / x1[:, 2:], x2[:, :2] / x2[:, 2:])
+        unseen = epipolar_distances(x1[:, :2] / x1[:, 2:], x2[:, :2] / x2[:, 2:], result.F_mat)
         assert np.median(unseen) < 0.5
 
     def test_fields(self, scene, result):
@@ -104,7 +90,7 @@ class TestEstimatePair:
         assert (result.size1, result.size2) == ((WIDTH, HEIGHT), (WIDTH, HEIGHT))
         assert (result.path1, result.path2) == (scene.left, scene.right)
         assert len(torch.cat([result.points1, result.points2], 1).unique(dim=0)) == result.num_matches
-        d = distances(result.F_mat.numpy(), result.points1.numpy(), result.points2.numpy())
+        d = epipolar_distances(result.points1, result.points2, result.F_mat)
         assert np.array_equal(d < 1.0, result.inliers.numpy())
         assert result.mean_distance == pytest.approx(d[d < 1].mean(), rel=1e-6)
         assert result.median_distance == pytest.approx(np.median(d[d < 1]), rel=1e-6)
@@ -298,51 +284,22 @@ class TestCommand:
             assert capsys.readouterr().out == ""
 
 
-def real_data() -> Path:
-    folder = os.environ.get("LEARNNORM_DATA")
-    if not folder:
-        pytest.skip("LEARNNORM_DATA does not name a folder of real images")
-    return Path(folder)
-
-
-def median_true_distance(result: PairEstimate, camera: np.ndarray, world1: np.ndarray, world2: np.ndarray) -> float:
-    """Median distance of the inliers under the true F of x2 = R x1 + t, from two camera-to-world poses (3, 4)."""
-    R, t = world2[:, :3].T @ world1[:, :3], world2[:, :3].T @ (world1[:, 3] - world2[:, 3])
-    F = np.linalg.inv(camera).T @ cross(t) @ R @ np.linalg.inv(camera)
-    return np.median(distances(F, *(p[result.inliers].numpy() for p in (result.points1, result.points2))))
-
-
-class TestRealImages:
-    @pytest.mark.parametrize(("first", "second"), [(10, 11), (20, 21), (40, 41)])
-    def test_kitti(self, first, second):
-        sequence = real_data() / "kitti" / "sequences" / "06"
-        calibration = (sequence / "calib.txt").read_text().splitlines()
-        P0 = next(line for line in calibration if line.startswith("P0"))
-        camera = np.array(P0.split()[1:], float).reshape(3, 4)[:, :3]
-        poses = np.loadtxt(sequence.parents[1] / "poses" / "06.txt").reshape(-1, 3, 4)
-        paths = [sequence / "image_0" / f"{frame:06d}.png" for frame in (first, second)]
-        result = estimate_pair(*paths, Hartley())
-        assert result.num_inliers > 500
-        assert result.median_distance < 0.3
-        assert median_true_distance(result, camera, poses[first], poses[second]) < 1.0
-
-    @pytest.mark.parametrize("first", [0, 12])
-    def test_tum(self, first):
-        folder = real_data() / "tum" / "rgbd_dataset_freiburg3_long_office_household"
-        paths = sorted((folder / "rgb").glob("*.png"))[first : first + 2]
-        result = estimate_pair(*paths, Hartley())
-        track = np.loadtxt(folder / "groundtruth.txt")
-        poses = []
-        for path in paths:
-            x, y, z, i, j, k, w = track[np.abs(track[:, 0] - float(path.stem)).argmin(), 1:]
-            angle = 2 * np.arctan2(np.linalg.norm([i, j, k]), w)
-            axis = np.array([i, j, k]) / np.linalg.norm([i, j, k])
-            poses.append(np.c_[cv2.Rodrigues(axis * angle)[0], [x, y, z]])
-        camera = np.array([[535.4, 0, 320.1], [0, 539.2, 247.6], [0, 0, 1]])
-        assert result.num_inliers > 300
-        assert result.median_distance < 0.5
+@pytest.mark.parametrize(
+    ("dataset", "options", "first", "inliers", "own", "true"),
+    [
+        *(("kitti", {"sequences": ["06"]}, first, 500, 0.3, 1.0) for first in (10, 20, 40)),
         # Images are not undistorted and poses the nearest in time: the ground truth is good to about 3 px.
-        assert median_true_distance(result, camera, *poses) < 4.0
+        *(("tum", {"max_difference": 0.1}, first, 300, 0.5, 4.0) for first in (0, 12)),
+    ],
+)
+def test_real_images(real_data, dataset, options, first, inliers, own, true):
+    frames = read_dataset(dataset, real_data / dataset, **options)
+    pair = FramePair(*frames[first : first + 2])
+    result = estimate_pair(pair.frame1.path, pair.frame2.path, Hartley())
+    assert result.num_inliers > inliers
+    assert result.median_distance < own
+    inlying = result.points1[result.inliers], result.points2[result.inliers]
+    assert np.median(epipolar_distances(*inlying, pair.F)) < true
 
 
 @pytest.mark.parametrize(("inliers", "chance"), [(12, True), (16, True), (29, False), (60, False)])

@@ -51,16 +51,7 @@ def numpy_spd(params) -> np.ndarray:
 
 
 class TestSmoke:
-    @pytest.mark.parametrize("batch_size", [0, 1, 3])
-    @pytest.mark.parametrize("num_points", [8, 20])
-    @pytest.mark.parametrize("weighted", [False, True])
-    def test_smoke(self, batch_size, num_points, weighted, device, dtype):
-        points = [uniform(batch_size, num_points, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
-        weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
-        for T in SearchedNormalizer(steps=2)(*points, weights):
-            assert (T.shape, T.dtype, T.device.type) == ((batch_size, 3, 3), dtype, device.type)
-            assert torch.isfinite(T).all()
-            assert torch.equal(T[:, 2].cpu(), torch.tensor([[0, 0, 1]], dtype=dtype).expand(batch_size, 3))
+    """See also tests/normalizers/test_contract.py."""
 
     def test_defaults(self):
         normalizer = SearchedNormalizer()
@@ -76,28 +67,10 @@ class TestSmoke:
         for T, H in zip(SearchedNormalizer(Hartley(), steps=1)(*points), expected, strict=True):
             assert torch.equal(T, H.to(dtype))
 
-    def test_float32_points_get_float64_arithmetic(self):
-        points = [p.float() for p in correspondences("handheld", 5)]
-        normalizer = SearchedNormalizer(steps=5)
-        for T, expected in zip(normalizer(*points), normalizer(*(p.double() for p in points)), strict=True):
-            assert torch.equal(T, expected.float())
-
     @pytest.mark.parametrize(("steps", "learning_rate"), [(0, 0.1), (-1, 0.1), (10, 0.0), (10, -1.0)])
     def test_exceptions(self, steps, learning_rate):
         with pytest.raises(ValueError, match=f"must be positive, got {steps} and {learning_rate}"):
             SearchedNormalizer(steps=steps, learning_rate=learning_rate)
-
-    @pytest.mark.parametrize(
-        ("points1", "weights", "message"),
-        [
-            (torch.rand(2, 7, 2), None, "at least 8 correspondences .* got 7"),
-            (torch.full((2, 8, 2), torch.nan), None, "points1 must be finite"),
-            (torch.rand(2, 8, 2), -torch.ones(2, 8), "must not be negative"),
-        ],
-    )
-    def test_wrong_correspondences(self, points1, weights, message):
-        with pytest.raises(ValueError, match=message):
-            SearchedNormalizer(steps=1)(points1, torch.rand_like(points1), weights)
 
 
 class TestSearch:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 import torch
@@ -142,15 +140,11 @@ class TestRelativePose:
         with pytest.raises(error, match=message):
             relative_pose(*change(*pair("orbit", 3, 10)[0]))
 
-    def test_real_correspondences(self):
-        folder = os.environ.get("LEARNNORM_DATA")
-        if not folder:
-            pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
-        store = read_store(f"{folder}/correspondences/kitti_06.h5@0:10")
+    def test_real_correspondences(self, real_data):
+        store = read_store(f"{real_data}/correspondences/kitti_06.h5@0:10")
         truth = [torch.tensor(value) for value in (store.R, store.t)]
         for i in range(len(store)):
-            rows = slice(store.offsets[i], store.offsets[i + 1])
             F, K1, K2 = (torch.tensor(value)[None] for value in (store.F[i], store.K[i, 0], store.K[i, 1]))
-            points1, points2 = (torch.tensor(value[rows])[None] for value in (store.points1, store.points2))
+            points1, points2 = (torch.tensor(points)[None] for points in store.matches(i)[:2])
             R, t = relative_pose(F, K1, K2, points1, points2)
             assert pose_error(R, t, *(value[i : i + 1] for value in truth)) < 1e-3

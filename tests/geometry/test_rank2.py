@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -114,11 +111,8 @@ class TestOptimalRank2:
         results = [find_fundamental(*points, normalizer=n, rank2="optimal") for n in (Hartley(), Whitening())]
         assert hartley_difference(*results, *points) < 1e-6
 
-    def test_real_eights(self):
-        pytest.importorskip("h5py")
-        if not (folder := os.environ.get("LEARNNORM_DATA")):
-            pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
-        store = read_store(Path(folder) / "correspondences" / "kitti_06.h5")
+    def test_real_eights(self, real_data):
+        store = read_store(real_data / "correspondences" / "kitti_06.h5")
         drawn = draw_samples(store, torch.Generator().manual_seed(0), max_residual=60)
         points1, points2 = drawn.points1.double(), drawn.points2.double()
         plain = epipolar_distances(points1, points2, find_fundamental(points1, points2)).mean(-1)

@@ -36,23 +36,6 @@ def make_trainer(folder, callbacks=(), **arguments):
     return pl.Trainer(default_root_dir=folder, callbacks=list(callbacks), max_epochs=-1, **quiet, **arguments)
 
 
-class Losses(pl.Callback):
-    def __init__(self):
-        self.seen = []
-
-    def on_train_batch_end(self, trainer, *_):
-        self.seen.append(trainer.callback_metrics["train/loss"].item())
-
-
-class Interrupt(pl.Callback):
-    def __init__(self, step):
-        self.step = step
-
-    def on_train_batch_end(self, trainer, *_):
-        if trainer.global_step == self.step:
-            raise InterruptedError("as if the machine had stopped")
-
-
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_training_lowers_the_loss(tmp_path, precision):
     """In bfloat16 the network, not the solver: the loss falls as in float32, and matrices are float64."""
@@ -90,18 +73,18 @@ class Blocks(SyntheticSamples):
 )
 def test_resumes_to_the_same_curve(tmp_path, interrupted_at, source, arguments):
     """An epoch has about nine batches: the run is cut in the middle of the first and of the second."""
-    whole, losses = make_task(), [Losses(), Losses()]
+    whole, watches = make_task(), [train_processes.Watch(), train_processes.Watch()]
     data = make_data(source, **arguments)
-    make_trainer(tmp_path / "whole", losses[:1], max_steps=20, enable_checkpointing=False).fit(whole, data)
+    make_trainer(tmp_path / "whole", watches[:1], max_steps=20, enable_checkpointing=False).fit(whole, data)
     first, second = make_task(), make_task()
-    callbacks = [Checkpoints(every_n_train_steps=2), Interrupt(interrupted_at)]
+    callbacks = [Checkpoints(every_n_train_steps=2), train_processes.Stop(interrupted_at)]
     with pytest.raises(InterruptedError):
         make_trainer(tmp_path / "cut", callbacks, max_steps=20).fit(first, make_data(source, **arguments))
-    trainer = make_trainer(tmp_path / "cut", [losses[1], Checkpoints(every_n_train_steps=2)], max_steps=20)
+    trainer = make_trainer(tmp_path / "cut", [watches[1], Checkpoints(every_n_train_steps=2)], max_steps=20)
     trainer.fit(second, make_data(source, **arguments), ckpt_path=tmp_path / "cut/checkpoints/last.ckpt")
-    for (name, expected), got in zip(whole.state_dict().items(), second.state_dict().values(), strict=True):
-        assert torch.equal(got, expected), name
-    assert losses[1].seen == losses[0].seen[interrupted_at // 2 * 2 :]
+    torch.testing.assert_close(second.state_dict(), whole.state_dict(), rtol=0, atol=0)
+    expected, got = (watch.seen["train/loss"] for watch in watches)
+    assert got == expected[interrupted_at // 2 * 2 :]
 
 
 @pytest.mark.parametrize("log", [True, False])
@@ -115,8 +98,7 @@ def test_accumulated_batches_make_the_step_of_a_larger_one(tmp_path, log):
         trainer.fit(task, data)
         assert trainer.global_step == 6
         states.append(task.state_dict())
-    for name, expected in states[0].items():
-        torch.testing.assert_close(states[1][name], expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(*states, rtol=0, atol=1e-9)
 
 
 def test_export_and_predictions(tmp_path):

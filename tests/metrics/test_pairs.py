@@ -1,8 +1,6 @@
-"""Inlier share, F1 and epipolar error against loops over correspondences."""
+"""Inlier share, F1 and epipolar error against sets of correspondences."""
 
 from __future__ import annotations
-
-import os
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from two_view import scenes
+from two_view import epipolar_distances, scenes
 
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
@@ -24,17 +22,9 @@ METRICS = {
 }
 
 
-def distance(p1, p2, F):
-    """Eq. 7 of one correspondence: line by line, d1 + d2."""
-    a, b = np.array([*p1, 1.0]), np.array([*p2, 1.0])
-    line2, line1 = F @ a, F.T @ b
-    return abs(b @ line2) / np.hypot(line2[0], line2[1]) + abs(a @ line1) / np.hypot(line1[0], line1[1])
-
-
 def by_hand(points1, points2, F, true, threshold):
     """All three of one pair, precision and recall apart."""
-    estimated = [distance(a, b, F) for a, b in zip(points1, points2, strict=True)]
-    actual = [distance(a, b, true) for a, b in zip(points1, points2, strict=True)]
+    estimated, actual = (epipolar_distances(points1, points2, matrix) for matrix in (F, true))
     chosen, right = ({i for i, d in enumerate(ds) if d < threshold} for ds in (estimated, actual))
     hits, f1 = len(chosen & right), NAN
     if right:
@@ -53,13 +43,6 @@ def pairs(seed=0, batch_size=6, num_points=40, jitter=1e-3):
     generator = torch.Generator().manual_seed(seed)
     wrong = 1 + jitter * torch.randn(scene.F_mat.shape, generator=generator, dtype=torch.float64)
     return scene.points1, scene.points2, scene.F_mat * wrong, scene.F_mat
-
-
-def real_pairs():
-    folder = os.environ.get("LEARNNORM_DATA")
-    if not folder:
-        pytest.skip("LEARNNORM_DATA does not name a folder of real correspondences")
-    return read_store(f"{folder}/correspondences/kitti_06.h5@0:5")
 
 
 @pytest.mark.parametrize("name", METRICS)
@@ -190,11 +173,10 @@ class TestByRows:
 
 
 class TestRealMatches:
-    def test_truth_against_itself_and_an_estimate(self):
-        store = real_pairs()
+    def test_truth_against_itself_and_an_estimate(self, real_data):
+        store = read_store(f"{real_data}/correspondences/kitti_06.h5@0:5")
         for i in range(len(store)):
-            rows = slice(store.offsets[i], store.offsets[i + 1])
-            points1, points2 = (torch.tensor(v[rows]).double() for v in (store.points1, store.points2))
+            points1, points2 = (torch.tensor(points).double() for points in store.matches(i)[:2])
             true = torch.tensor(store.F[i])
             estimate = true * (1 + 1e-3 * torch.randn(3, 3, generator=torch.Generator().manual_seed(i)).double())
             assert f1_score(points1, points2, true, true, 1.0) == 1

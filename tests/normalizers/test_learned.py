@@ -22,8 +22,10 @@ from two_view import (
     eight_point,
     epipolar_distances,
     hartley_difference,
+    paper,
     shaken,
     signless,
+    small,
     uniform,
     up_to_sign,
 )
@@ -45,14 +47,6 @@ from kornia_learnnorm.geometry.transforms import affine_transform
 from kornia_learnnorm.normalizers import learned
 
 SHIPPED = ["crossview", "crossview-synthetic"]
-
-
-def small(base=None) -> LearnedNormalizer:
-    return LearnedNormalizer(base or Whitening(), CrossViewNetwork(width=16, depth=2))
-
-
-def paper() -> LearnedNormalizer:
-    return LearnedNormalizer(Hartley(), PaperNetwork(16, 3), paper_transform)
 
 
 def public(module: nn.Module) -> dict[str, object]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-import os
 import time
 from itertools import count
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -177,14 +175,12 @@ class TestAccuracy:
         ]
         assert errors[0] < errors[1]
 
-    @pytest.mark.skipif("LEARNNORM_DATA" not in os.environ, reason="LEARNNORM_DATA is not set")
     @pytest.mark.parametrize("name", ["kitti_06", "tum_fr3_office"])
-    def test_level_with_kornia(self, name):
-        store = read_store(Path(os.environ["LEARNNORM_DATA"]) / "correspondences" / f"{name}.h5")
+    def test_level_with_kornia(self, real_data, name):
+        store = read_store(real_data / "correspondences" / f"{name}.h5")
         ours, theirs = [], []
         for i in range(2, 17, 2):
-            rows = slice(store.offsets[i], store.offsets[i + 1])
-            points = [torch.from_numpy(p[rows][store.ratio[rows] < 0.8]) for p in (store.points1, store.points2)]
+            points = [torch.from_numpy(p) for p in store.matches(i, 0.8)[:2]]
             F_true = torch.from_numpy(store.F[i])
             for found, ransac in ((ours, RANSAC(seed=0)), (theirs, kornia_ransac.RANSAC("fundamental", 1.0, seed=0))):
                 F_mat = ransac(*points)[0].double()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.motion import fundamental_from_motion
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.files import atomic_write, write_text
 
 __all__ = ["RenderedPair", "render_pair", "write_pair"]
 
@@ -122,8 +122,7 @@ def write_pair(folder: str | Path, pair: RenderedPair) -> None:
     for name in ("image1", "image2"):
         with atomic_write(folder / f"{name}.png") as temporary:
             temporary.write_bytes(cv2.imencode(".png", getattr(pair, name))[1].tobytes())
-    with atomic_write(folder / "ground_truth.json") as temporary:
-        temporary.write_text(json.dumps({"width": width, "height": height, **truth}, indent=2) + "\n")
+    write_text(folder / "ground_truth.json", json.dumps({"width": width, "height": height, **truth}, indent=2) + "\n")
 
 
 def _rotation(yaw: float, pitch: float, roll: float) -> Array:

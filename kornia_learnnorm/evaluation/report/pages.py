@@ -19,7 +19,7 @@ from kornia_learnnorm.evaluation.robust.run import RobustRun, read_robust
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
 from kornia_learnnorm.evaluation.runs.store import read_section
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.files import write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO
 
@@ -77,15 +77,10 @@ def write_report(folder: str | Path) -> Report:
         pictures += hypothesis_figures(robust)
         missing += robust.missing
     for picture in pictures:
-        _write(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", GREY))
-    _write(folder / "report.md", _markdown(about, tables, pictures))
-    _write(folder / "report.html", _html(about, tables, pictures))
+        write_text(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", GREY))
+    write_text(folder / "report.md", _markdown(about, tables, pictures))
+    write_text(folder / "report.html", _html(about, tables, pictures))
     return Report(tables, missing)
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _about_run(run: Run) -> str:

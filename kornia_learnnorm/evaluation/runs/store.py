@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.files import atomic_write, write_text
 
 __all__ = [
     "About",
@@ -130,8 +130,7 @@ def _read(folder: Path) -> dict[str, Any]:
 
 def _write(folder: Path, section: str, about: About) -> None:
     content = {"format": FORMAT, **_read(folder), section: about}
-    with atomic_write(folder / "run.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    write_text(folder / "run.json", json.dumps(content, indent=1))
 
 
 def file_name(name: str) -> str:

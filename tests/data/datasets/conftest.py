@@ -1,22 +1,10 @@
-"""Sequences on disk, in the layouts of all datasets."""
+"""Copies of the sequences on disk, to be changed."""
 
 from __future__ import annotations
 
 import shutil
 
 import pytest
-
-
-@pytest.fixture(scope="session")
-def written(tmp_path_factory):
-    """All layouts, not to be changed."""
-    pytest.importorskip("PIL.Image", reason="Pillow is not installed")
-    from make_sequences import LAYOUTS
-
-    folder = tmp_path_factory.mktemp("sequences")
-    for name, write in LAYOUTS.items():
-        write(folder / name)
-    return folder
 
 
 @pytest.fixture

@@ -55,8 +55,3 @@ def test_an_unreadable_image_has_no_camera(cambridge):
     frame = read_cambridge(cambridge)[0]
     assert frame.size == (0, 0)
     assert np.isnan(frame.K).all()
-
-
-def test_unknown_split(written):
-    with pytest.raises(ValueError, match="'train', 'test' or None for both, got 'val'"):
-        read_cambridge(written / "cambridge", "val")

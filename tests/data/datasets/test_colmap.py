@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from make_sequences import FOCAL, SIZE, STEP, edit, moved
+from make_sequences import FOCAL, SIZE, STEP, edit, moved, names
 from PIL import Image
 
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap
@@ -27,10 +27,6 @@ def read(folder):
 
 def set_camera(folder, camera: str) -> None:
     (folder / "model" / "cameras.txt").write_text(f"1 {camera}\n")
-
-
-def names(pairs) -> list[tuple[str, str]]:
-    return [(pair.frame1.name, pair.frame2.name) for pair in pairs]
 
 
 class TestReadColmap:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from make_sequences import SIZE
+from make_sequences import SIZE, names
 
 from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.pairs import pair_frames
@@ -32,7 +32,7 @@ def test_a_folder_within_does_not_part_its_sequence(tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
         (tmp_path / name).touch()
     pairs = pair_frames(read_folder(str(tmp_path)))
-    assert [(pair.frame1.name, pair.frame2.name) for pair in pairs] == [("s/1.png", "s/3.png")]
+    assert names(pairs) == [("s/1.png", "s/3.png")]
 
 
 def test_hidden(tmp_path):
@@ -46,5 +46,3 @@ def test_hidden(tmp_path):
 def test_missing(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no images \(\.bmp, .*\) in "):
         read_folder(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"no folder at .*none"):
-        read_folder(tmp_path / "none")

@@ -70,18 +70,3 @@ def test_frames_are_in_order_of_their_numbers(kitti):
 def test_calibration_of_other_cameras_does_not_matter(kitti):
     edit(kitti / "sequences/00/calib.txt", 2, "P1: 1 2 3")
     assert len(read_kitti(kitti, ["00"])) == FRAMES
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"sequences": ["07"]}, ValueError, r"no sequence '07' at .*, there are 00, 06, 11"),
-        ({"sequences": ["00", "00"]}, ValueError, r"each once, got \['00', '00'\]"),
-        ({"sequences": []}, ValueError, r"one name or more, each once, got \[\]"),
-        ({"sequences": "00"}, TypeError, "a list of names, got the string '00'"),
-        ({"camera": "image_4"}, ValueError, "image_0 to image_3, got 'image_4'"),
-    ],
-)
-def test_wrong_arguments(written, arguments, error, message):
-    with pytest.raises(error, match=message):
-        read_kitti(**{"root": written / "kitti", **arguments})

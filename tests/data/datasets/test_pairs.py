@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from make_sequences import names
 
 from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.pairs import listed_pairs, pair_frames
@@ -14,10 +15,6 @@ from kornia_learnnorm.data.datasets.pairs import listed_pairs, pair_frames
 
 def numbered(*sequences: str) -> list[Frame]:
     return [Frame(Path(), f"{sequence}/{n}.png", sequence, (640, 480)) for sequence in sequences for n in range(4)]
-
-
-def names(pairs) -> list[tuple[str, str]]:
-    return [(pair.frame1.name, pair.frame2.name) for pair in pairs]
 
 
 class TestPairFrames:

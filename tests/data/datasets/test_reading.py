@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
-from make_sequences import STEP
+from make_sequences import FR1, FR3, STEP
 
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairs import pair_frames
 from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.data.datasets.splits import SPLITS
-
-FR1 = "rgbd_dataset_freiburg1_wall"
-FR3 = "rgbd_dataset_freiburg3_long_office_household"
 
 
 def epipoles_agree(pair: FramePair) -> bool:
@@ -73,17 +67,14 @@ def test_wrong_arguments(written, dataset, folder, options, error, message):
         ("tum", {"sequences": [FR3], "max_difference": 0.1}, "tum_fr3_office", 19),
     ],
 )
-def test_real_data(dataset, options, store, count):
+def test_real_data(real_data, dataset, options, store, count):
     """Cameras, motions and F are those of stores that other code made of the same frames."""
     h5py = pytest.importorskip("h5py", reason="h5py is not installed")
-    data = os.environ.get("LEARNNORM_DATA")
-    if data is None:
-        pytest.skip("LEARNNORM_DATA does not name a folder of real data")
     pairs = {
         (pair.frame1.path.name, pair.frame2.path.name): pair
-        for pair in pair_frames(read_dataset(dataset, Path(data) / dataset, **options))
+        for pair in pair_frames(read_dataset(dataset, real_data / dataset, **options))
     }
-    with h5py.File(Path(data) / "correspondences" / f"{store}.h5") as file:
+    with h5py.File(real_data / "correspondences" / f"{store}.h5") as file:
         rows = [(row, tuple(names)) for row, names in enumerate(file["names"].asstr()[:]) if tuple(names) in pairs]
         assert len(rows) == len(pairs) == count
         for row, names in rows:
@@ -96,9 +87,6 @@ def test_real_data(dataset, options, store, count):
             assert [pair.frame1.size, pair.frame2.size] == [tuple(size) for size in file["image_size"][row]]
 
 
-def test_real_frame_without_a_pose_near_enough():
-    data = os.environ.get("LEARNNORM_DATA")
-    if data is None:
-        pytest.skip("LEARNNORM_DATA does not name a folder of real data")
-    known = [bool(np.isfinite(frame.pose).all()) for frame in read_dataset("tum", Path(data) / "tum")]
+def test_real_frame_without_a_pose_near_enough(real_data):
+    known = [bool(np.isfinite(frame.pose).all()) for frame in read_dataset("tum", real_data / "tum")]
     assert known == [False] + [True] * 19  # the motion capture starts 0.067 s after the first frame

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from make_sequences import FRAMES, STEP, TUM_START, moved, rotated
+from make_sequences import FR1, FR3, FRAMES, STEP, TUM_START, moved, rotated
 
 from kornia_learnnorm.data.datasets.tum import read_tum
-
-FR1 = "rgbd_dataset_freiburg1_wall"
-FR3 = "rgbd_dataset_freiburg3_long_office_household"
 
 
 def test_frames(written):
@@ -71,9 +68,6 @@ def test_association(tum, stamps, expected):
 
 def test_max_difference(written):
     assert np.isnan(read_tum(written / "tum", max_difference=0.001)[0].pose).all()
-    for wrong in (-0.1, float("nan")):
-        with pytest.raises(ValueError, match=f"zero or more seconds, got {wrong}"):
-            read_tum(written / "tum", max_difference=wrong)
 
 
 @pytest.mark.parametrize("norm", [0.01, 1.0, 100.0])
@@ -100,16 +94,3 @@ def test_no_ground_truth(tum):
     frames = read_tum(tum)
     assert np.isnan([frame.pose for frame in frames[:FRAMES]]).all()
     assert np.isfinite([frame.pose for frame in frames[FRAMES:]]).all()
-
-
-@pytest.mark.parametrize(
-    ("root", "sequences", "error", "message"),
-    [
-        ("tum", ["desk"], ValueError, f"no sequence 'desk' at .*, there are {FR1}, {FR3}"),
-        ("kitti", None, FileNotFoundError, r"no rgb\.txt in .*kitti, nor in a folder in it"),
-        ("none", None, FileNotFoundError, r"no folder at .*none"),
-    ],
-)
-def test_no_sequence(written, root, sequences, error, message):
-    with pytest.raises(error, match=message):
-        read_tum(written / root, sequences)

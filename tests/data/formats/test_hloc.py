@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import h5py
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 
 from kornia_learnnorm.data.formats.hloc import export_hloc, import_hloc
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 UNKNOWN = {"F": (3, 3), "K": (2, 3, 3), "R": (3, 3), "t": (3,)}
@@ -22,12 +19,6 @@ UNKNOWN = {"F": (3, 3), "K": (2, 3, 3), "R": (3, 3), "t": (3,)}
 @pytest.fixture
 def paths(tmp_path):
     return tmp_path / "features.h5", tmp_path / "matches.h5"
-
-
-@pytest.fixture
-def store():
-    made = synthetic_store(pairs=2, points=30, seed=1)
-    return replace(made, offsets=np.array([0, 10, 10, 50, 90, 150, 180]))
 
 
 def store_of(*pairs, size=(8, 6)) -> CorrespondenceStore:
@@ -150,11 +141,11 @@ class TestHloc:
         assert export_hloc(small(points1, points2, ratio), *paths) == dropped
         assert import_hloc(*paths).points2.tolist() == kept
 
-    def test_round_trip_of_a_store(self, store, tmp_path, paths):
-        assert export_hloc(store, *paths) == 0
+    def test_round_trip_of_a_store(self, uneven, tmp_path, paths):
+        assert export_hloc(uneven, *paths) == 0
         got = stored(import_hloc(*paths), tmp_path)
-        assert got.names == store.names  # the names of this store are in their order
-        same_pairs(got, store)
+        assert got.names == uneven.names  # the names of this store are in their order
+        same_pairs(got, uneven)
         unknown(got)
 
     def test_order_of_pairs(self, paths):
@@ -189,11 +180,11 @@ class TestHloc:
             export_hloc(named(*names), tmp_path / "f.h5", tmp_path / "m.h5")
         assert list(tmp_path.iterdir()) == []
 
-    def test_export_refuses(self, store, tmp_path):
+    def test_export_refuses(self, uneven, tmp_path):
         with pytest.raises(ValueError, match=r"must be two files, got .*one\.h5 for both"):
-            export_hloc(store, tmp_path / "one.h5", tmp_path / "one.h5")
+            export_hloc(uneven, tmp_path / "one.h5", tmp_path / "one.h5")
         with pytest.raises(FileNotFoundError, match="does not exist"):
-            export_hloc(store, tmp_path / "none" / "f.h5", tmp_path / "m.h5")
+            export_hloc(uneven, tmp_path / "none" / "f.h5", tmp_path / "m.h5")
         two = named(("a.png", "b.png"), ("a.png", "c.png"))
         two.image_size[1] = 9
         with pytest.raises(ValueError, match=r"'a.png' has several sizes: \[\[8, 6\], \[9, 9\]\]"):

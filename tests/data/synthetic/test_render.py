@@ -4,6 +4,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from two_view import epipolar_distances
 
 from kornia_learnnorm.data.synthetic.render import RenderedPair, render_pair, write_pair
 
@@ -25,13 +26,6 @@ def matches(pair):
     return points1, np.array([keys2[match.trainIdx].pt for match in good], np.float64)
 
 
-def symmetric_distance(points1, points2, F_mat):
-    x1, x2 = (np.column_stack([points, np.ones(len(points))]) for points in (points1, points2))
-    lines2, lines1 = x1 @ F_mat.T, x2 @ F_mat
-    residual = np.abs((x2 * lines2).sum(1))
-    return residual / np.linalg.norm(lines2[:, :2], axis=1) + residual / np.linalg.norm(lines1[:, :2], axis=1)
-
-
 def test_images(pair):
     assert isinstance(pair, RenderedPair)
     for image in (pair.image1, pair.image2):
@@ -51,13 +45,13 @@ def test_ground_truth_is_that_of_the_cameras(pair):
     X1 = np.random.default_rng(0).uniform((-2, -1, 3), (2, 1, 7), (20, 3))
     x1, x2 = X1 @ pair.K.T, (X1 @ pair.R.T + pair.t) @ pair.K.T
     x1, x2 = x1 / x1[:, 2:], x2 / x2[:, 2:]
-    assert symmetric_distance(x1[:, :2], x2[:, :2], pair.F_mat).max() < 1e-9
+    assert epipolar_distances(x1[:, :2], x2[:, :2], pair.F_mat).max() < 1e-9
     assert np.linalg.norm(pair.F_mat) == pytest.approx(1)
 
 
 def test_matches_agree_with_the_ground_truth(pair, matches):
     assert len(matches[0]) >= 300
-    distance = symmetric_distance(*matches, pair.F_mat)
+    distance = epipolar_distances(*matches, pair.F_mat)
     assert np.mean(distance < 1) >= 0.8
     assert np.median(distance) < 0.3  # images and F agree to a fraction of a pixel
 
@@ -67,8 +61,8 @@ def test_matches_determine_the_fundamental_matrix(pair, matches):
     assert on_plane.mean() < 0.6
     F_mat, _ = cv2.findFundamentalMat(*matches, cv2.FM_RANSAC, 0.5, 0.999, 2000)
     F_mat /= np.linalg.norm(F_mat)
-    good = symmetric_distance(*matches, pair.F_mat) < 1
-    assert np.median(symmetric_distance(matches[0][good], matches[1][good], F_mat)) < 0.5
+    good = epipolar_distances(*matches, pair.F_mat) < 1
+    assert np.median(epipolar_distances(matches[0][good], matches[1][good], F_mat)) < 0.5
     # The epipoles, computed from the estimate and from the truth, lie in the same direction.
     true, found = (np.linalg.svd(matrix)[2][-1] for matrix in (pair.F_mat, F_mat))
     true, found = (np.linalg.inv(pair.K) @ epipole for epipole in (true, found))

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from two_view import homogeneous, seeded
 
 from kornia_learnnorm.data.synthetic import (
     TwoViewScene,
@@ -17,20 +18,12 @@ NAMED = [forward_driving, handheld, orbit]
 ALL = [random_scenes, *NAMED]
 
 
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
 def clean(make, monkeypatch, batch_size=64, num_points=24, seed=0):
     """Scenes without noise or gross outliers."""
     if make is not random_scenes:
-        return make(batch_size, num_points, generator(seed), noise=0.0)
+        return make(batch_size, num_points, seeded(seed), noise=0.0)
     monkeypatch.setattr(scenes, "student_t", lambda shape, generator: torch.zeros(shape, dtype=torch.float64))
-    return make(batch_size, num_points, generator(seed))
-
-
-def homogeneous(points):
-    return np.concatenate([points, np.ones_like(points[..., :1])], -1)
+    return make(batch_size, num_points, seeded(seed))
 
 
 def triangulated_depths(scene):
@@ -46,7 +39,7 @@ def triangulated_depths(scene):
 @pytest.mark.parametrize("make", ALL)
 @pytest.mark.parametrize(("batch_size", "num_points"), [(1, 1), (3, 8), (2, 50)])
 def test_shapes_and_dtypes(make, batch_size, num_points):
-    scene = make(batch_size, num_points, generator())
+    scene = make(batch_size, num_points, seeded())
     assert isinstance(scene, TwoViewScene)
     points, matrix = (num_points, 2), (3, 3)
     shapes = [points, points, matrix, (num_points,), matrix, matrix, matrix, (3,), (2,)]
@@ -58,7 +51,7 @@ def test_shapes_and_dtypes(make, batch_size, num_points):
 
 @pytest.mark.parametrize("make", ALL)
 def test_fundamental_matrix_is_that_of_the_cameras(make):
-    scene = make(5, 8, generator(1))
+    scene = make(5, 8, seeded(1))
     for K1, K2, R, t, F_mat in zip(scene.K1, scene.K2, scene.R, scene.t, scene.F_mat, strict=True):
         K1, K2, R, (x, y, z) = K1.numpy(), K2.numpy(), R.numpy(), t.tolist()
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
@@ -101,22 +94,22 @@ def test_inliers_lie_before_both_cameras_and_in_both_images(make, seed, monkeypa
 @pytest.mark.parametrize("make", ALL)
 def test_the_generator_determines_everything(make):
     torch.manual_seed(0)
-    first, again, other = (make(3, 12, generator(seed)) for seed in (5, 5, 6))
+    first, again, other = (make(3, 12, seeded(seed)) for seed in (5, 5, 6))
     torch.manual_seed(1)
     untouched = torch.rand(1)
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not torch.equal(first.points1, other.points1)
-    source = generator()
+    source = seeded()
     assert not torch.equal(make(3, 12, source).points1, make(3, 12, source).points1)
     torch.manual_seed(1)
-    make(3, 12, generator())
+    make(3, 12, seeded())
     assert torch.equal(torch.rand(1), untouched)
 
 
 @pytest.mark.parametrize("make", NAMED)
 def test_noise_has_the_standard_deviation_asked_for(make):
-    exact = make(100, 200, generator(2), noise=0.0)
-    noisy = make(100, 200, generator(2), noise=0.7)
+    exact = make(100, 200, seeded(2), noise=0.0)
+    noisy = make(100, 200, seeded(2), noise=0.7)
     for view in ("points1", "points2"):
         noise = (getattr(noisy, view) - getattr(exact, view)).numpy().ravel()
         assert noise.std() == pytest.approx(0.7, rel=0.02)  # 40,000 numbers: standard error 0.4 %
@@ -127,16 +120,16 @@ def test_noise_has_the_standard_deviation_asked_for(make):
 @pytest.mark.parametrize("make", NAMED)
 @pytest.mark.parametrize(("outliers", "expected"), [(0.0, 0), (0.25, 10), (1.0, 40)])
 def test_share_of_gross_outliers(make, outliers, expected):
-    scene = make(20, 40, generator(3), noise=0.0, outliers=outliers)
+    scene = make(20, 40, seeded(3), noise=0.0, outliers=outliers)
     assert ((~scene.inliers).sum(-1) == expected).all()
-    exact = make(20, 40, generator(3), noise=0.0)
+    exact = make(20, 40, seeded(3), noise=0.0)
     moved = (scene.points2 != exact.points2).any(-1)
     assert torch.equal(moved, ~scene.inliers)
     assert torch.equal(scene.points1, exact.points1)
 
 
 def test_student_t_noise():
-    noise = draws.student_t((200_000, 2), generator(4)).numpy()
+    noise = draws.student_t((200_000, 2), seeded(4)).numpy()
     # Quantiles of Student's t with three degrees of freedom, from its closed-form distribution function:
     # F(x) = 1/2 + (x / (sqrt(3) (1 + x^2/3)) + atan(x / sqrt(3))) / pi.
     for x in (-3.0, -1.0, 0.0, 0.5, 2.0, 6.0):
@@ -146,7 +139,7 @@ def test_student_t_noise():
 
 
 def test_random_scenes_have_the_breadth_promised():
-    scene = random_scenes(4000, 20, generator(7))
+    scene = random_scenes(4000, 20, seeded(7))
     width, height = scene.image_size.unbind(-1)
     assert 400 <= width.min() < 420
     assert 1380 < width.max() <= 1400
@@ -171,7 +164,7 @@ def test_random_scenes_have_the_breadth_promised():
 
 def test_half_of_the_random_scenes_are_clustered():
     size = torch.tensor([[1000.0, 500.0]]).double().expand(2000, 2)
-    spread = [draws.spread_points(size, 30, generator(8), clustered=share).std(1).prod(-1) for share in (0.0, 0.5, 1.0)]
+    spread = [draws.spread_points(size, 30, seeded(8), clustered=share).std(1).prod(-1) for share in (0.0, 0.5, 1.0)]
     below = [(values < 20_000).double().mean().item() for values in spread]  # uniform: 289 x 144 = 41,600
     assert below[0] < 0.01
     assert below[2] > 0.3
@@ -179,10 +172,10 @@ def test_half_of_the_random_scenes_are_clustered():
 
 
 def test_ground_plane():
-    size, K = draws.random_cameras(2000, generator(9))
-    points = draws.spread_points(size, 20, generator(10))
+    size, K = draws.random_cameras(2000, seeded(9))
+    points = draws.spread_points(size, 20, seeded(10))
     height = torch.full((2000, 1), 2.0).double()
-    depths = draws.draw_depths(points, K, 3.0, 75.0, height, generator(11))
+    depths = draws.draw_depths(points, K, 3.0, 75.0, height, seeded(11))
     assert depths.min() >= 3
     assert depths.max() <= 75
     level = (points[..., 1] - K[:, 1, 2, None]) / K[:, 1, 1, None] * depths  # how far below the camera
@@ -191,7 +184,7 @@ def test_ground_plane():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_random_scenes_are_finite_for_many_seeds(seed):
-    scene = random_scenes(256, 12, generator(seed))
+    scene = random_scenes(256, 12, seeded(seed))
     assert all(torch.isfinite(value).all() for value in scene)
     assert scene.inliers.double().mean() > 0.9
     outside = (scene.points2 < 0) | (scene.points2 > scene.image_size[:, None] - 1)
@@ -200,8 +193,8 @@ def test_random_scenes_are_finite_for_many_seeds(seed):
 
 def flat(batch_size, num_points):
     """Points at a depth of five, with their camera: points, depths, K, image size."""
-    size, K = draws.fixed_camera(batch_size, (640.0, 480.0), 500.0, (319.5, 239.5), generator())
-    points = draws.spread_points(size, num_points, generator())
+    size, K = draws.fixed_camera(batch_size, (640.0, 480.0), 500.0, (319.5, 239.5), seeded())
+    points = draws.spread_points(size, num_points, seeded())
     return points, torch.full((batch_size, num_points), 5.0).double(), K, size
 
 
@@ -214,7 +207,7 @@ def test_points_that_no_motion_shows_become_outliers():
     scene = two_views.two_views(points, depths, K, R, torch.ones(2, 1, 3).double(), size, 8)
     assert not scene.inliers.any()
     zero = torch.zeros(2, 8, 2).double()
-    scene = two_views.corrupt(scene, zero, zero, torch.zeros(2, 1).double(), generator())
+    scene = two_views.corrupt(scene, zero, zero, torch.zeros(2, 1).double(), seeded())
     assert not scene.inliers.any()
     assert (scene.points2 >= 0).all()
     assert (scene.points2 <= size[:, None] - 1).all()
@@ -230,17 +223,17 @@ def test_the_first_motion_that_shows_enough_is_chosen():
 
 
 def test_cameras_of_the_named_scenes():
-    driving = forward_driving(1, 1, generator())
+    driving = forward_driving(1, 1, seeded())
     assert driving.image_size.tolist() == [[1241.0, 376.0]]
     assert driving.K1[0].tolist() == [[718.856, 0.0, 607.1928], [0.0, 718.856, 185.2157], [0.0, 0.0, 1.0]]
     for make in (handheld, orbit):
-        scene = make(1, 1, generator())
+        scene = make(1, 1, seeded())
         assert scene.image_size.tolist() == [[640.0, 480.0]]
         assert scene.K2[0, 0, 0] == scene.K2[0, 1, 1] == 535.0
 
 
 def test_motions_of_the_named_scenes():
-    driving, orbiting = forward_driving(50, 8, generator()), orbit(50, 8, generator())
+    driving, orbiting = forward_driving(50, 8, seeded()), orbit(50, 8, seeded())
     centre = -(driving.R.mT @ driving.t[..., None]).squeeze(-1)
     assert (centre[:, 2] > 0.9 * centre.norm(dim=-1)).all()
     pivot = torch.tensor([0.0, 0.0, 4.0]).double()  # stays where it is
@@ -251,8 +244,8 @@ def test_motions_of_the_named_scenes():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ((0, 8, generator()), ValueError, "batch_size .* 0"),
-        ((2, -1, generator()), ValueError, "num_points .* -1"),
+        ((0, 8, seeded()), ValueError, "batch_size .* 0"),
+        ((2, -1, seeded()), ValueError, "num_points .* -1"),
         ((2, 8, 0), TypeError, r"generator .* 'int'"),
     ],
 )
@@ -266,4 +259,4 @@ def test_wrong_arguments(make, arguments, error, message):
 def test_noise_and_outliers_must_make_sense(make, name, wrong):
     for value in wrong:
         with pytest.raises(ValueError, match=f"{name} .* {value}"):
-            make(2, 8, generator(), **{name: value})
+            make(2, 8, seeded(), **{name: value})

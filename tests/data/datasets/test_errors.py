@@ -1,18 +1,18 @@
-"""What the readers say about malformed and missing files: the file, the line, what came and what was expected."""
+"""What the readers say about wrong arguments and files: the file, the line, what came and what was expected."""
 
 from __future__ import annotations
 
 import shutil
 
 import pytest
-from make_sequences import edit
+from make_sequences import FR1, FR3, edit
 
 from kornia_learnnorm.data.datasets.cambridge import read_cambridge
+from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.kitti import read_kitti
 from kornia_learnnorm.data.datasets.tum import read_tum
 
-READERS = {"kitti": read_kitti, "tum": read_tum, "cambridge": read_cambridge}
-FR1 = "rgbd_dataset_freiburg1_wall"
+READERS = {"kitti": read_kitti, "tum": read_tum, "cambridge": read_cambridge, "folder": read_folder}
 WHOLE = 0  # in place of the number of a line
 
 
@@ -75,3 +75,25 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
         (root / file).unlink()
     with pytest.raises(error, match=message):
         READERS[dataset](root)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "root", "arguments", "error", "message"),
+    [
+        ("kitti", "kitti", {"sequences": ["07"]}, ValueError, r"no sequence '07' at .*, there are 00, 06, 11"),
+        ("kitti", "kitti", {"sequences": ["00", "00"]}, ValueError, r"each once, got \['00', '00'\]"),
+        ("kitti", "kitti", {"sequences": []}, ValueError, r"one name or more, each once, got \[\]"),
+        ("kitti", "kitti", {"sequences": "00"}, TypeError, "a list of names, got the string '00'"),
+        ("kitti", "kitti", {"camera": "image_4"}, ValueError, "image_0 to image_3, got 'image_4'"),
+        ("tum", "tum", {"sequences": ["desk"]}, ValueError, f"no sequence 'desk' at .*, there are {FR1}, {FR3}"),
+        ("tum", "tum", {"max_difference": -0.1}, ValueError, r"zero or more seconds, got -0\.1"),
+        ("tum", "tum", {"max_difference": float("nan")}, ValueError, "zero or more seconds, got nan"),
+        ("tum", "kitti", {}, FileNotFoundError, r"no rgb\.txt in .*kitti, nor in a folder in it"),
+        ("tum", "none", {}, FileNotFoundError, r"no folder at .*none"),
+        ("cambridge", "cambridge", {"split": "val"}, ValueError, "'train', 'test' or None for both, got 'val'"),
+        ("folder", "none", {}, FileNotFoundError, r"no folder at .*none"),
+    ],
+)
+def test_wrong_arguments(written, dataset, root, arguments, error, message):
+    with pytest.raises(error, match=message):
+        READERS[dataset](written / root, **arguments)
