@@ -256,15 +256,23 @@ class RANSAC(nn.Module):
         return pool, drawn
 
     def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
-        """Return the matrices of the non-degenerate minimal samples (K, 8), or of all where every one is degenerate."""
+        """Return the matrices of the non-degenerate minimal samples (K, 8), or of all where every one is degenerate.
+
+        Matches on one line give none.
+        """
         x1, x2 = scorer.samples(rows)
+        shift = MIN_SAMPLE_SHIFT * self.inl_th
         if self.normalizer is None:
-            F_mat = solve_samples(x1, x2, MIN_SAMPLE_SHIFT * self.inl_th)
+            F_mat = solve_samples(x1, x2, shift)
             if len(F_mat):
                 return F_mat
+            determined = torch.zeros_like(rows[:, 0], dtype=torch.bool)
         else:
-            determined = are_determined(x1, x2, MIN_SAMPLE_SHIFT * self.inl_th)
-            rows = rows[determined] if bool(determined.any()) else rows
+            determined = are_determined(x1, x2, shift)
+        if bool(determined.any()):
+            rows = rows[determined]
+        elif any(_on_a_line(points, shift) for points in scorer.pixels):
+            return x1.new_zeros(0, 3, 3)
         points1, points2 = (points[rows] for points in scorer.pixels)
         return scorer.from_pixels(find_fundamental(points1, points2, None, self.normalizer, self.rank2))
 
@@ -285,6 +293,12 @@ class RANSAC(nn.Module):
         if hit_rate == 0:
             return self.max_samples
         return math.ceil(min(self.max_samples, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
+
+
+def _on_a_line(points: Tensor, shift: float) -> bool:
+    """Return whether points (N, 2) are less than ``shift`` pixels from one line, in root mean square."""
+    distance = torch.linalg.svdvals(points - points.mean(0))[1] / len(points) ** 0.5
+    return bool(distance < shift)
 
 
 def _failure(points: Tensor, drawn: int) -> RansacResult:

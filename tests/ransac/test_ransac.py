@@ -278,8 +278,9 @@ class TestHardInput:
         ],
         ids=["eight", "on a line", "seven finite rows", "seven weights"],
     )
-    def test_what_determines_no_matrix(self, arguments):
-        assert failed(RANSAC(seed=0, max_samples=2000)(*arguments))
+    @pytest.mark.parametrize("normalizer", [None, kln.Whitening()])
+    def test_what_determines_no_matrix(self, arguments, normalizer):
+        assert failed(RANSAC(seed=0, normalizer=normalizer, max_samples=2000)(*arguments))
 
     def test_many(self):
         points1, points2, _, true = pair(num_points=100_000, outliers=0.3)
