@@ -21,9 +21,10 @@ from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.identity import Identity
-from kornia_learnnorm.normalizers.learned import WEIGHTS, LearnedNormalizer
+from kornia_learnnorm.normalizers.learned import FORMAT, LearnedNormalizer
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.normalizers.whitening import Whitening
+from kornia_learnnorm.pretrained import WEIGHTS, shipped_weights
 
 __all__ = [
     "DEFAULT_METHODS",
@@ -112,7 +113,7 @@ def _find_normalizer(name: str) -> Normalizer:
         return CLOSED_FORMS[name]()
     if ":" in name:
         return _own_normalizer(name)
-    shipped = sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
+    shipped = shipped_weights(FORMAT)
     if name not in shipped and Path(name).suffix != ".safetensors":
         raise FileNotFoundError(
             f"no weights {name!r} and no such normalisation: expected {', '.join([*CLOSED_FORMS, *shipped])}, a"

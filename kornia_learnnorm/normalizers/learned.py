@@ -8,12 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry import transforms
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform, transform_points
@@ -22,13 +18,12 @@ from kornia_learnnorm.normalizers.contract import Normalizer, ProblemNormalizer,
 from kornia_learnnorm.normalizers.networks import crossview, paper
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
+from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
 __all__ = ["LearnedNormalizer"]
 
-WEIGHTS = Path(__file__).parents[1] / "weights"
 BASES = (hartley, identity, reweighted, whitening)  # modules of the bases that a file may name
 FORMAT = "kornia_learnnorm.normalizer.v1"
-MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that a file may name
 
 
 class LearnedNormalizer(ProblemNormalizer):
@@ -103,24 +98,12 @@ class LearnedNormalizer(ProblemNormalizer):
             OSError: if it cannot be written.
 
         """
-        if Path(path).suffix != ".safetensors":
-            raise ValueError(f"weights are written to a .safetensors file, got {str(path)!r}")
         architecture = {
             "base": _describe(self.base, *BASES),
             "network": _describe(self.network, crossview, paper),
             "transform": _name(self.transform, transforms),
         }
-        state = {key: value.detach().cpu().contiguous() for key, value in self.state_dict().items()}
-        metadata = {
-            "format": FORMAT,
-            "architecture": json.dumps(architecture),
-            "trained_on": json.dumps(self.trained_on),
-        }
-        with atomic_write(path) as beside:
-            try:
-                save_file(state, beside, metadata=metadata)
-            except SafetensorError as error:
-                raise OSError(f"{path} could not be written: {error}") from error
+        save_module(path, self, FORMAT, architecture)
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "crossview") -> LearnedNormalizer:
@@ -140,44 +123,7 @@ class LearnedNormalizer(ProblemNormalizer):
             >>> normalizer = LearnedNormalizer.from_pretrained("crossview-synthetic")
 
         """
-        path = Path(name) if Path(name).suffix == ".safetensors" else WEIGHTS / f"{name}.safetensors"
-        if not path.is_file() and Path(name).is_file():
-            raise ValueError(f"{name} is not a .safetensors file by its name")
-        if not path.is_file():
-            shipped = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
-            raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {shipped}")
-        try:
-            with safe_open(path, "pt") as file:
-                metadata = file.metadata() or {}
-                state = {key: file.get_tensor(key).clone() for key in file.keys()}  # noqa: SIM118 (not a dict)
-        except SafetensorError as error:
-            raise ValueError(f"{path} is not a safetensors file: {error}") from error
-        if metadata.get("format") != FORMAT:
-            raise ValueError(f"{path} is not a normaliser: expected format {FORMAT!r}, got {metadata.get('format')!r}")
-        with torch.device("meta"):  # weights take no memory before their shapes are known to be those in the file
-            normalizer = cls(**_build(path, metadata.get("architecture", "")))
-        try:
-            normalizer.load_state_dict(state, strict=True, assign=True)
-        except RuntimeError as error:
-            text = " ".join(str(error).split())
-            raise ValueError(f"{path}: the tensors do not fit the architecture: {text}") from error
-        normalizer.to(next(iter(state.values())).dtype if state else None)
-        broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
-        if broken:
-            raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
-        normalizer.trained_on = _read_names(path, metadata.get("trained_on", "[]"))
-        return normalizer.eval()
-
-
-def _read_names(path: Path, text: str) -> tuple[str, ...]:
-    """Return the names in a JSON list."""
-    try:
-        names = json.loads(text)
-    except ValueError:
-        names = None
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{path}: trained_on must be a JSON list of names, got {text[:80]!r}")
-    return tuple(names)
+        return load_module(name, FORMAT, lambda path, architecture: cls(**_build(path, architecture)))
 
 
 def _name(part: Any, *modules: Any) -> str:
@@ -211,13 +157,7 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
     try:
         parts = json.loads(architecture)
         base, network = dict(parts["base"]), dict(parts["network"])
-        large = [
-            value
-            for value in (*base.values(), *network.values())
-            if isinstance(value, int) and value > MAX_ARCHITECTURE_INT
-        ]
-        if large:
-            raise ValueError(f"numbers can be at most {MAX_ARCHITECTURE_INT}, got {large[0]}")
+        check_architecture(base, network)
         return {
             "base": find(base.pop("name"), *BASES)(**base),
             "network": find(network.pop("name"), crossview, paper)(**network),
