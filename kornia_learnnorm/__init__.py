@@ -11,6 +11,7 @@ Example:
 
 from kornia_learnnorm.estimators.eight_point import EightPoint, TwoViewEstimate
 from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedEstimate, StageEstimate
 from kornia_learnnorm.estimators.refinement import Refinement, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated, squared_loss
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
@@ -26,7 +27,7 @@ from kornia_learnnorm.geometry.dlt import design_matrix, null_vector
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.rank2 import optimal_rank2, rank2_projection
 from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
-from kornia_learnnorm.losses import EpipolarLoss
+from kornia_learnnorm.losses import BoundedEpipolarLoss, EpipolarLoss, InlierLoss, LogEpipolarLoss
 from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate
 from kornia_learnnorm.metrics.bootstrap import PairedDifference, bootstrap_interval, paired_bootstrap
 from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
@@ -48,6 +49,7 @@ __version__ = "0.1.0"
 __all__ = [
     "RANSAC",
     "BetterRate",
+    "BoundedEpipolarLoss",
     "Cauchy",
     "CrossViewNetwork",
     "Diagnostics",
@@ -57,7 +59,11 @@ __all__ = [
     "Hartley",
     "Huber",
     "Identity",
+    "InlierLoss",
+    "LearnedEightPoint",
+    "LearnedEstimate",
     "LearnedNormalizer",
+    "LogEpipolarLoss",
     "PairedDifference",
     "PaperNetwork",
     "PerView",
@@ -67,6 +73,7 @@ __all__ = [
     "ReweightedWhitening",
     "SearchedNormalizer",
     "SoftChoice",
+    "StageEstimate",
     "Truncated",
     "TwoViewEstimate",
     "WeightedSampler",

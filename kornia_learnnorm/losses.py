@@ -1,19 +1,23 @@
-r"""Losses of a fundamental matrix: residuals of correspondences, reduced to one number.
+r"""Losses of a fundamental matrix.
 
-No loss needs a label. Measured on a sample's own points it is the paper's self-supervision; measured on held-out
-correspondences of the same image pair, it asks for the motion instead of the fit.
+:class:`EpipolarLoss` is the paper's self-supervision of samples. Sets of matches with outliers have
+:class:`BoundedEpipolarLoss` without labels, :class:`LogEpipolarLoss` and :class:`InlierLoss` with ground truth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
-__all__ = ["EpipolarLoss"]
+__all__ = ["BoundedEpipolarLoss", "EpipolarLoss", "InlierLoss", "LogEpipolarLoss"]
+
+MAX_DISTANCE = 1e4  # pixels; larger distances count as this and send no gradient
 
 
 class EpipolarLoss(nn.Module):
@@ -112,3 +116,79 @@ class EpipolarLoss(nn.Module):
         """
         dtype = solve_dtype(F_mat.device)
         return self.residual(points1.to(dtype), points2.to(dtype), F_mat.to(dtype)).clamp(max=self.ceiling)
+
+
+class BoundedEpipolarLoss(nn.Module):
+    r"""Mean of :math:`d^2 / (d^2 + s^2)` over matches with outliers, for training without labels.
+
+    :math:`d` is the symmetric epipolar distance (Fan et al., Eq. 7). A match far from its lines costs one and pulls
+    little, so that the matrix that explains most matches has the least loss.
+
+    Args:
+        scale: distance :math:`s` in pixels at which a match costs one half.
+
+    Raises:
+        ValueError: if ``scale`` is not positive.
+
+    Example:
+        >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
+        >>> BoundedEpipolarLoss(2.0)(torch.tensor([[[5.0, 1.0]]]), torch.tensor([[[9.0, 2.0]]]), F_mat)
+        tensor([0.5000])
+
+    """
+
+    def __init__(self, scale: float = 2.0) -> None:
+        super().__init__()
+        if not scale > 0:
+            raise ValueError(f"scale must be positive, got {scale}")
+        self.scale = scale
+
+    def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+        """Return the loss of each set, (B,), of matches (B, M, 2) x 2 under matrices (B, 3, 3)."""
+        squared = symmetric_epipolar_distance(points1, points2, F_mat).clamp(max=MAX_DISTANCE).square()
+        return (squared / (squared + self.scale**2)).mean(-1)
+
+
+class LogEpipolarLoss(nn.Module):
+    r"""Mean of :math:`\log(d + f)` over true inliers, with the symmetric epipolar distance :math:`d`.
+
+    Args:
+        floor: distance :math:`f` in pixels, far below which nothing is gained.
+
+    Raises:
+        ValueError: if ``floor`` is not positive.
+
+    Example:
+        >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
+        >>> LogEpipolarLoss(1.0)(torch.tensor([[[5.0, 1.0]]]), torch.tensor([[[9.0, 1.0]]]), F_mat)
+        tensor([0.])
+
+    """
+
+    def __init__(self, floor: float = 0.1) -> None:
+        super().__init__()
+        if not floor > 0:
+            raise ValueError(f"floor must be positive, got {floor}")
+        self.floor = floor
+
+    def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+        """Return the loss of each set, (B,), of correspondences (B, M, 2) x 2 under matrices (B, 3, 3)."""
+        distance = symmetric_epipolar_distance(points1, points2, F_mat).clamp(max=MAX_DISTANCE)
+        return (distance + self.floor).log().mean(-1)
+
+
+class InlierLoss(nn.Module):
+    """Cross-entropy of the logits of inliers; correspondences of unknown kind, NaN, don't count.
+
+    Example:
+        >>> InlierLoss()(torch.tensor([[0.0, 9.0]]), torch.tensor([[1.0, torch.nan]]))
+        tensor([0.6931])
+
+    """
+
+    def forward(self, logits: Tensor, inliers: Tensor) -> Tensor:
+        """Return the loss of each set, (B,), of logits (B, N) and inliers (B, N): one, zero or NaN."""
+        known = ~inliers.isnan()
+        target = torch.where(known, inliers, 0.0).to(logits)
+        entropy = binary_cross_entropy_with_logits(logits, target, reduction="none")
+        return (entropy * known).sum(-1) / known.sum(-1).clamp(min=1)

@@ -10,7 +10,15 @@ import torch
 from torch.autograd import gradcheck
 from two_view import epipolar_distances, scenes, uniform
 
-from kornia_learnnorm import EpipolarLoss, algebraic_distance, find_fundamental, sampson_distance
+from kornia_learnnorm import (
+    BoundedEpipolarLoss,
+    EpipolarLoss,
+    InlierLoss,
+    LogEpipolarLoss,
+    algebraic_distance,
+    find_fundamental,
+    sampson_distance,
+)
 
 ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # symmetric distance: twice |y1 - y2|
 
@@ -140,3 +148,41 @@ class TestEpipolarLoss:
     def test_heldout_points_are_needed(self, heldout):
         with pytest.raises(ValueError, match=r"heldout_weight=0\.5 needs held-out correspondences, got none"):
             EpipolarLoss(heldout_weight=0.5)(*rows([1.0, 2.0]), *heldout)
+
+
+class TestLossesOfSets:
+    """One number a set, against hand computation."""
+
+    def test_bounded(self):
+        found = BoundedEpipolarLoss(2.0)(*rows([1.0, 0.0], [2.0, 50.0], dtype=torch.float64))
+        expected = [(4 / 8 + 0) / 2, (16 / 20 + 10_000 / 10_004) / 2]
+        assert found.tolist() == pytest.approx(expected)
+
+    def test_log(self):
+        found = LogEpipolarLoss(0.5)(*rows([1.0, 0.0], [2.0, 50.0], dtype=torch.float64))
+        assert found.tolist() == pytest.approx(
+            [(math.log(2.5) + math.log(0.5)) / 2, (math.log(4.5) + math.log(100.5)) / 2]
+        )
+
+    def test_inliers(self):
+        logits = torch.tensor([[0.0, 2.0, -1.0], [1.0, 1.0, 1.0]])
+        inliers = torch.tensor([[1.0, 0.0, torch.nan], [torch.nan] * 3])
+        expected = [(math.log(2) + math.log(1 + math.exp(2))) / 2, 0.0]
+        assert InlierLoss()(logits, inliers).tolist() == pytest.approx(expected)
+
+    @pytest.mark.parametrize("loss", [BoundedEpipolarLoss(), LogEpipolarLoss()])
+    def test_gradcheck_and_epipole(self, loss):
+        F_mat = uniform(3, 3, 3, low=-1).requires_grad_()  # entries of one size, as in normalised coordinates
+        points = uniform(3, 12, 2, low=-1, seed=1), uniform(3, 12, 2, low=-1, seed=2)
+        assert gradcheck(lambda F: loss(*points, F), F_mat, eps=1e-6, atol=1e-4)
+        on_epipole = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]).requires_grad_()
+        value = loss(torch.zeros(1, 2, 2), torch.ones(1, 2, 2), on_epipole[None])
+        (gradient,) = torch.autograd.grad(value.sum(), on_epipole)
+        assert value.isfinite().all()
+        assert not gradient.any()
+
+    @pytest.mark.parametrize("loss", [BoundedEpipolarLoss, LogEpipolarLoss])
+    @pytest.mark.parametrize("number", [0.0, -1.0, math.nan])
+    def test_exceptions(self, loss, number):
+        with pytest.raises(ValueError, match="must be positive, got"):
+            loss(number)

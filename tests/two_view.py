@@ -10,6 +10,7 @@ from torch import Tensor
 from kornia_learnnorm import (
     CrossViewNetwork,
     Hartley,
+    LearnedEightPoint,
     LearnedNormalizer,
     PaperNetwork,
     ReweightedWhitening,
@@ -55,6 +56,18 @@ def shaken(normalizer: LearnedNormalizer | None = None, scale: float = 0.3, seed
         for value in getattr(normalizer.network, "set_network", normalizer.network).head[-1].parameters():
             value.normal_(0, scale)
     return normalizer.eval()
+
+
+def shaken_estimator(seed: int = 0, **options) -> LearnedEightPoint:
+    """A small estimator whose last layers hold random numbers, so that weights and transforms differ."""
+    torch.manual_seed(seed)
+    layer = LearnedEightPoint(**{"width": 16, "depth": 2, "stages": 2} | options)
+    with torch.no_grad():
+        for network in layer.networks:
+            for last in (network.logit, network.head[-1]):
+                for value in last.parameters():
+                    value.normal_(0, 0.3)
+    return layer.eval()
 
 
 def homogeneous(points: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@ r"""The normalised eight-point algorithm as a layer: masks, weights, cameras, an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, NoReturn
 
 import torch
@@ -24,7 +24,15 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fun
 from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
 from kornia_learnnorm.normalizers.hartley import Hartley
 
-__all__ = ["EightPoint", "TwoViewEstimate"]
+__all__ = [
+    "EightPoint",
+    "TwoViewEstimate",
+    "essential_matrix",
+    "prepare_problem",
+    "refuse_jit",
+    "solve_undetermined",
+    "solve_where_determined",
+]
 
 MIN_RANK2_RATIO = 1e-10  # second over first singular value of a matrix of rank 2
 
@@ -147,25 +155,10 @@ class EightPoint(nn.Module):
                 weight is negative, or only one camera is given or one is not invertible.
 
         """
-        if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
-            self.__prepare_scriptable__()
-        if (K1 is None) != (K2 is None):
-            raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
-        if mask is not None:
-            check_mask(mask, points1, points2, weights)
-            points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
-            weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
-        check_correspondences(points1, points2, weights)
-        _check_cameras(K1, K2, len(points1))
-        problem = LinearProblem.from_points(
-            points1, points2, None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
-        )
-        determined, gap = problem.determined, problem.gap
-        F_mat = self._solve(problem, determined).to(points1.dtype)
-        if K1 is None or K2 is None:
-            return TwoViewEstimate(F_mat, None, determined, gap)
-        E_mat = unit_fundamental(transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat)))
-        return TwoViewEstimate(F_mat, E_mat, determined, gap)
+        problem = prepare_problem(points1, points2, weights, mask, K1, K2)
+        (F_mat,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
+        F_mat = F_mat.to(points1.dtype)
+        return TwoViewEstimate(F_mat, essential_matrix(F_mat, K1, K2), problem.determined, problem.gap)
 
     def from_matches(
         self,
@@ -198,45 +191,112 @@ class EightPoint(nn.Module):
         points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
         return self.estimate(points1, points2, weights=weights, mask=mask, K1=K1, K2=K2)
 
-    def _solve(self, problem: LinearProblem, determined: Tensor) -> Tensor:
-        """Return the matrices: of the normaliser where determined, elsewhere of its base and without gradient."""
-        if problem.all_determined:
-            return solve_fundamental(problem, self.normalizer, self.rank2)
-        if problem.all_determined is None:
-            return self._solve_traced(problem, determined)
-        found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
-        F_mat = problem.x1.new_empty(len(determined), 3, 3)
-        F_mat = F_mat.index_copy(0, rest, self._solve_undetermined(problem.select(rest)))
-        return F_mat.index_copy(0, found, solve_fundamental(problem.select(found), self.normalizer, self.rank2))
+    def _solve(self, problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor]:
+        return (solve_fundamental(problem, self.normalizer, self.rank2),)
 
-    def _solve_traced(self, problem: LinearProblem, determined: Tensor) -> Tensor:
-        """Return the matrices of :meth:`_solve` without data-dependent shapes, as ``torch.compile`` and ``vmap`` need.
-
-        No derivative meets an undetermined sample: generic points take its place, and their result is dropped.
-        """
-        rows, points = determined[:, None], (problem.points1, problem.points2)
-        generic = _generic_points(problem.points1)
-        points1, points2 = (torch.where(rows[..., None], p, g) for p, g in zip(points, generic, strict=True))
-        weights = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
-        replaced = LinearProblem.from_points(points1, points2, weights)
-        F_mat = solve_fundamental(replaced, self.normalizer, self.rank2)
-        return torch.where(rows[..., None], F_mat, self._solve_undetermined(problem))
-
-    @torch.no_grad()
-    def _solve_undetermined(self, problem: LinearProblem) -> Tensor:
-        F_mat = solve_fundamental(problem, getattr(self.normalizer, "base", None) or Hartley(), self.rank2)
-        # With at most one point F has rank 1; use the F of a sideways motion.
-        values = torch.linalg.svdvals(F_mat)
-        return torch.where((values[:, 1] > MIN_RANK2_RATIO * values[:, 0])[:, None, None], F_mat, _sideways(F_mat))
+    def _solve_undetermined(self, problem: LinearProblem) -> tuple[Tensor]:
+        return (solve_undetermined(problem, getattr(self.normalizer, "base", None) or Hartley(), self.rank2),)
 
     def __prepare_scriptable__(self) -> NoReturn:
-        """Raise an error: ``torch.jit`` is not supported.
+        """Raise a TypeError: ``torch.jit`` is not supported."""
+        refuse_jit()
 
-        Raises:
-            TypeError: always.
 
-        """
-        raise TypeError("EightPoint cannot be compiled by torch.jit, use torch.compile or torch.export")
+def refuse_jit() -> NoReturn:
+    """Raise a TypeError that says what to use instead of ``torch.jit``."""
+    raise TypeError("this layer cannot be compiled by torch.jit, use torch.compile or torch.export")
+
+
+def prepare_problem(
+    points1: Tensor,
+    points2: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    K1: Tensor | None,
+    K2: Tensor | None,
+) -> LinearProblem:
+    """Return the problem of the arguments of :meth:`EightPoint.estimate`, checked; masked rows have weight zero."""
+    if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
+        refuse_jit()
+    if (K1 is None) != (K2 is None):
+        raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
+    if mask is not None:
+        check_mask(mask, points1, points2, weights)
+        points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
+        weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
+    check_correspondences(points1, points2, weights)
+    _check_cameras(K1, K2, len(points1))
+    return LinearProblem.from_points(
+        points1, points2, None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
+    )
+
+
+def solve_where_determined(
+    problem: LinearProblem,
+    solve: Callable[[LinearProblem, Tensor | None], tuple[Tensor, ...]],
+    solve_undetermined: Callable[[LinearProblem], tuple[Tensor, ...]],
+) -> tuple[Tensor, ...]:
+    """Return the solutions of sets of correspondences that determine their matrix, and other ones of those that don't.
+
+    Args:
+        problem: all sets.
+        solve: returns tensors (B', ...) of a problem and the indices of its sets, None for all.
+        solve_undetermined: returns the same tensors of a problem that does not determine its matrices.
+
+    """
+    determined = problem.determined
+    if problem.all_determined:
+        return solve(problem, None)
+    if problem.all_determined is None:
+        return _solve_traced(problem, solve, solve_undetermined)
+    found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
+    with torch.no_grad():
+        others = solve_undetermined(problem.select(rest))
+    solutions = solve(problem.select(found), found)
+    return tuple(
+        value.new_empty(len(determined), *value.shape[1:]).index_copy(0, rest, other).index_copy(0, found, value)
+        for value, other in zip(solutions, others, strict=True)
+    )
+
+
+def _solve_traced(
+    problem: LinearProblem,
+    solve: Callable[[LinearProblem, Tensor | None], tuple[Tensor, ...]],
+    solve_undetermined: Callable[[LinearProblem], tuple[Tensor, ...]],
+) -> tuple[Tensor, ...]:
+    """Return the solutions without data-dependent shapes, as ``torch.compile`` and ``vmap`` need.
+
+    No derivative meets an undetermined set: generic points take its place, and their result is dropped.
+    """
+    rows, points = problem.determined[:, None], (problem.points1, problem.points2)
+    generic = _generic_points(problem.points1)
+    points1, points2 = (torch.where(rows[..., None], p, g) for p, g in zip(points, generic, strict=True))
+    weights = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
+    solutions = solve(LinearProblem.from_points(points1, points2, weights), None)
+    with torch.no_grad():
+        others = solve_undetermined(problem)
+    return tuple(
+        torch.where(rows.view(-1, *[1] * (value.ndim - 1)), value, other)
+        for value, other in zip(solutions, others, strict=True)
+    )
+
+
+@torch.no_grad()
+def solve_undetermined(
+    problem: LinearProblem, normalizer: Normalizer, rank2: Literal["projection", "optimal"] = "projection"
+) -> Tensor:
+    """Return matrices of rank 2 of sets of correspondences that do not determine them, without gradient."""
+    F_mat = solve_fundamental(problem, normalizer, rank2)
+    # With at most one point F has rank 1; use the F of a sideways motion.
+    values = torch.linalg.svdvals(F_mat)
+    return torch.where((values[:, 1] > MIN_RANK2_RATIO * values[:, 0])[:, None, None], F_mat, _sideways(F_mat))
+
+
+def essential_matrix(F_mat: Tensor, K1: Tensor | None, K2: Tensor | None) -> Tensor | None:
+    r"""Return :math:`K_2^\top F K_1` with unit Frobenius norm, None without cameras."""
+    if K1 is None or K2 is None:
+        return None
+    return unit_fundamental(transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat)))
 
 
 def _rescale(weights: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 from torch.func import grad, jacrev, vmap
 from torch.utils.checkpoint import checkpoint
-from two_view import correspondences, scenes, shaken, signless, uniform, unit, up_to_sign
+from two_view import correspondences, scenes, shaken, shaken_estimator, signless, uniform, unit, up_to_sign
 
 from kornia_learnnorm import (
     EightPoint,
@@ -30,10 +30,11 @@ LAYERS = {
     "reweighted": lambda: EightPoint(ReweightedWhitening()),
     "learned": lambda: EightPoint(shaken()),
     "shipped": lambda: EightPoint(LearnedNormalizer.from_pretrained()),
+    "estimator": shaken_estimator,
 }
 
 
-SLOW = ["reweighted", "learned"]  # to compile
+SLOW = ["reweighted", "learned", "estimator"]  # to compile
 
 
 @pytest.fixture(params=LAYERS)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from two_view import shaken, uniform
+from two_view import shaken, shaken_estimator, uniform
 
 from kornia_learnnorm import (
     CrossViewNetwork,
@@ -149,6 +149,7 @@ LAYERS = {
     "reweighted": lambda: EightPoint(ReweightedWhitening()),
     "learned": lambda: EightPoint(shaken()),
     "shipped": lambda: EightPoint(LearnedNormalizer.from_pretrained()),
+    "estimator": shaken_estimator,
 }
 NEAR = ["coincident", "collinear", "plane", "identical", "repeated", "pure rotation", "far"]
 
@@ -184,7 +185,7 @@ FUZZ = {
     "num_points": st.sampled_from([8, 8, 9, 16]),
     "weighting": st.sampled_from([None, "random", "zeros", "extreme"]),
     "single": st.booleans(),
-    "name": st.sampled_from(["hartley", "reweighted", "learned", "optimal", "shipped"]),
+    "name": st.sampled_from(["hartley", "reweighted", "learned", "optimal", "shipped", "estimator"]),
     "seed": st.integers(0, 2**20),
 }
 

@@ -1,0 +1,105 @@
+r"""The network of a stage of :class:`~kornia_learnnorm.LearnedEightPoint`: a logit for every correspondence of a set.
+
+All operations are invariant or equivariant under permutations of the correspondences, and ignore absent ones.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["SetWeightingNetwork"]
+
+MIN_VARIANCE = 1e-3  # added to the variance of a feature over the set
+
+
+class SetWeightingNetwork(nn.Module):
+    r"""Predict a logit for every correspondence and parameters of the whole set.
+
+    Residual blocks in which every correspondence sees the attentive mean, deviation and maximum of the set. The last
+    layers start at zero: an untrained network gives all correspondences the same weight and leaves the transforms.
+
+    Args:
+        features: features of a correspondence.
+        width: channels.
+        depth: blocks.
+        outputs: numbers predicted for the set.
+
+    Reference:
+        W. Sun, W. Jiang, E. Trulls, A. Tagliasacchi, K. M. Yi, ACNe: Attentive context normalization for robust
+        permutation-equivariant learning, CVPR 2020.
+
+    Example:
+        >>> logits, params = SetWeightingNetwork(9, width=16, depth=2, outputs=10)(torch.rand(3, 20, 9))
+        >>> logits.shape, params.shape
+        (torch.Size([3, 20]), torch.Size([3, 10]))
+
+    """
+
+    def __init__(self, features: int, width: int, depth: int, outputs: int) -> None:
+        super().__init__()
+        self.stem = nn.Linear(features, width)
+        self.blocks = nn.ModuleList(AttentiveContextBlock(width) for _ in range(depth))
+        self.norm = nn.LayerNorm(width)
+        self.logit = nn.Linear(width, 1)
+        self.attention = nn.Linear(width, 1)
+        last = nn.Linear(width, outputs)
+        self.head = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), last)
+        for layer in (self.logit, last):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, features: Tensor, absent: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return logits with shape :math:`(B, N)` and the outputs of the set with shape :math:`(B, P)`.
+
+        Args:
+            features: features of the correspondences with shape :math:`(B, N, C)`.
+            absent: optional mask of the rows that are no correspondences, :math:`(B, N)` bool.
+
+        """
+        hidden = self.stem(features)
+        for block in self.blocks:
+            hidden = block(hidden, absent)
+        hidden = self.norm(hidden)
+        pooled = torch.cat(set_statistics(hidden, self.attention(hidden), absent), -1)
+        outputs: Tensor = self.head(pooled.squeeze(1))
+        return self.logit(hidden).squeeze(-1), outputs
+
+
+class AttentiveContextBlock(nn.Module):
+    """A residual two-layer perceptron on features normalised over the set by attention, with the set's maximum."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.attention = nn.Linear(width, 1)
+        self.point = nn.Linear(2 * width, 2 * width)
+        self.context = nn.Linear(width, 2 * width, bias=False)
+        self.out = nn.Linear(2 * width, width)
+
+    def forward(self, hidden: Tensor, absent: Tensor | None) -> Tensor:
+        """Return the features after the block with shape :math:`(B, N, C)`."""
+        z = self.norm(hidden)
+        mean, deviation, maximum = set_statistics(z, self.attention(z), absent)
+        update = self.point(torch.cat([z, (z - mean) / deviation], -1)) + self.context(maximum)
+        out: Tensor = hidden + self.out(torch.relu(update))
+        return out
+
+
+def set_statistics(features: Tensor, logits: Tensor, absent: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return attentive mean, attentive deviation and maximum over the set, each :math:`(B, 1, C)`.
+
+    Sets without any correspondence have some finite statistics.
+    """
+    features = features.to(logits.dtype)
+    lowest = torch.finfo(logits.dtype).min
+    if absent is not None:
+        logits = logits.masked_fill(absent[..., None], lowest)
+        maximum = features.masked_fill(absent[..., None], lowest).amax(1, keepdim=True)
+        maximum = torch.where(absent.all(1)[:, None, None], 0.0, maximum)
+    else:
+        maximum = features.amax(1, keepdim=True)
+    attention = torch.softmax(logits, 1).mT
+    mean = attention @ features
+    deviation = (attention @ (features - mean).square() + MIN_VARIANCE).sqrt()
+    return mean, deviation, maximum

@@ -1,0 +1,178 @@
+"""The learned eight-point algorithm: invariances, small sets, scores, stages, files, errors."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch.autograd import gradcheck
+from two_view import correspondences, scenes, shaken_estimator, signless, uniform, up_to_sign
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.estimators.match_features import CommonFrame, masked_median
+
+
+def shaken_double(**options) -> kln.LearnedEightPoint:
+    return shaken_estimator(**options).double()
+
+
+class TestInvariances:
+    @pytest.mark.parametrize("num_points", [8, 9, 40])
+    @given(seed=st.integers(0, 2**20))
+    def test_order_of_the_correspondences(self, num_points, seed):
+        layer, points = shaken_double(), correspondences("handheld", 4, num_points)
+        order = torch.randperm(num_points, generator=torch.Generator().manual_seed(seed))
+        estimate = layer.estimate(*points)
+        shuffled = layer.estimate(*(p[:, order] for p in points))
+        assert up_to_sign(shuffled.F_mat.detach(), estimate.F_mat.detach()) < 1e-6
+        assert torch.allclose(shuffled.weights, estimate.weights[:, order], atol=1e-8)
+
+    @pytest.mark.parametrize("num_points", [8, 9, 40])
+    @given(seed=st.integers(0, 2**20))
+    def test_swap_of_the_views(self, num_points, seed):
+        layer, (points1, points2) = shaken_double(), correspondences("handheld", 4, num_points, seed=seed)
+        F_mat, swapped = layer(points1, points2), layer(points2, points1)
+        assert up_to_sign(swapped.detach(), F_mat.detach().mT) < 1e-6
+
+    @pytest.mark.parametrize("num_points", [9, 40])
+    @given(factor=st.floats(1e-3, 1e3), shift=st.floats(-1e3, 1e3))
+    def test_one_scale_and_translation_of_both_images(self, num_points, factor, shift):
+        layer, points = shaken_double(), correspondences("handheld", 4, num_points)
+        moved = layer(*(factor * (p + shift) for p in points)).detach()
+        T = torch.tensor([[factor, 0, factor * shift], [0, factor, factor * shift], [0, 0, 1]], dtype=torch.float64)
+        assert up_to_sign(T.mT @ moved @ T, layer(*points).detach()) < 1e-5
+
+
+class TestSmallSets:
+    def test_eight_are_the_optimal_correction(self):
+        points, layer = correspondences("handheld", 5), shaken_double()
+        expected = kln.find_fundamental(*points, rank2="optimal")
+        assert up_to_sign(layer(*points).detach(), expected) < 1e-9
+        padded = [torch.cat([p, p[:, :3]], 1) for p in points]
+        mask = torch.arange(11).expand(5, 11) < 8
+        assert up_to_sign(layer(*padded, mask=mask).detach(), expected) < 1e-9
+
+    def test_an_untrained_layer_is_hartleys(self):
+        points = correspondences("handheld", 5, 20)
+        layer = kln.LearnedEightPoint(width=16, depth=1, stages=1)
+        assert up_to_sign(layer(*points).detach(), kln.find_fundamental(*points)) < 1e-6
+
+
+class TestEstimate:
+    def test_smoke(self, device, dtype):
+        layer = shaken_estimator(stages=3).to(device)
+        points = [p.to(device, dtype) for p in correspondences("driving", 3, 30)]
+        estimate = layer.estimate(*points, scores=torch.rand(3, 30))
+        assert (estimate.F_mat.shape, estimate.F_mat.dtype) == ((3, 3, 3), dtype)
+        assert len(estimate.stages) == 3
+        assert torch.equal(estimate.stages[-1].F_mat, estimate.F_mat)
+        assert torch.allclose(estimate.weights, estimate.stages[-1].logits.sigmoid())
+        assert estimate.E_mat is None
+        assert estimate.determined.all()
+
+    def test_cameras(self):
+        scene = scenes("handheld", 5, 20)
+        estimate = shaken_double().estimate(scene.points1, scene.points2, K1=scene.K1, K2=scene.K2)
+        expected = scene.K2.mT @ estimate.F_mat @ scene.K1
+        assert up_to_sign(estimate.E_mat.detach(), expected.detach()) < 1e-12
+
+    def test_matches(self):
+        points1, points2 = correspondences("handheld", 2, 30)
+        index = torch.arange(30)[:, None].expand(30, 2)
+        scores = [torch.rand(30, requires_grad=True) for _ in range(2)]
+        layer = shaken_double()
+        estimate = layer.from_matches(points1, points2, [index, index], scores)
+        expected = layer(points1, points2, scores=torch.stack(scores))
+        assert up_to_sign(estimate.F_mat.detach(), expected.detach()) < 1e-9
+        signless(estimate.F_mat).sum().backward()
+        assert all(score.grad.any() and score.grad.isfinite().all() for score in scores)
+
+    def test_gradcheck_of_the_scores(self):
+        points, layer = correspondences("handheld", 2, 12), shaken_double()
+        scores = uniform(2, 12).requires_grad_()
+        assert gradcheck(lambda s: signless(layer(*points, scores=s)), scores, eps=1e-6, atol=1e-4, rtol=1e-3)
+
+    @pytest.mark.parametrize(
+        ("scores", "error", "message"),
+        [
+            (torch.rand(2, 9), ValueError, r"scores must have shape \[2, 12\], got \[2, 9\]"),
+            (torch.full((2, 12), 1.5), ValueError, r"between 0 and 1, got 1\.5 to 1\.5"),
+            (torch.full((2, 12), torch.nan), ValueError, "between 0 and 1, got nan"),
+            (torch.ones(2, 12, dtype=torch.int64), TypeError, r"scores must be .* got torch\.int64"),
+        ],
+    )
+    def test_wrong_scores(self, scores, error, message):
+        with pytest.raises(error, match=message):
+            shaken_estimator()(*correspondences("handheld", 2, 12), scores=scores)
+
+    @pytest.mark.parametrize(("options", "message"), [({"stages": 0}, "stages must be"), ({"rank2": "no"}, "rank2")])
+    def test_wrong_options(self, options, message):
+        with pytest.raises(ValueError, match=message):
+            kln.LearnedEightPoint(**options)
+
+    def test_masked_scores_may_hold_anything(self):
+        points, layer = correspondences("handheld", 2, 12), shaken_double()
+        mask = torch.arange(12).expand(2, 12) < 10
+        scores = torch.where(mask, 0.5, torch.nan)
+        expected = layer(*(p[:, :10] for p in points), scores=scores[:, :10])
+        assert up_to_sign(layer(*points, mask=mask, scores=scores).detach(), expected.detach()) < 1e-6
+
+
+class TestFiles:
+    @pytest.fixture
+    def file(self, tmp_path):
+        path = tmp_path / "weights.safetensors"
+        layer = shaken_estimator(learn_transforms=False, rank2="optimal")
+        layer.trained_on = ("one", "two@0:3")
+        layer.save_pretrained(path)
+        return path
+
+    def test_round_trip(self, file):
+        layer, expected = kln.LearnedEightPoint.from_pretrained(file), shaken_estimator()
+        assert (layer.learn_transforms, layer.rank2, layer.trained_on) == (False, "optimal", ("one", "two@0:3"))
+        assert not layer.training
+        for key, value in expected.state_dict().items():
+            assert torch.equal(layer.state_dict()[key], value)
+
+    @pytest.mark.parametrize(
+        "architecture", ["", "[]", "3", "{}x", '{"widht": 3}', '{"width": 10000}', '{"stages": 0}', '{"rank2": "no"}']
+    )
+    def test_garbled_architecture(self, file, architecture):
+        with safe_open(file, "pt") as opened:
+            metadata = opened.metadata()
+        save_file(load_file(file), file, metadata=metadata | {"architecture": architecture})
+        with pytest.raises(ValueError, match=r"weights\.safetensors describes no estimator of this version"):
+            kln.LearnedEightPoint.from_pretrained(file)
+
+    def test_architecture_of_another_size(self, file):
+        with safe_open(file, "pt") as opened:
+            metadata = opened.metadata()
+        architecture = json.loads(metadata["architecture"]) | {"depth": 5}
+        save_file(load_file(file), file, metadata=metadata | {"architecture": json.dumps(architecture)})
+        with pytest.raises(ValueError, match="do not fit the architecture"):
+            kln.LearnedEightPoint.from_pretrained(file)
+
+    def test_weights_of_a_normaliser(self):
+        with pytest.raises(ValueError, match=r"expected format 'kornia_learnnorm\.eight_point\.v1'"):
+            kln.LearnedEightPoint.from_pretrained("crossview")
+
+
+class TestFeatures:
+    def test_median_of_the_present_rows(self):
+        values, present = uniform(6, 11, 3, low=-1), (uniform(6, 11, seed=1) < 0.6).double()
+        found = masked_median(values, present)
+        for k in range(6):
+            held = values[k][present[k] > 0].sort(0).values
+            assert torch.equal(found[k, 0], held[(len(held) - 1) // 2])
+        assert torch.equal(masked_median(values, torch.ones(6, 11)), masked_median(values, None))
+        assert not masked_median(values, torch.zeros(6, 11)).any()
+
+    def test_the_view_of_smaller_spread_comes_first(self):
+        points = uniform(3, 20, 2, high=100)
+        assert CommonFrame.from_points(points, 2 * points, None).swapped.tolist() == [False] * 3
+        assert CommonFrame.from_points(2 * points, points, None).swapped.tolist() == [True] * 3
