@@ -12,8 +12,10 @@ from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import save_file
 from torch import Tensor, distributed
 
+from kornia_learnnorm.data.sets import StoreSets, SyntheticSets
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
 from kornia_learnnorm.files import atomic_write, short_name
+from lightning_modules.estimator_task import EstimatorTask
 from lightning_modules.task import NormalizerTask
 
 __all__ = ["Checkpoints", "ExportWeights", "WritePredictions"]
@@ -44,7 +46,7 @@ class Checkpoints(ModelCheckpoint):
 
 
 class ExportWeights(Callback):
-    """Write the normaliser as safetensors when training ends, for ``LearnedNormalizer.from_pretrained``.
+    """Write the trained module as safetensors when training ends, for its ``from_pretrained``.
 
     The file names the training data: the stores, or ``synthetic scenes``; nothing for a source of another class.
 
@@ -56,23 +58,28 @@ class ExportWeights(Callback):
         self.filename = filename
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Save the normaliser."""
+        """Save the module."""
         if trainer.is_global_zero:
             path = Path(trainer.default_root_dir) / self.filename
             path.parent.mkdir(parents=True, exist_ok=True)
-            if not isinstance(pl_module, NormalizerTask):
-                raise TypeError(f"only a NormalizerTask has a normaliser to export, got {type(pl_module).__name__}")
-            pl_module.normalizer.trained_on = _names_of_source(getattr(trainer, "datamodule", None))
-            pl_module.normalizer.save_pretrained(path)
+            if not isinstance(pl_module, NormalizerTask | EstimatorTask):
+                raise TypeError(f"expected a NormalizerTask or an EstimatorTask, got {type(pl_module).__name__}")
+            trained = pl_module.normalizer if isinstance(pl_module, NormalizerTask) else pl_module.estimator
+            trained.trained_on = _names_of_sources(getattr(trainer, "datamodule", None))
+            trained.save_pretrained(path)
             print(f"wrote {path}")
 
 
-def _names_of_source(datamodule: Any) -> tuple[str, ...]:
+def _names_of_sources(datamodule: Any) -> tuple[str, ...]:
     """Return the names of the data that a datamodule trains on; nothing where they are not known."""
-    source = getattr(datamodule, "train", None)
-    if isinstance(source, StoreSamples):
-        return tuple(dict.fromkeys(short_name(path) for path in source.paths))
-    return ("synthetic scenes",) if isinstance(source, SyntheticSamples) else ()
+    sources = getattr(datamodule, "train", None)
+    names: list[str] = []
+    for source in sources if isinstance(sources, list) else [sources]:
+        if isinstance(source, StoreSamples | StoreSets):
+            names += [short_name(path) for path in source.paths]
+        elif isinstance(source, SyntheticSamples | SyntheticSets):
+            names.append("synthetic scenes")
+    return tuple(dict.fromkeys(names))
 
 
 class WritePredictions(Callback):

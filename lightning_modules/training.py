@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import warnings
 import zipfile
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
+import pytorch_lightning as pl
 import torch
+import yaml
 from pytorch_lightning.cli import LightningCLI
 from torch import Tensor
 
@@ -58,12 +64,29 @@ def _state_dict(path: str) -> dict[str, Tensor]:
     return dict(state)
 
 
+def _names_its_classes(args: Sequence[str]) -> bool:
+    """Return whether a configuration among the arguments names the classes of its task and datamodule."""
+    files = [value for key, value in pairwise(args) if key in ("-c", "--config")]
+    files += [arg.partition("=")[2] for arg in args if arg.startswith("--config=")]
+    for path in filter(os.path.isfile, files):
+        try:
+            content = yaml.safe_load(Path(path).read_text())
+        except (OSError, ValueError, yaml.YAMLError):
+            continue  # the parser says what is wrong with it
+        if isinstance(content, dict) and "class_path" in (content.get("model") or {}):
+            return True
+    return False
+
+
 def run(args: list[str] | None) -> None:
     """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict``; ``args`` is ``sys.argv`` when None."""
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")  # Lightning's own call of torch
+    named = _names_its_classes(sys.argv[1:] if args is None else args)
     TrainingCLI(
-        NormalizerTask,
-        CorrespondenceDataModule,
+        pl.LightningModule if named else NormalizerTask,
+        pl.LightningDataModule if named else CorrespondenceDataModule,
+        subclass_mode_model=named,
+        subclass_mode_data=named,
         args=args,
         auto_configure_optimizers=False,
         parser_kwargs={"prog": "learnnorm"},

@@ -25,7 +25,7 @@ from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.protocol import MAX_RESIDUAL, RATIO
 
-__all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator"]
+__all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator", "expand_path"]
 
 SCENES_PER_BLOCK = 8192
 
@@ -82,7 +82,7 @@ class StoreSamples:
             got = f"size={size}, block_pairs={block_pairs}"
             raise ValueError(f"a sample needs at least 8 correspondences, a block at least one pair, got {got}")
         self.paths = tuple(paths)
-        self.stores = [StoreReader(_expand(path)) for path in paths]
+        self.stores = [StoreReader(expand_path(path)) for path in paths]
         self.max_ratios = tuple(max_ratios)
         self.num_heldout = num_heldout
         self.max_residual = max_residual
@@ -195,7 +195,8 @@ class SyntheticSamples:
         return Samples(points1, points2, heldout1, heldout2, pair).with_residual_below(self.max_residual)
 
 
-def _expand(path: str) -> str:
+def expand_path(path: str) -> str:
+    """Return the path of a store with the environment variables filled in; an unset one is a ValueError."""
     for name in re.findall(r"\$\{?(\w+)", path):
         if not os.environ.get(name):
             keys = "data.train, data.val and data.test of a configuration name stores, in init_args.paths"

@@ -29,7 +29,7 @@ from kornia_learnnorm.data.synthetic.draws import (
 )
 from kornia_learnnorm.data.synthetic.two_views import TwoViewScene, corrupt, corrupt_evenly, two_views
 
-__all__ = ["forward_driving", "handheld", "orbit", "random_scenes"]
+__all__ = ["forward_driving", "handheld", "orbit", "random_scenes", "random_views"]
 
 
 def random_scenes(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
@@ -60,20 +60,23 @@ def random_scenes(batch_size: int, num_points: int, generator: Generator) -> Two
         (torch.Size([4, 24, 2]), torch.Size([4, 3, 3]))
 
     """
-    _check_arguments(batch_size, num_points, generator)
-    candidates = _num_candidates(num_points)
-    size, K = random_cameras(batch_size, generator)
-    points1 = spread_points(size, candidates, generator, clustered=0.5)
-    height = log_uniform((batch_size, 1), 1.2, 4.0, generator)
-    depths = draw_depths(points1, K, 3.0, 75.0, height, generator, tilt=0.1)
-    R, t = random_motions(depths.median(dim=1, keepdim=True).values, generator)
-    scene = two_views(points1, depths, K, R, t, size, num_points)
-
+    scene = random_views(batch_size, num_points, generator)
     scale = log_uniform((batch_size, 1, 1), 0.1, 1.5, generator)
     noise1, noise2 = (scale * student_t(scene.points1.shape, generator) for _ in range(2))
     contaminated = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
     share = torch.where(contaminated, uniform((batch_size, 1), 0.0, 0.3, generator), 0.0)
     return corrupt(scene, noise1, noise2, share, generator)
+
+
+def random_views(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
+    """Draw the scenes of :func:`random_scenes` without noise and outliers; the arguments and errors are the same."""
+    _check_arguments(batch_size, num_points, generator)
+    size, K = random_cameras(batch_size, generator)
+    points1 = spread_points(size, _num_candidates(num_points), generator, clustered=0.5)
+    height = log_uniform((batch_size, 1), 1.2, 4.0, generator)
+    depths = draw_depths(points1, K, 3.0, 75.0, height, generator, tilt=0.1)
+    R, t = random_motions(depths.median(dim=1, keepdim=True).values, generator)
+    return two_views(points1, depths, K, R, t, size, num_points)
 
 
 def forward_driving(

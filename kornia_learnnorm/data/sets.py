@@ -1,0 +1,159 @@
+r"""Sets of matches with outliers, as many as wanted from each image pair, and what supervises an estimator on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Generator, Tensor
+
+from kornia_learnnorm.data.sources import expand_path
+from kornia_learnnorm.data.store import StoreReader
+from kornia_learnnorm.data.synthetic.matches import SyntheticMatches, random_matches
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+
+__all__ = ["MatchSets", "SetSource", "StoreSets", "SyntheticSets"]
+
+LABEL_THRESHOLD = 2.0  # pixels from the true epipolar lines up to which a match counts as an inlier
+
+
+class MatchSets(NamedTuple):
+    """Sets of matches of image pairs.
+
+    Attributes:
+        points1: pixels in the first view, (B, N, 2).
+        points2: pixels in the second view, (B, N, 2).
+        scores: a score for each match, 1 minus Lowe's ratio, (B, N), or None.
+        inliers: one for inliers, zero for outliers, NaN where that is not known, (B, N).
+        heldout1: pixels in the first view of further matches, (B, M, 2): true inliers where those are known, else any.
+        heldout2: pixels in the second view of the further matches, (B, M, 2).
+        labelled: whether the ground truth is known, (B,) bool.
+    """
+
+    points1: Tensor
+    points2: Tensor
+    scores: Tensor | None
+    inliers: Tensor
+    heldout1: Tensor
+    heldout2: Tensor
+    labelled: Tensor
+
+
+class SetSource(Protocol):
+    """Anything that draws sets of matches."""
+
+    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
+        """Return sets of one size, which depend on nothing but the arguments and the generator's state."""
+
+
+class StoreSets:
+    """Random sets of matches of the image pairs of stores; half of the draws with the ratio test.
+
+    Pairs without ground truth are supervised by their own matches, see :class:`~kornia_learnnorm.BoundedEpipolarLoss`.
+
+    Args:
+        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
+            ``$LEARNNORM_DATA`` are filled in.
+        num_heldout: further matches of the pair.
+        max_ratios: limits of Lowe's ratio, of which each draw takes one; None for no limit.
+
+    Raises:
+        ValueError: if no path is given, an environment variable is not set, or no pair can be used.
+        FileNotFoundError: if there is no such store.
+    """
+
+    def __init__(
+        self, paths: Sequence[str], num_heldout: int = 48, max_ratios: Sequence[float | None] = (RATIO, None)
+    ) -> None:
+        if not paths or not max_ratios:
+            raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
+        self.paths, self.num_heldout, self.max_ratios = tuple(paths), num_heldout, tuple(max_ratios)
+        self._pairs = [pair for path in paths for pair in _read_pairs(path)]
+        if not self._pairs:
+            raise ValueError(f"no pair of {', '.join(paths)} has {MIN_HELDOUT} matches to hold out")
+        self._sizes = [torch.tensor([len(pair.passing(ratio)) for pair in self._pairs]) for ratio in self.max_ratios]
+
+    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
+        """Return sets of random matches of random pairs; the pairs with most matches where too few have enough."""
+        choice = int(torch.randint(len(self.max_ratios), (), generator=generator))
+        ratio, sizes = self.max_ratios[choice], self._sizes[choice]
+        able = (sizes >= min(num_points, int(sizes.max()))).nonzero()[:, 0]
+        chosen = able[torch.randint(len(able), (num_sets,), generator=generator)].tolist()
+        parts = [self._pairs[i].draw(num_points, self.num_heldout, ratio, generator) for i in chosen]
+        return MatchSets(*(torch.stack(values) for values in zip(*parts, strict=True)))
+
+
+MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
+
+
+class _Pair(NamedTuple):
+    """The matches of one image pair: points (M, 4), ratios (M,), distances from the true lines (M,), NaN if unknown."""
+
+    points: Tensor
+    ratio: Tensor
+    distance: Tensor
+
+    def passing(self, max_ratio: float | None) -> Tensor:
+        """Return the indices of the matches that pass the ratio test."""
+        return torch.arange(len(self.ratio)) if max_ratio is None else (self.ratio < max_ratio).nonzero()[:, 0]
+
+    @property
+    def heldout(self) -> Tensor:
+        """The indices of the matches that supervise."""
+        if self.distance.isnan().any():
+            return torch.arange(len(self.ratio))
+        return ((self.distance < INLIER_THRESHOLD) & (self.ratio < RATIO)).nonzero()[:, 0]
+
+    def draw(
+        self, num_points: int, num_heldout: int, max_ratio: float | None, generator: Generator
+    ) -> Sequence[Tensor]:
+        """Return the fields of a :class:`MatchSets` of one set."""
+        passing, heldout = self.passing(max_ratio), self.heldout
+        rows = passing[torch.randperm(len(passing), generator=generator)]
+        rows = rows[torch.arange(num_points) % len(rows)]
+        held = self.points[heldout[torch.randint(len(heldout), (num_heldout,), generator=generator)]]
+        points, distance = self.points[rows], self.distance[rows]
+        inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
+        labelled = ~distance.isnan().any()
+        return points[:, :2], points[:, 2:], 1 - self.ratio[rows], inliers, held[:, :2], held[:, 2:], labelled
+
+
+def _read_pairs(path: str) -> list[_Pair]:
+    reader = StoreReader(expand_path(path))
+    store = reader.read(range(len(reader)))
+    pairs = []
+    for i in range(len(reader)):
+        rows = slice(int(store.offsets[i]), int(store.offsets[i + 1]))
+        points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
+        distance = symmetric_epipolar_distance(points1, points2, torch.from_numpy(store.F[i]))
+        points = torch.cat([points1, points2], -1).float()
+        pair = _Pair(points, torch.from_numpy(store.ratio[rows]), distance.float())
+        if len(pair.heldout) >= MIN_HELDOUT:
+            pairs.append(pair)
+    return pairs
+
+
+class SyntheticSets:
+    """Sets of matches of synthetic scenes, supervised by exact correspondences.
+
+    Args:
+        num_heldout: exact correspondences of each scene.
+        matches: function of the number of scenes, the points per scene, further exact ones and a generator.
+    """
+
+    def __init__(
+        self,
+        num_heldout: int = 48,
+        matches: Callable[[int, int, int, Generator], SyntheticMatches] = random_matches,
+    ) -> None:
+        self.num_heldout = num_heldout
+        self.matches = matches
+
+    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
+        """Return the matches of new scenes."""
+        found = self.matches(num_sets, num_points, self.num_heldout, generator)
+        points1, points2, scores, inliers, exact1, exact2 = (value.float() for value in found)
+        labelled = torch.ones(num_sets, dtype=torch.bool)
+        return MatchSets(points1, points2, scores, inliers, exact1, exact2, labelled)

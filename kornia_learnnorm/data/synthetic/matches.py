@@ -1,0 +1,179 @@
+"""Synthetic matches as a matcher gives them: varied scenes, noise, scores, and outliers of several kinds."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Generator, Tensor
+from torch.nn.functional import normalize
+
+from kornia_learnnorm.data.synthetic.draws import (
+    log_uniform,
+    normal,
+    random_cameras,
+    spread_points,
+    student_t,
+    uniform,
+    viewing_rays,
+)
+from kornia_learnnorm.data.synthetic.scenes import forward_driving, handheld, orbit, random_views
+from kornia_learnnorm.data.synthetic.two_views import TwoViewScene, two_views
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+
+__all__ = ["SyntheticMatches", "random_matches", "wide_baseline"]
+
+ORBIT_CANDIDATES = 6  # motions per scene
+KINDS = 5  # of scenes
+
+
+class SyntheticMatches(NamedTuple):
+    """Matches of synthetic scenes.
+
+    Attributes:
+        points1: pixels in the first image, (B, N, 2).
+        points2: pixels in the second image, (B, N, 2).
+        scores: a score for each match, as 1 minus Lowe's ratio, (B, N).
+        inliers: one for inliers, zero for outliers, (B, N).
+        exact1: pixels in the first image of further correspondences, without noise, (B, M, 2).
+        exact2: pixels in the second image of the further correspondences, (B, M, 2).
+    """
+
+    points1: Tensor
+    points2: Tensor
+    scores: Tensor
+    inliers: Tensor
+    exact1: Tensor
+    exact2: Tensor
+
+
+def random_matches(batch_size: int, num_points: int, num_exact: int, generator: Generator) -> SyntheticMatches:
+    r"""Draw matches of varied scenes.
+
+    All scenes of a call are of one kind: :func:`~kornia_learnnorm.data.synthetic.random_scenes`, driving, hand-held,
+    orbit or :func:`wide_baseline`. The noise is Gaussian or, in half of the scenes, Student-t with three degrees of
+    freedom, its scale log-uniform in 0.1-1.5 px; a quarter of the scenes has some radial distortion. Half of the scenes
+    have up to 20 % outliers, the others 10 to 90 %, in equal parts: anywhere in the other image; at the partner of
+    another point, often of one of a few; shifted by 5-150 px, together with their neighbours in a third of the scenes.
+
+    Args:
+        batch_size: number of scenes :math:`B`.
+        num_points: matches per scene :math:`N`.
+        num_exact: further correspondences without noise :math:`M`.
+        generator: source of all randomness.
+
+    Example:
+        >>> random_matches(4, 24, 8, torch.Generator().manual_seed(0)).points1.shape
+        torch.Size([4, 24, 2])
+
+    """
+    kind = int(torch.randint(KINDS, (), generator=generator, device=generator.device))
+    total = num_points + num_exact
+    if kind == 0:
+        scene = random_views(batch_size, total, generator)
+    elif kind == 4:
+        scene = wide_baseline(batch_size, total, generator)
+    else:
+        scene = (forward_driving, handheld, orbit)[kind - 1](batch_size, total, generator, noise=0.0)
+    scene = _distort(scene, generator)
+    points1, exact1 = torch.split(scene.points1, [num_points, num_exact], 1)
+    points2, exact2 = torch.split(scene.points2, [num_points, num_exact], 1)
+    shown = scene.inliers[:, :num_points]
+
+    scale = log_uniform((batch_size, 1, 1), 0.1, 1.5, generator)
+    heavy = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
+    points1, points2 = (
+        p + scale * torch.where(heavy, 0.7 * student_t(p.shape, generator), normal(tuple(p.shape), generator))
+        for p in (points1, points2)
+    )
+    clean = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
+    share = torch.where(clean, 0.2, 0.9) * uniform((batch_size, 1), 0.0, 1.0, generator)
+    outliers = _choose_outliers(points1, share, generator)
+    points2 = torch.where(outliers[..., None], _outliers(points1, points2, scene.image_size, generator), points2)
+    distance = symmetric_epipolar_distance(points1, points2, scene.F_mat)
+    inliers = shown & (distance < 4 * scale[..., 0] + 0.5)
+    return SyntheticMatches(points1, points2, _scores(inliers, clean, generator), inliers, exact1, exact2)
+
+
+def wide_baseline(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
+    """Draw scenes that two photographers take of one object or facade, 5-45 degrees apart, without noise.
+
+    Half of the scenes are a slanted plane with a relief of up to 20 % of its distance.
+    """
+    size, K = random_cameras(batch_size, generator)
+    points1 = spread_points(size, 2 * num_points + 16, generator, clustered=0.5)
+    rays = viewing_rays(points1, K)
+    median = log_uniform((batch_size, 1), 4.0, 40.0, generator)
+    slope = 0.4 * normal((batch_size, 2, 1), generator)
+    plane = 1 / (1 + (rays[..., :2] @ slope)[..., 0]).clamp(min=0.4)
+    relief = log_uniform((batch_size, 1), 0.01, 0.2, generator) * normal(tuple(plane.shape), generator)
+    free = log_uniform(tuple(plane.shape), 0.5, 2.0, generator)
+    flat = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
+    depths = median * torch.where(flat, plane * (1 + relief).clamp(min=0.3), free)
+
+    shape = (batch_size, ORBIT_CANDIDATES)
+    axes = normal((*shape, 3), generator) * size.new_tensor([0.4, 1.0, 0.3])
+    angle = log_uniform((*shape, 1), math.radians(5.0), math.radians(45.0), generator)
+    R = axis_angle_to_rotation_matrix(angle * normalize(axes, dim=-1))
+    aside = axis_angle_to_rotation_matrix(0.1 * normal((*shape, 3), generator))
+    centre = torch.stack([torch.zeros_like(median), torch.zeros_like(median), median], -1)
+    distance = log_uniform((*shape, 1), 0.7, 1.4, generator)
+    t = distance * centre - (R @ centre[..., None]).squeeze(-1)
+    return two_views(points1, depths, K, aside @ R, (aside @ t[..., None]).squeeze(-1), size, num_points)
+
+
+def _distort(scene: TwoViewScene, generator: Generator) -> TwoViewScene:
+    """Return the scenes with some radial distortion in both images, in a quarter of them."""
+    batch_size = len(scene.F_mat)
+    some = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.25
+    strength = torch.where(some, 0.01 * normal((batch_size, 1, 1), generator), 0.0)
+    centre = scene.image_size[:, None] / 2
+    radius = centre.norm(dim=-1, keepdim=True)
+    moved = []
+    for points in (scene.points1, scene.points2):
+        offset = (points - centre) / radius
+        moved.append(points + radius * strength * offset.square().sum(-1, keepdim=True) * offset)
+    return scene._replace(points1=moved[0], points2=moved[1])
+
+
+def _choose_outliers(points1: Tensor, share: Tensor, generator: Generator) -> Tensor:
+    """Return a mask (B, N) of a share (B, 1) of the points; neighbours of one point first in a third of the scenes."""
+    batch_size, num_points = points1.shape[:2]
+    order = uniform((batch_size, num_points), 0.0, 1.0, generator)
+    near = (points1 - points1[:, :1]).norm(dim=-1)
+    near = near / near.amax(1, keepdim=True)
+    together = uniform((batch_size, 1), 0.0, 1.0, generator) < 1 / 3
+    rank = torch.where(together, near + 0.3 * order, order).argsort(1).argsort(1)
+    return rank < (share * num_points).round()
+
+
+def _outliers(points1: Tensor, points2: Tensor, size: Tensor, generator: Generator) -> Tensor:
+    """Return wrong partners (B, N, 2) of all points, of three kinds."""
+    shape = tuple(points1.shape[:2])
+    anywhere = (size[:, None] - 1) * uniform((*shape, 2), 0.0, 1.0, generator)
+    popular = uniform((shape[0], 1), 0.0, 1.0, generator) < 0.5
+    index = uniform(shape, 0.0, 1.0, generator)
+    index = (torch.where(popular, index**4, index) * shape[1]).long().clamp(max=shape[1] - 1)
+    another = points2.gather(1, index[..., None].expand(-1, -1, 2))
+    angle = uniform((*shape, 1), 0.0, 2 * math.pi, generator)
+    length = log_uniform((*shape, 1), 5.0, 150.0, generator)
+    # An object that moves: one shift for all, but for a little.
+    common = uniform((shape[0], 1, 1), 0.0, 1.0, generator) < 1 / 3
+    angle = torch.where(common, angle[:, :1] + 0.02 * angle, angle)
+    length = torch.where(common, length[:, :1] * (1 + 0.0002 * length), length)
+    shifted = points2 + length * torch.cat([angle.cos(), angle.sin()], -1)
+    kind = uniform((*shape, 1), 0.0, 3.0, generator)
+    kind = torch.where(common, 2.0 + 0.0 * kind, kind)
+    return torch.where(kind < 1, anywhere, torch.where(kind < 2, another, shifted))
+
+
+def _scores(inliers: Tensor, clean: Tensor, generator: Generator) -> Tensor:
+    """Return scores (B, N) such as 1 minus Lowe's ratio has; sets marked ``clean`` (B, 1) have passed a ratio test."""
+    shape = tuple(inliers.shape)
+    exponent = log_uniform((shape[0], 1), 0.4, 1.2, generator)
+    good = uniform(shape, 0.02, 0.95, generator) ** exponent
+    bad = 1 - 0.3 * uniform(shape, 0.0, 1.0, generator) ** 3
+    ratio = torch.where(inliers, good, bad)
+    return 1 - torch.where(clean, 0.8 * ratio, ratio)

@@ -1,0 +1,140 @@
+"""The training task of an estimator: sets of matches in, losses of all its stages out, with labels or without."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from pytorch_lightning.utilities import rank_zero_warn
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import OneCycleLR
+
+from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss
+
+__all__ = ["EstimatorTask"]
+
+EARLY_STAGE = 0.3  # weight of the losses of all stages but the last
+MAX_SET_GRADIENT = 1.0  # norm of a set's gradient of its logits or parameters; nearly degenerate sets have more
+
+
+def _adamw(params: Iterable[nn.Parameter]) -> Optimizer:
+    return torch.optim.AdamW(params, lr=2e-3)
+
+
+def _limit_gradients(module: nn.Module, args: Any, outputs: tuple[Tensor, ...]) -> None:
+    """Limit the norm of each set's gradient of a network's outputs, before the batch's average."""
+
+    def limit(gradient: Tensor) -> Tensor:
+        most = MAX_SET_GRADIENT / len(gradient)
+        norm: Tensor = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+        return gradient * torch.where(norm > most, most / norm, 1.0)
+
+    for output in outputs:
+        if output.requires_grad:
+            output.register_hook(limit)  # type: ignore[no-untyped-call]
+
+
+class EstimatorTask(pl.LightningModule):
+    """Train a learned estimator by back-propagating losses of its matrices.
+
+    Sets whose ground truth is known have the logarithmic loss of true inliers and the cross-entropy of the logits, the
+    others the bounded loss of all matches. Validation logs the median distance of the held-out matches.
+
+    Args:
+        estimator: the estimator to train.
+        labels: use the ground truth where it is known; without, all sets count as unlabelled.
+        label_free: loss of the sets without ground truth, times ``label_free_weight``.
+        labelled: loss of the sets with ground truth.
+        inlier_weight: weight of the cross-entropy.
+        label_free_weight: weight of the label-free loss.
+        optimizer: builds the optimiser from the parameters; AdamW with a learning rate of 2e-3 when not given. The
+            learning rate follows one cycle over all steps of the run.
+    """
+
+    def __init__(
+        self,
+        estimator: LearnedEightPoint,
+        labels: bool = True,
+        label_free: BoundedEpipolarLoss | None = None,
+        labelled: LogEpipolarLoss | None = None,
+        inlier_weight: float = 0.3,
+        label_free_weight: float = 4.0,
+        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = _adamw,
+    ) -> None:
+        super().__init__()
+        self.estimator = estimator
+        self.labels = labels
+        self.label_free = label_free or BoundedEpipolarLoss()
+        self.labelled = labelled or LogEpipolarLoss()
+        self.inlier = InlierLoss()
+        self.inlier_weight, self.label_free_weight = inlier_weight, label_free_weight
+        self.optimizer = optimizer
+        self._medians: list[tuple[int, Tensor]] = []  # set sizes and errors since the last validation
+
+    def configure_optimizers(self) -> Any:
+        """Build the optimiser and its schedule."""
+        optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
+        steps = max(2, int(self.trainer.estimated_stepping_batches))
+        schedule = OneCycleLR(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=0.05)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_fit_start(self) -> None:
+        """Train each stage by its own losses; limit the gradient of each set where it enters the networks."""
+        self.estimator.detach_stages = True
+        self._limits = [network.register_forward_hook(_limit_gradients) for network in self.estimator.networks]
+
+    def on_fit_end(self) -> None:
+        """Undo :meth:`on_fit_start`."""
+        self.estimator.detach_stages = False
+        for handle in self._limits:
+            handle.remove()
+
+    def training_step(self, batch: MatchSets, batch_idx: int) -> Tensor:
+        """Return the loss of a batch."""
+        loss = self.compute_loss(batch)
+        self.log("train/loss", loss.detach(), prog_bar=True)
+        return loss
+
+    def compute_loss(self, batch: MatchSets) -> Tensor:
+        """Return the loss of a batch: of all stages, and of the sets of both kinds."""
+        points1, points2 = batch.points1.double(), batch.points2.double()
+        heldout1, heldout2 = batch.heldout1.double(), batch.heldout2.double()
+        stages: Sequence[Any] = self.estimator.estimate(points1, points2, scores=batch.scores).stages
+        labelled = batch.labelled & self.labels
+        total = points1.new_zeros(())
+        for number, (F_mat, logits) in enumerate(stages):
+            known = self.labelled(heldout1, heldout2, F_mat)
+            known = known + self.inlier_weight * self.inlier(logits, batch.inliers)
+            unknown = self.label_free_weight * self.label_free(heldout1, heldout2, F_mat)
+            loss = torch.where(labelled, known, unknown).mean()
+            total = total + (1.0 if number + 1 == len(stages) else EARLY_STAGE) * loss
+        return total
+
+    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
+        """Skip a step whose gradient is not finite."""
+        finite = all(bool(p.grad.isfinite().all()) for p in self.parameters() if p.grad is not None)
+        if not finite:
+            rank_zero_warn("a step was skipped: non-finite gradient")
+            for p in self.parameters():
+                p.grad = None
+        self.log("train/skipped", float(not finite))
+
+    def validation_step(self, batch: MatchSets, batch_idx: int) -> None:
+        """Collect the median distance of the held-out matches of each set."""
+        F_mat = self.estimator(batch.points1.double(), batch.points2.double())
+        distance = symmetric_epipolar_distance(batch.heldout1.double(), batch.heldout2.double(), F_mat)
+        self._medians.append((batch.points1.shape[1], distance.median(-1).values))
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the median over the sets of at most 32, at most 256 and more matches."""
+        for name, low, high in (("32", 0, 32), ("256", 32, 256), ("1000", 256, 10**9)):
+            own = [errors for size, errors in self._medians if low < size <= high]
+            if own:
+                self.log(f"val/median_{name}", torch.cat(own).median(), prog_bar=True)
+        self._medians = []
