@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from kornia_learnnorm.geometry import transforms
@@ -39,6 +40,8 @@ class LearnedNormalizer(ProblemNormalizer):
         network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates; an untrained
             :class:`~kornia_learnnorm.CrossViewNetwork` of their size when not given.
         transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
+        max_points: sets of more correspondences get Hartley's transforms; None for no limit. It is 12 in the shipped
+            weights ``crossview``, which were trained on eights and don't help above that.
 
     Attributes:
         trained_on: names of the stores that the weights were trained on, ``STORE@FIRST:STOP`` for some pairs of one, or
@@ -64,15 +67,28 @@ class LearnedNormalizer(ProblemNormalizer):
         base: nn.Module | None = None,
         network: nn.Module | None = None,
         transform: Callable[[Tensor], Tensor] = spd_transform,
+        max_points: int | None = None,
     ) -> None:
         super().__init__()
+        if max_points is not None and max_points < 8:
+            raise ValueError(f"max_points must be at least 8 or None, got {max_points}")
         self.base: Normalizer = ReweightedWhitening() if base is None else base
         self.network = CrossViewNetwork() if network is None else network
         self.transform = transform
+        self.max_points = max_points
         self.trained_on: tuple[str, ...] = ()
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views, in the dtype of the problem."""
+        if self.max_points is None or problem.x1.shape[1] <= self.max_points:
+            return self._predict(problem)
+        if problem.weights is None:
+            return problem.T1, problem.T2
+        few = ((problem.weights > 0).sum(-1) <= self.max_points)[:, None, None]
+        T1, T2 = self._predict(problem)
+        return torch.where(few, T1, problem.T1), torch.where(few, T2, problem.T2)
+
+    def _predict(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         T1, T2 = (T.to(problem.x1) for T in transforms_of(self.base, problem))
         x1, x2 = transform_points(problem.points1, T1), transform_points(problem.points2, T2)
         if getattr(self.network, "needs_null_matrix", False):
@@ -83,7 +99,8 @@ class LearnedNormalizer(ProblemNormalizer):
 
     def extra_repr(self) -> str:
         """Return the parameters."""
-        return f"transform={getattr(self.transform, '__name__', self.transform)}, trained_on={self.trained_on}"
+        transform = getattr(self.transform, "__name__", self.transform)
+        return f"transform={transform}, max_points={self.max_points}, trained_on={self.trained_on}"
 
     def save_pretrained(self, path: str | Path) -> None:
         """Write weights and architecture to one safetensors file, beside the target and then renamed.
@@ -102,6 +119,7 @@ class LearnedNormalizer(ProblemNormalizer):
             "base": _describe(self.base, *BASES),
             "network": _describe(self.network, crossview, paper),
             "transform": _name(self.transform, transforms),
+            "max_points": self.max_points,
         }
         save_module(path, self, FORMAT, architecture)
 
@@ -158,10 +176,14 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
         parts = json.loads(architecture)
         base, network = dict(parts["base"]), dict(parts["network"])
         check_architecture(base, network)
+        max_points = parts.get("max_points")  # files of older versions have none
+        if not isinstance(max_points, int | None):
+            raise ValueError(f"max_points must be a whole number or null, got {max_points!r}")
         return {
             "base": find(base.pop("name"), *BASES)(**base),
             "network": find(network.pop("name"), crossview, paper)(**network),
             "transform": find(parts["transform"], transforms),
+            "max_points": max_points,
         }
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(f"{path} describes no normaliser of this version: {error}") from error

@@ -234,6 +234,7 @@ class TestFiles:
                 "features": "epipolar",
             },
             "transform": "spd_transform",
+            "max_points": None,
         }
         state = load_file(file)
         assert state.keys() == small().state_dict().keys()
@@ -262,6 +263,40 @@ class TestFiles:
         message = rf"no weights {re.escape(repr(name))}: expected a .safetensors file or one of {shipped}"
         with pytest.raises(FileNotFoundError, match=message):
             LearnedNormalizer.from_pretrained(name)
+
+
+class TestMaxPoints:
+    def test_larger_sets_get_hartleys(self):
+        normalizer, points = shaken(), correspondences("handheld", 4, 20)
+        own = normalizer(*points)
+        normalizer.max_points = 19
+        for found, hartley, unlimited in zip(normalizer(*points), Hartley()(*points), own, strict=True):
+            assert torch.equal(found, hartley)
+            assert not torch.allclose(found, unlimited)
+        normalizer.max_points = 20
+        assert all(torch.equal(found, before) for found, before in zip(normalizer(*points), own, strict=True))
+
+    def test_absent_correspondences_do_not_count(self):
+        normalizer, points = shaken().double(), correspondences("handheld", 2, 20)
+        weights = torch.ones(2, 20)
+        weights[1, 12:] = 0
+        own = normalizer(*points, weights)
+        normalizer.max_points = 12
+        for found, hartley, unlimited in zip(
+            normalizer(*points, weights), Hartley()(*points, weights), own, strict=True
+        ):
+            assert torch.equal(found[0], hartley[0])
+            assert torch.equal(found[1], unlimited[1])
+
+    def test_is_saved(self, tmp_path):
+        normalizer = LearnedNormalizer(Whitening(), max_points=9)
+        normalizer.save_pretrained(tmp_path / "weights.safetensors")
+        assert LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors").max_points == 9
+        assert LearnedNormalizer.from_pretrained("paper").max_points is None  # a file without it
+
+    def test_too_few(self):
+        with pytest.raises(ValueError, match="max_points must be at least 8 or None, got 7"):
+            LearnedNormalizer(max_points=7)
 
 
 BIAS = "network.set_network.head.2.bias"
