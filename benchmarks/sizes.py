@@ -1,56 +1,203 @@
-"""Measure how the number of correspondences decides which normalisation is the most accurate.
+"""Measure how the number of matches decides which estimator of F is the most accurate, and what it costs.
 
-The matches of each image pair that pass the ratio test are shuffled and cut into samples of N, at most 20 a pair. The
-error of a sample is the median symmetric epipolar distance of the ground-truth inliers of its pair; the table has the
-medians over samples, in pixels.
+A set is N random matches of one image pair, filtered by the ratio test or not. Its error is the median symmetric
+epipolar distance of 64 ground-truth inliers of the pair, most of which are not in the set. The tables have the medians
+over the sets, in pixels, and the time per set of batches of 32 sets, in milliseconds; estimators of other packages and
+RANSAC take one set at a time. Prints progress to stderr; writes the numbers and the picture where asked to.
 
-    python benchmarks/sizes.py STORE.h5 [--sizes 8 32 128 512] [--seed 0]
+    python benchmarks/sizes.py STORE.h5 [STORE.h5 ...] [--sizes 8 16 32 64 128 512] [--sets 128] [--seed 0]
+        [--methods NAME ...] [--json FILE] [--picture FILE]
 """
 
 import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
+import numpy as np
 import torch
+from torch import Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.robust.peers import find_peer
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+from kornia_learnnorm.files import atomic_write, write_text
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, PROTOCOLS, RATIO
 
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("store")
-parser.add_argument("--sizes", type=int, nargs="+", default=[8, 32, 128, 512], help="correspondences in a sample")
-parser.add_argument("--seed", type=int, default=0)
-args = parser.parse_args()
+BATCH = 32  # sets solved at once, as in training
+NUM_TRUE = 64  # ground-truth inliers that measure a set
+MIN_TRUE = 32  # ground-truth inliers of a pair that is used
+FAILED = 999.0  # pixels; the error of a set without a matrix
 
-ransac = kln.RANSAC(seed=0)
-methods = {
-    "Hartley": kln.EightPoint(),
-    "whitening": kln.EightPoint(kln.Whitening()),
-    "reweighted": kln.EightPoint(kln.ReweightedWhitening()),
-    "paper": kln.EightPoint(kln.LearnedNormalizer.from_pretrained("paper")),
-    "crossview": kln.EightPoint(kln.LearnedNormalizer.from_pretrained()),
-    "crossview-synthetic": kln.EightPoint(kln.LearnedNormalizer.from_pretrained("crossview-synthetic")),
-    "Hartley+optimal": kln.EightPoint(rank2="optimal"),
-    "RANSAC": lambda x1, x2: torch.stack([ransac(*pair)[0] for pair in zip(x1, x2, strict=True)]),
+
+def batched(solve: Callable[[Tensor, Tensor], Tensor], points1: Tensor, points2: Tensor) -> Tensor:
+    """Return the matrices of sets (S, N, 2), solved in batches."""
+    parts = zip(points1.split(BATCH), points2.split(BATCH), strict=True)
+    with torch.no_grad():
+        return torch.cat([solve(*part) for part in parts])
+
+
+def one_by_one(solve: Callable[[Tensor, Tensor], Tensor | None], points1: Tensor, points2: Tensor) -> Tensor:
+    """Return the matrices of sets (S, N, 2), solved one at a time; zero for a failure."""
+    found = []
+    for pair in zip(points1, points2, strict=True):
+        F_mat = solve(*pair)
+        found.append(torch.zeros(3, 3).double() if F_mat is None else F_mat)
+    return torch.stack(found)
+
+
+def hartley_lm(points1: Tensor, points2: Tensor) -> Tensor:
+    """Return Hartley's matrices after robust refinement at 2 px."""
+    F_mat = kln.find_fundamental(points1, points2)
+    return kln.refine_fundamental(points1, points2, F_mat, loss=kln.GemanMcClure(2.0)).F_mat
+
+
+def peer(name: str) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return an estimator of another package; the images count as large as their points need."""
+
+    def solve(points1: Tensor, points2: Tensor) -> Tensor | None:
+        sizes = np.array([p.amax(0).ceil().int().tolist() for p in (points1, points2)], np.int32)
+        F_mat = find_peer(name)(points1.numpy(), points2.numpy(), sizes, 0, INLIER_THRESHOLD)
+        return None if F_mat is None or np.shape(F_mat) != (3, 3) else torch.tensor(np.array(F_mat, float))
+
+    return partial(one_by_one, solve)
+
+
+def learned(name: str) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return a learned estimator by the name of its weights."""
+    return partial(batched, kln.LearnedEightPoint.from_pretrained(name))
+
+
+def normalized(normalizer: torch.nn.Module) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return the eight-point algorithm with a normaliser."""
+    return partial(batched, kln.EightPoint(normalizer))
+
+
+METHODS: dict[str, Callable[[], Callable[[Tensor, Tensor], Tensor]]] = {
+    "Hartley": lambda: normalized(kln.Hartley()),
+    "whitening": lambda: normalized(kln.Whitening()),
+    "reweighted": lambda: normalized(kln.ReweightedWhitening()),
+    "paper": lambda: normalized(kln.LearnedNormalizer.from_pretrained("paper")),
+    "crossview": lambda: normalized(kln.LearnedNormalizer.from_pretrained()),
+    "crossview-synthetic": lambda: normalized(kln.LearnedNormalizer.from_pretrained("crossview-synthetic")),
+    "Hartley+optimal": lambda: partial(batched, kln.EightPoint(rank2="optimal")),
+    "Hartley+LM": lambda: partial(batched, hartley_lm),
+    "opencv-usac-magsac": lambda: peer("opencv-usac-magsac"),
+    "poselib": lambda: peer("poselib"),
+    "kornia": lambda: peer("kornia"),
+    "RANSAC": lambda: partial(one_by_one, lambda x1, x2: kln.RANSAC(seed=0)(x1, x2)[0]),
+    "learned:robust": lambda: learned("robust"),
+    "learned:robust-synthetic": lambda: learned("robust-synthetic"),
 }
-store, generator = read_store(args.store), torch.Generator().manual_seed(args.seed)
-columns = []
-for size in args.sizes:
-    errors: dict[str, list[torch.Tensor]] = {name: [] for name in methods}
-    for pair in range(len(store)):
-        rows = torch.arange(store.offsets[pair], store.offsets[pair + 1])
-        rows = rows[torch.from_numpy(store.ratio)[rows] < RATIO]
-        x1, x2 = (torch.from_numpy(points)[rows].double() for points in (store.points1, store.points2))
-        near = kln.symmetric_epipolar_distance(x1, x2, torch.from_numpy(store.F[pair])) < INLIER_THRESHOLD
-        samples = torch.randperm(len(rows), generator=generator)[: len(rows) // size * size].view(-1, size)[:20]
-        for name, method in methods.items():
-            if len(samples) and near.any() and (name != "RANSAC" or size > 8):  # RANSAC needs more than a sample
-                with torch.no_grad():
-                    F_mat = method(x1[samples], x2[samples])
-                truth = (points[near].expand(len(samples), -1, -1) for points in (x1, x2))
-                errors[name].append(kln.symmetric_epipolar_distance(*truth, F_mat).median(-1).values)
-    number = sum(len(values) for values in errors["Hartley"])
-    columns.append([f"N = {size}, {number} samples"])
-    columns[-1] += [f"{torch.cat(values).median():.2f}" if values else "-" for values in errors.values()]
-rows = [list(cells) for cells in zip(["median error, px", *methods], *columns, strict=True)]
-print(format_table(rows[0], rows[1:]))
+ROBUST = ("opencv-usac-magsac", "poselib", "kornia", "RANSAC")  # need more than eight matches
+DRAWN = ("Hartley", "Hartley+optimal", "Hartley+LM", *ROBUST, "learned:robust", "learned:robust-synthetic")
+
+
+def draw_sets(store: CorrespondenceStore, protocol: str, size: int, number: int, seed: int) -> Tensor | None:
+    """Return sets and the true inliers that measure them, (S, N + 64, 4); None where too few pairs have enough."""
+    generator, pairs = np.random.default_rng(seed), []
+    for i in range(len(store)):
+        points = np.hstack([store.points1[store.rows(i, None)], store.points2[store.rows(i, None)]]).astype(float)
+        F_mat = torch.from_numpy(store.F[i])
+        distance = kln.symmetric_epipolar_distance(*torch.from_numpy(points).split(2, -1), F_mat).numpy()
+        true = np.flatnonzero((distance < INLIER_THRESHOLD) & (store.ratio[store.rows(i, None)] < RATIO))
+        limit = PROTOCOLS[protocol]
+        passing = np.arange(len(points)) if limit is None else np.flatnonzero(store.ratio[store.rows(i, None)] < limit)
+        if len(true) >= MIN_TRUE and len(passing) >= size:
+            pairs.append((points, passing, true))
+    if not pairs:
+        return None
+    sets = []
+    for _ in range(number):
+        points, passing, true = pairs[generator.integers(len(pairs))]
+        rows = np.concatenate([generator.choice(passing, size, replace=False), generator.choice(true, NUM_TRUE)])
+        sets.append(points[rows])
+    return torch.from_numpy(np.stack(sets))
+
+
+def measure(name: str, sets: Tensor, size: int) -> tuple[float, float]:
+    """Return the median error of a method, pixels, and its time per set, milliseconds."""
+    solve, (points, true) = METHODS[name](), sets.split([size, NUM_TRUE], 1)
+    solve(points[:2, :, :2], points[:2, :, 2:])
+    start = time.perf_counter()
+    F_mat = solve(points[..., :2], points[..., 2:])
+    seconds = time.perf_counter() - start
+    error = kln.symmetric_epipolar_distance(true[..., :2], true[..., 2:], F_mat).median(-1).values
+    failed = (F_mat == 0).flatten(1).all(1) | ~error.isfinite()
+    return torch.where(failed, FAILED, error).median().item(), 1e3 * seconds / len(points)
+
+
+def table(results: dict[str, dict[str, list[float]]], sizes: list[int], column: int, title: str, digits: int) -> str:
+    """Return the errors (column 0) or times (column 1) of the methods by size."""
+    rows = [
+        [name, *(f"{found[str(size)][column]:.{digits}f}" if str(size) in found else "-" for size in sizes)]
+        for name, found in results.items()
+    ]
+    return format_table([title, *(f"N = {size}" for size in sizes)], rows)
+
+
+def draw(everything: dict[str, dict], path: str) -> None:
+    """Draw the error against the number of matches, a panel for each store and protocol."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.2 * len(everything), 4.2), layout="constrained")
+    axes = figure.subplots(1, len(everything), sharey=True, squeeze=False)[0]
+    for axis, (title, results) in zip(axes, everything.items(), strict=True):
+        for index, name in enumerate(name for name in DRAWN if name in results):
+            sizes = sorted(map(int, results[name]))
+            style = {"color": f"C{index % 10}", "linewidth": 2.4 if name.startswith("learned") else 1.2}
+            axis.plot(sizes, [results[name][str(size)][0] for size in sizes], ".-", label=name, **style)
+        axis.set(title=title, xscale="log", yscale="log", xlabel="matches in the set", ylim=(0.1, 200))
+        axis.set_xticks(sizes, [str(size) for size in sizes])
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("median error of true inliers, px")
+    axes[-1].legend(fontsize=7)
+    with atomic_write(path) as beside:
+        figure.savefig(beside, dpi=150, format=Path(path).suffix[1:])
+
+
+def main() -> None:
+    """Measure, print the tables, write the numbers and the picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("stores", nargs="+", help="stores of correspondences with ground truth")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[8, 16, 32, 64, 128, 512], help="matches in a set")
+    parser.add_argument("--sets", type=int, default=128, help="sets of each size")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
+    parser.add_argument("--json", help="write the numbers to this file")
+    parser.add_argument("--picture", help="draw the errors to this file")
+    args = parser.parse_args()
+    everything: dict[str, dict] = {}
+    for path in args.stores:
+        store = read_store(path)
+        for protocol in args.protocols:
+            results: dict[str, dict[str, list[float]]] = {name: {} for name in args.methods}
+            for size in args.sizes:
+                sets = draw_sets(store, protocol, size, args.sets, args.seed)
+                for name in args.methods:
+                    if sets is None or (size == 8 and name in ROBUST):
+                        continue
+                    try:
+                        results[name][str(size)] = list(measure(name, sets, size))
+                    except ImportError as error:
+                        print(f"without {name}: {error}", file=sys.stderr)
+                print(f"{Path(path).stem}, {protocol}: {size} matches", file=sys.stderr)
+            results = {name: found for name, found in results.items() if found}
+            everything[f"{Path(path).stem}, {protocol}"] = results
+            print(f"\n{Path(path).stem}, {protocol} matches, {args.sets} sets\n")
+            print(table(results, args.sizes, 0, "median error, px", 3))
+            print("\n" + table(results, args.sizes, 1, "ms per set", 2), flush=True)
+    if args.json:
+        write_text(args.json, json.dumps(everything, indent=1))
+    if args.picture:
+        draw(everything, args.picture)
+
+
+if __name__ == "__main__":
+    main()
