@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +15,7 @@ from torch import nn
 
 from kornia_learnnorm.files import atomic_write
 
-__all__ = ["check_architecture", "load_module", "save_module", "shipped_weights"]
+__all__ = ["check_architecture", "load_module", "save_module", "shipped_weights", "weights_digest"]
 
 WEIGHTS = Path(__file__).parent / "weights"
 MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that a file may name
@@ -68,7 +69,7 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
         ValueError: if the file is not of the format or its tensors do not fit.
 
     """
-    path = Path(name) if Path(name).suffix == ".safetensors" else WEIGHTS / f"{name}.safetensors"
+    path = weights_path(name)
     if not path.is_file() and Path(name).is_file():
         raise ValueError(f"{name} is not a .safetensors file by its name")
     if not path.is_file():
@@ -106,6 +107,16 @@ def shipped_weights(form: str) -> list[str]:
             if file.metadata()["format"] == form:
                 names.append(path.stem)
     return sorted(names)
+
+
+def weights_digest(name: str | Path) -> str:
+    """Return what tells files of weights apart, of shipped weights by name or of a file."""
+    return sha256(weights_path(name).read_bytes()).hexdigest()[:16]
+
+
+def weights_path(name: str | Path) -> Path:
+    """Return the file of shipped weights, or the path that ends in ``.safetensors`` as it is."""
+    return Path(name) if Path(name).suffix == ".safetensors" else WEIGHTS / f"{name}.safetensors"
 
 
 def check_architecture(*parts: Mapping[str, Any]) -> None:

@@ -89,8 +89,10 @@ def residual_features(
     r"""Return the features of correspondences under a matrix, :math:`(B, N, 5)`, and gradient factors, :math:`(B, N)`.
 
     The features are the Sampson distance, its ratios to the median and to the geometric mean over the inliers, and the
-    gradient factor, all as logarithms, and the logit before. The mean is weighted by the probabilities of the logits. The gradient factor :math:`1 / (\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2)` turns squared
-    algebraic residuals into squared Sampson distances; its median is one.
+    gradient factor, all as logarithms, and the logit before. The mean is weighted by the probabilities of the logits.
+
+    The gradient factor :math:`1 / (\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2)` turns squared algebraic residuals
+    into squared Sampson distances; its median is one.
     """
     x1, x2 = convert_points_to_homogeneous(frame.x1), convert_points_to_homogeneous(frame.x2)
     F = transform_fundamental(F_mat, frame.inverse, frame.inverse)

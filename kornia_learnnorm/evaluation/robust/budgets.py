@@ -11,7 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.minimal import are_determined
+from kornia_learnnorm.estimators.refinement import refine_fundamental
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.evaluation.robust.matches import Matches
 from kornia_learnnorm.evaluation.robust.peers import Peer
 from kornia_learnnorm.normalizers.contract import Normalizer
@@ -19,7 +22,18 @@ from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, draw_distinct
 from kornia_learnnorm.ransac.scoring import PairScorer
 
-__all__ = ["Estimate", "Estimator", "Solver", "best_of", "minimal_samples", "peer_estimator", "ransac", "run_estimator"]
+__all__ = [
+    "Estimate",
+    "Estimator",
+    "Solver",
+    "best_of",
+    "guided_ransac",
+    "learned",
+    "minimal_samples",
+    "peer_estimator",
+    "ransac",
+    "run_estimator",
+]
 
 
 class Estimate(NamedTuple):
@@ -88,6 +102,33 @@ def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
 
     def estimate(matches: Matches, seed: int, threshold: float) -> tuple[Tensor | None, float]:
         result = RANSAC(normalizer, inl_th=threshold, seed=seed, **options).estimate(matches.points1, matches.points2)
+        return result.F_mat if bool(result.F_mat.any()) else None, result.num_samples
+
+    return _timed(estimate)
+
+
+def learned(estimator: LearnedEightPoint, refined: bool) -> Estimator:
+    """Return a learned estimator, which has no threshold, followed by robust refinement at the threshold if wanted."""
+
+    @torch.no_grad()
+    def estimate(matches: Matches, seed: int, threshold: float) -> tuple[Tensor | None, float]:
+        points1, points2 = matches.points1[None], matches.points2[None]
+        F_mat = estimator(points1, points2)
+        if refined:
+            F_mat = refine_fundamental(points1, points2, F_mat, loss=GemanMcClure(threshold)).F_mat
+        return F_mat[0], math.nan
+
+    return _timed(estimate)
+
+
+def guided_ransac(estimator: LearnedEightPoint) -> Estimator:
+    """Return :class:`~kornia_learnnorm.RANSAC` whose samples follow the probabilities of a learned estimator."""
+
+    @torch.no_grad()
+    def estimate(matches: Matches, seed: int, threshold: float) -> tuple[Tensor | None, float]:
+        points1, points2 = matches.points1, matches.points2
+        weights = estimator.estimate(points1[None], points2[None]).weights[0]
+        result = RANSAC(inl_th=threshold, seed=seed).estimate(points1, points2, weights)
         return result.F_mat if bool(result.F_mat.any()) else None, result.num_samples
 
     return _timed(estimate)

@@ -8,11 +8,22 @@ from typing import Any
 
 from kornia.geometry.epipolar.fundamental import run_7point
 
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, find_method, identify_method, short_name_of
-from kornia_learnnorm.evaluation.robust.budgets import Estimate, Estimator, Solver, best_of, peer_estimator, ransac
+from kornia_learnnorm.evaluation.robust.budgets import (
+    Estimate,
+    Estimator,
+    Solver,
+    best_of,
+    guided_ransac,
+    learned,
+    peer_estimator,
+    ransac,
+)
 from kornia_learnnorm.evaluation.robust.matches import Matches
 from kornia_learnnorm.evaluation.robust.peers import PEERS, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.pretrained import weights_digest
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 
 __all__ = [
@@ -32,7 +43,8 @@ NUM_SAMPLES = 1000  # minimal samples of count:
 MAX_SECONDS = 0.05  # of a run of time:
 MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network
 DEFAULTS = "RANSAC"  # RANSAC with its default options
-KINDS = ("count:", "time:", f"{DEFAULTS}:")
+LEARNED = ("learned:", "guided:")  # followed by the name of weights of an estimator
+KINDS = ("count:", "time:", *LEARNED, f"{DEFAULTS}:")
 _SOLVERS = ("Hartley", "whitening", "paper", "crossview", "Hartley+optimal")
 DEFAULT_SOLVERS = ("none", "Hartley", "whitening", "reweighted", *_SOLVERS[2:], SEVEN_POINT, "searched")
 DEFAULT_ESTIMATORS = (
@@ -57,11 +69,17 @@ def find_estimator(name: str) -> Estimator:
     """Return a robust estimator by its name.
 
     Args:
-        name: a name in :data:`~kornia_learnnorm.evaluation.robust.peers.PEERS`; ``count:SOLVER``, the best of 1,000
-            minimal samples, which all solvers share; ``time:METHOD``, the best of the samples drawn in 50 ms;
-            ``RANSAC``, :class:`~kornia_learnnorm.RANSAC` with its defaults; ``RANSAC:METHOD``, RANSAC with another
-            normaliser and at most 20,000 samples; ``ground-truth``, the true matrix, which shows how far the metrics
-            can be trusted.
+        name: one of
+
+            - a name in :data:`~kornia_learnnorm.evaluation.robust.peers.PEERS`;
+            - ``learned:WEIGHTS``, a :class:`~kornia_learnnorm.LearnedEightPoint`; ``learned:WEIGHTS+LM``, refined with
+              Geman and McClure's loss at the threshold;
+            - ``guided:WEIGHTS``, RANSAC with the probabilities of the learned estimator as weights of the matches;
+            - ``count:SOLVER``, the best of 1,000 minimal samples, which all solvers share;
+            - ``time:METHOD``, the best of the samples drawn in 50 ms;
+            - ``RANSAC``, :class:`~kornia_learnnorm.RANSAC` with its defaults;
+            - ``RANSAC:METHOD``, RANSAC with another normaliser and at most 20,000 samples;
+            - ``ground-truth``, the true matrix, which shows how far the metrics can be trusted.
 
     Raises:
         ValueError: if there is no estimator of this name.
@@ -80,17 +98,22 @@ def find_estimator(name: str) -> Estimator:
         return ransac(None, {})
     if kind == DEFAULTS and method:
         return _ransac(method, {"max_samples": MAX_SAMPLES})
+    if kind == "learned" and method:
+        weights = method.removesuffix(REFINED)
+        return learned(LearnedEightPoint.from_pretrained(weights), refined=weights != method)
+    if kind == "guided" and method:
+        return guided_ransac(LearnedEightPoint.from_pretrained(method))
     if kind == "time" and method:
         return _ransac(method, {"max_samples": 10**7, "max_seconds": MAX_SECONDS, "confidence": 1, "refine": False})
     raise ValueError(
-        f"no estimator {name!r}: expected {', '.join(PEERS)}, count:SOLVER, time:METHOD, RANSAC, RANSAC:METHOD or "
-        f"{TRUTH}"
+        f"no estimator {name!r}: expected {', '.join(PEERS)}, learned:WEIGHTS, learned:WEIGHTS{REFINED},"
+        f" guided:WEIGHTS, count:SOLVER, time:METHOD, RANSAC, RANSAC:METHOD or {TRUTH}"
     )
 
 
 def is_slow(name: str) -> bool:
     """Return whether an estimator can take more than a second on pairs with few inliers."""
-    return not name.startswith(("opencv", TRUTH, *KINDS[:2]))
+    return not name.startswith(("opencv", TRUTH, "count:", "time:", "learned:"))
 
 
 def is_timed(name: str) -> bool:
@@ -103,6 +126,8 @@ def identify_estimator(name: str) -> str:
     if name in PEERS:
         return peer_version(name)
     kind, colon, method = _split(name)
+    if name.startswith(LEARNED):
+        return f"{name} {weights_digest(method.removesuffix(REFINED))}"
     return name if method in (DEFAULTS, SEVEN_POINT, TRUTH) else f"{kind}{colon}{identify_method(method)}"
 
 

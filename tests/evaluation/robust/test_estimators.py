@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from two_view import shaken_estimator
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
@@ -16,6 +17,7 @@ from kornia_learnnorm.evaluation.robust.estimators import (
     DEFAULT_ESTIMATORS,
     estimator_names,
     find_estimator,
+    identify_estimator,
     is_slow,
 )
 from kornia_learnnorm.evaluation.robust.matches import draw_matches, even_pairs, measure
@@ -40,6 +42,23 @@ def test_each_finds_the_truth(name, matches):
         assert found.samples == 1000
     if name.startswith("time:"):
         assert found.samples >= 1
+
+
+@pytest.mark.parametrize("name", ["learned:{}", "learned:{}+LM", "guided:{}"])
+def test_learned_weights_in_a_file(name, matches, tmp_path):
+    layer, file = shaken_estimator(), tmp_path / "mine.safetensors"
+    layer.save_pretrained(file)
+    drawn = matches(outliers=0.0)
+    (found,) = run_estimator(find_estimator(name.format(file)), drawn, 0, [1.0])
+    points1, points2 = drawn.points1[None], drawn.points2[None]
+    with torch.no_grad():
+        expected, weights = (layer.estimate(points1, points2)[i] for i in (0, 4))
+    if name.endswith("+LM"):
+        expected = kln.refine_fundamental(points1, points2, expected, loss=kln.GemanMcClure(1.0)).F_mat
+    if name.startswith("guided"):
+        expected = kln.RANSAC(seed=0)(drawn.points1, drawn.points2, weights[0])[0][None]
+    assert torch.allclose(found.F_mat, expected[0], rtol=1e-6, atol=1e-12)
+    assert file.name in identify_estimator(name.format(file))
 
 
 def test_equal_samples_by_hand(matches):
