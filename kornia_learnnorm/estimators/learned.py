@@ -291,8 +291,10 @@ class LearnedEightPoint(nn.Module):
         for network in self.networks:
             seen = features
             if found:
-                before = [value.detach() if self.detach_stages else value for value in found[-1]]
-                residuals, factor = residual_features(frame, *before, present)
+                F_before, logits_before = found[-1]
+                if self.detach_stages:
+                    F_before, logits_before = F_before.detach(), logits_before.detach()
+                residuals, factor = residual_features(frame, F_before, logits_before, present)
                 seen = torch.cat([features, residuals], -1)
             logits, params = network(seen.to(self.dtype), absent)
             logits, params = logits.to(problem.x1), params.to(problem.x1)
