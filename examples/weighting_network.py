@@ -89,13 +89,11 @@ def make_normalizer(name: str) -> nn.Module:
         return kln.Hartley()
     if name == "whitening":
         return kln.Whitening()
-    if name == "crossview":  # as it ships, trained on samples of eight
-        return kln.LearnedNormalizer.from_pretrained().requires_grad_(False)
     # Starts exactly as Hartley's.
     return kln.LearnedNormalizer(kln.Hartley(), kln.CrossViewNetwork(width=32, depth=2))
 
 
-NORMALIZERS = ["hartley", "whitening", "crossview", "learned"]
+NORMALIZERS = ["hartley", "whitening", "learned"]
 
 
 def loss(results: list[tuple[Tensor, Tensor]], batch: Pairs, whole: Pairs) -> Tensor:
@@ -174,7 +172,7 @@ def format_row(name: str, f1: float, f1_fine: float, error: float) -> str:
 def parse(args: Sequence[str] | None) -> Namespace:
     """Return the options."""
     parser = ArgumentParser(description=__doc__)
-    parser.add_argument("--normalizers", nargs="+", choices=NORMALIZERS, default=["hartley", "whitening", "learned"])
+    parser.add_argument("--normalizers", nargs="+", choices=NORMALIZERS, default=NORMALIZERS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=600, help="with Hartley's normalisation")
     parser.add_argument("--last-steps", type=int, default=200, help="with each normalisation")
