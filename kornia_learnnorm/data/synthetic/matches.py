@@ -53,10 +53,11 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     r"""Draw matches of varied scenes.
 
     All scenes of a call are of one kind: :func:`~kornia_learnnorm.data.synthetic.random_scenes`, driving, hand-held,
-    orbit or :func:`wide_baseline`. The noise is Gaussian or, in half of the scenes, Student-t with three degrees of
-    freedom, its scale log-uniform in 0.1-1.5 px; a quarter of the scenes has some radial distortion. Half of the scenes
-    have up to 20 % outliers, the others 10 to 90 %, in equal parts: anywhere in the other image; at the partner of
-    another point, often of one of a few; shifted by 5-150 px, together with their neighbours in a third of the scenes.
+    orbit or :func:`wide_baseline`. The noise is Gaussian or, in a third of the scenes, Student-t with three degrees of
+    freedom, its scale log-uniform in 0.1-1.2 px; a quarter of the scenes has some radial distortion. Half of the scenes
+    have up to 20 % outliers, the others 10 to 85 %, in equal parts: anywhere in the other image; at the partner of
+    another point, often of one of a few; shifted by 4-150 px. In a quarter of the scenes, with at most half outliers,
+    all are shifted alike, as an object that moves. Outliers are neighbours in a third of the scenes.
 
     Args:
         batch_size: number of scenes :math:`B`.
@@ -82,18 +83,20 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     points2, exact2 = torch.split(scene.points2, [num_points, num_exact], 1)
     shown = scene.inliers[:, :num_points]
 
-    scale = log_uniform((batch_size, 1, 1), 0.1, 1.5, generator)
-    heavy = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
+    scale = log_uniform((batch_size, 1, 1), 0.1, 1.2, generator)
+    heavy = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 1 / 3
     points1, points2 = (
-        p + scale * torch.where(heavy, 0.7 * student_t(p.shape, generator), normal(tuple(p.shape), generator))
+        p + scale * torch.where(heavy, 0.6 * student_t(p.shape, generator), normal(tuple(p.shape), generator))
         for p in (points1, points2)
     )
-    clean = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
-    share = torch.where(clean, 0.2, 0.9) * uniform((batch_size, 1), 0.0, 1.0, generator)
+    clean, common = (uniform((batch_size, 1), 0.0, 1.0, generator) < share for share in (0.5, 0.25))
+    share = uniform((batch_size, 1), 0.0, 1.0, generator)
+    share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, 0.1 + 0.75 * share))
     outliers = _choose_outliers(points1, share, generator)
-    points2 = torch.where(outliers[..., None], _outliers(points1, points2, scene.image_size, generator), points2)
+    wrong = _wrong_partners(points2, scene.image_size, common, generator)
+    points2 = torch.where(outliers[..., None], wrong, points2)
     distance = symmetric_epipolar_distance(points1, points2, scene.F_mat)
-    inliers = shown & (distance < 4 * scale[..., 0] + 0.5)
+    inliers = shown & (distance < 3 * scale[..., 0] + 0.5)
     return SyntheticMatches(points1, points2, _scores(inliers, clean, generator), inliers, exact1, exact2)
 
 
@@ -149,23 +152,21 @@ def _choose_outliers(points1: Tensor, share: Tensor, generator: Generator) -> Te
     return rank < (share * num_points).round()
 
 
-def _outliers(points1: Tensor, points2: Tensor, size: Tensor, generator: Generator) -> Tensor:
-    """Return wrong partners (B, N, 2) of all points, of three kinds."""
-    shape = tuple(points1.shape[:2])
+def _wrong_partners(points2: Tensor, size: Tensor, common: Tensor, generator: Generator) -> Tensor:
+    """Return wrong partners (B, N, 2) of all points, of three kinds; scenes marked ``common`` (B, 1) have one shift."""
+    shape = tuple(points2.shape[:2])
     anywhere = (size[:, None] - 1) * uniform((*shape, 2), 0.0, 1.0, generator)
     popular = uniform((shape[0], 1), 0.0, 1.0, generator) < 0.5
     index = uniform(shape, 0.0, 1.0, generator)
     index = (torch.where(popular, index**4, index) * shape[1]).long().clamp(max=shape[1] - 1)
     another = points2.gather(1, index[..., None].expand(-1, -1, 2))
     angle = uniform((*shape, 1), 0.0, 2 * math.pi, generator)
-    length = log_uniform((*shape, 1), 5.0, 150.0, generator)
+    length = log_uniform((*shape, 1), 4.0, 150.0, generator)
     # An object that moves: one shift for all, but for a little.
-    common = uniform((shape[0], 1, 1), 0.0, 1.0, generator) < 1 / 3
-    angle = torch.where(common, angle[:, :1] + 0.02 * angle, angle)
-    length = torch.where(common, length[:, :1] * (1 + 0.0002 * length), length)
+    angle = torch.where(common[..., None], angle[:, :1] + 0.02 * angle, angle)
+    length = torch.where(common[..., None], length[:, :1] * (1 + 0.0002 * length), length)
     shifted = points2 + length * torch.cat([angle.cos(), angle.sin()], -1)
     kind = uniform((*shape, 1), 0.0, 3.0, generator)
-    kind = torch.where(common, 2.0 + 0.0 * kind, kind)
     return torch.where(kind < 1, anywhere, torch.where(kind < 2, another, shifted))
 
 
