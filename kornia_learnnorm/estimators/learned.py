@@ -187,10 +187,8 @@ class LearnedEightPoint(nn.Module):
                 weight is negative, a score is outside of 0 to 1, or only one camera is given or one is not invertible.
 
         """
-        if scores is not None:
-            scores = _check_scores(scores, points1, mask)
         problem = prepare_problem(points1, points2, weights, mask, K1, K2)
-        scores = None if scores is None else scores.to(problem.x1)
+        scores = None if scores is None else _check_scores(scores, points1, mask).to(problem.x1)
 
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
             found = self._solve(problem, scores if scores is None or rows is None else scores[rows])
