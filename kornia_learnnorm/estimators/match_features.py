@@ -21,7 +21,7 @@ __all__ = ["POINT_FEATURES", "RESIDUAL_FEATURES", "CommonFrame", "masked_median"
 POINT_FEATURES, RESIDUAL_FEATURES = 9, 5  # numbers of a correspondence
 RESIDUAL_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
 MIN_PROBABILITY = 1e-3  # added to the probabilities of inliers in a mean
-LINE_FLOOR = 1e-2  # of the mean norm of a line's normal, added to each
+LINE_FLOOR = 0.3  # of the mean norm of a line's normal, added to each, or points near an epipole outweigh all others
 
 
 class CommonFrame(NamedTuple):
