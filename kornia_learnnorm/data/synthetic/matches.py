@@ -53,11 +53,12 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     r"""Draw matches of varied scenes.
 
     All scenes of a call are of one kind: :func:`~kornia_learnnorm.data.synthetic.random_scenes`, driving, hand-held,
-    orbit or :func:`wide_baseline`. The noise is Gaussian or, in a third of the scenes, Student-t with three degrees of
-    freedom, its scale log-uniform in 0.1-1.2 px; a quarter of the scenes has some radial distortion. Half of the scenes
-    have up to 20 % outliers, the others 10 to 85 %, in equal parts: anywhere in the other image; at the partner of
-    another point, often of one of a few; shifted by 4-150 px. In a quarter of the scenes, with at most half outliers,
-    all are shifted alike, as an object that moves. Outliers are neighbours in a third of the scenes.
+    orbit or :func:`wide_baseline`. The noise is Gaussian or, in half of the scenes, Student-t with three degrees of
+    freedom; its scale is log-uniform in 0.05-1 px and varies between the points of a scene by a log-normal factor. A
+    quarter of the scenes has some radial distortion. Half of the scenes have up to 20 % outliers, the others 20 to
+    85 %: two fifths anywhere in the other image, the rest at the partner of another point, often of one of a few, or
+    shifted by 4-150 px. In a quarter of the scenes, with 10 to 50 % outliers, all are shifted alike, as an object that
+    moves. Outliers are neighbours in a third of the scenes.
 
     Args:
         batch_size: number of scenes :math:`B`.
@@ -83,15 +84,16 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     points2, exact2 = torch.split(scene.points2, [num_points, num_exact], 1)
     shown = scene.inliers[:, :num_points]
 
-    scale = log_uniform((batch_size, 1, 1), 0.1, 1.2, generator)
-    heavy = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 1 / 3
+    scale = log_uniform((batch_size, 1, 1), 0.05, 1.0, generator)
+    heavy = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
+    uneven = (0.6 * normal((batch_size, num_points, 1), generator)).exp()  # features of different sizes
     points1, points2 = (
-        p + scale * torch.where(heavy, 0.6 * student_t(p.shape, generator), normal(tuple(p.shape), generator))
+        p + scale * uneven * torch.where(heavy, 0.6 * student_t(p.shape, generator), normal(tuple(p.shape), generator))
         for p in (points1, points2)
     )
     clean, common = (uniform((batch_size, 1), 0.0, 1.0, generator) < share for share in (0.5, 0.25))
     share = uniform((batch_size, 1), 0.0, 1.0, generator)
-    share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, 0.1 + 0.75 * share))
+    share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, 0.2 + 0.65 * share))
     outliers = _choose_outliers(points1, share, generator)
     wrong = _wrong_partners(points2, scene.image_size, common, generator)
     points2 = torch.where(outliers[..., None], wrong, points2)
@@ -167,7 +169,7 @@ def _wrong_partners(points2: Tensor, size: Tensor, common: Tensor, generator: Ge
     length = torch.where(common[..., None], length[:, :1] * (1 + 0.0002 * length), length)
     shifted = points2 + length * torch.cat([angle.cos(), angle.sin()], -1)
     kind = uniform((*shape, 1), 0.0, 3.0, generator)
-    return torch.where(kind < 1, anywhere, torch.where(kind < 2, another, shifted))
+    return torch.where(kind < 1.2, anywhere, torch.where(kind < 2, another, shifted))
 
 
 def _scores(inliers: Tensor, clean: Tensor, generator: Generator) -> Tensor:
