@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, NoReturn
 
 import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.eight_point import (
@@ -27,17 +28,25 @@ from kornia_learnnorm.estimators.match_features import (
 )
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
+from kornia_learnnorm.estimators.weighted_refinement import refine_weighted
 from kornia_learnnorm.geometry.checks import check_rank2, check_tensor, is_true
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2
-from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.geometry.transforms import spd_transform, transform_fundamental, unit_fundamental
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
 __all__ = ["LearnedEightPoint", "LearnedEstimate", "StageEstimate"]
 
 FORMAT = "kornia_learnnorm.eight_point.v1"
-ARCHITECTURE = ("width", "depth", "stages", "learn_transforms", "rank2")  # arguments of the constructor in a file
+ARCHITECTURE = (
+    "width",
+    "depth",
+    "stages",
+    "learn_transforms",
+    "rank2",
+    "refine_steps",
+)  # arguments of the constructor in a file
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
 
@@ -63,7 +72,7 @@ class LearnedEstimate(NamedTuple):
         determined: whether the correspondences determine a matrix; see :class:`~kornia_learnnorm.TwoViewEstimate`.
         gap: relative gap of the design matrix that ``determined`` is decided on, (B,).
         weights: probability of each correspondence to be an inlier, (B, N); zero for absent ones.
-        stages: what each stage gives, the last one last.
+        stages: what each stage gives, before the refinement, the last one last.
     """
 
     F_mat: Tensor
@@ -84,7 +93,9 @@ class LearnedEightPoint(nn.Module):
     .. math:: w_i = \frac{\sigma(l_i)}{\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2}
 
     (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds an
-    SPD transform and Hartley's is that of the weighted points.
+    SPD transform and Hartley's is that of the weighted points. A few robust steps of Levenberg-Marquardt on the Sampson
+    distances, weighted by :math:`\sigma(l_i)`, end the pass
+    (:func:`~kornia_learnnorm.estimators.weighted_refinement.refine_weighted`).
 
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
     their null matrix, :func:`~kornia_learnnorm.optimal_rank2`.
@@ -98,14 +109,16 @@ class LearnedEightPoint(nn.Module):
         stages: number of stages.
         learn_transforms: predict transforms; without, they are Hartley's of the weighted points.
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
+        refine_steps: steps of the refinement; 0 returns the last stage's matrix.
 
     Attributes:
-        detach_stages: send no gradient from a stage into the one before, as when the layer itself is trained; a loss of
-            every stage takes its place.
+        detach_stages: send no gradient from a stage into the one before and don't refine, as when the layer itself is
+            trained; a loss of every stage takes its place.
         trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
 
     Raises:
-        ValueError: if there is no stage, or ``rank2`` is neither ``"projection"`` nor ``"optimal"``.
+        ValueError: if there is no stage, ``refine_steps`` is negative, or ``rank2`` is neither ``"projection"`` nor
+            ``"optimal"``.
 
     Example:
         >>> layer = LearnedEightPoint(width=16, depth=2)
@@ -121,14 +134,16 @@ class LearnedEightPoint(nn.Module):
         stages: int = 3,
         learn_transforms: bool = True,
         rank2: Literal["projection", "optimal"] = "projection",
+        refine_steps: int = 10,
     ) -> None:
         super().__init__()
         check_rank2(rank2)
-        if stages < 1:
-            raise ValueError(f"stages must be at least 1, got {stages}")
+        if stages < 1 or refine_steps < 0:
+            raise ValueError(f"stages must be at least 1, refine_steps at least 0, got {stages} and {refine_steps}")
         self.width, self.depth, self.stages = width, depth, stages
         self.learn_transforms = learn_transforms
         self.rank2: Literal["projection", "optimal"] = rank2
+        self.refine_steps = refine_steps
         self.networks = nn.ModuleList(
             SetWeightingNetwork(POINT_FEATURES + (RESIDUAL_FEATURES if stage else 0), width, depth, 10)
             for stage in range(stages)
@@ -195,7 +210,8 @@ class LearnedEightPoint(nn.Module):
             return tuple(value for stage in found for value in stage)
 
         def solve_rest(problem: LinearProblem) -> tuple[Tensor, ...]:
-            return (solve_undetermined(problem, Hartley()), torch.zeros_like(problem.x1[..., 0])) * self.stages
+            number = self.stages if self.detach_stages else self.stages + 1
+            return (solve_undetermined(problem, Hartley()), torch.zeros_like(problem.x1[..., 0])) * number
 
         flat = [value.to(points1.dtype) for value in solve_where_determined(problem, solve, solve_rest)]
         stages = tuple(StageEstimate(*flat[i : i + 2]) for i in range(0, len(flat), 2))
@@ -204,7 +220,7 @@ class LearnedEightPoint(nn.Module):
         if problem.weights is not None:
             probability = torch.where(problem.weights > 0, probability, 0.0)
         E_mat = essential_matrix(F_mat, K1, K2)
-        return LearnedEstimate(F_mat, E_mat, problem.determined, problem.gap, probability, stages)
+        return LearnedEstimate(F_mat, E_mat, problem.determined, problem.gap, probability, stages[: self.stages])
 
     def from_matches(
         self,
@@ -300,7 +316,23 @@ class LearnedEightPoint(nn.Module):
             weights = weights if given is None else weights * given
             F_mat = self._solve_weighted(problem, weights, params, frame.swapped)
             found.append(StageEstimate(F_mat, logits))
-        return [*found[:-1], StageEstimate(_correct_eights(problem, found[-1].F_mat, present), found[-1].logits)]
+        return found if self.detach_stages else [*found, self._refine(problem, frame, found[-1])]
+
+    def _refine(self, problem: LinearProblem, frame: CommonFrame, last: StageEstimate) -> StageEstimate:
+        """Return the last stage's matrices after robust refinement, or the optimal correction of eight matches."""
+        given, x1, x2 = problem.weights, frame.x1, frame.x2
+        if x1.shape[1] == 8:
+            return StageEstimate(correct_rank2(problem, problem.null_matrix), last.logits)
+        weights = last.logits.sigmoid() if given is None else last.logits.sigmoid() * given
+        T = torch.linalg.inv_ex(frame.inverse)[0]
+        F_frame = transform_fundamental(last.F_mat, frame.inverse, frame.inverse)
+        x1, x2 = convert_points_to_homogeneous(x1), convert_points_to_homogeneous(x2)
+        refined = refine_weighted(x1, x2, F_frame, weights, self.refine_steps)
+        F_mat = unit_fundamental(transform_fundamental(refined, T, T))
+        if given is not None:
+            eight = ((given > 0).sum(1) <= 8)[:, None, None]
+            F_mat = torch.where(eight, correct_rank2(problem, problem.null_matrix), F_mat)
+        return StageEstimate(F_mat, last.logits)
 
     def _solve_weighted(self, problem: LinearProblem, weights: Tensor, params: Tensor, swapped: Tensor) -> Tensor:
         """Return the matrices of the weighted eight-point algorithm with the predicted transforms."""
@@ -335,11 +367,3 @@ def _check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tenso
         low, high = scores.aminmax()
         raise ValueError(f"scores must be between 0 and 1, got {low.item():g} to {high.item():g}")
     return scores
-
-
-def _correct_eights(problem: LinearProblem, F_mat: Tensor, present: Tensor | None) -> Tensor:
-    """Return the matrices, with the optimal correction of the null matrix for sets of eight correspondences."""
-    if present is None:
-        return F_mat if problem.x1.shape[1] > 8 else correct_rank2(problem, problem.null_matrix)
-    eight = (present.sum(1) <= 8)[:, None, None]
-    return torch.where(eight, correct_rank2(problem, problem.null_matrix), F_mat)

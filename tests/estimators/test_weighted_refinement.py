@@ -1,0 +1,62 @@
+"""Unrolled robust refinement, against the refinement that runs to convergence."""
+
+from __future__ import annotations
+
+import torch
+from torch.autograd import gradcheck
+from two_view import correspondences, homogeneous, scenes, signless, uniform, up_to_sign
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.estimators.weighted_refinement import SCALE, refine_weighted
+
+
+def framed(num_points: int = 40, **options):
+    """Homogeneous points of about unit size, a matrix to start from and weights."""
+    points = [(p - 300) / 200 for p in correspondences("handheld", 6, num_points, **options)]
+    x1, x2 = (torch.from_numpy(homogeneous(p.numpy())) for p in points)
+    return x1, x2, kln.find_fundamental(*points), uniform(6, num_points, low=0.2)
+
+
+def test_is_the_optimum_at_its_scale():
+    """Dividing a set's points by its scale gives Geman and McClure's loss at one pixel."""
+    x1, x2, F_mat, weights = framed(noise=0.3)
+    found = refine_weighted(x1, x2, F_mat, weights, 60)
+    points1, points2 = x1[..., :2], x2[..., :2]
+    distance = kln.sampson_distance(points1, points2, F_mat)
+    mean = ((weights * (distance**2 + 1e-10).log() / 2).sum(1) / weights.sum(1)).exp()
+    scale = (SCALE * mean)[:, None, None]
+    T = torch.diag_embed(torch.cat([scale[:, 0], scale[:, 0], torch.ones_like(scale[:, 0])], -1))
+    options = {"loss": kln.GemanMcClure(1.0), "max_iterations": 200}
+    expected = kln.refine_fundamental(points1 / scale, points2 / scale, T @ F_mat @ T, weights, **options).F_mat
+    T = torch.linalg.inv(T)
+    assert up_to_sign(found, T @ expected @ T) < 1e-4
+
+
+def test_exact_correspondences_stay_exact():
+    x1, x2, F_mat, weights = framed(noise=0.0)
+    found = refine_weighted(x1, x2, F_mat, weights, 5)
+    assert (x2 * (x1 @ found.mT)).sum(-1).abs().max() < 1e-9
+    assert torch.linalg.svdvals(found)[:, 2].max() < 1e-12
+
+
+def test_outliers_lose_their_weight():
+    scene = scenes("handheld", 6, 60, noise=0.1, outliers=0.1)
+    points = [(p - 300) / 200 for p in (scene.points1, scene.points2)]
+    x1, x2 = (torch.from_numpy(homogeneous(p.numpy())) for p in points)
+    weights = torch.where(scene.inliers, 1.0, 0.3).double()
+    start = kln.find_fundamental(*points, torch.where(scene.inliers, 1.0, 1e-3).double())
+    errors = [
+        kln.symmetric_epipolar_distance(*points, F)[scene.inliers].median()
+        for F in (refine_weighted(x1, x2, start, weights, steps) for steps in (0, 10))
+    ]
+    assert errors[1] < errors[0]
+
+
+def test_gradcheck():
+    x1, x2, F_mat, weights = (value[:2].clone().requires_grad_() for value in framed(12, noise=0.5))
+
+    def refined(a, b, F, w):
+        projected = kln.rank2_projection(F)
+        return signless(refine_weighted(a, b, projected, w, 2))
+
+    assert gradcheck(refined, (x1, x2, F_mat, weights), eps=1e-6, atol=1e-4, rtol=1e-3)
