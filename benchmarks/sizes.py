@@ -17,6 +17,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -61,7 +62,10 @@ def peer(name: str) -> Callable[[Tensor, Tensor], Tensor]:
 
     def solve(points1: Tensor, points2: Tensor) -> Tensor | None:
         sizes = np.array([p.amax(0).ceil().int().tolist() for p in (points1, points2)], np.int32)
-        F_mat = find_peer(name)(points1.numpy(), points2.numpy(), sizes, 0, INLIER_THRESHOLD)
+        try:
+            F_mat = find_peer(name)(points1.numpy(), points2.numpy(), sizes, 0, INLIER_THRESHOLD)
+        except cv2.error:  # too few matches are left to sample from
+            F_mat = None
         return None if F_mat is None or np.shape(F_mat) != (3, 3) else torch.tensor(np.array(F_mat, float))
 
     return partial(one_by_one, solve)

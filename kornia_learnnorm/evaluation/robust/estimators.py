@@ -53,6 +53,9 @@ DEFAULT_ESTIMATORS = (
     *(f"time:{name}" for name in _SOLVERS),
     DEFAULTS,
     f"{DEFAULTS}:crossview",
+    "learned:robust",
+    "learned:robust-synthetic",
+    "guided:robust",
     TRUTH,
 )
 
