@@ -178,6 +178,7 @@ def main() -> None:
     parser.add_argument("--picture", help="draw the errors to this file")
     args = parser.parse_args()
     everything: dict[str, dict] = {}
+    missing: dict[str, ImportError] = {}
     for path in args.stores:
         store = read_store(path)
         for protocol in args.protocols:
@@ -190,13 +191,15 @@ def main() -> None:
                     try:
                         results[name][str(size)] = list(measure(name, sets, size))
                     except ImportError as error:
-                        print(f"without {name}: {error}", file=sys.stderr)
+                        missing[name] = error
                 print(f"{Path(path).stem}, {protocol}: {size} matches", file=sys.stderr)
             results = {name: found for name, found in results.items() if found}
             everything[f"{Path(path).stem}, {protocol}"] = results
             print(f"\n{Path(path).stem}, {protocol} matches, {args.sets} sets\n")
             print(table(results, args.sizes, 0, "median error, px", 3))
             print("\n" + table(results, args.sizes, 1, "ms per set", 2), flush=True)
+    for name, error in missing.items():
+        print(f"without {name}: {error}", file=sys.stderr)
     if args.json:
         write_text(args.json, json.dumps(everything, indent=1))
     if args.picture:
