@@ -17,7 +17,10 @@ html_title = f"kornia-learnnorm {release}"
 
 # Names of this project must resolve; those of others have no pages here.
 nitpicky = True
-nitpick_ignore_regex = [(r"py:.*", r"(?!kornia_learnnorm|lightning_modules).*")]
+nitpick_ignore_regex = [
+    (r"py:.*", r"(?!kornia_learnnorm|lightning_modules).*"),
+    ("py:class", r"kornia_learnnorm\.pretrained\.Module"),  # a type variable
+]
 
 add_module_names = False
 autodoc_member_order = "bysource"

@@ -52,7 +52,7 @@ class SyntheticMatches(NamedTuple):
 def random_matches(batch_size: int, num_points: int, num_exact: int, generator: Generator) -> SyntheticMatches:
     r"""Draw matches of varied scenes.
 
-    All scenes of a call are of one kind: :func:`~kornia_learnnorm.data.synthetic.random_scenes`, driving, hand-held,
+    All scenes of a call are of one kind: :func:`~kornia_learnnorm.data.synthetic.scenes.random_scenes`, driving, hand-held,
     orbit or :func:`wide_baseline`. The noise is Gaussian or, in half of the scenes, Student-t with three degrees of
     freedom; its scale is log-uniform in 0.05-1 px and varies between the points of a scene by a log-normal factor. A
     quarter of the scenes has some radial distortion. Half of the scenes have up to 20 % outliers, the others 20 to
