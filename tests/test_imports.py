@@ -20,7 +20,7 @@ PACKAGES = ["kornia_learnnorm", "lightning_modules"]
 # From the bottom up. A room imports from itself and from lower floors; rooms of one floor do not import each other.
 FLOORS = [
     {"files", "optional", "protocol"},
-    {"geometry"},
+    {"geometry", "pretrained"},
     {"normalizers", "metrics", "losses"},
     {"estimators"},
     {"ransac"},

@@ -19,7 +19,7 @@ from kornia_learnnorm.data.writer import write_store
 pytestmark = pytest.mark.usefixtures("program")
 
 FOLDER = Path(__file__).parents[2] / "configs"
-CONFIGS = sorted(FOLDER.glob("*.yaml"))
+CONFIGS = sorted(path for path in FOLDER.glob("*.yaml") if not path.stem.startswith("robust"))
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 NETWORK = "model.normalizer.init_args.network.init_args"
 SMALL_PAPER_NETWORK = [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
@@ -81,6 +81,21 @@ def test_every_config_runs(config, data, tmp_path, monkeypatch, capsys):
         assert main([command, "--config", str(config), *small, checkpoint]) == 0
     assert "better_than_hartley" in capsys.readouterr().out
     assert set(load_file(tmp_path / "predictions.safetensors")) == {"F_mat", "T1", "T2", "pair", "residual"}
+
+
+@pytest.mark.parametrize("name", ["robust-synthetic", "robust"])
+def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch, capsys):
+    if name == "robust":  # it names pairs of the real stores
+        monkeypatch.setenv("LEARNNORM_DATA", str(request.getfixturevalue("real_data")))
+    config = ["--config", str(FOLDER / f"{name}.yaml")]
+    config += ["--data.init_args.correspondences=128", "--data.init_args.steps=2", "--trainer.limit_val_batches=1"]
+    config += ["--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={tmp_path}"]
+    assert main(["fit", *config, "--trainer.max_steps=2"]) == 0
+    layer = kln.LearnedEightPoint.from_pretrained(tmp_path / "weights.safetensors")
+    assert "synthetic scenes" in layer.trained_on
+    assert all(bool(value.any()) for key, value in layer.state_dict().items() if "logit.weight" in key)
+    assert main(["validate", *config, f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"]) == 0
+    assert "val/median" in capsys.readouterr().out
 
 
 def together(configs):

@@ -5,7 +5,6 @@ import pytorch_lightning as pl
 import torch
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.sets import SyntheticSets
 from kornia_learnnorm.data.sources import block_generator
 from lightning_modules.callbacks import Checkpoints, ExportWeights
@@ -87,10 +86,3 @@ def test_batches_depend_on_seed_and_number_alone():
 def test_wrong_options(arguments, message):
     with pytest.raises(ValueError, match=message):
         MatchSetDataModule(**{"train": [SyntheticSets()]} | arguments)
-
-
-def test_command(program, tmp_path):
-    options = ["--trainer.max_steps=2", "--data.init_args.correspondences=128", "--trainer.limit_val_batches=1"]
-    options += ["--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={tmp_path}"]
-    assert main(["fit", "--config", "configs/robust-synthetic.yaml", *options]) == 0
-    assert kln.LearnedEightPoint.from_pretrained(tmp_path / "weights.safetensors").stages == 3
