@@ -23,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         nargs="*",
         default=list(DEFAULT_ESTIMATORS),
-        help="robust estimators; count:METHOD, time:METHOD and RANSAC:METHOD for your own (default: %(default)s)",
+        help="robust estimators; learned:WEIGHTS, guided:WEIGHTS, count:METHOD, time:METHOD and RANSAC:METHOD for your"
+        " own (default: %(default)s)",
     )
     parser.add_argument(
         "--solvers",

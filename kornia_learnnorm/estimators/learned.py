@@ -71,7 +71,8 @@ class LearnedEstimate(NamedTuple):
         E_mat: :math:`K_2^\top F K_1` with unit Frobenius norm, (B, 3, 3), or None without cameras.
         determined: whether the correspondences determine a matrix; see :class:`~kornia_learnnorm.TwoViewEstimate`.
         gap: relative gap of the design matrix that ``determined`` is decided on, (B,).
-        weights: probability of each correspondence to be an inlier, (B, N); zero for absent ones.
+        weights: probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that
+            do not determine their matrix.
         stages: what each stage gives, before the refinement, the last one last.
     """
 
@@ -100,8 +101,9 @@ class LearnedEightPoint(nn.Module):
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
     their null matrix, :func:`~kornia_learnnorm.optimal_rank2`.
 
-    The order of the correspondences has no effect. Swapping the views gives :math:`F^\top`. Moving both images by one
-    translation and scaling them by one factor moves :math:`F` along; rotations and different factors are only trained.
+    The order of the correspondences has no effect. Swapping the views gives :math:`F^\top` up to sign. Moving both
+    images by one translation and scaling them by one factor moves :math:`F` along; rotations and different factors are
+    only trained.
 
     Args:
         width: channels of the networks.
@@ -117,8 +119,8 @@ class LearnedEightPoint(nn.Module):
         trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
 
     Raises:
-        ValueError: if there is no stage, ``refine_steps`` is negative, or ``rank2`` is neither ``"projection"`` nor
-            ``"optimal"``.
+        ValueError: if a number is not whole or too small, ``learn_transforms`` is no bool, or ``rank2`` is neither
+            ``"projection"`` nor ``"optimal"``.
 
     Example:
         >>> layer = LearnedEightPoint(width=16, depth=2)
@@ -138,8 +140,12 @@ class LearnedEightPoint(nn.Module):
     ) -> None:
         super().__init__()
         check_rank2(rank2)
-        if stages < 1 or refine_steps < 0:
-            raise ValueError(f"stages must be at least 1, refine_steps at least 0, got {stages} and {refine_steps}")
+        numbers = {"width": (width, 1), "depth": (depth, 1), "stages": (stages, 1), "refine_steps": (refine_steps, 0)}
+        for name, (number, least) in numbers.items():
+            if not isinstance(number, int) or number < least:
+                raise ValueError(f"{name} must be a whole number, at least {least}, got {number!r}")
+        if not isinstance(learn_transforms, bool):
+            raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
         self.width, self.depth, self.stages = width, depth, stages
         self.learn_transforms = learn_transforms
         self.rank2: Literal["projection", "optimal"] = rank2
@@ -301,7 +307,8 @@ class LearnedEightPoint(nn.Module):
         absent = None if given is None else given <= 0
         frame = CommonFrame.from_points(problem.points1, problem.points2, present)
         features = match_features(frame, scores, present)
-        factor, found = None, list[StageEstimate]()
+        factor: Tensor | None = None
+        found: list[StageEstimate] = []
         for network in self.networks:
             seen = features
             if found:
@@ -322,7 +329,9 @@ class LearnedEightPoint(nn.Module):
         """Return the last stage's matrices after robust refinement, or the optimal correction of eight matches."""
         given, x1, x2 = problem.weights, frame.x1, frame.x2
         if x1.shape[1] == 8:
-            return StageEstimate(correct_rank2(problem, problem.null_matrix), last.logits)
+            # The logits have no effect; through the zero, scores and weights still get their gradient of zero.
+            F_mat = correct_rank2(problem, problem.null_matrix) + 0.0 * last.logits.sum(1)[:, None, None]
+            return StageEstimate(F_mat, last.logits)
         weights = last.logits.sigmoid() if given is None else last.logits.sigmoid() * given
         T = torch.linalg.inv_ex(frame.inverse)[0]
         F_frame = transform_fundamental(last.F_mat, frame.inverse, frame.inverse)

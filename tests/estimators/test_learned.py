@@ -94,6 +94,15 @@ class TestEstimate:
         signless(estimate.F_mat).sum().backward()
         assert all(score.grad.any() and score.grad.isfinite().all() for score in scores)
 
+    @pytest.mark.parametrize("number", [0, 5, 8])
+    def test_scores_of_few_matches_get_zero(self, number):
+        points1, points2 = correspondences("handheld", 2, 30)
+        matches = [torch.arange(number)[:, None].expand(number, 2)] * 2
+        scores = [torch.rand(number, requires_grad=True) for _ in range(2)]
+        estimate = shaken_estimator().from_matches(points1, points2, matches, scores)
+        for gradient in torch.autograd.grad(signless(estimate.F_mat).sum(), scores):
+            assert not gradient.any()
+
     def test_gradcheck_of_the_scores(self):
         points, layer = correspondences("handheld", 2, 12), shaken_double()
         scores = uniform(2, 12).requires_grad_()
@@ -115,8 +124,11 @@ class TestEstimate:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"stages": 0}, "stages must be at least 1"),
-            ({"refine_steps": -1}, "got 3 and -1"),
+            ({"stages": 0}, "stages must be a whole number, at least 1, got 0"),
+            ({"refine_steps": -1}, "refine_steps must be a whole number, at least 0, got -1"),
+            ({"width": 0}, "width must be"),
+            ({"depth": 1.5}, "depth must be .* got 1.5"),
+            ({"learn_transforms": "no"}, "learn_transforms must be true or false, got 'no'"),
             ({"rank2": "no"}, "rank2 must be"),
         ],
     )

@@ -14,7 +14,7 @@ from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.evaluation.methods import SHIPPED, default_methods, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.report.rates import was_trained_on
 from kornia_learnnorm.evaluation.tables import names_of
-from kornia_learnnorm.normalizers.learned import WEIGHTS
+from kornia_learnnorm.pretrained import WEIGHTS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -80,7 +80,7 @@ class TestTrainedOn:
         assert find_method(name).trained_on == find_method(f"{name}+LM").trained_on == tuple(names_of(paths).values())
 
     def test_shipped_weights(self):
-        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {*SHIPPED}
+        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {*SHIPPED, "robust", "robust-synthetic"}
         assert find_method("crossview-synthetic").trained_on == ("synthetic scenes",)
 
     def test_without_weights_or_without_names(self, tmp_path):

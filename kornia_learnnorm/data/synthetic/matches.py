@@ -57,8 +57,8 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     three degrees of freedom; its scale is log-uniform in 0.05-1 px and varies between the points of a scene by a
     log-normal factor. A quarter of the scenes has some radial distortion. Half of the scenes have up to 20 % outliers,
     the others 20 to 85 %: two fifths anywhere in the other image, the rest at the partner of another point, often of
-    one of a few, or shifted by 4-150 px. In a quarter of the scenes, with 10 to 50 % outliers, all are shifted alike,
-    as an object that moves. Outliers are neighbours in a third of the scenes.
+    one of a few, or shifted by 4-150 px. In a quarter of the scenes, with 10 to 50 % outliers, the shifts are one,
+    as of an object that moves. Outliers are neighbours in a third of the scenes.
 
     Args:
         batch_size: number of scenes :math:`B`.

@@ -22,7 +22,7 @@ from kornia_learnnorm.evaluation.methods import find_method
 from kornia_learnnorm.evaluation.runs import record
 from kornia_learnnorm.evaluation.runs.predict import ERRORS, SampleOptions
 from kornia_learnnorm.evaluation.runs.run import read_run
-from kornia_learnnorm.normalizers.learned import WEIGHTS
+from kornia_learnnorm.pretrained import WEIGHTS
 
 
 def assert_same(one, other):
