@@ -44,11 +44,13 @@ class EstimatorTask(pl.LightningModule):
     """Train a learned estimator by back-propagating losses of its matrices.
 
     Sets whose ground truth is known have the logarithmic loss of true inliers and the cross-entropy of the logits, the
-    others the bounded loss of all matches. Validation logs the median distance of the held-out matches.
+    others the bounded loss of all matches. Validation logs the median distance of the held-out matches under the last
+    stage's matrix, before the refinement.
 
     Args:
         estimator: the estimator to train.
-        labels: use the ground truth where it is known; without, all sets count as unlabelled.
+        labels: give sets with ground truth their own losses; without, all sets have the bounded loss. The held-out
+            matches of a source with ground truth are true inliers even so: train on stores without it to use no labels.
         label_free: loss of the sets without ground truth, times ``label_free_weight``.
         labelled: loss of the sets with ground truth.
         inlier_weight: weight of the cross-entropy.

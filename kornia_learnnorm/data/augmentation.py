@@ -20,7 +20,7 @@ def augment(sets: MatchSets, generator: Generator) -> MatchSets:
     Rotations: up to about 15 degrees for each view alone, in half of the sets; a quarter turn or none for both; any
     angle for each view in a tenth. Scales: log-uniform 0.6-1.6 for both, 0.8-1.25 for one, and as much for the aspect
     of both. Half of the sets are mirrored, in half the views are swapped. In half of the sets up to 40 % of the matches
-    are replaced: by random ones, or shifted along and off their lines.
+    get a wrong partner: another match's, or their own shifted by 5-150 px in any direction.
 
     Args:
         sets: the sets.

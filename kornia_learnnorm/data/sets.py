@@ -16,6 +16,7 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
 __all__ = ["MatchSets", "SetSource", "StoreSets", "SyntheticSets"]
 
+MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
 LABEL_THRESHOLD = 2.0  # pixels from the true epipolar lines up to which a match counts as an inlier
 
 
@@ -83,9 +84,6 @@ class StoreSets:
         chosen = able[torch.randint(len(able), (num_sets,), generator=generator)].tolist()
         parts = [self._pairs[i].draw(num_points, self.num_heldout, ratio, generator) for i in chosen]
         return MatchSets(*(torch.stack(values) for values in zip(*parts, strict=True)))
-
-
-MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
 
 
 class _Pair(NamedTuple):
