@@ -7,9 +7,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from kornia_learnnorm.data.images import read_image
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation.pair import estimate_pair, write_json
 from kornia_learnnorm.files import atomic_write
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
 __all__ = ["add_arguments", "run"]
@@ -28,14 +28,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--threshold",
         type=float,
         default=INLIER_THRESHOLD,
-        help="symmetric epipolar distance of an inlier, px (default: %(default)s)",
+        help="symmetric epipolar distance of an inlier, and RANSAC's threshold, px (default: %(default)s)",
     )
-    parser.add_argument("--weights", metavar="NAME_OR_PATH", help="weights of the normaliser (default: the package's)")
+    parser.add_argument(
+        "--estimator",
+        choices=("ransac", "learned"),
+        default="ransac",
+        help="RANSAC, or the learned layer in one pass (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--weights", metavar="NAME_OR_PATH", help="weights of the learned layer (default: the package's)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the fundamental matrix; write the picture and the JSON file if asked to, both or neither."""
-    _check_outputs(args)
+    _check_options(args)
     with ExitStack() as stack:
         picture = None if args.out is None else stack.enter_context(atomic_write(args.out))
         report = None if args.json is None else stack.enter_context(atomic_write(args.json))
@@ -43,8 +51,10 @@ def run(args: argparse.Namespace) -> int:
             from kornia_learnnorm.evaluation.drawing import draw_pair, import_matplotlib
 
             import_matplotlib()
-        normalizer = LearnedNormalizer.from_pretrained(*([args.weights] if args.weights else []))
-        estimate = estimate_pair(args.image1, args.image2, normalizer, args.ratio, args.threshold)
+        layer = None
+        if args.estimator == "learned":
+            layer = LearnedEightPoint.from_pretrained(*([args.weights] if args.weights else []))
+        estimate = estimate_pair(args.image1, args.image2, layer, args.ratio, args.threshold)
         if picture is not None:
             draw_pair(read_image(args.image1), read_image(args.image2), estimate, picture)
         if report is not None:
@@ -56,8 +66,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_outputs(args: argparse.Namespace) -> None:
-    """Raise ValueError for a picture of unknown format and for files that would overwrite an input or each other."""
+def _check_options(args: argparse.Namespace) -> None:
+    """Raise ValueError for options that do not go together and for files that must not be written."""
+    if args.weights is not None and args.estimator != "learned":
+        raise ValueError(f"--weights {args.weights}: only --estimator learned has weights")
     if args.out is not None and args.out.suffix.lower() not in PICTURE_SUFFIXES:
         raise ValueError(f"--out {args.out}: expected a name that ends in one of {' '.join(PICTURE_SUFFIXES)}")
     taken = [args.image1.resolve(), args.image2.resolve()]

@@ -28,7 +28,7 @@ def make_pair(width: int = 160, height: int = 120, points: int = 30) -> tuple[np
     F_mat = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / 2**0.5
     size = (width, height)
     estimate = PairEstimate(
-        F_mat, points1, points2, inliers, 0.2, 0.1, Path("1.png"), Path("2.png"), size, size, 0.8, 1.0
+        F_mat, "RANSAC", points1, points2, inliers, 0.2, 0.1, Path("1.png"), Path("2.png"), size, size, 0.8, 1.0
     )
     return image1, image2, estimate
 

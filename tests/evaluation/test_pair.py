@@ -20,12 +20,10 @@ from kornia_learnnorm.cli import estimate as command_module
 from kornia_learnnorm.cli.estimate import add_arguments, run
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation import pair as module
 from kornia_learnnorm.evaluation.pair import PairEstimate, estimate_pair, write_json
 from kornia_learnnorm.files import atomic_write
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.normalizers.hartley import Hartley
-from kornia_learnnorm.normalizers.whitening import Whitening
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
@@ -65,7 +63,7 @@ def scene(tmp_path_factory) -> Scene:
 
 @pytest.fixture(scope="module")
 def result(scene) -> PairEstimate:
-    return estimate_pair(scene.left, scene.right, Hartley())
+    return estimate_pair(scene.left, scene.right)
 
 
 class TestEstimatePair:
@@ -89,7 +87,9 @@ class TestEstimatePair:
         assert result.points1.shape == result.points2.shape == (result.num_matches, 2)
         assert (result.size1, result.size2) == ((WIDTH, HEIGHT), (WIDTH, HEIGHT))
         assert (result.path1, result.path2) == (scene.left, scene.right)
-        assert len(torch.cat([result.points1, result.points2], 1).unique(dim=0)) == result.num_matches
+        for points in (result.points1, result.points2):
+            assert len(points.unique(dim=0)) == result.num_matches
+        assert result.estimator == "RANSAC"
         d = epipolar_distances(result.points1, result.points2, result.F_mat)
         assert np.array_equal(d < 1.0, result.inliers.numpy())
         assert result.mean_distance == pytest.approx(d[d < 1].mean(), rel=1e-6)
@@ -97,38 +97,32 @@ class TestEstimatePair:
 
     def test_seeds(self, scene, result):
         """The same files and seed give the same estimate, other seeds a similar one."""
-        again = estimate_pair(str(scene.left), str(scene.right), Hartley())
+        again = estimate_pair(str(scene.left), str(scene.right))
         assert torch.equal(again.F_mat, result.F_mat)
         assert torch.equal(again.inliers, result.inliers)
-        other = estimate_pair(scene.left, scene.right, Hartley(), seed=7)
+        other = estimate_pair(scene.left, scene.right, seed=7)
         assert abs(other.num_inliers - result.num_inliers) < 0.05 * result.num_inliers
 
-    def test_normalizer_is_used_and_no_gradient_leaves_it(self, scene, result):
-        calls, scale = [], torch.ones((), dtype=torch.float64, requires_grad=True)
-
-        def normalizer(points1, points2, weights=None):
-            calls.append((points1, weights))
-            return [scale * T for T in Whitening()(points1, points2, weights)]
-
-        other = estimate_pair(scene.left, scene.right, normalizer)
-        points, weights = calls[0]
-        assert 1 <= len(calls) <= 3
-        assert points.dtype == torch.float64
-        assert points.shape[0] == 1
-        assert weights is None
-        assert not torch.equal(other.F_mat, result.F_mat)
+    def test_a_layer_estimates_as_well(self, scene, result):
+        layer = LearnedEightPoint.from_pretrained()
+        other = estimate_pair(scene.left, scene.right, layer)
+        assert other.estimator == "LearnedEightPoint"
+        assert torch.equal(other.points1, result.points1)
         assert not other.F_mat.requires_grad
+        assert abs(other.num_inliers - result.num_inliers) < 0.05 * result.num_inliers
+        inlying = other.points1[other.inliers], other.points2[other.inliers]
+        assert np.median(epipolar_distances(*inlying, scene.F)) < 0.3
 
-    def test_refit_keeps_the_larger_set(self, scene, result):
-        """Starting from few inliers, the fit may only grow them."""
-        start = torch.zeros_like(result.inliers)
-        start[torch.nonzero(result.inliers).flatten()[::8]] = True
-        F_mat, inliers = module._fit(result.points1, result.points2, start, Hartley(), 1.0)
-        x1, x2 = result.points1[start][None], result.points2[start][None]
-        first = module.find_fundamental(x1, x2, normalizer=Hartley())[0]
-        once = symmetric_epipolar_distance(result.points1, result.points2, first) < 1.0
-        assert inliers.sum() >= once.sum()
-        assert torch.equal(symmetric_epipolar_distance(result.points1, result.points2, F_mat) < 1.0, inliers)
+    def test_matches_that_share_a_point_count_once(self):
+        points1 = torch.tensor([[float(10 * i), 5.0] for i in range(12)])
+        points2 = points1 + torch.tensor([3.0, 1.0])
+        ratios = torch.linspace(0.1, 0.6, 12)
+        points2[9:] = points2[3]  # four onto one point, of which the first has the smallest ratio
+        points1[8] = points1[2]
+        order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
+        found = module._one_to_one_matches(points1[order], points2[order], ratios[order], 0.8)
+        for value, expected in zip(found, (points1[:8], points2[:8], 1 - ratios[:8].double()), strict=True):
+            assert torch.equal(value, expected.double())
 
 
 class TestErrors:
@@ -149,12 +143,12 @@ class TestErrors:
     )
     def test_images_or_options(self, scene, first, second, message, options):
         with pytest.raises(ValueError, match=message) as caught:
-            estimate_pair(scene.folder / f"{first}.png", scene.folder / f"{second}.png", Hartley(), **options)
+            estimate_pair(scene.folder / f"{first}.png", scene.folder / f"{second}.png", **options)
         assert "\n" not in str(caught.value)
 
     def test_missing_file(self, scene):
         with pytest.raises(FileNotFoundError, match=r"no\.png does not exist"):
-            estimate_pair(scene.left, scene.folder / "no.png", Hartley())
+            estimate_pair(scene.left, scene.folder / "no.png")
 
 
 class TestWriting:
@@ -196,16 +190,7 @@ class TestWriting:
 
 @pytest.fixture
 def command(scene, tmp_path, monkeypatch):
-    """Run the command with Hartley's normalisation in the place of the learned one; record the weights asked for."""
-    asked = []
-
-    class LearnedNormalizer:
-        @staticmethod
-        def from_pretrained(*names):
-            asked.append(names)
-            return Hartley()
-
-    monkeypatch.setattr(command_module, "LearnedNormalizer", LearnedNormalizer)
+    """Run the command in an empty folder."""
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments, images=(scene.left, scene.right)):
@@ -213,7 +198,6 @@ def command(scene, tmp_path, monkeypatch):
         add_arguments(parser)
         return run(parser.parse_args([*map(str, images), *arguments]))
 
-    call.asked = asked
     return call
 
 
@@ -223,20 +207,24 @@ class TestCommand:
         lines = capsys.readouterr().out.splitlines()
         printed = [[float(value) for value in line.split()] for line in lines[1:4]]
         assert np.allclose(printed, result.F_mat.numpy(), rtol=1e-8)
-        assert re.match(rf"matches +{result.num_matches} \(ratio test 0\.8\)", lines[4])
-        assert re.match(rf"inliers +{result.num_inliers} ", lines[5])
-        assert f"mean {result.mean_distance:.3f} px, median {result.median_distance:.3f} px" in lines[6]
-        assert len(lines) == 7
+        assert re.match(r"by +RANSAC", lines[4])
+        assert re.match(rf"matches +{result.num_matches} \(ratio test 0\.8\)", lines[5])
+        assert re.match(rf"inliers +{result.num_inliers} ", lines[6])
+        assert f"mean {result.mean_distance:.3f} px, median {result.median_distance:.3f} px" in lines[7]
+        assert len(lines) == 8
         assert not list(Path().iterdir())
-        assert command.asked == [()]
 
     def test_writes_picture_and_json(self, command, capsys):
         pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
-        assert command("--out", "pair.png", "--json", "F.json", "--weights", "mine.safetensors") == 0
+        LearnedEightPoint.from_pretrained("robust").save_pretrained("mine.safetensors")
+        assert (
+            command("--out", "pair.png", "--json", "F.json", "--estimator", "learned", "--weights", "mine.safetensors")
+            == 0
+        )
+        Path("mine.safetensors").unlink()
         assert sorted(path.name for path in Path().iterdir()) == ["F.json", "pair.png"]
         assert cv2.imread("pair.png").shape[1] == 1200
         assert capsys.readouterr().out.splitlines()[-2:] == ["wrote    pair.png", "wrote    F.json"]
-        assert command.asked == [("mine.safetensors",)]
         command("--ratio", "0.7", "--threshold", "2")
         printed = capsys.readouterr().out
         assert "(ratio test 0.7)" in printed
@@ -252,6 +240,7 @@ class TestCommand:
             (["--json", "."], ValueError, "not a regular file"),
             (["--out", "a.png", "--json", "a.png"], ValueError, "would overwrite another file"),
             (["--out", "pair.png"], ImportError, r"pip install '\.\[report\]'"),  # without Matplotlib
+            (["--weights", "robust"], ValueError, "--weights robust: only --estimator learned has weights"),
         ],
     )
     def test_bad_outputs_are_refused_before_the_work(self, command, arguments, error, message, monkeypatch, capsys):
@@ -295,7 +284,7 @@ class TestCommand:
 def test_real_images(real_data, dataset, options, first, inliers, own, true):
     frames = read_dataset(dataset, real_data / dataset, **options)
     pair = FramePair(*frames[first : first + 2])
-    result = estimate_pair(pair.frame1.path, pair.frame2.path, Hartley())
+    result = estimate_pair(pair.frame1.path, pair.frame2.path)
     assert result.num_inliers > inliers
     assert result.median_distance < own
     inlying = result.points1[result.inliers], result.points2[result.inliers]
