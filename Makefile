@@ -5,6 +5,7 @@
 # make docs   set up, build the documentation in docs/_build/html
 # make audit  report known vulnerabilities of the locked packages; never fails
 # make ablations DATA=<folder>, make table1 DATA=<folder>   train what is not trained yet, print the tables; -j 2 for two at once
+# make layer-ablations DATA=<folder>   those of the learned layer alone
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -18,7 +19,7 @@ STORES = "$(DATA)"/correspondences
 AUDIT := .venv-audit
 comma := ,
 
-.PHONY: demo test test-cpus lint docs audit wheel clean ablations table1
+.PHONY: demo test test-cpus lint docs audit wheel clean ablations layer-ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -89,9 +90,10 @@ ABLATIONS += paper-loss-sampson paper-loss-algebraic paper-reduction-log
 TABLE1 := $(patsubst configs/table1/%.yaml,%,$(wildcard configs/table1/*.yaml))
 ABLATION_RUNS := $(ABLATIONS:%=runs/ablations/%/weights.safetensors)
 TABLE1_RUNS := $(TABLE1:%=runs/table1/%/weights.safetensors)
-.PRECIOUS: $(ABLATION_RUNS) $(TABLE1_RUNS)
+LAYER_RUNS := $(patsubst configs/%.yaml,runs/%/weights.safetensors,$(wildcard configs/ablations/layer/*.yaml))
+.PRECIOUS: $(ABLATION_RUNS) $(TABLE1_RUNS) $(LAYER_RUNS)
 
-ablations: $(VENV)/.ready $(ABLATION_RUNS)
+ablations: layer-ablations $(VENV)/.ready $(ABLATION_RUNS)
 	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
 		--weights $(ABLATION_RUNS) paper crossview
 
@@ -100,6 +102,14 @@ table1: $(VENV)/.ready $(TABLE1_RUNS)
 	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5@10:19 \
 		$(STORES)/tum_fr3_office_kitti_size.h5@10:19 runs/table1/synthetic.h5 \
 		--weights paper crossview $(TABLE1_RUNS)
+
+layer-ablations: $(VENV)/.ready $(LAYER_RUNS)
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/sizes.py $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
+		--sets 512 --methods RANSAC $(addprefix learned:,$(LAYER_RUNS)) learned:runs/ablations/layer/base/weights.safetensors+scores
+
+LAYER_BASE = --config configs/robust.yaml --config configs/ablations/layer/base.yaml
+runs/ablations/layer/%/weights.safetensors: | $(VENV)/.ready
+	$(FIT) $(LAYER_BASE) --config configs/ablations/layer/$*.yaml $(INTO)
 
 PAPER_BASE = --config configs/paper-short.yaml --config configs/ablations/paper-base.yaml
 runs/ablations/paper-base/weights.safetensors: | $(VENV)/.ready

@@ -7,6 +7,9 @@ RANSAC take one set at a time. Prints progress to stderr; writes the numbers and
 
     python benchmarks/sizes.py STORE.h5 [STORE.h5 ...] [--sizes 8 16 32 64 128 512] [--sets 128] [--seed 0]
         [--methods NAME ...] [--json FILE] [--picture FILE]
+
+A method learned:WEIGHTS is a learned estimator by the name or file of its weights; with +scores after it, it also reads
+1 minus the ratio of each match, as RANSAC+scores does.
 """
 
 import argparse
@@ -26,41 +29,44 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.robust.peers import find_peer
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import atomic_write, write_text
+from kornia_learnnorm.files import atomic_write, short_name, write_text
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, PROTOCOLS, RATIO
 
 BATCH = 32  # sets solved at once, as in training
 NUM_TRUE = 64  # ground-truth inliers that measure a set
 MIN_TRUE = 32  # ground-truth inliers of a pair that is used
+LEARNED, SCORES = "learned:", "+scores"
 FAILED = 999.0  # pixels; the error of a set without a matrix
 
+Solver = Callable[[Tensor, Tensor, Tensor], Tensor]  # points1, points2 (S, N, 2) and scores (S, N) to F (S, 3, 3)
 
-def batched(solve: Callable[[Tensor, Tensor], Tensor], points1: Tensor, points2: Tensor) -> Tensor:
+
+def batched(solve: Solver, points1: Tensor, points2: Tensor, scores: Tensor) -> Tensor:
     """Return the matrices of sets (S, N, 2), solved in batches."""
-    parts = zip(points1.split(BATCH), points2.split(BATCH), strict=True)
+    parts = zip(points1.split(BATCH), points2.split(BATCH), scores.split(BATCH), strict=True)
     with torch.no_grad():
         return torch.cat([solve(*part) for part in parts])
 
 
-def one_by_one(solve: Callable[[Tensor, Tensor], Tensor | None], points1: Tensor, points2: Tensor) -> Tensor:
+def one_by_one(solve: Callable[..., Tensor | None], points1: Tensor, points2: Tensor, scores: Tensor) -> Tensor:
     """Return the matrices of sets (S, N, 2), solved one at a time; zero for a failure."""
     found = []
-    for pair in zip(points1, points2, strict=True):
+    for pair in zip(points1, points2, scores, strict=True):
         F_mat = solve(*pair)
         found.append(torch.zeros(3, 3).double() if F_mat is None else F_mat)
     return torch.stack(found)
 
 
-def hartley_lm(points1: Tensor, points2: Tensor) -> Tensor:
+def hartley_lm(points1: Tensor, points2: Tensor, _: Tensor) -> Tensor:
     """Return Hartley's matrices after robust refinement at 2 px."""
     F_mat = kln.find_fundamental(points1, points2)
     return kln.refine_fundamental(points1, points2, F_mat, loss=kln.GemanMcClure(2.0)).F_mat
 
 
-def peer(name: str) -> Callable[[Tensor, Tensor], Tensor]:
+def peer(name: str) -> Solver:
     """Return an estimator of another package; the images count as large as their points need."""
 
-    def solve(points1: Tensor, points2: Tensor) -> Tensor | None:
+    def solve(points1: Tensor, points2: Tensor, _: Tensor) -> Tensor | None:
         sizes = np.array([p.amax(0).ceil().int().tolist() for p in (points1, points2)], np.int32)
         try:
             F_mat = find_peer(name)(points1.numpy(), points2.numpy(), sizes, 0, INLIER_THRESHOLD)
@@ -71,43 +77,68 @@ def peer(name: str) -> Callable[[Tensor, Tensor], Tensor]:
     return partial(one_by_one, solve)
 
 
-def learned(name: str) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a learned estimator by the name of its weights."""
-    return partial(batched, kln.LearnedEightPoint.from_pretrained(name))
+def ransac(with_scores: bool) -> Solver:
+    """Return RANSAC, whose samples follow the scores or not."""
+    estimate = kln.RANSAC(seed=0)
+    return partial(one_by_one, lambda x1, x2, scores: estimate(x1, x2, scores if with_scores else None)[0])
 
 
-def normalized(normalizer: torch.nn.Module) -> Callable[[Tensor, Tensor], Tensor]:
+def learned(name: str) -> Solver:
+    """Return a learned estimator by the name or file of its weights, which reads the scores where the name says so."""
+    layer, with_scores = kln.LearnedEightPoint.from_pretrained(name.removesuffix(SCORES)), name.endswith(SCORES)
+    return partial(batched, lambda x1, x2, scores: layer(x1, x2, scores=scores if with_scores else None))
+
+
+def normalized(layer: kln.EightPoint) -> Solver:
     """Return the eight-point algorithm with a normaliser."""
-    return partial(batched, kln.EightPoint(normalizer))
+    return partial(batched, lambda x1, x2, _: layer(x1, x2))
 
 
-METHODS: dict[str, Callable[[], Callable[[Tensor, Tensor], Tensor]]] = {
-    "Hartley": lambda: normalized(kln.Hartley()),
-    "whitening": lambda: normalized(kln.Whitening()),
-    "reweighted": lambda: normalized(kln.ReweightedWhitening()),
-    "paper": lambda: normalized(kln.LearnedNormalizer.from_pretrained("paper")),
-    "crossview": lambda: normalized(kln.LearnedNormalizer.from_pretrained()),
-    "crossview-synthetic": lambda: normalized(kln.LearnedNormalizer.from_pretrained("crossview-synthetic")),
-    "Hartley+optimal": lambda: partial(batched, kln.EightPoint(rank2="optimal")),
+def find_method(name: str) -> Solver:
+    """Return a method by its name."""
+    if name.startswith(LEARNED):
+        return learned(name.removeprefix(LEARNED))
+    return METHODS[name]()
+
+
+METHODS: dict[str, Callable[[], Solver]] = {
+    "Hartley": lambda: normalized(kln.EightPoint()),
+    "whitening": lambda: normalized(kln.EightPoint(kln.Whitening())),
+    "reweighted": lambda: normalized(kln.EightPoint(kln.ReweightedWhitening())),
+    **{
+        name: partial(lambda name: normalized(kln.EightPoint(kln.LearnedNormalizer.from_pretrained(name))), name)
+        for name in ("paper", "crossview", "crossview-synthetic")
+    },
+    "Hartley+optimal": lambda: normalized(kln.EightPoint(rank2="optimal")),
     "Hartley+LM": lambda: partial(batched, hartley_lm),
     "opencv-usac-magsac": lambda: peer("opencv-usac-magsac"),
     "poselib": lambda: peer("poselib"),
     "kornia": lambda: peer("kornia"),
-    "RANSAC": lambda: partial(one_by_one, lambda x1, x2: kln.RANSAC(seed=0)(x1, x2)[0]),
-    "learned:robust": lambda: learned("robust"),
-    "learned:robust-synthetic": lambda: learned("robust-synthetic"),
+    "RANSAC": lambda: ransac(with_scores=False),
+    "RANSAC+scores": lambda: ransac(with_scores=True),
 }
-ROBUST = ("opencv-usac-magsac", "poselib", "kornia", "RANSAC")  # need more than eight matches
-DRAWN = ("Hartley", "Hartley+optimal", "Hartley+LM", *ROBUST, "learned:robust", "learned:robust-synthetic")
+SHIPPED = ["learned:robust", "learned:robust-synthetic"]
+ROBUST = ("opencv-usac-magsac", "poselib", "kornia", "RANSAC", "RANSAC+scores")  # need more than eight matches
+DRAWN = ("Hartley", "Hartley+optimal", "Hartley+LM", *ROBUST[:-1], *SHIPPED)
+
+
+def shown(name: str) -> str:
+    """Return how tables call a method; files of weights go by their short names."""
+    weights = name.removeprefix(LEARNED).removesuffix(SCORES)
+    return name.replace(weights, short_name(weights)) if name.startswith(LEARNED) else name
 
 
 def draw_sets(store: CorrespondenceStore, protocol: str, size: int, number: int, seed: int) -> Tensor | None:
-    """Return sets and the true inliers that measure them, (S, N + 64, 4); None where too few pairs have enough."""
+    """Return sets and the true inliers that measure them, (S, N + 64, 5); None where too few pairs have enough.
+
+    The last column is the score of a match, 1 minus the ratio.
+    """
     generator, pairs = np.random.default_rng(seed), []
     for i in range(len(store)):
         points = np.hstack([store.points1[store.rows(i, None)], store.points2[store.rows(i, None)]]).astype(float)
         F_mat = torch.from_numpy(store.F[i])
         distance = kln.symmetric_epipolar_distance(*torch.from_numpy(points).split(2, -1), F_mat).numpy()
+        points = np.hstack([points, 1 - store.ratio[store.rows(i, None), None].astype(float)])
         true = np.flatnonzero((distance < INLIER_THRESHOLD) & (store.ratio[store.rows(i, None)] < RATIO))
         limit = PROTOCOLS[protocol]
         passing = np.arange(len(points)) if limit is None else np.flatnonzero(store.ratio[store.rows(i, None)] < limit)
@@ -125,12 +156,13 @@ def draw_sets(store: CorrespondenceStore, protocol: str, size: int, number: int,
 
 def measure(name: str, sets: Tensor, size: int) -> tuple[float, float]:
     """Return the median error of a method, pixels, and its time per set, milliseconds."""
-    solve, (points, true) = METHODS[name](), sets.split([size, NUM_TRUE], 1)
-    solve(points[:2, :, :2], points[:2, :, 2:])
+    solve, (points, true) = find_method(name), sets.split([size, NUM_TRUE], 1)
+    points1, points2, scores = points[..., :2], points[..., 2:4], points[..., 4]
+    solve(points1[:2], points2[:2], scores[:2])
     start = time.perf_counter()
-    F_mat = solve(points[..., :2], points[..., 2:])
+    F_mat = solve(points1, points2, scores)
     seconds = time.perf_counter() - start
-    error = kln.symmetric_epipolar_distance(true[..., :2], true[..., 2:], F_mat).median(-1).values
+    error = kln.symmetric_epipolar_distance(true[..., :2], true[..., 2:4], F_mat).median(-1).values
     failed = (F_mat == 0).flatten(1).all(1) | ~error.isfinite()
     return torch.where(failed, FAILED, error).median().item(), 1e3 * seconds / len(points)
 
@@ -172,24 +204,26 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[8, 16, 32, 64, 128, 512], help="matches in a set")
     parser.add_argument("--sets", type=int, default=128, help="sets of each size")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--methods", nargs="+", default=[*METHODS, *SHIPPED], help="of these: %(default)s")
     parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     parser.add_argument("--json", help="write the numbers to this file")
     parser.add_argument("--picture", help="draw the errors to this file")
     args = parser.parse_args()
+    if unknown := [name for name in args.methods if name not in METHODS and not name.startswith(LEARNED)]:
+        parser.error(f"--methods {' '.join(unknown)}: expected some of {', '.join(METHODS)} or learned:WEIGHTS")
     everything: dict[str, dict] = {}
     missing: dict[str, ImportError] = {}
     for path in args.stores:
         store = read_store(path)
         for protocol in args.protocols:
-            results: dict[str, dict[str, list[float]]] = {name: {} for name in args.methods}
+            results: dict[str, dict[str, list[float]]] = {shown(name): {} for name in args.methods}
             for size in args.sizes:
                 sets = draw_sets(store, protocol, size, args.sets, args.seed)
                 for name in args.methods:
                     if sets is None or (size == 8 and name in ROBUST):
                         continue
                     try:
-                        results[name][str(size)] = list(measure(name, sets, size))
+                        results[shown(name)][str(size)] = list(measure(name, sets, size))
                     except ImportError as error:
                         missing[name] = error
                 print(f"{Path(path).stem}, {protocol}: {size} matches", file=sys.stderr)

@@ -1,7 +1,8 @@
-"""Kornia's LightGlue with the eight-point layer behind it: the error of the matrix reaches the scores of the matches.
+"""Kornia's LightGlue with a layer behind it: the error of the matrix reaches the scores of the matches.
 
-Without images, a small LightGlue of random weights learns from synthetic features which matches to trust. With two
-image files, DISK and LightGlue with Kornia's weights match them, and the gradient of one step is shown.
+The layer is the eight-point algorithm, which takes the scores as weights, or the learned one, which reads them. Without
+images, a small LightGlue of random weights learns from synthetic features which matches to trust. With two image files,
+DISK and LightGlue with Kornia's weights match them, and the gradient of one step is shown.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ from torch import Generator, Tensor, nn
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.images import read_image
 from kornia_learnnorm.data.synthetic import orbit
-from kornia_learnnorm.estimators.eight_point import TwoViewEstimate
 
 Features = dict[str, Tensor]
+LAYERS = {
+    "eight-point": lambda: kln.EightPoint(kln.Whitening()),
+    "learned": lambda: kln.LearnedEightPoint.from_pretrained("robust-synthetic").requires_grad_(False),
+}
 # No early stop and no pruning; with a threshold of zero every mutual neighbour is a match, whose score decides.
 EVERY_MATCH = {"depth_confidence": -1, "width_confidence": -1, "filter_threshold": 0.0}
 
@@ -29,10 +33,10 @@ def small_lightglue() -> LightGlue:
     return LightGlue(None, input_dim=32, descriptor_dim=32, n_layers=2, num_heads=2, flash=False, **EVERY_MATCH)
 
 
-def estimate(lightglue: nn.Module, layer: kln.EightPoint, sides: Sequence[Features]) -> TwoViewEstimate:
-    """Match the features of both images and solve with the scores as weights."""
+def estimate(lightglue: nn.Module, layer: nn.Module, sides: Sequence[Features]) -> Tensor:
+    """Match the features of both images and return the matrices (B, 3, 3) of the matches and their scores."""
     found = lightglue({"image0": sides[0], "image1": sides[1]})
-    return layer.from_matches(sides[0]["keypoints"], sides[1]["keypoints"], found["matches"], found["scores"])
+    return layer.from_matches(sides[0]["keypoints"], sides[1]["keypoints"], found["matches"], found["scores"]).F_mat
 
 
 def synthetic_sides(num_pairs: int, generator: Generator) -> tuple[list[Features], Tensor]:
@@ -51,18 +55,18 @@ def synthetic_sides(num_pairs: int, generator: Generator) -> tuple[list[Features
     return sides, scene.F_mat.float()
 
 
-def error(found: TwoViewEstimate, sides: Sequence[Features], F_mat: Tensor) -> Tensor:
-    """Return the mean bounded distance (B,) of the true inliers, in pixels."""
+def error(found: Tensor, sides: Sequence[Features], F_mat: Tensor) -> Tensor:
+    """Return the mean bounded distance (B,) of the true inliers under the found matrices, in pixels."""
     points = sides[0]["keypoints"], sides[1]["keypoints"]
     inliers = (kln.symmetric_epipolar_distance(*points, F_mat) < 2).float()
-    distance = kln.symmetric_epipolar_distance(*points, found.F_mat).clamp(max=50)
+    distance = kln.symmetric_epipolar_distance(*points, found).clamp(max=50)
     return (inliers * distance).sum(-1) / inliers.sum(-1)
 
 
-def train(steps: int) -> tuple[float, float]:
+def train(layer: nn.Module, steps: int) -> tuple[float, float]:
     """Train on synthetic features; return the held-out error in pixels before and after."""
     torch.manual_seed(0)
-    lightglue, layer, generator = small_lightglue(), kln.EightPoint(kln.Whitening()), Generator().manual_seed(0)
+    lightglue, generator = small_lightglue(), Generator().manual_seed(0)
     optimizer = torch.optim.Adam(lightglue.parameters(), 1e-3)
     held_out, F_held_out = synthetic_sides(32, Generator().manual_seed(1))
     errors = []
@@ -89,12 +93,14 @@ def read_sides(disk: nn.Module, images: Sequence[Path], num_features: int = 1024
     return sides
 
 
-def match_images(disk: nn.Module, lightglue: nn.Module, images: Sequence[Path]) -> tuple[float, float]:
+def match_images(
+    disk: nn.Module, lightglue: nn.Module, layer: nn.Module, images: Sequence[Path]
+) -> tuple[float, float]:
     """Return the median distance of the matches in pixels and the norm of LightGlue's gradient."""
     with torch.no_grad():
         sides = read_sides(disk, images)
     found = lightglue({"image0": sides[0], "image1": sides[1]})
-    layer, (matches, scores) = kln.EightPoint(kln.Whitening()), (found["matches"], found["scores"])
+    matches, scores = found["matches"], found["scores"]
     points = [side["keypoints"][0, matches[0][:, k]][None] for k, side in enumerate(sides)]
     F_mat = layer.from_matches(sides[0]["keypoints"], sides[1]["keypoints"], matches, scores).F_mat
     distance = kln.symmetric_epipolar_distance(*points, F_mat)
@@ -111,12 +117,14 @@ def match_images(disk: nn.Module, lightglue: nn.Module, images: Sequence[Path]) 
 def main(args: Sequence[str] | None = None) -> tuple[float, float]:
     """Train on synthetic features, or match two images."""
     parser = ArgumentParser(description=__doc__)
+    parser.add_argument("--layer", choices=LAYERS, default="eight-point")
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--images", nargs=2, type=Path, help="two image files; loads Kornia's weights")
     options = parser.parse_args(args)
+    layer = LAYERS[options.layer]()
     if options.images:
-        return match_images(DISK.from_pretrained("depth").eval(), LightGlue("disk").eval(), options.images)
-    return train(options.steps)
+        return match_images(DISK.from_pretrained("depth").eval(), LightGlue("disk").eval(), layer, options.images)
+    return train(layer, options.steps)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytorch_lightning as pl
@@ -40,17 +41,28 @@ def _limit_gradients(module: nn.Module, args: Any, outputs: tuple[Tensor, ...]) 
             output.register_hook(limit)  # type: ignore[no-untyped-call]
 
 
+@contextmanager
+def _stages_apart(estimator: LearnedEightPoint) -> Iterator[None]:
+    """Train each stage by its own losses; limit the gradient of each set where it enters the networks."""
+    limits = [network.register_forward_hook(_limit_gradients) for network in estimator.networks]
+    before, estimator.detach_stages = estimator.detach_stages, True
+    try:
+        yield
+    finally:
+        estimator.detach_stages = before
+        for handle in limits:
+            handle.remove()
+
+
 class EstimatorTask(pl.LightningModule):
     """Train a learned estimator by back-propagating losses of its matrices.
 
     Sets whose ground truth is known have the logarithmic loss of true inliers and the cross-entropy of the logits, the
-    others the bounded loss of all matches. Validation logs the median distance of the held-out matches under the last
-    stage's matrix, before the refinement.
+    others the bounded loss of all matches: sources with ``labels=False`` train without labels. Validation logs the
+    median distance of the held-out matches.
 
     Args:
         estimator: the estimator to train.
-        labels: give sets with ground truth their own losses; without, all sets have the bounded loss. The held-out
-            matches of a source with ground truth are true inliers even so: train on stores without it to use no labels.
         label_free: loss of the sets without ground truth, times ``label_free_weight``.
         labelled: loss of the sets with ground truth.
         inlier_weight: weight of the cross-entropy.
@@ -62,7 +74,6 @@ class EstimatorTask(pl.LightningModule):
     def __init__(
         self,
         estimator: LearnedEightPoint,
-        labels: bool = True,
         label_free: BoundedEpipolarLoss | None = None,
         labelled: LogEpipolarLoss | None = None,
         inlier_weight: float = 0.3,
@@ -71,7 +82,6 @@ class EstimatorTask(pl.LightningModule):
     ) -> None:
         super().__init__()
         self.estimator = estimator
-        self.labels = labels
         self.label_free = label_free or BoundedEpipolarLoss()
         self.labelled = labelled or LogEpipolarLoss()
         self.inlier = InlierLoss()
@@ -86,17 +96,6 @@ class EstimatorTask(pl.LightningModule):
         schedule = OneCycleLR(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=0.05)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def on_fit_start(self) -> None:
-        """Train each stage by its own losses; limit the gradient of each set where it enters the networks."""
-        self.estimator.detach_stages = True
-        self._limits = [network.register_forward_hook(_limit_gradients) for network in self.estimator.networks]
-
-    def on_fit_end(self) -> None:
-        """Undo :meth:`on_fit_start`."""
-        self.estimator.detach_stages = False
-        for handle in self._limits:
-            handle.remove()
-
     def training_step(self, batch: MatchSets, batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
         loss = self.compute_loss(batch)
@@ -105,17 +104,16 @@ class EstimatorTask(pl.LightningModule):
 
     def compute_loss(self, batch: MatchSets) -> Tensor:
         """Return the loss of a batch: of all stages, and of the sets of both kinds."""
-        points1, points2 = batch.points1.double(), batch.points2.double()
         heldout1, heldout2 = batch.heldout1.double(), batch.heldout2.double()
-        stages: Sequence[Any] = self.estimator.estimate(points1, points2, scores=batch.scores).stages
-        labelled = batch.labelled & self.labels
-        total = points1.new_zeros(())
-        for number, (F_mat, logits) in enumerate(stages):
+        with _stages_apart(self.estimator):
+            found = self.estimator.estimate(batch.points1.double(), batch.points2.double(), scores=batch.scores)
+        total = heldout1.new_zeros(())
+        for number, (F_mat, logits) in enumerate(found.stages):
             known = self.labelled(heldout1, heldout2, F_mat)
             known = known + self.inlier_weight * self.inlier(logits, batch.inliers)
             unknown = self.label_free_weight * self.label_free(heldout1, heldout2, F_mat)
-            loss = torch.where(labelled, known, unknown).mean()
-            total = total + (1.0 if number + 1 == len(stages) else EARLY_STAGE) * loss
+            loss = torch.where(batch.labelled, known, unknown).mean()
+            total = total + (1.0 if number + 1 == len(found.stages) else EARLY_STAGE) * loss
         return total
 
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:

@@ -64,30 +64,6 @@ def test_runs_on_real_pairs(name, example, real_data):
     assert 0 < after < 10
 
 
-def test_weights_are_learned_through_the_layer(example, synthetic):
-    main, short = example("weighting_network").main, ["--normalizers", "hartley", "--seeds", "0", "--points", "48"]
-    untrained, trained = (main([*short, "--steps", steps, "--last-steps", "0"])["hartley"][0] for steps in ("0", "80"))
-    assert trained[0] > untrained[0] + 10
-    assert trained[2] < 0.5 * untrained[2]
-
-
-def test_a_learned_normaliser_starts_as_hartleys_and_is_trained(example, synthetic):
-    short = ["--seeds", "0", "--points", "48", "--steps", "2", "--pairs", "4"]
-    start, trained = (
-        example("weighting_network").main([*short, "--normalizers", "hartley", "learned", "--last-steps", steps])
-        for steps in ("0", "2")
-    )
-    assert start["learned"][0] == pytest.approx(start["hartley"][0], rel=1e-5)
-    assert trained["learned"][0] != pytest.approx(trained["hartley"][0], rel=1e-5)
-
-
-def test_weighting_network_on_real_pairs(example, real_data, capsys):
-    short = ["--seeds", "0", "--steps", "1", "--last-steps", "1", "--pairs", "2", "--points", "480"]
-    results = example("weighting_network").main([*short, "--normalizers", "whitening", "hartley"])
-    assert all(0 <= row[0] <= 100 and row[2] > 0 for rows in results.values() for row in rows)
-    assert "hartley, mean of 1" in capsys.readouterr().out
-
-
 class Counting(torch.nn.Module):
     """Hartley's normalisation that counts its calls by the number of points."""
 
@@ -130,13 +106,18 @@ def test_lightglue_learns_through_the_layer(example):
     assert after < 0.9 * before
 
 
-def test_gradients_reach_all_that_makes_lightglues_scores(example):
+def test_the_learned_layer_needs_no_trained_scores(example, synthetic):
+    before, _ = example("match_and_estimate").main(["--layer", "learned", "--steps", "1"])
+    assert before < 1
+
+
+@pytest.mark.parametrize("layer", ["eight-point", "learned"])
+def test_gradients_reach_all_that_makes_lightglues_scores(layer, example):
     module = example("match_and_estimate")
     torch.manual_seed(0)
     lightglue = module.small_lightglue()
     sides, F_mat = module.synthetic_sides(2, torch.Generator().manual_seed(0))
-    found = module.estimate(lightglue, kln.EightPoint(kln.LearnedNormalizer.from_pretrained()), sides)
-    assert found.determined.all()
+    found = module.estimate(lightglue, module.LAYERS[layer](), sides)
     module.error(found, sides, F_mat).sum().backward()
     gradients = {name: p.grad for name, p in lightglue.named_parameters()}
     # What stops early and the matching of the layers before the last do not enter the scores.
@@ -155,7 +136,7 @@ def test_images_are_matched_with_gradients(example, tmp_path):
     for path in images:
         cv2.imwrite(str(path), torch.randint(256, (64, 80), dtype=torch.uint8).numpy())
     lightglue = LightGlue(None, input_dim=128, n_layers=1, flash=False, **module.EVERY_MATCH)
-    distance, norm = module.match_images(DISK().eval(), lightglue, images)
+    distance, norm = module.match_images(DISK().eval(), lightglue, kln.EightPoint(), images)
     assert distance > 0
     assert norm > 0
 

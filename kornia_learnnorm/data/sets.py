@@ -59,6 +59,7 @@ class StoreSets:
             ``$LEARNNORM_DATA`` are filled in.
         num_heldout: further matches of the pair.
         max_ratios: limits of Lowe's ratio, of which each draw takes one; None for no limit.
+        labels: use the ground truth where there is one; without, all pairs are supervised by their own matches.
 
     Raises:
         ValueError: if no path is given, an environment variable is not set, or no pair can be used.
@@ -66,12 +67,16 @@ class StoreSets:
     """
 
     def __init__(
-        self, paths: Sequence[str], num_heldout: int = 48, max_ratios: Sequence[float | None] = (RATIO, None)
+        self,
+        paths: Sequence[str],
+        num_heldout: int = 48,
+        max_ratios: Sequence[float | None] = (RATIO, None),
+        labels: bool = True,
     ) -> None:
         if not paths or not max_ratios:
             raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
         self.paths, self.num_heldout, self.max_ratios = tuple(paths), num_heldout, tuple(max_ratios)
-        self._pairs = [pair for path in paths for pair in _read_pairs(path)]
+        self._pairs = [pair for path in paths for pair in _read_pairs(path, labels)]
         if not self._pairs:
             raise ValueError(f"no pair of {', '.join(paths)} has {MIN_HELDOUT} matches to hold out")
         self._sizes = [torch.tensor([len(pair.passing(ratio)) for pair in self._pairs]) for ratio in self.max_ratios]
@@ -118,14 +123,16 @@ class _Pair(NamedTuple):
         return points[:, :2], points[:, 2:], 1 - self.ratio[rows], inliers, held[:, :2], held[:, 2:], labelled
 
 
-def _read_pairs(path: str) -> list[_Pair]:
+def _read_pairs(path: str, labels: bool) -> list[_Pair]:
+    """Return the pairs of a store that have enough matches that supervise."""
     reader = StoreReader(expand_path(path))
     store = reader.read(range(len(reader)))
     pairs = []
     for i in range(len(reader)):
         rows = slice(int(store.offsets[i]), int(store.offsets[i + 1]))
         points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
-        distance = symmetric_epipolar_distance(points1, points2, torch.from_numpy(store.F[i]))
+        F_mat = torch.from_numpy(store.F[i]) if labels else torch.full((3, 3), torch.nan, dtype=torch.float64)
+        distance = symmetric_epipolar_distance(points1, points2, F_mat)
         points = torch.cat([points1, points2], -1).float()
         pair = _Pair(points, torch.from_numpy(store.ratio[rows]), distance.float())
         if len(pair.heldout) >= MIN_HELDOUT:
@@ -134,24 +141,37 @@ def _read_pairs(path: str) -> list[_Pair]:
 
 
 class SyntheticSets:
-    """Sets of matches of synthetic scenes, supervised by exact correspondences.
+    """Sets of matches of synthetic scenes, supervised by exact correspondences, or by further matches.
 
     Args:
-        num_heldout: exact correspondences of each scene.
+        num_heldout: exact correspondences of each scene, or further matches.
         matches: function of the number of scenes, the points per scene, further exact ones and a generator.
+        labels: use exact correspondences and the true inliers; without, scenes are supervised by their own matches.
     """
 
     def __init__(
         self,
         num_heldout: int = 48,
         matches: Callable[[int, int, int, Generator], SyntheticMatches] = random_matches,
+        labels: bool = True,
     ) -> None:
         self.num_heldout = num_heldout
         self.matches = matches
+        self.labels = labels
 
     def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
         """Return the matches of new scenes."""
-        found = self.matches(num_sets, num_points, self.num_heldout, generator)
-        points1, points2, scores, inliers, exact1, exact2 = (value.float() for value in found)
-        labelled = torch.ones(num_sets, dtype=torch.bool)
-        return MatchSets(points1, points2, scores, inliers, exact1, exact2, labelled)
+        labelled = torch.full((num_sets,), self.labels)
+        if self.labels:
+            found = self.matches(num_sets, num_points, self.num_heldout, generator)
+            points1, points2, scores, inliers, exact1, exact2 = (value.float() for value in found)
+            return MatchSets(points1, points2, scores, inliers, exact1, exact2, labelled)
+        total = num_points + self.num_heldout
+        found = self.matches(num_sets, total, 1, generator)
+        order = torch.randperm(total, generator=generator)
+        points1, points2, scores = (value[:, order].float() for value in found[:3])
+        own, rest = slice(num_points), slice(num_points, None)
+        inliers = torch.full_like(scores[:, own], torch.nan)
+        return MatchSets(
+            points1[:, own], points2[:, own], scores[:, own], inliers, points1[:, rest], points2[:, rest], labelled
+        )

@@ -29,7 +29,8 @@ from kornia_learnnorm.estimators.match_features import (
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
 from kornia_learnnorm.estimators.weighted_refinement import refine_weighted
-from kornia_learnnorm.geometry.checks import check_rank2, check_tensor, is_true
+from kornia_learnnorm.geometry.checks import check_rank2, check_tensor, is_true, weighted_mean
+from kornia_learnnorm.geometry.distances import sampson_distance
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2
 from kornia_learnnorm.geometry.transforms import spd_transform, transform_fundamental, unit_fundamental
@@ -47,6 +48,8 @@ ARCHITECTURE = (
     "rank2",
     "refine_steps",
 )  # arguments of the constructor in a file
+EARLY_STEPS = 3  # of the refinement, in all stages but the last
+MAX_EIGHT_DISTANCE = 0.01  # of the frame's unit; quadratic mean after the optimal correction of eight inliers
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
 
@@ -73,7 +76,7 @@ class LearnedEstimate(NamedTuple):
         gap: relative gap of the design matrix that ``determined`` is decided on, (B,).
         weights: probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that
             do not determine their matrix.
-        stages: what each stage gives, before the refinement, the last one last.
+        stages: what each stage gives, before its refinement, the last one last.
     """
 
     F_mat: Tensor
@@ -95,11 +98,12 @@ class LearnedEightPoint(nn.Module):
 
     (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds an
     SPD transform and Hartley's is that of the weighted points. A few robust steps of Levenberg-Marquardt on the Sampson
-    distances, weighted by :math:`\sigma(l_i)`, end the pass
+    distances, weighted by :math:`\sigma(l_i)`, end each stage
     (:func:`~kornia_learnnorm.estimators.weighted_refinement.refine_weighted`).
 
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
-    their null matrix, :func:`~kornia_learnnorm.optimal_rank2`.
+    their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
+    eight more than 1 % of their mean distance from the centroid away: some of them are outliers then.
 
     The order of the correspondences has no effect. Swapping the views gives :math:`F^\top` up to sign. Moving both
     images by one translation and scaling them by one factor moves :math:`F` along; rotations and different factors are
@@ -111,11 +115,11 @@ class LearnedEightPoint(nn.Module):
         stages: number of stages.
         learn_transforms: predict transforms; without, they are Hartley's of the weighted points.
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
-        refine_steps: steps of the refinement; 0 returns the last stage's matrix.
+        refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
 
     Attributes:
-        detach_stages: send no gradient from a stage into the one before and don't refine, as when the layer itself is
-            trained; a loss of every stage takes its place.
+        detach_stages: send no gradient from a stage into the one before and don't refine the last, as when the layer
+            itself is trained; a loss of every stage takes its place.
         trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
 
     Raises:
@@ -312,10 +316,9 @@ class LearnedEightPoint(nn.Module):
         for network in self.networks:
             seen = features
             if found:
-                F_before, logits_before = found[-1]
-                if self.detach_stages:
-                    F_before, logits_before = F_before.detach(), logits_before.detach()
-                residuals, factor = residual_features(frame, F_before, logits_before, present)
+                with torch.set_grad_enabled(torch.is_grad_enabled() and not self.detach_stages):
+                    before = self._refine(problem, frame, found[-1], min(EARLY_STEPS, self.refine_steps))
+                    residuals, factor = residual_features(frame, *before, present)
                 seen = torch.cat([features, residuals], -1)
             logits, params = network(seen.to(self.dtype), absent)
             logits, params = logits.to(problem.x1), params.to(problem.x1)
@@ -323,25 +326,24 @@ class LearnedEightPoint(nn.Module):
             weights = weights if given is None else weights * given
             F_mat = self._solve_weighted(problem, weights, params, frame.swapped)
             found.append(StageEstimate(F_mat, logits))
-        return found if self.detach_stages else [*found, self._refine(problem, frame, found[-1])]
+        return found if self.detach_stages else [*found, self._refine(problem, frame, found[-1], self.refine_steps)]
 
-    def _refine(self, problem: LinearProblem, frame: CommonFrame, last: StageEstimate) -> StageEstimate:
-        """Return the last stage's matrices after robust refinement, or the optimal correction of eight matches."""
+    def _refine(self, problem: LinearProblem, frame: CommonFrame, stage: StageEstimate, steps: int) -> StageEstimate:
+        """Return a stage's matrices after robust refinement; for eight matches, those of :func:`_solve_eight`."""
         given, x1, x2 = problem.weights, frame.x1, frame.x2
         if x1.shape[1] == 8:
             # The logits have no effect; through the zero, scores and weights still get their gradient of zero.
-            F_mat = correct_rank2(problem, problem.null_matrix) + 0.0 * last.logits.sum(1)[:, None, None]
-            return StageEstimate(F_mat, last.logits)
-        weights = last.logits.sigmoid() if given is None else last.logits.sigmoid() * given
+            return StageEstimate(_solve_eight(problem, frame) + 0.0 * stage.logits.sum(1)[:, None, None], stage.logits)
+        weights = stage.logits.sigmoid() if given is None else stage.logits.sigmoid() * given
         T = torch.linalg.inv_ex(frame.inverse)[0]
-        F_frame = transform_fundamental(last.F_mat, frame.inverse, frame.inverse)
+        F_frame = transform_fundamental(stage.F_mat, frame.inverse, frame.inverse)
         x1, x2 = convert_points_to_homogeneous(x1), convert_points_to_homogeneous(x2)
-        refined = refine_weighted(x1, x2, F_frame, weights, self.refine_steps)
+        refined = refine_weighted(x1, x2, F_frame, weights, steps)
         F_mat = unit_fundamental(transform_fundamental(refined, T, T))
         if given is not None:
             eight = ((given > 0).sum(1) <= 8)[:, None, None]
-            F_mat = torch.where(eight, correct_rank2(problem, problem.null_matrix), F_mat)
-        return StageEstimate(F_mat, last.logits)
+            F_mat = torch.where(eight, _solve_eight(problem, frame), F_mat)
+        return StageEstimate(F_mat, stage.logits)
 
     def _solve_weighted(self, problem: LinearProblem, weights: Tensor, params: Tensor, swapped: Tensor) -> Tensor:
         """Return the matrices of the weighted eight-point algorithm with the predicted transforms."""
@@ -364,6 +366,21 @@ class LearnedEightPoint(nn.Module):
     def dtype(self) -> torch.dtype:
         """The dtype of the networks' weights."""
         return next(self.parameters()).dtype
+
+
+def _solve_eight(problem: LinearProblem, frame: CommonFrame) -> Tensor:
+    """Return the optimal corrections of the null matrices of eight matches; Hartley's where they don't fit.
+
+    A correction that leaves large distances is one of outliers. There the optimum of the first-order distances is, on
+    average, worse than the projection in Hartley's coordinates.
+    """
+    corrected = correct_rank2(problem, problem.null_matrix)
+    projected = solve_in_coordinates(problem, problem.T1, problem.T2)
+    present = None if problem.weights is None else (problem.weights > 0).to(problem.x1)
+    F_frame = transform_fundamental(corrected.detach(), frame.inverse, frame.inverse)
+    square = sampson_distance(frame.x1, frame.x2, F_frame).square()
+    fits = weighted_mean(square[..., None], present) < MAX_EIGHT_DISTANCE**2
+    return torch.where(fits[..., None], corrected, projected)
 
 
 def _check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor:

@@ -39,6 +39,12 @@ TABLE1 = {
     path.stem: [FOLDER / ("paper-short.yaml" if path.stem.startswith("paper") else "crossview.yaml"), path]
     for path in sorted((FOLDER / "table1").glob("*.yaml"))
 }
+LAYER_BASE = [FOLDER / "robust.yaml", FOLDER / "ablations/layer/base.yaml"]
+LAYER = {
+    path.stem: [*LAYER_BASE, path]
+    for path in sorted((FOLDER / "ablations/layer").glob("*.yaml"))
+    if path.stem != "base"
+}
 STORES = ("kitti_00", "kitti_01", "kitti_03", "kitti_06", "tum_fr3_office")
 RUNS = {"base": BASE, "paper-base": PAPER_BASE} | ABLATIONS | TABLE1
 
@@ -141,6 +147,25 @@ def differences(before, after, name=""):
 def changes(*configs):
     """Names of the settings that the last configuration changes."""
     return differences(settings(*configs[:-1]), settings(*configs))
+
+
+SEVERAL_LAYER_CHANGES = {
+    "hartley-optimal": {"estimator.init_args.learn_transforms", "estimator.init_args.rank2"},
+    "seed-1": {"seed_everything", "data.init_args.seed"},
+    "seed-2": {"seed_everything", "data.init_args.seed"},
+    "without-kitti": {"data.init_args.train", "data.init_args.shares"},
+    "without-photos": {"data.init_args.train", "data.init_args.shares"},
+    "without-synthetic": {"data.init_args.train", "data.init_args.shares"},
+}
+
+
+@pytest.mark.parametrize("name", LAYER)
+def test_an_ablation_of_the_layer_changes_one_thing(name):
+    changed = {setting.removeprefix("model.init_args.") for setting in changes(*LAYER[name])}
+    if name in SEVERAL_LAYER_CHANGES:
+        assert changed == SEVERAL_LAYER_CHANGES[name]
+    else:
+        assert len(changed) == 1, changed
 
 
 SEVERAL_CHANGES = {

@@ -83,6 +83,16 @@ class TestStoreSets:
         assert sets.inliers.isnan().all()
         assert torch.allclose(sets.scores, torch.tensor(0.5))
 
+    def test_without_labels_the_ground_truth_has_no_effect(self, store, tmp_path):
+        wrong = tmp_path / "wrong.h5"
+        wrong.write_bytes(store.read_bytes())
+        with h5py.File(wrong, "a") as file:
+            file["F"][0] = torch.rand(3, 3).numpy()
+        hidden, other = (StoreSets([str(path)], 16, labels=False).draw(6, 40, seeded()) for path in (store, wrong))
+        assert_equal(hidden, other)
+        assert not hidden.labelled.any()
+        assert hidden.inliers.isnan().all()
+
     def test_ratio_test_and_sizes(self, store):
         source = StoreSets([str(store)], 8, [0.8])
         assert source.draw(20, 60, seeded()).labelled.any().item() is False  # 45 of 60 matches pass, 60 of 80
@@ -100,6 +110,22 @@ class TestStoreSets:
     def test_exceptions(self, arguments, error, message):
         with pytest.raises(error, match=message):
             StoreSets(*arguments)
+
+
+class TestSyntheticSets:
+    def test_without_labels_further_matches_supervise(self):
+        sets = SyntheticSets(200, labels=False).draw(8, 100, seeded(3))
+        assert sets.points1.shape == (8, 100, 2)
+        assert sets.heldout2.shape == (8, 200, 2)
+        assert not sets.labelled.any()
+        assert sets.inliers.isnan().all()
+        exact = SyntheticSets(200).draw(8, 100, seeded(3))
+        F_mat = kln.find_fundamental(exact.heldout1.double(), exact.heldout2.double(), rank2="optimal")
+        found, exact = (
+            kln.symmetric_epipolar_distance(s.heldout1.double(), s.heldout2.double(), F_mat) for s in (sets, exact)
+        )
+        assert exact.median() < 0.1
+        assert (found > 5).double().mean() > 0.1  # outliers are among them
 
 
 class TestAugment:

@@ -19,7 +19,7 @@ def make_task(**arguments):
 
 def make_data(**arguments):
     options = {"sizes": (16, 64), "correspondences": 512, "steps": 20, "val": [SyntheticSets(16)]}
-    return MatchSetDataModule([SyntheticSets(16)], **options | arguments)
+    return MatchSetDataModule(**{"train": [SyntheticSets(16)]} | options | arguments)
 
 
 def make_trainer(folder, callbacks=(), **arguments):
@@ -29,17 +29,21 @@ def make_trainer(folder, callbacks=(), **arguments):
 
 @pytest.mark.parametrize("labels", [True, False])
 def test_training_lowers_the_loss(tmp_path, labels):
-    task, data = make_task(labels=labels), make_data()
-    batch = SyntheticSets(32).draw(64, 32, block_generator(9))
+    task, data = make_task(), make_data(train=[SyntheticSets(16, labels=labels)])
+    batch = SyntheticSets(32, labels=labels).draw(64, 32, block_generator(9))
     before = task.compute_loss(batch).item()
     make_trainer(tmp_path, max_steps=60, enable_checkpointing=False, gradient_clip_val=1.0).fit(task, data)
     assert task.compute_loss(batch).item() < before - (0.05 if labels else 0.01)
     assert not task.estimator.detach_stages
 
 
-def test_labels_are_not_looked_at_without(tmp_path):
-    task, batch = make_task(labels=False), SyntheticSets(8).draw(4, 20, block_generator(1))
-    assert task.compute_loss(batch) == task.compute_loss(batch._replace(inliers=1 - batch.inliers))
+def test_a_loss_leaves_the_estimator_as_it_was():
+    task, batch = make_task(), SyntheticSets(8).draw(4, 20, block_generator(1))
+    task.compute_loss(batch)
+    with pytest.raises(ValueError, match="must be finite"):
+        task.compute_loss(batch._replace(points1=batch.points1 * torch.nan))
+    assert not task.estimator.detach_stages
+    assert not any(network._forward_hooks for network in task.estimator.networks)
 
 
 def test_resumes_exactly(tmp_path):

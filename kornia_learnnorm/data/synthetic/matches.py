@@ -56,7 +56,7 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     driving, hand-held, orbit or :func:`wide_baseline`. The noise is Gaussian or, in half of the scenes, Student-t with
     three degrees of freedom; its scale is log-uniform in 0.05-1 px and varies between the points of a scene by a
     log-normal factor. A quarter of the scenes has some radial distortion. Half of the scenes have up to 20 % outliers,
-    the others 20 to 85 %: two fifths anywhere in the other image, the rest at the partner of another point, often of
+    the others 20 to 90 %: two fifths anywhere in the other image, the rest at the partner of another point, often of
     one of a few, or shifted by 4-150 px. In a quarter of the scenes, with 10 to 50 % outliers, the shifts are one,
     as of an object that moves. Outliers are neighbours in a third of the scenes.
 
@@ -93,7 +93,7 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     )
     clean, common = (uniform((batch_size, 1), 0.0, 1.0, generator) < share for share in (0.5, 0.25))
     share = uniform((batch_size, 1), 0.0, 1.0, generator)
-    share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, 0.2 + 0.65 * share))
+    share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, 0.2 + 0.7 * share))
     outliers = _choose_outliers(points1, share, generator)
     wrong = _wrong_partners(points2, scene.image_size, common, generator)
     points2 = torch.where(outliers[..., None], wrong, points2)
