@@ -204,7 +204,12 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[8, 16, 32, 64, 128, 512], help="matches in a set")
     parser.add_argument("--sets", type=int, default=128, help="sets of each size")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--methods", nargs="+", default=[*METHODS, *SHIPPED], help="of these: %(default)s")
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=[*METHODS, *SHIPPED, *(name + SCORES for name in SHIPPED)],
+        help="of these: %(default)s",
+    )
     parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     parser.add_argument("--json", help="write the numbers to this file")
     parser.add_argument("--picture", help="draw the errors to this file")

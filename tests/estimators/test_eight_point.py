@@ -371,7 +371,7 @@ class TestBackEnds:
         assert up_to_sign(compiled(*points).detach(), layer(*points).detach()) < 1e-6
 
     def test_vmap(self, layer):
-        layer, points = layer.double(), correspondences("handheld", 5, 10)  # batches of one round differently
+        layer, points = layer.double(), correspondences("handheld", 5, 20)  # batches of one round differently
         mapped = vmap(lambda x1, x2: layer(x1[None], x2[None])[0])(*points)
         assert up_to_sign(mapped.detach(), layer(*points).detach()) < 1e-9
 
