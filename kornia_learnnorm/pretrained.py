@@ -83,7 +83,8 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
     except SafetensorError as error:
         raise ValueError(f"{path} is not a safetensors file: {error}") from error
     if metadata.get("format") != form:
-        raise ValueError(f"{path} has another format: expected format {form!r}, got {metadata.get('format')!r}")
+        got, fitting = metadata.get("format"), ", ".join(shipped_weights(form))
+        raise ValueError(f"{path} has another format: expected format {form!r}, as {fitting} have, got {got!r}")
     with torch.device("meta"):
         module = build(path, metadata.get("architecture", ""))
     try:

@@ -93,7 +93,8 @@ class EstimatorTask(pl.LightningModule):
         """Build the optimiser and its schedule."""
         optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
         steps = max(2, int(self.trainer.estimated_stepping_batches))
-        schedule = OneCycleLR(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=0.05)
+        warm_up = max(0.05, 1.5 / steps)  # the schedule divides by the warm-up's steps less one
+        schedule = OneCycleLR(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=warm_up)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def training_step(self, batch: MatchSets, batch_idx: int) -> Tensor:

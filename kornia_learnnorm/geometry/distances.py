@@ -9,6 +9,7 @@ distance in pixels, a function of the squared norms :math:`n_1 = \|(F^\top x_2)_
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -74,9 +75,16 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
 
     """
     _check(points1, points2, F_mat)
-    right = left_to_right_epipolar_distance(points1, points2, F_mat)
-    distance = right + right_to_left_epipolar_distance(points1, points2, F_mat)
-    return torch.where(_on_epipole(points1, F_mat) | _on_epipole(points2, F_mat.mT), torch.inf, distance)
+    with _without_autocast(points1):
+        right = left_to_right_epipolar_distance(points1, points2, F_mat)
+        distance = right + right_to_left_epipolar_distance(points1, points2, F_mat)
+        return torch.where(_on_epipole(points1, F_mat) | _on_epipole(points2, F_mat.mT), torch.inf, distance)
+
+
+def _without_autocast(points: Tensor) -> AbstractContextManager[object]:
+    """Return a context in which autocast is off: pixels have more digits than its dtypes hold."""
+    device = points.device.type
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 @torch.no_grad()
@@ -114,7 +122,8 @@ def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
 
     """
     _check(points1, points2, F_mat)
-    return sampson_epipolar_distance(points1, points2, F_mat, squared=False)
+    with _without_autocast(points1):
+        return sampson_epipolar_distance(points1, points2, F_mat, squared=False)
 
 
 def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
@@ -142,7 +151,8 @@ def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tenso
     _check(points1, points2, F_mat)
     F_mat = F_mat / F_mat.norm(dim=(-2, -1), keepdim=True)
     x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
-    return torch.einsum("...ni,...ij,...nj->...n", x2, F_mat, x1).abs()
+    with _without_autocast(points1):
+        return torch.einsum("...ni,...ij,...nj->...n", x2, F_mat, x1).abs()
 
 
 def line_norms(

@@ -212,3 +212,24 @@ class TestLineNorms:
             np.testing.assert_allclose(norms[0].numpy(), [0.0025, 5.0025], rtol=1e-5)
         for norms in line_norms(x[:, :1], x[:, :1], F_mat):
             assert (norms > 0).all()
+
+
+@pytest.mark.parametrize("distance", ALL)
+@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
+def test_autocast_changes_nothing(distance, half):
+    points1, points2 = (p.float().requires_grad_() for p in correspondences("driving", 3, 20))
+    F_mat = find_fundamental(points1, points2).detach()
+    expected = distance(points1, points2, F_mat)
+    with torch.autocast("cpu", half):
+        found = distance(points1, points2, F_mat)
+    assert torch.equal(found, expected)
+    gradients = [torch.autograd.grad(value.clamp(max=1e4).sum(), points1)[0] for value in (found, expected)]
+    assert torch.equal(*gradients)
+
+
+@pytest.mark.parametrize("distance", ALL)
+def test_compiles_as_one_graph(distance):
+    points1, points2 = correspondences("driving", 3, 20)
+    F_mat = find_fundamental(points1, points2)
+    compiled = torch.compile(distance, fullgraph=True, backend="aot_eager")
+    assert torch.allclose(compiled(points1, points2, F_mat), distance(points1, points2, F_mat))

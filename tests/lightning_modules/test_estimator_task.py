@@ -46,6 +46,13 @@ def test_a_loss_leaves_the_estimator_as_it_was():
     assert not any(network._forward_hooks for network in task.estimator.networks)
 
 
+@pytest.mark.parametrize("steps", [1, 2, 3, 20, 40])
+def test_every_number_of_steps_has_a_schedule(tmp_path, steps):
+    trainer = make_trainer(tmp_path, max_steps=steps, limit_val_batches=0, enable_checkpointing=False)
+    trainer.fit(make_task(), make_data(correspondences=32))
+    assert trainer.global_step == steps
+
+
 def test_resumes_exactly(tmp_path):
     whole = make_task()
     make_trainer(tmp_path / "whole", max_steps=10, enable_checkpointing=False).fit(whole, make_data())
