@@ -84,7 +84,9 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
         raise ValueError(f"{path} is not a safetensors file: {error}") from error
     if metadata.get("format") != form:
         got, fitting = metadata.get("format"), ", ".join(shipped_weights(form))
-        raise ValueError(f"{path} has another format: expected format {form!r}, as {fitting} have, got {got!r}")
+        raise ValueError(
+            f"{path} has another format: expected format {form!r}, got {got!r}; the package's of that format: {fitting}"
+        )
     with torch.device("meta"):
         module = build(path, metadata.get("architecture", ""))
     try:
