@@ -107,7 +107,7 @@ def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor,
 
 def independence_gap(dtype: torch.dtype) -> float:
     """Return the relative gap up to which rows are linearly dependent but for rounding."""
-    return 64 * torch.finfo(dtype).eps
+    return 256 * torch.finfo(dtype).eps
 
 
 @torch.no_grad()

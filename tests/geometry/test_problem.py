@@ -146,3 +146,15 @@ class TestSign:
         F_mat = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
         moved = -F_mat + size * uniform(3, 3, low=-1, seed=seed + 1)
         assert (unit_fundamental(F_mat) - unit_fundamental(moved)).abs().max() < 1e-6
+
+
+def test_equal_views():
+    """Eight matches without motion, whose rows are dependent but for rounding (a relative gap of 2e-14)."""
+    x = [[68.393906, 466.22247], [413.4204, 457.2358], [183.80737, 463.65524]]
+    x += [[386.50964, 465.5876], [389.8796, 462.79868], [384.9661, 468.36307]]
+    x += [[50.873444, 16.89095], [40.96122, 43.963448]]
+    points = torch.tensor([x], dtype=torch.float32).double().requires_grad_()
+    null_matrix = LinearProblem.from_points(points, points).null_matrix
+    assert torch.allclose(null_matrix.abs()[0, 1:, 1:].diag().flip(0), torch.zeros(2).double(), atol=1e-9)
+    assert float(null_matrix.detach().norm()) == pytest.approx(1)
+    assert torch.autograd.grad(null_matrix.sum(), points)[0].isfinite().all()
