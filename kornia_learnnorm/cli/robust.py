@@ -24,7 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         default=list(DEFAULT_ESTIMATORS),
         help="robust estimators; learned:WEIGHTS, guided:WEIGHTS, count:METHOD, time:METHOD and RANSAC:METHOD for your"
-        " own (default: %(default)s)",
+        " own; RANSAC-calibrated, poselib-calibrated and opencv-usac-magsac-calibrated use the cameras of the store"
+        " (default: %(default)s)",
     )
     parser.add_argument(
         "--solvers",

@@ -12,11 +12,10 @@ from torch.nn.functional import normalize
 from kornia_learnnorm.estimators.fundamental import solve_fundamental
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
 from kornia_learnnorm.geometry.checks import (
+    check_cameras,
     check_correspondences,
     check_mask,
     check_rank2,
-    check_tensor,
-    is_true,
     solve_dtype,
 )
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -225,7 +224,7 @@ def prepare_problem(
         points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
         weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
     check_correspondences(points1, points2, weights)
-    _check_cameras(K1, K2, len(points1))
+    check_cameras(K1, K2, len(points1))
     return LinearProblem.from_points(
         points1, points2, None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
     )
@@ -309,17 +308,6 @@ def _rescale(weights: Tensor) -> Tensor:
 def _sideways(like: Tensor) -> Tensor:
     """Return the fundamental matrix of a sideways motion, whose epipolar lines are the rows of the image."""
     return normalize(like.new_tensor([0.0, 0, 0, 0, 0, 1, 0, -1, 0]), dim=-1).view(3, 3)
-
-
-def _check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int) -> None:
-    for name, K in (("K1", K1), ("K2", K2)):
-        if K is None:
-            continue
-        check_tensor(name, K)
-        if K.shape not in ((3, 3), (batch_size, 3, 3)):
-            raise ValueError(f"{name} must have shape [3, 3] or [{batch_size}, 3, 3], got {[*K.shape]}")
-        if is_true(~(K.isfinite().all() & (torch.linalg.det(K.detach().to(solve_dtype(K.device))) != 0).all())):
-            raise ValueError(f"{name} must be finite and invertible")
 
 
 def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:

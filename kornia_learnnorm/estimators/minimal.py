@@ -1,4 +1,4 @@
-r"""Many minimal samples of eight correspondences at once, without derivatives.
+r"""Many minimal samples of eight correspondences, or of five with known cameras, at once and without derivatives.
 
 :func:`~kornia_learnnorm.find_fundamental` with ``rank2="optimal"`` corrects the same null vectors in other coordinates.
 Its matrices agree to second order in the correction, and have the same residuals in the median. It also serves more
@@ -8,11 +8,12 @@ points, weights, any normaliser and gradients, and takes several times as long.
 from __future__ import annotations
 
 import torch
+from kornia.geometry.epipolar import find_essential
 from torch import Tensor
 
 from kornia_learnnorm.geometry.dlt import cofactors, design_matrix
 
-__all__ = ["are_determined", "solve_samples"]
+__all__ = ["are_determined", "solve_calibrated_samples", "solve_samples"]
 
 
 def are_determined(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
@@ -64,6 +65,27 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
         F = torch.unflatten(u, -1, (3, 3))
     F_mat: Tensor = F / torch.linalg.vector_norm(F, dim=(1, 2), keepdim=True)
     return F_mat
+
+
+def solve_calibrated_samples(rays1: Tensor, rays2: Tensor) -> Tensor:
+    r"""Return the essential matrices of minimal samples of five correspondences, by Kornia's five-point solver.
+
+    Five points on one plane determine them too.
+
+    Args:
+        rays1: directions :math:`K_1^{-1} x_1` in the first camera with shape :math:`(K, 5, 3)`, any length.
+        rays2: directions in the second camera with shape :math:`(K, 5, 3)`.
+
+    Returns:
+        all real solutions of all samples, of unit norm, :math:`(M, 3, 3)`, :math:`M \le 10 K`. Degenerate samples,
+        such as those with a repeated correspondence, have none.
+
+    Reference:
+        D. Nister, An efficient solution to the five-point relative pose problem, TPAMI 2004.
+
+    """
+    E_mat: Tensor = find_essential(*(rays[..., :2] / rays[..., 2:] for rays in (rays1, rays2))).flatten(0, 1)
+    return E_mat[E_mat.isfinite().flatten(1).all(1)]
 
 
 def _independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:

@@ -7,7 +7,8 @@ are those in pixels.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Generic, Literal, NamedTuple
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -17,10 +18,10 @@ from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
 from kornia_learnnorm.estimators.robust_losses import Loss, squared_loss
 from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, solve_dtype
 from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
-from kornia_learnnorm.geometry.manifold import Rank2, decompose, retract, tangents
+from kornia_learnnorm.geometry.manifold import Rank2, State, decompose, retract
 from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental, unit_fundamental
 
-__all__ = ["Refinement", "minimize", "refine_fundamental"]
+__all__ = ["Optimum", "Refinement", "check_options", "minimize", "refine_fundamental"]
 
 
 class Refinement(NamedTuple):
@@ -105,14 +106,7 @@ def refine_fundamental(
     """
     check_correspondences(points1, points2, weights)
     check_fundamental(F_mat, F_mat if len(points1) == 1 else points1)
-    if isinstance(loss, type):
-        raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
-    if not callable(loss):
-        raise TypeError(f"loss must be a function or an instance such as Huber(1.0), got {loss!r}")
-    if not isinstance(max_iterations, int):
-        raise TypeError(f"max_iterations must be a whole number, got {max_iterations!r}")
-    if max_iterations < 0 or not tolerance >= 0:
-        raise ValueError(f"max_iterations and tolerance must be >= 0, got {max_iterations} and {tolerance}")
+    check_options(loss, max_iterations, tolerance)
     dtype = solve_dtype(points1.device)
     x1, x2 = points1.to(dtype), points2.to(dtype)
     w = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)
@@ -132,11 +126,22 @@ def refine_fundamental(
     return Refinement(F.to(dtype), before.to(dtype), best.cost.to(dtype), best.iterations, best.converged)
 
 
-class _Estimate(NamedTuple):
+def check_options(loss: Loss, max_iterations: int, tolerance: float) -> None:
+    """Raise a clear error for options that :func:`refine_fundamental` does not take."""
+    if isinstance(loss, type):
+        raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
+    if not callable(loss):
+        raise TypeError(f"loss must be a function or an instance such as Huber(1.0), got {loss!r}")
+    if not isinstance(max_iterations, int):
+        raise TypeError(f"max_iterations must be a whole number, got {max_iterations!r}")
+    if max_iterations < 0 or not tolerance >= 0:
+        raise ValueError(f"max_iterations and tolerance must be >= 0, got {max_iterations} and {tolerance}")
+
+
+class Optimum(NamedTuple, Generic[State]):
     """States, their costs and normal equations, convergence, damping of the next steps and number of past ones."""
 
-    axes: Tensor
-    A: Tensor
+    state: State
     cost: Tensor
     normal: Tensor
     gradient: Tensor
@@ -144,33 +149,36 @@ class _Estimate(NamedTuple):
     damping: Tensor
     iterations: Tensor
 
-    @property
-    def state(self) -> Rank2:
-        return Rank2(self.axes, self.A)
 
-    def select(self, rows: Tensor) -> _Estimate:
-        return _Estimate(*(value[rows] for value in self))
-
-
-def minimize(objective: EpipolarCost, state: Rank2, max_iterations: int, tolerance: float) -> tuple[Tensor, _Estimate]:
-    """Return the costs at the states and the best estimates found from there."""
+def minimize(
+    objective: EpipolarCost, state: State, max_iterations: int, tolerance: float
+) -> tuple[Tensor, Optimum[State]]:
+    """Return the costs at the states and the best found from there, on the manifold that the states belong to."""
     # What a step computes of so many correspondences stays in the cache of a CPU: 2.5 times faster than all at once.
     size = max(1, (2**14 if state.A.device.type == "cpu" else 2**24) // objective.x1.shape[-1])
     if len(state.A) > size:
         parts = torch.split(torch.arange(len(state.A), device=state.A.device), size)
-        states = (Rank2(state.axes[rows], state.A[rows]) for rows in parts)
-        found = [
-            minimize(objective.select(rows), part, max_iterations, tolerance)
-            for rows, part in zip(parts, states, strict=True)
-        ]
-        costs, estimates = zip(*found, strict=True)
-        return torch.cat(costs), _Estimate(*(torch.cat(values) for values in zip(*estimates, strict=True)))
+        found = [minimize(objective.select(rows), _select(state, rows), max_iterations, tolerance) for rows in parts]
+        costs, optima = zip(*found, strict=True)
+        return torch.cat(costs), _each(lambda *values: torch.cat(values), *optima)
     damping = state.A.new_full((len(state.A),), 1e-3)
     start = _evaluate(objective, state, tolerance, damping, torch.zeros_like(damping, dtype=torch.int64))
     return start.cost, _minimise(objective, start, max_iterations, tolerance)
 
 
-def _minimise(objective: EpipolarCost, estimate: _Estimate, max_iterations: int, tolerance: float) -> _Estimate:
+def _each(function: Callable[..., Tensor], *optima: Optimum[State]) -> Optimum[State]:
+    """Return what a function makes of the same tensor of all optima, for each of their tensors."""
+    state = type(optima[0].state)(*map(function, *(optimum.state for optimum in optima)))
+    return Optimum(state, *map(function, *(optimum[1:] for optimum in optima)))
+
+
+def _select(state: State, rows: Tensor) -> State:
+    return type(state)(*(value[rows] for value in state))
+
+
+def _minimise(
+    objective: EpipolarCost, estimate: Optimum[State], max_iterations: int, tolerance: float
+) -> Optimum[State]:
     for iteration in range(max_iterations):
         # No step that is damped this much changes the cost by more than rounding.
         active = ~estimate.converged & (estimate.damping < 1e8)
@@ -179,13 +187,21 @@ def _minimise(objective: EpipolarCost, estimate: _Estimate, max_iterations: int,
             break
         if 2 * count <= len(active):
             rows = torch.nonzero(active)[:, 0]
-            rest = _minimise(objective.select(rows), estimate.select(rows), max_iterations - iteration, tolerance)
-            return _Estimate(*(v.index_copy(0, rows, r) for v, r in zip(estimate, rest, strict=True)))
+            return _minimise_some(objective, estimate, rows, max_iterations - iteration, tolerance)
         estimate = _try_step(objective, estimate, active, tolerance)
     return estimate
 
 
-def _try_step(objective: EpipolarCost, estimate: _Estimate, active: Tensor, tolerance: float) -> _Estimate:
+def _minimise_some(
+    objective: EpipolarCost, estimate: Optimum[State], rows: Tensor, max_iterations: int, tolerance: float
+) -> Optimum[State]:
+    """Return the estimates, of which only some go on."""
+    part = _each(lambda value: value[rows], estimate)
+    part = _minimise(objective.select(rows), part, max_iterations, tolerance)
+    return _each(lambda value, new: value.index_copy(0, rows, new), estimate, part)
+
+
+def _try_step(objective: EpipolarCost, estimate: Optimum[State], active: Tensor, tolerance: float) -> Optimum[State]:
     damped = estimate.normal.clone()
     damped.diagonal(dim1=-2, dim2=-1).mul_(1 + estimate.damping[:, None])
     step = -torch.linalg.solve_ex(damped, estimate.gradient)[0]
@@ -195,17 +211,16 @@ def _try_step(objective: EpipolarCost, estimate: _Estimate, active: Tensor, tole
     if better.all():
         return moved
     kept = estimate._replace(damping=10 * estimate.damping, iterations=iterations)
-    choices = zip(moved, kept, strict=True)
-    return _Estimate(*(torch.where(better.view(-1, *[1] * (new.ndim - 1)), new, old) for new, old in choices))
+    return _each(lambda new, old: torch.where(better.view(-1, *[1] * (new.ndim - 1)), new, old), moved, kept)
 
 
 def _evaluate(
-    objective: EpipolarCost, state: Rank2, tolerance: float, damping: Tensor, iterations: Tensor
-) -> _Estimate:
+    objective: EpipolarCost, state: State, tolerance: float, damping: Tensor, iterations: Tensor
+) -> Optimum[State]:
     J = objective.linearise(state.matrix())
     value, weights = objective.loss(J[:, 9].square())
     products = (weights * objective.weights)[:, None] * J @ J.mT
-    D = tangents(state)
+    D = state.tangents()
     reduced = D.mT @ products[:, :9]
     normal, gradient, size = reduced[..., :9] @ D, reduced[..., 9], products[:, 9, 9]
     diagonal = normal.diagonal(dim1=-2, dim2=-1).clamp_(min=torch.finfo(D.dtype).tiny)
@@ -213,7 +228,7 @@ def _evaluate(
     flat = (gradient.square() <= tolerance**2 * size[:, None] * diagonal).all(-1)
     converged = flat | (size <= objective.rounding())
     cost = (objective.weights * value).sum(-1)
-    return _Estimate(*state, cost, normal, gradient, converged, damping, iterations)
+    return Optimum(state, cost, normal, gradient, converged, damping, iterations)
 
 
 def _attach_gradient(objective: EpipolarCost, state: Rank2, converged: Tensor) -> Rank2:

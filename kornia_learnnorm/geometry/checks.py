@@ -9,6 +9,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 __all__ = [
+    "check_cameras",
     "check_correspondences",
     "check_fundamental",
     "check_mask",
@@ -51,6 +52,32 @@ def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, p
         raise TypeError(f"{name} must be {kind}, got {value.dtype}")
     if shape is not None:
         KORNIA_CHECK_SHAPE(value, [*shape], f"Argument: {name}")
+
+
+def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None = None) -> None:
+    """Raise a clear error for anything but two finite and invertible cameras, or none.
+
+    Args:
+        K1: camera of view 1 with shape :math:`(3, 3)`, or of a batch with shape :math:`(B, 3, 3)`.
+        K2: camera of view 2.
+        batch_size: number of image pairs :math:`B`; None where there is one pair without a batch.
+
+    Raises:
+        TypeError: if a camera is not a floating-point tensor.
+        ValueError: if only one is given, a shape is wrong, or one is not finite and invertible.
+
+    """
+    if (K1 is None) != (K2 is None):
+        raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
+    shapes = [[3, 3]] if batch_size is None else [[3, 3], [batch_size, 3, 3]]
+    for name, K in (("K1", K1), ("K2", K2)):
+        if K is None:
+            continue
+        check_tensor(name, K)
+        if [*K.shape] not in shapes:
+            raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {[*K.shape]}")
+        if is_true(~(K.isfinite().all() & (torch.linalg.det(K.detach().to(solve_dtype(K.device))) != 0).all())):
+            raise ValueError(f"{name} must be finite and invertible")
 
 
 def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | None = None, min_points: int = 8) -> None:

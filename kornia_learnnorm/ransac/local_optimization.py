@@ -8,12 +8,12 @@ from torch import Tensor
 from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
 from kornia_learnnorm.estimators.refinement import minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
-from kornia_learnnorm.geometry.manifold import Rank2, decompose
+from kornia_learnnorm.geometry.manifold import Calibrated, Rank2, decompose
 from kornia_learnnorm.ransac.constrained_fit import constrained_fit
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
 
-__all__ = ["fit_final", "optimize_locally"]
+__all__ = ["fit_final", "fit_final_calibrated", "optimize_calibrated", "optimize_locally"]
 
 LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps: a noisy sample has few inliers
 FINAL_POOL_SIZE = 4  # best hypotheses that the final fit starts from
@@ -22,6 +22,8 @@ FINAL_STEPS = 3  # steps of least squares on that loss
 FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
+CALIBRATED_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages, with cameras
+CALIBRATED_STEPS = 2  # steps of Levenberg-Marquardt in a stage
 
 
 def optimize_locally(scorer: PairScorer, F_mat: Tensor, number: int) -> Hypotheses:
@@ -36,6 +38,14 @@ def optimize_locally(scorer: PairScorer, F_mat: Tensor, number: int) -> Hypothes
     return scorer.best(constrained_fit(x1, x2, F_mat, losses, scorer.scale).F_mat, number)
 
 
+def optimize_calibrated(scorer: PairScorer, state: Calibrated, number: int) -> Hypotheses:
+    """Return the best of the essential matrices fitted to their inliers among the scored correspondences."""
+    for scale in CALIBRATED_SCALES:
+        objective = _objective(scorer, Truncated(scale * scorer.threshold), scorer.rows)
+        state = minimize(objective, state, CALIBRATED_STEPS, LM_TOLERANCE)[1].state
+    return scorer.best(state.matrix(), number)
+
+
 def fit_final(scorer: PairScorer, pool: Hypotheses) -> Rank2:
     """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
     threshold, loss = scorer.threshold, GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold)
@@ -44,11 +54,39 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Rank2:
     best = int(fit.cost.argmin())
     state, cost = decompose(fit.F_mat[best : best + 1]), float(fit.cost[best])
     if not float(fit.gain[best]) <= FINAL_GAIN:
-        ones = torch.ones_like(scorer.x1[:1])
-        objective = EpipolarCost(scorer.x1[None], scorer.x2[None], ones, scorer.scale, loss)
-        optimum = minimize(objective, state, MAX_LM_STEPS, LM_TOLERANCE)[1]
+        optimum = minimize(_objective(scorer, loss), state, MAX_LM_STEPS, LM_TOLERANCE)[1]
         state, cost = optimum.state, float(optimum.cost[0])
-    # The loss is nowhere above that of MSAC: up to a margin, the optimum costs no more than the pool's best.
+    return state if cost <= _largest_cost(scorer, pool, SAMPLE_SIZE) else decompose(pool.F_mat[:1])
+
+
+def fit_final_calibrated(scorer: PairScorer, pool: Hypotheses, start: Calibrated, sample_size: int) -> Calibrated:
+    """Return the optimum (1, 3, 3) among essential matrices that is next to the best of the pool.
+
+    Args:
+        scorer: all correspondences.
+        pool: the best hypotheses.
+        start: the best of the pool as essential matrices, the first of them first.
+        sample_size: correspondences in a minimal sample.
+
+    """
+    loss = GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold)
+    near = minimize(_objective(scorer, Truncated(scorer.threshold)), start, CALIBRATED_STEPS, LM_TOLERANCE)[1].state
+    optimum = minimize(_objective(scorer, loss), near, MAX_LM_STEPS, LM_TOLERANCE)[1]
+    best = int(optimum.cost.argmin())
+    if float(optimum.cost[best]) <= _largest_cost(scorer, pool, sample_size):
+        start, first = optimum.state, best
+    else:
+        first = 0
+    return Calibrated(*(value[first : first + 1] for value in start))
+
+
+def _objective(scorer: PairScorer, loss: Loss, rows: Tensor | slice = slice(None)) -> EpipolarCost:
+    x1, x2 = scorer.x1[None, :, rows], scorer.x2[None, :, rows]
+    return EpipolarCost(x1, x2, torch.ones_like(x1[:, 0]), scorer.scale, loss)
+
+
+def _largest_cost(scorer: PairScorer, pool: Hypotheses, sample_size: int) -> float:
+    """Return what an optimum costs at most: the loss is nowhere above that of MSAC, up to a margin for the scores."""
     share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
-    most = threshold**2 * (1.1 * share * scorer.x1.shape[-1] + SAMPLE_SIZE)
-    return state if cost <= most else decompose(pool.F_mat[:1])
+    most: float = scorer.threshold**2 * (1.1 * share * scorer.x1.shape[-1] + sample_size)
+    return most

@@ -1,4 +1,4 @@
-r"""RANSAC whose minimal samples and refits run through a normaliser."""
+r"""RANSAC whose minimal samples and refits run through a normaliser, or through known cameras."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.fundamental import find_fundamental
-from kornia_learnnorm.estimators.minimal import are_determined, solve_samples
-from kornia_learnnorm.geometry.checks import check_rank2, check_tensor, solve_dtype
+from kornia_learnnorm.geometry.checks import check_cameras, check_rank2, check_tensor, solve_dtype
 from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
-from kornia_learnnorm.geometry.manifold import decompose
+from kornia_learnnorm.geometry.manifold import Calibrated
 from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
 from kornia_learnnorm.normalizers.hartley import Hartley
-from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
-from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
+from kornia_learnnorm.ransac.distinct_points import distinct_points
+from kornia_learnnorm.ransac.models import EssentialModel, FundamentalModel
+from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.ransac.scoring import (
     MAX_MEDIAN_DISTANCES,
     PRESCORED,
@@ -38,7 +37,9 @@ MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
 POOL_SIZE = 8  # best hypotheses of a batch, which local optimisation fits
 MIN_RANK2_DETERMINANT = 1e-9  # of the 2x2 part of a matrix of rank 2 and unit norm
-MIN_SAMPLE_SHIFT = 0.01  # thresholds; a sample that a shift of a point by less makes degenerate is dropped
+
+Model = FundamentalModel | EssentialModel
+Cameras = tuple[Tensor, Tensor]
 
 
 class RansacResult(NamedTuple):
@@ -49,12 +50,15 @@ class RansacResult(NamedTuple):
         inliers: which correspondences are inliers, (N,) bool.
         num_samples: minimal samples drawn.
         score: MSAC score of ``F_mat``, the sum of :math:`\max(0, 1 - d_i^2 / \tau^2)` over the correspondences.
+        E_mat: essential matrix of unit Frobenius norm, singular values (s, s, 0), with
+            :math:`F = K_2^{-\top} E K_1^{-1}` up to scale, (3, 3); zeros where none was found, None without cameras.
     """
 
     F_mat: Tensor
     inliers: Tensor
     num_samples: int
     score: float
+    E_mat: Tensor | None = None
 
 
 class RANSAC(nn.Module):
@@ -65,6 +69,13 @@ class RANSAC(nn.Module):
     the first also by the normaliser (local optimisation); the inliers of the best matrix so far say how many samples
     are still needed. In the end the best few are fitted on Geman and McClure's loss, and the one of least cost goes on
     to Levenberg-Marquardt where least squares have not converged.
+
+    With both cameras, minimal samples of five run through Kornia's five-point solver, and local optimisation and the
+    final fit are Levenberg-Marquardt on essential matrices; distances stay in pixels. ``normalizer`` and ``rank2`` then
+    have no effect.
+
+    Matches that share a point exactly, in either view, with a match of higher weight, or of the same weight and before
+    them, are treated as absent: many matches on one point agree with every epipolar line through it.
 
     On the CPU, PyTorch is held to one thread meanwhile, see :func:`~kornia_learnnorm.ransac.threads.one_thread`.
 
@@ -88,7 +99,8 @@ class RANSAC(nn.Module):
             the time. When not given, ``"projection"`` with a ``normalizer`` and ``"optimal"`` without.
         refine: whether to optimise; otherwise the result is the minimal sample of highest score.
         sampler: how weights steer the sampling: :class:`~kornia_learnnorm.ransac.samplers.ProsacSampler` or
-            :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`.
+            :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`. It is called with the weights, and with cameras
+            also with ``size=5``.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
 
     Raises:
@@ -123,7 +135,7 @@ class RANSAC(nn.Module):
         distance: Literal["sampson", "symmetric"] | DistanceScale = "sampson",
         rank2: Literal["projection", "optimal"] | None = None,
         refine: bool = True,
-        sampler: Callable[[Tensor], Sampler] = ProsacSampler,
+        sampler: Callable[..., Sampler] = ProsacSampler,
         seed: int | None = None,
     ) -> None:
         super().__init__()
@@ -148,13 +160,22 @@ class RANSAC(nn.Module):
         values = {name: getattr(self, name) for name in names}
         return ", ".join(f"{name}={getattr(value, '__name__', repr(value))}" for name, value in values.items())
 
-    def forward(self, kp1: Tensor, kp2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(
+        self,
+        kp1: Tensor,
+        kp2: Tensor,
+        weights: Tensor | None = None,
+        K1: Tensor | None = None,
+        K2: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
         r"""Return the fundamental matrix and the inliers of one image pair, as Kornia's RANSAC.
 
         Args:
             kp1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, float32 or float64.
             kp2: pixels in the second image with shape :math:`(N, 2)`.
             weights: optional non-negative scores with shape :math:`(N,)`.
+            K1: optional camera of the first image with shape :math:`(3, 3)`.
+            K2: optional camera of the second image; both or none.
 
         Returns:
             the matrix :math:`(3, 3)` and the inliers :math:`(N,)`, see :meth:`estimate`.
@@ -165,34 +186,47 @@ class RANSAC(nn.Module):
             ValueError: as :meth:`estimate`.
 
         """
-        F_mat, inliers, *_ = self.estimate(kp1, kp2, weights)
+        F_mat, inliers, *_ = self.estimate(kp1, kp2, weights, K1, K2)
         return F_mat, inliers
 
-    def estimate(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> RansacResult:
-        r"""Estimate the fundamental matrix of one image pair.
+    def estimate(
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        weights: Tensor | None = None,
+        K1: Tensor | None = None,
+        K2: Tensor | None = None,
+    ) -> RansacResult:
+        r"""Estimate the fundamental matrix of one image pair, and with cameras the essential matrix.
 
         Args:
-            points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, float32 or float64. Rows that
-                are not finite, or more than 1e6 median distances from the other points, are no inliers.
+            points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, with cameras
+                :math:`N \ge 5`, float32 or float64. Rows that are not finite, more than 1e6 median distances from the
+                other points, or share a point with a better match, are no inliers.
             points2: pixels in the second image with shape :math:`(N, 2)`.
             weights: optional non-negative scores :math:`(N,)`, higher is better, such as one minus Lowe's ratio. They
-                steer sampling only; a match of weight zero is never sampled.
+                steer sampling, and decide between matches that share a point; a match of weight zero is never sampled.
+            K1: optional camera of the first image with shape :math:`(3, 3)`.
+            K2: optional camera of the second image with shape :math:`(3, 3)`; both or none.
 
         Returns:
             the matrix :math:`(3, 3)`, :math:`x_2^\top F x_1 = 0`, the inliers of the matrix before it is rounded to the
             dtype of the points, the number of samples and the score; no gradients. Zeros and no inliers where no matrix
-            of rank 2 was found that has more than eight inliers, and where fewer than eight weights are positive. Where
-            every sample is degenerate, as on a plane without noise or under no motion, the matrix is one of those that
-            fit.
+            of rank 2 was found that has more inliers than a sample, which are eight, or five with cameras, and where
+            fewer weights than that are positive. Where every sample is degenerate, as on a plane without noise or under
+            no motion, the matrix is one of those that fit. With cameras a plane has at most two.
 
         Raises:
-            TypeError: if the points are not floating-point tensors of one dtype, or the weights not floating-point.
+            TypeError: if the points are not floating-point tensors of one dtype, or weights or cameras not
+                floating-point.
             ShapeError: if a shape is wrong.
-            ValueError: if there are fewer than eight rows, the views do not pair up, or a weight is negative or not
-                finite.
+            ValueError: if there are fewer than eight rows, or five with cameras, the views do not pair up, a weight is
+                negative or not finite, only one camera is given, or one is not a finite and invertible (3, 3) matrix.
 
         """
-        _check_matches(points1, points2, weights)
+        check_cameras(K1, K2)
+        cameras = None if K1 is None or K2 is None else (K1, K2)
+        _check_matches(points1, points2, weights, self._model_of(cameras).sample_size)
         device = points1.device.type
         with ExitStack() as stack:
             if device == "cpu":
@@ -201,43 +235,68 @@ class RANSAC(nn.Module):
                 stack.enter_context(torch.autocast(device, enabled=False))
             # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
             stack.enter_context(torch.inference_mode() if self.normalizer is None else torch.no_grad())
-            result = self._estimate(points1, points2, weights)
-        return result._replace(F_mat=result.F_mat.clone(), inliers=result.inliers.clone())
+            result = self._estimate(points1, points2, weights, cameras)
+        E_mat = None if result.E_mat is None else result.E_mat.clone()
+        return result._replace(F_mat=result.F_mat.clone(), inliers=result.inliers.clone(), E_mat=E_mat)
 
-    def _estimate(self, points1: Tensor, points2: Tensor, weights: Tensor | None) -> RansacResult:
-        if torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:  # and no NaN
-            return self._estimate_kept(points1, points2, weights)
-        kept = finite_and_bounded(points1, points2, self.inl_th)
-        result = self._estimate_kept(points1[kept], points2[kept], None if weights is None else weights[kept])
+    def _estimate(
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None
+    ) -> RansacResult:
+        """Estimate from the matches that count: finite, bounded, and one on each point."""
+        kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
+        if not torch.maximum(points1.abs().max(), points2.abs().max()) <= MAX_MEDIAN_DISTANCES * self.inl_th:  # or NaN
+            kept = finite_and_bounded(points1, points2, self.inl_th)
+        best = distinct_points(points1[kept], points2[kept], None if weights is None else weights[kept])
+        kept = kept.masked_scatter(kept, best)
+        result = self._estimate_kept(points1[kept], points2[kept], None if weights is None else weights[kept], cameras)
         return result._replace(inliers=torch.zeros_like(kept).masked_scatter(kept, result.inliers))
 
-    def _estimate_kept(self, points1: Tensor, points2: Tensor, weights: Tensor | None) -> RansacResult:
-        if (len(points1) if weights is None else int((weights > 0).sum())) < SAMPLE_SIZE:
-            return _failure(points1, 0)
+    def _estimate_kept(
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None
+    ) -> RansacResult:
+        size = self._model_of(cameras).sample_size
+        if (len(points1) if weights is None else int((weights > 0).sum())) < size:
+            return _failure(points1, 0, cameras)
         x1, x2 = (points.to(solve_dtype(points.device)) for points in (points1, points2))
         generator = torch.Generator(x1.device)
         generator.manual_seed(int(torch.randint(2**62, ())) if self.seed is None else self.seed)
-        sampler = UniformSampler(len(x1), x1.device) if weights is None else self.sampler(weights.to(x1))
+        sampler = UniformSampler(len(x1), x1.device, size) if weights is None else self._sampler(weights.to(x1), size)
         scored: Tensor | slice = slice(None)
         if len(x1) >= 2 * PRESCORED:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:MAX_SCORED]
         scorer = PairScorer(x1, x2, self.inl_th, find_scale(self.distance), scored)
-        pool, drawn = self._search(scorer, sampler, generator)
+        model = self._model(scorer, cameras)
+        pool, drawn = self._search(model, sampler, generator)
         if len(pool.F_mat) == 0:
-            return _failure(points1, drawn)
-        state = fit_final(scorer, pool) if self.refine else decompose(pool.F_mat[:1])
+            return _failure(points1, drawn, cameras)
+        state = model.fit(pool, self.refine)
         if state.A.det().abs() < MIN_RANK2_DETERMINANT:
-            return _failure(points1, drawn)
+            return _failure(points1, drawn, cameras)
         F = state.matrix()
         distances = scorer.distances(F[0])
         inliers = distances <= self.inl_th
-        if int(inliers.sum()) <= SAMPLE_SIZE:
-            return _failure(points1, drawn)
+        if int(inliers.sum()) <= size:
+            return _failure(points1, drawn, cameras)
         score = float((1 - (distances / self.inl_th).square()).clamp(min=0).nansum())
-        return RansacResult(unit_fundamental(scorer.to_pixels(F)[0]).to(points1.dtype), inliers, drawn, score)
+        F_mat = unit_fundamental(scorer.to_pixels(F)[0]).to(points1.dtype)
+        E_mat = unit_fundamental(state.essential()[0]).to(points1.dtype) if isinstance(state, Calibrated) else None
+        return RansacResult(F_mat, inliers, drawn, score, E_mat)
 
-    def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
+    def _model(self, scorer: PairScorer, cameras: Cameras | None) -> Model:
+        if cameras is None:
+            return FundamentalModel(scorer, self.normalizer, self.rank2)
+        return EssentialModel(scorer, *cameras)
+
+    @staticmethod
+    def _model_of(cameras: Cameras | None) -> type[Model]:
+        return FundamentalModel if cameras is None else EssentialModel
+
+    def _sampler(self, weights: Tensor, size: int) -> Sampler:
+        return self.sampler(weights) if size == FundamentalModel.sample_size else self.sampler(weights, size=size)
+
+    def _search(self, model: Model, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
         """Return the best hypotheses that enough minimal samples give, best first, and the number of samples."""
+        scorer = model.scorer
         pool = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0))
         batch, drawn, needed, start = FIRST_BATCH, 0, self.max_samples, time.perf_counter()
         while drawn < needed:
@@ -245,45 +304,15 @@ class RANSAC(nn.Module):
                 break
             rows = sampler.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, MAX_BATCH)
-            F_mat = self._solve(scorer, rows)
+            F_mat = model.solve(rows)
             found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL_SIZE)
             pool = pool.join(found, POOL_SIZE)
             needed = self._samples_needed(pool, scorer, sampler)
             # A pool that ends the search is optimised anyway.
             if self.refine and drawn < needed and len(found.F_mat):
-                pool = pool.join(self._optimize(scorer, found.F_mat), POOL_SIZE)
+                pool = pool.join(model.optimize(found.F_mat, POOL_SIZE), POOL_SIZE)
                 needed = self._samples_needed(pool, scorer, sampler)
         return pool, drawn
-
-    def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
-        """Return the matrices of the non-degenerate minimal samples (K, 8), or of all where every one is degenerate.
-
-        Matches on one line give none.
-        """
-        x1, x2 = scorer.samples(rows)
-        shift = MIN_SAMPLE_SHIFT * self.inl_th
-        if self.normalizer is None:
-            F_mat = solve_samples(x1, x2, shift)
-            if len(F_mat):
-                return F_mat
-            determined = torch.zeros_like(rows[:, 0], dtype=torch.bool)
-        else:
-            determined = are_determined(x1, x2, shift)
-        if bool(determined.any()):
-            rows = rows[determined]
-        elif any(_on_a_line(points, shift) for points in scorer.pixels):
-            return x1.new_zeros(0, 3, 3)
-        points1, points2 = (points[rows] for points in scorer.pixels)
-        return scorer.from_pixels(find_fundamental(points1, points2, None, self.normalizer, self.rank2))
-
-    def _optimize(self, scorer: PairScorer, F_mat: Tensor) -> Hypotheses:
-        """Return the best of the matrices fitted to their inliers, the first of them also by the normaliser."""
-        if self.normalizer is not None:
-            inliers = scorer.inliers(F_mat[:1]).to(F_mat)
-            points1, points2 = (points[None, scorer.rows] for points in scorer.pixels)
-            refit = find_fundamental(points1, points2, inliers, self.normalizer, self.rank2)
-            F_mat = torch.cat([scorer.from_pixels(refit), F_mat])
-        return optimize_locally(scorer, F_mat, POOL_SIZE)
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
@@ -295,15 +324,10 @@ class RANSAC(nn.Module):
         return math.ceil(min(self.max_samples, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
 
 
-def _on_a_line(points: Tensor, shift: float) -> bool:
-    """Return whether points (N, 2) are less than ``shift`` pixels from one line, in root mean square."""
-    distance = torch.linalg.svdvals(points - points.mean(0))[1] / len(points) ** 0.5
-    return bool(distance < shift)
-
-
-def _failure(points: Tensor, drawn: int) -> RansacResult:
+def _failure(points: Tensor, drawn: int, cameras: Cameras | None) -> RansacResult:
     inliers = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    return RansacResult(points.new_zeros(3, 3), inliers, drawn, 0.0)
+    E_mat = None if cameras is None else points.new_zeros(3, 3)
+    return RansacResult(points.new_zeros(3, 3), inliers, drawn, 0.0, E_mat)
 
 
 def _check_numbers(
@@ -330,15 +354,15 @@ def _is_whole(value: object) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
-def _check_matches(points1: Tensor, points2: Tensor, weights: Tensor | None) -> None:
+def _check_matches(points1: Tensor, points2: Tensor, weights: Tensor | None, min_points: int) -> None:
     for name, points in (("points1", points1), ("points2", points2)):
         check_tensor(name, points, ["N", "2"], precise=True)
     if points1.dtype != points2.dtype:
         raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
     if points1.shape != points2.shape:
         raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
-    if len(points1) < SAMPLE_SIZE:
-        raise ValueError(f"at least {SAMPLE_SIZE} correspondences are needed, got {len(points1)}")
+    if len(points1) < min_points:
+        raise ValueError(f"at least {min_points} correspondences are needed, got {len(points1)}")
     if weights is None:
         return
     if isinstance(weights, Tensor) and weights.dtype == torch.bool:

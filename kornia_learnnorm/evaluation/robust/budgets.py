@@ -85,11 +85,12 @@ def _timed(estimate: Callable[[Matches, int, float], tuple[Tensor | None, float]
     return run
 
 
-def peer_estimator(peer: Peer) -> Estimator:
-    """Return an estimator of another package that measures its time."""
+def peer_estimator(peer: Peer, calibrated: bool = False) -> Estimator:
+    """Return an estimator of another package that measures its time; if ``calibrated``, it gets the cameras too."""
 
     def estimate(matches: Matches, seed: int, threshold: float) -> tuple[Tensor | None, float]:
-        F_mat = peer(matches.points1.numpy(), matches.points2.numpy(), matches.size, seed, threshold)
+        cameras = [matches.K.numpy()] if calibrated else []
+        F_mat = peer(matches.points1.numpy(), matches.points2.numpy(), matches.size, seed, threshold, *cameras)
         # OpenCV stacks up to three matrices if there are only seven points.
         good = F_mat is not None and F_mat.shape == (3, 3)
         return torch.tensor(np.array(F_mat, float)) if good else None, math.nan
@@ -97,11 +98,18 @@ def peer_estimator(peer: Peer) -> Estimator:
     return _timed(estimate)
 
 
-def ransac(normalizer: Normalizer | None, options: dict[str, Any]) -> Estimator:
-    """Return :class:`~kornia_learnnorm.RANSAC` with a normaliser, its default if None, as an estimator."""
+def ransac(normalizer: Normalizer | None, options: dict[str, Any], calibrated: bool = False) -> Estimator:
+    """Return :class:`~kornia_learnnorm.RANSAC` with a normaliser, its default if None, as an estimator.
+
+    If ``calibrated``, it gets the cameras too, and fails on pairs of unknown cameras.
+    """
 
     def estimate(matches: Matches, seed: int, threshold: float) -> tuple[Tensor | None, float]:
-        result = RANSAC(normalizer, inl_th=threshold, seed=seed, **options).estimate(matches.points1, matches.points2)
+        if calibrated and not bool(matches.K.isfinite().all()):
+            return None, 0.0
+        cameras = {"K1": matches.K[0], "K2": matches.K[1]} if calibrated else {}
+        estimator = RANSAC(normalizer, inl_th=threshold, seed=seed, **options)
+        result = estimator.estimate(matches.points1, matches.points2, **cameras)
         return result.F_mat if bool(result.F_mat.any()) else None, result.num_samples
 
     return _timed(estimate)

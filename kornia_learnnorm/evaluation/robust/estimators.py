@@ -21,7 +21,7 @@ from kornia_learnnorm.evaluation.robust.budgets import (
     ransac,
 )
 from kornia_learnnorm.evaluation.robust.matches import Matches
-from kornia_learnnorm.evaluation.robust.peers import PEERS, find_peer, peer_version
+from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.pretrained import weights_digest
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
@@ -48,7 +48,7 @@ KINDS = ("count:", "time:", *LEARNED, f"{DEFAULTS}:")
 _SOLVERS = ("Hartley", "whitening", "paper", "crossview", "Hartley+optimal")
 DEFAULT_SOLVERS = ("none", "Hartley", "whitening", "reweighted", *_SOLVERS[2:], SEVEN_POINT, "searched")
 DEFAULT_ESTIMATORS = (
-    *PEERS,
+    *(name for name in PEERS if not name.endswith(CALIBRATED)),
     *(f"count:{name}" for name in (*_SOLVERS, SEVEN_POINT)),
     *(f"time:{name}" for name in _SOLVERS),
     DEFAULTS,
@@ -81,6 +81,7 @@ def find_estimator(name: str) -> Estimator:
             - ``count:SOLVER``, the best of 1,000 minimal samples, which all solvers share;
             - ``time:METHOD``, the best of the samples drawn in 50 ms;
             - ``RANSAC``, :class:`~kornia_learnnorm.RANSAC` with its defaults;
+            - ``RANSAC-calibrated``, RANSAC with the cameras of the store;
             - ``RANSAC:METHOD``, RANSAC with another normaliser and at most 20,000 samples;
             - ``ground-truth``, the true matrix, which shows how far the metrics can be trusted.
 
@@ -91,14 +92,14 @@ def find_estimator(name: str) -> Estimator:
 
     """
     if name in PEERS:
-        return peer_estimator(find_peer(name))
+        return peer_estimator(find_peer(name), name.endswith(CALIBRATED))
     if name == TRUTH:
         return _truth
     kind, _, method = name.partition(":")
     if kind == "count" and method:
         return best_of(NUM_SAMPLES, find_solver(method))
-    if name == DEFAULTS:
-        return ransac(None, {})
+    if name in (DEFAULTS, DEFAULTS + CALIBRATED):
+        return ransac(None, {}, calibrated=name != DEFAULTS)
     if kind == DEFAULTS and method:
         return _ransac(method, {"max_samples": MAX_SAMPLES})
     if kind == "learned" and method:
@@ -110,7 +111,7 @@ def find_estimator(name: str) -> Estimator:
         return _ransac(method, {"max_samples": 10**7, "max_seconds": MAX_SECONDS, "confidence": 1, "refine": False})
     raise ValueError(
         f"no estimator {name!r}: expected {', '.join(PEERS)}, learned:WEIGHTS, learned:WEIGHTS{REFINED},"
-        f" guided:WEIGHTS, count:SOLVER, time:METHOD, RANSAC, RANSAC:METHOD or {TRUTH}"
+        f" guided:WEIGHTS, count:SOLVER, time:METHOD, RANSAC, RANSAC{CALIBRATED}, RANSAC:METHOD or {TRUTH}"
     )
 
 
@@ -131,7 +132,8 @@ def identify_estimator(name: str) -> str:
     kind, colon, method = _split(name)
     if name.startswith(LEARNED):
         return f"{name} {weights_digest(method.removesuffix(REFINED))}"
-    return name if method in (DEFAULTS, SEVEN_POINT, TRUTH) else f"{kind}{colon}{identify_method(method)}"
+    known = (DEFAULTS, DEFAULTS + CALIBRATED, SEVEN_POINT, TRUTH)
+    return name if method in known else f"{kind}{colon}{identify_method(method)}"
 
 
 def estimator_names(names: Sequence[str]) -> dict[str, str]:

@@ -1,8 +1,8 @@
 """Robust estimators of other packages, with their defaults except for the threshold and the seed.
 
 Each estimator takes its package, points in pixels (N, 2), the (width, height) of both images (2, 2), a seed and a
-threshold in pixels. It returns a matrix (3, 3), or None for a failure. Each package applies the threshold to a
-different distance.
+threshold in pixels, and those with the suffix ``-calibrated`` also the matrices of both cameras (2, 3, 3). It returns a
+fundamental matrix (3, 3), or None for a failure. Each package applies the threshold to a different distance.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["PEERS", "Peer", "PeerPackage", "find_peer", "peer_version"]
+__all__ = ["CALIBRATED", "PEERS", "Peer", "PeerPackage", "find_peer", "peer_version"]
 
 Array = NDArray[np.float64]
 Sizes = NDArray[np.int32]
-Peer = Callable[[Array, Array, Sizes, int, float], Any]
+Peer = Callable[..., Any]
+CALIBRATED = "-calibrated"  # suffix of the names of estimators that know the cameras; a failure where a store has none
 
 
 class PeerPackage(NamedTuple):
@@ -41,6 +42,32 @@ def _opencv(method: str, cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int
 
 def _poselib(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float) -> Any:
     return poselib.estimate_fundamental(x1, x2, {"max_epipolar_error": threshold, "seed": seed}, {})[0]
+
+
+def _opencv_calibrated(cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array) -> Any:
+    if not np.isfinite(K).all():
+        return None
+    options = {"method": cv2.USAC_MAGSAC, "threshold": threshold}
+    E = cv2.findEssentialMat(x1, x2, K[0], None, K[1], None, **options)[0]
+    return None if E is None or E.shape != (3, 3) else _to_pixels(E, K)
+
+
+def _poselib_calibrated(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array) -> Any:
+    if not np.isfinite(K).all():
+        return None
+    cameras = [
+        {"model": "PINHOLE", "width": w, "height": h, "params": [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]}
+        for k, (w, h) in zip(K, sizes.tolist(), strict=True)
+    ]
+    pose = poselib.estimate_relative_pose(x1, x2, *cameras, {"max_epipolar_error": threshold, "seed": seed}, {})[0]
+    return _to_pixels(np.cross(np.eye(3), pose.t).T @ pose.R, K) if np.any(pose.t) else None
+
+
+def _to_pixels(E: Array, K: Array) -> Array:
+    """Return the fundamental matrix of an essential one."""
+    inverse1, inverse2 = np.linalg.inv(K)
+    F: Array = inverse2.T @ E @ inverse1
+    return F / np.linalg.norm(F)
 
 
 def _kornia(model: str, ransac: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float) -> Any:
@@ -75,7 +102,9 @@ OPENCV = {
 }
 PEERS = {
     **{name: PeerPackage(partial(_opencv, method), "cv2", "opencv", "images") for name, method in OPENCV.items()},
+    f"opencv-usac-magsac{CALIBRATED}": PeerPackage(_opencv_calibrated, "cv2", "opencv", "images"),
     "poselib": PeerPackage(_poselib, "poselib", "poselib"),
+    f"poselib{CALIBRATED}": PeerPackage(_poselib_calibrated, "poselib", "poselib"),
     "kornia": PeerPackage(partial(_kornia, "fundamental"), "kornia.geometry.ransac", "kornia"),
     "kornia-8pt": PeerPackage(partial(_kornia, "fundamental_8pt"), "kornia.geometry.ransac", "kornia"),
     "pydegensac": PeerPackage(_pydegensac, "pydegensac", "pydegensac"),

@@ -23,8 +23,10 @@ from kornia_learnnorm.evaluation.robust.estimators import (
 from kornia_learnnorm.evaluation.robust.matches import draw_matches, even_pairs, measure
 from kornia_learnnorm.metrics.pairs import f1_score
 
+KNOWN_CAMERAS = ["RANSAC-calibrated", "poselib-calibrated", "opencv-usac-magsac-calibrated"]
 
-@pytest.mark.parametrize("name", [*DEFAULT_ESTIMATORS, "count:none", "RANSAC:Hartley+optimal"])
+
+@pytest.mark.parametrize("name", [*DEFAULT_ESTIMATORS, *KNOWN_CAMERAS, "count:none", "RANSAC:Hartley+optimal"])
 def test_each_finds_the_truth(name, matches):
     try:
         estimator = find_estimator(name)
@@ -42,6 +44,19 @@ def test_each_finds_the_truth(name, matches):
         assert found.samples == 1000
     if name.startswith("time:"):
         assert found.samples >= 1
+
+
+@pytest.mark.parametrize("name", KNOWN_CAMERAS)
+def test_known_cameras(name, matches):
+    """The matrix has the essential one's equal singular values; without cameras there is none."""
+    drawn, estimator = matches(), find_estimator(name)
+    (found,) = estimator(drawn, 0, [1.0])
+    values = np.linalg.svd((drawn.K[1].mT @ found.F_mat @ drawn.K[0]).numpy())[1]
+    assert values[1] == pytest.approx(values[0], rel=1e-6)
+    assert measure(drawn, found.F_mat, 1.0)["rotation_error"] < 1
+    assert estimator(drawn._replace(K=drawn.K * torch.nan), 0, [1.0])[0].F_mat.isnan().all()
+    assert name not in DEFAULT_ESTIMATORS
+    assert identify_estimator(name) == name or identify_estimator(name).startswith(("poselib ", "opencv "))
 
 
 @pytest.mark.parametrize("name", ["learned:{}", "learned:{}+LM", "guided:{}"])

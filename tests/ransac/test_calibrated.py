@@ -1,0 +1,195 @@
+"""RANSAC with known cameras against the truth of synthetic scenes, a plane among them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from two_view import homogeneous, scenes, uniform, unit, up_to_sign
+
+import kornia_learnnorm as kln
+from kornia_learnnorm import RANSAC
+from kornia_learnnorm.estimators.essential import refine_essential
+from kornia_learnnorm.ransac.samplers import ProsacSampler, UniformSampler, WeightedSampler
+
+
+def pair(name: str = "handheld", num_points: int = 200, noise: float = 0.3, outliers: float = 0.4, seed: int = 0):
+    """Correspondences (N, 2) of one pair, both cameras, its essential matrix, and which are no outliers."""
+    scene = scenes(name, 1, num_points, seed, noise=noise, outliers=outliers)
+    K1, K2, R, t = scene.K1[0], scene.K2[0], scene.R[0].numpy(), scene.t[0].numpy()
+    E = unit(np.cross(np.eye(3), t).T @ R)  # [t]_x R
+    return (scene.points1[0], scene.points2[0]), (K1, K2), E, scene.inliers[0]
+
+
+def plane(num_points: int = 60, off_plane: int = 0, seed: int = 0):
+    """Noise-free correspondences of a plane, and some points behind it; both cameras, R and t."""
+    scene = scenes("handheld", 1, num_points, seed, noise=0.0, outliers=0.0)
+    K1, K2, R, t = scene.K1[0].numpy(), scene.K2[0].numpy(), scene.R[0].numpy(), scene.t[0].numpy()
+    rays = homogeneous(scene.points1[0].numpy()) @ np.linalg.inv(K1).T
+    depth = 4 / (rays @ np.array([0.2, -0.1, 1.0]))
+    depth[:off_plane] *= np.linspace(1.2, 3, off_plane)
+    x2 = (depth[:, None] * rays @ R.T + 0.5 * t / np.linalg.norm(t)) @ K2.T
+    return (scene.points1[0], torch.from_numpy(x2[:, :2] / x2[:, 2:])), (scene.K1[0], scene.K2[0]), R, t
+
+
+def estimate(points, cameras, weights=None, **options):
+    return RANSAC(seed=0, **options).estimate(*points, weights, *cameras)
+
+
+class TestSmoke:
+    @pytest.mark.parametrize("refine", [True, False])
+    def test_shapes(self, refine, device, dtype):
+        points, cameras, _, _ = pair()
+        found = estimate([p.to(device, dtype) for p in points], [K.to(device) for K in cameras], refine=refine)
+        assert found.E_mat.shape == found.F_mat.shape == (3, 3)
+        assert found.E_mat.dtype == dtype
+        assert found.inliers.shape == (200,)
+        values = torch.linalg.svdvals(found.E_mat.double())
+        assert torch.allclose(values, torch.tensor([0.5**0.5, 0.5**0.5, 0.0]).double(), atol=1e-6)
+
+    def test_forward_and_estimate(self):
+        points, (K1, K2), _, _ = pair()
+        found = estimate(points, (K1, K2))
+        F_mat, inliers = RANSAC(seed=0)(*points, K1=K1, K2=K2)
+        assert torch.equal(found.F_mat, F_mat)
+        assert torch.equal(found.inliers, inliers)
+        expected = torch.linalg.inv(K2).mT @ found.E_mat @ torch.linalg.inv(K1)
+        assert up_to_sign(F_mat[None], expected[None]) < 1e-10
+        distances = kln.sampson_distance(*(p[None] for p in points), F_mat[None])[0]
+        assert torch.equal(inliers, distances <= 1)
+        assert found.score == pytest.approx((1 - distances.square()).clamp(min=0).sum().item(), rel=1e-6)
+
+    def test_without_cameras_there_is_no_essential_matrix(self):
+        points, _, _, _ = pair()
+        assert RANSAC(seed=0).estimate(*points).E_mat is None
+
+    @pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
+    def test_weights(self, sampler):
+        points, cameras, E, true = pair(outliers=0.7)
+        weights = 0.1 + true + 0.5 * uniform(200)
+        found = estimate(points, cameras, weights, sampler=sampler)
+        assert found.num_samples < estimate(points, cameras).num_samples
+        assert up_to_sign(found.E_mat[None], E[None]) < 0.05
+
+
+class TestExceptions:
+    @pytest.mark.parametrize(
+        ("K1", "K2", "error", "message"),
+        [
+            (torch.eye(3), None, ValueError, "K1 and K2 must be given together, got only K1"),
+            (None, torch.eye(3), ValueError, "got only K2"),
+            (torch.eye(3), torch.zeros(3, 3), ValueError, "K2 must be finite and invertible"),
+            (torch.full((3, 3), torch.nan), torch.eye(3), ValueError, "K1 must be finite and invertible"),
+            (torch.eye(3)[None], torch.eye(3), ValueError, r"K1 must have shape \[3, 3\], got \[1, 3, 3\]"),
+            (np.eye(3), torch.eye(3), TypeError, "K1 must be a floating-point tensor"),
+        ],
+    )
+    def test_cameras(self, K1, K2, error, message):
+        with pytest.raises(error, match=message):
+            RANSAC().estimate(uniform(20, 2), uniform(20, 2, seed=1), None, K1, K2)
+
+    def test_fewer_than_five(self):
+        with pytest.raises(ValueError, match="at least 5 correspondences are needed, got 4"):
+            RANSAC()(uniform(4, 2), uniform(4, 2, seed=1), K1=torch.eye(3), K2=torch.eye(3))
+
+    def test_failure(self):
+        """Five matches fit exactly: no other one confirms the matrix."""
+        found = estimate((uniform(5, 2), uniform(5, 2, seed=1)), (torch.eye(3), torch.eye(3)))
+        assert not found.E_mat.any()
+        assert not found.F_mat.any()
+        assert not found.inliers.any()
+
+
+class TestAccuracy:
+    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
+    @pytest.mark.parametrize("num_points", [7, 60, 1500])
+    def test_exact_points(self, name, num_points):
+        points, cameras, E, _ = pair(name, num_points, noise=0.0, outliers=0.0)
+        found = estimate(points, cameras)
+        assert found.inliers.all()
+        if num_points > 7:  # of fewer, others fit within the threshold
+            assert up_to_sign(found.E_mat[None], E[None]) < 1e-6
+
+    def test_mostly_a_plane(self):
+        """Samples of eight are degenerate or need points off the plane; samples of five do not."""
+        points, cameras, R, t = plane(off_plane=6)
+        found = estimate(points, cameras)
+        assert up_to_sign(found.E_mat[None], unit(np.cross(np.eye(3), t).T @ R)[None]) < 1e-6
+        assert found.inliers.all()
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_plane(self, seed):
+        """The poses that fit a plane are those of its homography, by OpenCV: two, each with two signs."""
+        cv2 = pytest.importorskip("cv2")
+        points, cameras, R, t = plane(seed=seed)
+        found = estimate(points, cameras)
+        assert found.inliers.all()
+        assert kln.sampson_distance(*(p[None] for p in points), found.F_mat[None]).max() < 1e-6
+        H = R + 0.5 * np.outer(t / np.linalg.norm(t), np.array([0.2, -0.1, 1.0]) / 4)
+        _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+        solutions = [np.cross(np.eye(3), t[:, 0]).T @ R for R, t in zip(rotations, translations, strict=True)]
+        assert min(up_to_sign(found.E_mat[None], unit(E)[None]) for E in solutions) < 1e-5
+
+    def test_is_closer_to_the_truth_than_without_cameras(self):
+        errors = {True: [], False: []}
+        for seed in range(10):
+            points, (K1, K2), E, _ = pair(num_points=60, noise=0.5, seed=seed)
+            for known, cameras in ((True, (K1, K2)), (False, ())):
+                F = estimate(points, cameras).F_mat
+                errors[known].append(up_to_sign((K2.mT @ F @ K1)[None], E[None]))
+        assert np.median(errors[True]) < np.median(errors[False])
+
+    def test_many_matches_and_few_inliers(self):
+        points, cameras, E, true = pair(num_points=2000, outliers=0.85)
+        found = estimate(points, cameras)
+        assert found.inliers[true].float().mean() > 0.9
+        assert up_to_sign(found.E_mat[None], E[None]) < 0.02
+
+    def test_final_fit_is_the_optimum_of_its_loss(self):
+        points, cameras, _, _ = pair(outliers=0.2)
+        found, points = estimate(points, cameras), [p[None] for p in points]
+        optimum = refine_essential(*points, found.E_mat[None], *cameras, loss=kln.GemanMcClure(0.7))
+        assert optimum.cost_before <= 1.001 * optimum.cost
+
+
+class TestInvariances:
+    @given(seed=st.integers(0, 5))
+    def test_swapping_the_views_transposes(self, seed):
+        points, cameras, _, _ = pair("driving", 100, seed=seed)
+        found, swapped = estimate(points, cameras), estimate(points[::-1], cameras[::-1])
+        assert (found.inliers == swapped.inliers).float().mean() > 0.97
+        assert up_to_sign(found.E_mat[None], swapped.E_mat.mT[None]) < 0.02
+
+    def test_permutation(self):
+        points, cameras, _, _ = pair(outliers=0.2)
+        order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+        found, again = estimate(points, cameras), estimate([p[order] for p in points], cameras)
+        assert (found.inliers[order] == again.inliers).float().mean() > 0.97
+        assert up_to_sign(found.E_mat[None], again.E_mat[None]) < 0.02
+
+    @pytest.mark.parametrize("scale", [0.1, 30.0])
+    def test_scale_of_the_pixels(self, scale):
+        points, cameras, _, _ = pair(outliers=0.2)
+        T = torch.diag(torch.tensor([scale, scale, 1.0])).double()
+        scaled = estimate([scale * p for p in points], [T @ K for K in cameras], inl_th=scale)
+        found = estimate(points, cameras)
+        assert up_to_sign(found.E_mat[None], scaled.E_mat[None]) < 1e-2
+        assert (found.inliers == scaled.inliers).float().mean() > 0.97
+
+
+@pytest.mark.parametrize("weights", [False, True])
+def test_samplers_of_five(weights, generator):
+    scores = uniform(20)
+    scores[10:] = 0
+    samplers = [ProsacSampler(scores, size=5), WeightedSampler(scores, size=5)] if weights else []
+    for sampler in samplers or [UniformSampler(20, torch.device("cpu"), 5)]:
+        drawn = sampler.draw(100, generator)
+        assert drawn.shape == (100, 5)
+        assert (drawn.sort(-1).values.diff(dim=-1) > 0).all()
+        assert drawn.max() < (10 if weights else 20)
+        inliers = torch.arange(20) < 5
+        share = {ProsacSampler: None, WeightedSampler: float(scores[:5].sum() / scores.sum()), UniformSampler: 0.25}
+        if (expected := share[type(sampler)]) is not None:
+            assert sampler.hit_rate(inliers, slice(None)) == pytest.approx(expected**5, rel=1e-5)

@@ -1,0 +1,88 @@
+"""Matches that share a point: the mask against a loop, and what they do to RANSAC."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from two_view import scenes, uniform
+
+from kornia_learnnorm import RANSAC
+from kornia_learnnorm.ransac.distinct_points import distinct_points
+
+
+def reference(points1, points2, weights=None) -> list[bool]:
+    """One match after another, from the best to the worst."""
+    order = sorted(range(len(points1)), key=lambda k: 0 if weights is None else -weights[k].item())
+    seen1, seen2, kept = set(), set(), [False] * len(points1)
+    for k in order:
+        a, b = tuple(points1[k].tolist()), tuple(points2[k].tolist())
+        if a not in seen1 and b not in seen2:
+            kept[k] = True
+            seen1.add(a)
+            seen2.add(b)
+    return kept
+
+
+class TestMask:
+    @given(seed=st.integers(0, 1000), number=st.integers(0, 40), values=st.integers(1, 6))
+    @pytest.mark.parametrize("weighted", [False, True])
+    @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+    def test_against_a_loop(self, weighted, kind, seed, number, values):
+        points1, points2 = (uniform(2, number, 2, seed=seed) * values).floor().to(kind) - 2
+        weights = (uniform(number, seed=seed + 1) * 4).floor() if weighted else None
+        assert distinct_points(points1, points2, weights).tolist() == reference(points1, points2, weights)
+
+    def test_of_a_chain_every_second_is_kept(self):
+        points1 = torch.tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+        assert distinct_points(points1, torch.tensor([[5.0, 5.0], [6.0, 5.0], [6.0, 5.0]])).tolist() == [
+            True,
+            False,
+            True,
+        ]
+
+    def test_zeros_of_both_signs_are_equal(self):
+        points = torch.tensor([[0.0, 1.0], [-0.0, 1.0]])
+        assert distinct_points(points, uniform(2, 2)).tolist() == [True, False]
+
+    def test_equal_coordinates_are_no_shared_point(self):
+        grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0))
+        assert distinct_points(grid, grid.flip(0)).all()
+
+
+class TestRansac:
+    def test_many_matches_on_one_point_count_once(self):
+        """All of 165 agree with every epipolar line through the point; the other hundred are random."""
+        points1, points2 = uniform(265, 2, high=600), uniform(265, 2, high=600, seed=1)
+        points2[:165] = points2[0]
+        _, inliers = RANSAC(seed=0, max_samples=2000)(points1, points2)
+        assert inliers[:165].sum() <= 1
+        assert inliers.sum() < 30
+
+    @pytest.mark.parametrize("cameras", [False, True])
+    def test_copies_are_absent(self, cameras):
+        scene = scenes("handheld", 1, 200, noise=0.3, outliers=0.3)
+        points1, points2 = scene.points1[0], scene.points2[0]
+        known = (scene.K1[0], scene.K2[0]) if cameras else (None, None)
+        found = RANSAC(seed=0).estimate(points1, points2, None, *known)
+        copied = [torch.cat([points, points[:50]]) for points in (points1, points2)]
+        again = RANSAC(seed=0).estimate(*copied, None, *known)
+        assert torch.equal(found.F_mat, again.F_mat)
+        assert torch.equal(torch.cat([found.inliers, torch.zeros(50, dtype=torch.bool)]), again.inliers)
+
+    def test_the_weights_decide_which_counts(self):
+        scene = scenes("handheld", 1, 200, noise=0.3, outliers=0.0)
+        points1, points2 = scene.points1[0].repeat(2, 1), torch.cat([uniform(200, 2, high=600), scene.points2[0]])
+        weights = torch.cat([torch.full((200,), 0.1), torch.full((200,), 0.2)])
+        _, inliers = RANSAC(seed=0)(points1, points2, weights)
+        assert inliers[200:].float().mean() > 0.9
+        assert not inliers[:200].any()
+
+    def test_rows_that_are_not_finite_hide_no_match(self):
+        scene = scenes("handheld", 1, 100, noise=0.3, outliers=0.0)
+        points1, points2 = scene.points1[0], scene.points2[0]
+        _, inliers = RANSAC(seed=0)(points1, points2)
+        bad = torch.full_like(points2, torch.nan)
+        _, more = RANSAC(seed=0)(torch.cat([points1, points1]), torch.cat([bad, points2]))
+        assert torch.equal(more, torch.cat([torch.zeros(100, dtype=torch.bool), inliers]))
