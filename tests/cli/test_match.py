@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 pytest.importorskip("h5py", reason="h5py is not installed")
@@ -16,6 +17,7 @@ from make_sequences import FR3, LAYOUTS
 from kornia_learnnorm.cli import match
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.matching import collect
+from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.data.store import read_store
 
 
@@ -167,6 +169,9 @@ def test_real_data_gives_the_stores_that_other_code_made(
         assert np.allclose(getattr(ours, name), getattr(theirs, name), rtol=0, atol=1e-6)
     for place in range(limit):
         one, two = ours.select(place, place + 1), theirs.select(place, place + 1)
-        wanted = np.hstack([two.points1, two.points2])[two.ratio < 0.8]
+        # The other code keeps matches that share a point, 1,000 that pass the ratio test. The best of those that share
+        # one may be among those it left out: at most 0.5 % of these pairs.
+        kept = one_to_one(*map(torch.from_numpy, (two.points1, two.points2, two.ratio))).numpy()
+        wanted = np.hstack([two.points1, two.points2])[kept[two.ratio[kept] < 0.8]]
         distance = np.abs(wanted[:, None] - np.hstack([one.points1, one.points2])[None]).max(-1).min(1)
-        assert (distance < 0.01).mean() >= 0.95
+        assert (distance < 0.01).mean() >= 0.99

@@ -8,10 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from make_sequences import texture
 
+from kornia_learnnorm.data import decoding
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.images import image_size, read_frame, read_image
+from kornia_learnnorm.data.images import (
+    content_mask,
+    image_size,
+    read_frame,
+    read_image,
+    read_mask,
+    scale_points,
+    scaling,
+)
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
@@ -60,7 +73,8 @@ class TestReadImage:
         ("name", "change", "message"),
         [
             ("empty.png", lambda data: b"", r"empty\.png is empty"),
-            ("text.png", lambda data: b"hello", "not an image"),
+            ("text.png", lambda data: b"hello", "5 bytes, not an image of a kind that Pillow reads"),
+            ("text.tif", lambda data: b"II*\0hello", "a corrupt TIFF"),
             ("half.png", lambda data: data[: len(data) // 2], "truncated"),
             ("half.jpg", lambda data: data[: len(data) // 2], "truncated"),
             ("half.bmp", lambda data: data[: len(data) // 2], "truncated"),
@@ -72,6 +86,24 @@ class TestReadImage:
         with pytest.raises(ValueError, match=message) as caught:
             read_image(tmp_path / name)
         assert "\n" not in str(caught.value)
+        assert "<_io" not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("error", "message"),
+        [
+            (PermissionError(13, "Permission denied"), r"a\.png .* \d+ bytes, Permission denied$"),
+            (MemoryError(), "too large for the memory"),
+            (SyntaxError("broken PNG file (chunk b'\\xe3')"), r"bytes, truncated or corrupt$"),
+        ],
+    )
+    def test_reasons_without_the_words_of_pillow(self, tmp_path, monkeypatch, error, message):
+        def fail(*_):
+            raise error
+
+        cv2.imwrite(str(tmp_path / "a.png"), texture())
+        monkeypatch.setattr(decoding, "open_image", fail)
+        with pytest.raises(ValueError, match=message):
+            read_image(tmp_path / "a.png")
 
     def test_jpeg_with_a_thumbnail_is_whole_and_noticed_when_cut(self, tmp_path):
         thumbnail = cv2.imencode(".jpg", texture(width=32, height=24))[1].tobytes()
@@ -101,11 +133,6 @@ class TestReadImage:
         deep = np.array([[0, 0xFF, 0x100, 0x80FF, 0xFFFF]], np.uint16)
         cv2.imwrite(str(tmp_path / f"deep{suffix}"), deep)
         assert read_image(tmp_path / f"deep{suffix}").tolist() == [[0, 0, 1, 0x80, 0xFF]]
-
-    def test_floating_point(self, tmp_path):
-        Image.fromarray(np.zeros((3, 4), np.float32)).save(tmp_path / "float.tif")
-        with pytest.raises(ValueError, match=r"float\.tif .*floating-point numbers, expected 8 or 16 bits"):
-            read_image(tmp_path / "float.tif")
 
     def test_without_pillow(self, tmp_path, monkeypatch):
         cv2.imwrite(str(tmp_path / "image.png"), texture())
@@ -154,6 +181,123 @@ class TestImageSize:
             image_size(tmp_path / "a.png")
         with pytest.raises(FileNotFoundError):
             image_size(tmp_path)
+
+
+class TestScale:
+    SIZES = st.tuples(st.integers(1, 20000), st.integers(1, 20000))
+
+    def test_against_corners(self):
+        """The outer corners of the image stay where they are: -0.5 and the size less 0.5."""
+        corners = np.array([[-0.5, -0.5], [1000.5, 600.5]])
+        assert np.allclose(scale_points(corners, (1001, 601), (333, 200)), [[-0.5, -0.5], [332.5, 199.5]], atol=1e-12)
+
+    @given(size=SIZES, other=SIZES, point=st.tuples(st.floats(-1e4, 3e4), st.floats(-1e4, 3e4)))
+    def test_there_and_back(self, size, other, point):
+        points = np.array([point])
+        there = scale_points(points, size, other)
+        assert np.allclose(np.append(points, 1) @ scaling(size, other).numpy().T, np.append(there, 1), rtol=1e-9)
+        assert np.allclose(scale_points(there, other, size), points, rtol=1e-9, atol=1e-6)
+
+    def test_fundamental_matrix_of_the_full_images(self):
+        rng = np.random.default_rng(0)
+        full, small = ((4001, 2999), (3000, 2000)), ((1000, 750), (999, 666))
+        F_small = torch.from_numpy(rng.normal(size=(3, 3)))
+        F_full = transform_fundamental(F_small, *(scaling(*sizes) for sizes in zip(full, small, strict=True)))
+        points = [rng.uniform(0, 2000, (20, 2)) for _ in range(2)]
+        reduced = [scale_points(p, *sizes) for p, *sizes in zip(points, full, small, strict=True)]
+        # the values of the bilinear form, coordinate by coordinate
+        before, after = (
+            np.einsum("ni,ij,nj->n", np.c_[p2, np.ones(20)], F.numpy(), np.c_[p1, np.ones(20)])
+            for (p1, p2), F in ((points, F_full), (reduced, F_small))
+        )
+        assert np.allclose(before, after)
+
+    @pytest.mark.parametrize("sizes", [((0, 0), (3, 4)), ((3, 4), (3, 0))])
+    def test_no_size(self, sizes):
+        with pytest.raises(ValueError, match=r"a positive width and height, got .*0\)"):
+            scaling(*sizes)
+
+
+class TestContentMask:
+    @pytest.mark.parametrize(
+        ("top", "bottom", "left", "right"), [(30, 30, 0, 0), (0, 0, 25, 0), (1, 0, 0, 2), (5, 7, 9, 11)]
+    )
+    @pytest.mark.parametrize("level", [0, 2])
+    def test_frame(self, top, bottom, left, right, level):
+        image = np.pad(np.maximum(texture(), 40), ((top, bottom), (left, right)), constant_values=level)
+        wanted = np.pad(np.ones((180, 240), bool), ((top, bottom), (left, right)))
+        assert np.array_equal(content_mask(image), wanted)
+
+    @pytest.mark.parametrize("quality", [95, 60, 30])
+    def test_letterbox_in_a_jpeg(self, tmp_path, quality):
+        path = tmp_path / "a.jpg"
+        Image.fromarray(np.pad(texture(), ((37, 37), (0, 0)))).save(path, quality=quality)
+        rows = content_mask(read_image(path)).all(1)
+        assert rows[37:-37].all()
+        assert rows.sum() <= 180 + 2 * 8  # the blocks of 8 x 8 pixels at the edge have some of both
+
+    @pytest.mark.parametrize("mean", [0.0, 0.3, 1.0, 3.0, 10.0])
+    def test_photograph_at_night_loses_nothing(self, mean):
+        noise = np.random.default_rng(0).normal(mean, 1.0, (300, 400)).clip(0, 255)
+        image = np.round(noise).astype(np.uint8)
+        image[100:150, 180:260] = texture(width=80, height=50)  # what is lit
+        assert content_mask(image) is None
+
+    @pytest.mark.parametrize("image", [texture(), np.zeros((20, 30), np.uint8), np.full((20, 30), 255, np.uint8)])
+    def test_no_frame(self, image):
+        assert content_mask(image) is None
+
+    def test_black_inside(self):
+        image = np.full((20, 30), 90, np.uint8)
+        image[8:12], image[:, 5:9] = 0, 0
+        assert content_mask(image) is None
+
+    @pytest.mark.parametrize(
+        ("image", "error", "message"),
+        [
+            (np.zeros((4, 5)), TypeError, "array of uint8, got float64"),
+            (np.zeros((4, 5, 3), np.uint8), ValueError, r"must be grey .* got \(4, 5, 3\)"),
+            (np.zeros((0, 5), np.uint8), ValueError, r"got \(0, 5\)"),
+        ],
+    )
+    def test_wrong_arguments(self, image, error, message):
+        with pytest.raises(error, match=message):
+            content_mask(image)
+
+
+class TestReadMask:
+    def test_pixels_above_half_count(self, tmp_path):
+        cv2.imwrite(str(tmp_path / "m.png"), np.array([[0, 1, 127], [128, 254, 255]], np.uint8))
+        mask = read_mask(tmp_path / "m.png", (3, 2))
+        assert mask.dtype == bool
+        assert mask.tolist() == [[False, False, False], [True, True, True]]
+
+    @pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA"])
+    def test_modes(self, tmp_path, mode):
+        wanted = texture() > 127
+        Image.fromarray(wanted).convert(mode).save(tmp_path / "m.png")
+        assert np.array_equal(read_mask(tmp_path / "m.png", (240, 180)), wanted)
+
+    def test_reduced_as_its_image(self, tmp_path):
+        cv2.imwrite(str(tmp_path / "a.png"), texture())
+        cv2.imwrite(str(tmp_path / "m.png"), np.repeat([0, 255], 120).astype(np.uint8)[None].repeat(180, 0))
+        mask = read_mask(tmp_path / "m.png", image_size(tmp_path / "a.png"), max_size=100)
+        assert mask.shape == read_image(tmp_path / "a.png", max_size=100).shape == (75, 100)
+        assert np.array_equal(mask, (np.arange(100) >= 50)[None].repeat(75, 0))
+
+    @pytest.mark.parametrize(
+        ("mask", "size", "message"),
+        [
+            (np.full((4, 5), 255, np.uint8), (4, 5), r"m\.png has 5 x 4 pixels, its image 4 x 5"),
+            (np.ones((4, 5), np.uint8), (5, 4), r"m\.png has no pixel above 127, its largest value is 1"),
+        ],
+    )
+    def test_wrong(self, tmp_path, mask, size, message):
+        cv2.imwrite(str(tmp_path / "m.png"), mask)
+        with pytest.raises(ValueError, match=message):
+            read_mask(tmp_path / "m.png", size)
+        with pytest.raises(FileNotFoundError):
+            read_mask(tmp_path / "none.png", size)
 
 
 class TestReadFrame:

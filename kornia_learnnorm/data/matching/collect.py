@@ -21,7 +21,7 @@ from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.images import import_cv2, read_frame
 from kornia_learnnorm.data.matching.cache import FeatureCache
 from kornia_learnnorm.data.matching.features import DETECTORS, Features
-from kornia_learnnorm.data.matching.matchers import MATCHERS
+from kornia_learnnorm.data.matching.matchers import MATCHERS, one_to_one
 from kornia_learnnorm.data.matching.workers import Workers, open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.writer import StoreWriter
@@ -30,6 +30,8 @@ from kornia_learnnorm.protocol import MAX_FILTERED, RATIO
 
 __all__ = ["MatchOptions", "collect_matches", "match_pair"]
 
+# one of the options of a store: those of earlier versions have matches that share points, and are not continued
+METHOD = {"matches": "one-to-one"}
 WINDOW = 8  # pairs per process that are matched before unneeded features are deleted
 MAX_RESTARTS = 3  # consecutive worker crashes without progress
 LOG_INTERVAL = 30.0  # seconds between lines of progress where stderr is not a terminal
@@ -78,11 +80,13 @@ def match_pair(
     options: MatchOptions,
     place: int = 0,
 ) -> CorrespondenceStore:
-    """Match two frames by their features and return a store of this pair, its matches in random order.
+    """Match two frames by their features and return a store of this pair, its matches one-to-one and in random order.
 
     The index of the pair in the whole store, ``place``, determines the order together with the seed.
     """
-    points1, points2, ratio = (part.numpy() for part in MATCHERS[options.matcher](features1, features2))
+    matches = MATCHERS[options.matcher](features1, features2)
+    kept = one_to_one(*matches)
+    points1, points2, ratio = (part[kept].numpy() for part in matches)
     order = np.random.default_rng([options.seed, place]).permutation(len(ratio))
     if options.max_matches is not None:
         passes = ratio[order] < RATIO
@@ -136,7 +140,7 @@ def collect_matches(
     options, about = options or MatchOptions(), about or {}
     if not pairs:
         raise ValueError("no pairs of frames to match: one pair or more expected, got none")
-    writer = StoreWriter(path, {**about, **asdict(options), "frames": _digest(pairs)})
+    writer = StoreWriter(path, {**about, **asdict(options), **METHOD, "frames": _digest(pairs)})
     if writer.complete:
         print(f"{path} exists already, made with these options; remove it to match again", file=sys.stderr)
         return writer.skipped

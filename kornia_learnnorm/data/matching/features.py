@@ -18,7 +18,18 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2
 
-__all__ = ["DETECTORS", "Features", "detect_disk", "detect_keynet", "detect_rootsift", "detect_sift", "pretrained"]
+__all__ = [
+    "DETECTORS",
+    "Features",
+    "detect_disk",
+    "detect_keynet",
+    "detect_rootsift",
+    "detect_sift",
+    "keep_features",
+    "pretrained",
+]
+
+MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is of the mask's edge
 
 
 class Features(NamedTuple):
@@ -111,6 +122,37 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
     found = frames[0].flatten(1).any(1)  # Kornia pads with zeros
     points, rows = frames[0, found, :, 2].float(), descriptors[0, found].float()
     return Features(points.numpy(), rows.numpy(), (image.shape[1], image.shape[0]))
+
+
+def keep_features(features: Features, mask: NDArray[np.bool_]) -> Features:
+    """Return the features whose pixels count and are more than 8 rows or columns away from those that do not.
+
+    The border of the image itself drops nothing.
+
+    Args:
+        features: features of one image.
+        mask: true for the pixels that count, (H, W) bool; see :func:`~kornia_learnnorm.data.images.content_mask` and
+            :func:`~kornia_learnnorm.data.images.read_mask`.
+
+    Returns:
+        some of the features, in their order.
+
+    Raises:
+        TypeError: if the mask is not an array of bool.
+        ValueError: if its shape is not that of the image.
+        ImportError: if OpenCV is not installed.
+
+    """
+    if not isinstance(mask, np.ndarray) or mask.dtype != bool:
+        raise TypeError(f"a mask must be an array of bool, got {getattr(mask, 'dtype', type(mask))}")
+    width, height = features.size
+    if mask.shape != (height, width):
+        raise ValueError(f"a mask must have the shape of its image, {(height, width)}, got {mask.shape}")
+    side = 2 * MASK_MARGIN + 1
+    inner = import_cv2().erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    x, y = np.rint(features.points).astype(int).clip(0, (width - 1, height - 1)).T
+    kept = inner[y, x]
+    return features._replace(points=features.points[kept], descriptors=features.descriptors[kept])
 
 
 # names on the command line

@@ -7,14 +7,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.feature import LightGlue
 from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.features import Features, detect_sift, pretrained
+from kornia_learnnorm.ransac.distinct_points import distinct_points
 
-__all__ = ["MATCHERS", "Matches", "match_images", "match_lightglue", "match_nearest"]
+__all__ = ["MATCHERS", "Matches", "match_both_ways", "match_images", "match_lightglue", "match_nearest", "one_to_one"]
 
 
 class Matches(NamedTuple):
@@ -41,13 +43,30 @@ def match_nearest(features1: Features, features2: Features) -> Matches:
     feature of image 2. An image of fewer than two features, as a blank one, is a ValueError.
     """
     _check(features1, features2)
+    index2, ratio = _nearest(features1, features2)
+    return Matches(torch.from_numpy(features1.points), torch.from_numpy(features2.points[index2]), ratio)
+
+
+def match_both_ways(features1: Features, features2: Features) -> tuple[Matches, Tensor]:
+    """Return the matches of :func:`match_nearest` and their ratios in the other direction, (N,).
+
+    The latter is 1 where the feature of image 1 is not the nearest neighbour of its match among those of image 1.
+    """
+    _check(features1, features2)
+    (index2, ratio), (index1, ratio_back) = _nearest(features1, features2), _nearest(features2, features1)
+    matches = Matches(torch.from_numpy(features1.points), torch.from_numpy(features2.points[index2]), ratio)
+    mutual = torch.from_numpy(index1[index2] == np.arange(len(index2)))
+    return matches, torch.where(mutual, ratio_back[index2], 1.0)
+
+
+def _nearest(features1: Features, features2: Features) -> tuple[NDArray[np.int64], Tensor]:
+    """Return the nearest neighbour in image 2 of each feature of image 1, (N,), and the ratios of distances, (N,)."""
     descriptors1, descriptors2 = (features.descriptors.astype(np.float32) for features in (features1, features2))
     pairs = import_cv2().BFMatcher().knnMatch(descriptors1, descriptors2, k=2)
-    index1, index2 = np.array([(nearest.queryIdx, nearest.trainIdx) for nearest, _ in pairs]).T
+    index2 = np.array([nearest.trainIdx for nearest, _ in pairs])
     distances = torch.tensor([[nearest.distance, second.distance] for nearest, second in pairs])
     # two neighbours at distance zero are a tie, ratio 1
-    ratio = torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
-    return Matches(torch.from_numpy(features1.points[index1]), torch.from_numpy(features2.points[index2]), ratio)
+    return index2, torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
 
 
 def match_lightglue(features1: Features, features2: Features) -> Matches:
@@ -100,6 +119,35 @@ def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_featu
 
     """
     return match_nearest(detect_sift(image1, num_features), detect_sift(image2, num_features))
+
+
+def one_to_one(points1: Tensor, points2: Tensor, ratio: Tensor) -> Tensor:
+    """Return the indices of matches that share no point, sorted by ratio.
+
+    A match is left out if it shares a pixel, in image 1 or in image 2, with a kept match of a smaller ratio.
+    Coordinates decide between equal ratios, so the order of the matches has no effect on which are kept, and a limit on
+    the ratio can be applied before or after.
+
+    Args:
+        points1: pixels in image 1 with shape :math:`(N, 2)`.
+        points2: pixels in image 2 with shape :math:`(N, 2)`.
+        ratio: nearest over second-nearest descriptor distance, or another cost, with shape :math:`(N,)`.
+
+    Returns:
+        up to N indices, int64.
+
+    Example:
+        >>> points = torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
+        >>> one_to_one(points, points[[0, 0, 2]], torch.tensor([0.7, 0.5, 0.6]))
+        tensor([1, 2])
+
+    """
+    KORNIA_CHECK_SHAPE(points1, ["N", "2"])
+    KORNIA_CHECK_SHAPE(points2, [str(len(points1)), "2"])
+    KORNIA_CHECK_SHAPE(ratio, [str(len(points1))])
+    rows = torch.cat([points1, points2, ratio[:, None]], -1).detach().double().cpu().numpy()
+    order = torch.from_numpy(np.lexsort(rows.T))  # by ratio
+    return order[distinct_points(points1[order], points2[order])]
 
 
 def _check(features1: Features, features2: Features) -> None:

@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,10 +27,12 @@ from PIL import Image
 from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairs import pair_frames
+from kornia_learnnorm.data.images import read_frame
 from kornia_learnnorm.data.matching import collect
 from kornia_learnnorm.data.matching.cache import FeatureCache
 from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches, match_pair
-from kornia_learnnorm.data.matching.features import Features
+from kornia_learnnorm.data.matching.features import Features, detect_sift
+from kornia_learnnorm.data.matching.matchers import match_nearest
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 
 OPTIONS = MatchOptions(num_features=200, max_matches=30)
@@ -282,6 +285,24 @@ class TestGoingOn:
         with pytest.raises(ValueError, match=r"other data.* the images, their cameras, their poses or the pairs"):
             collect_matches(moved, expected, OPTIONS)
 
+    @pytest.mark.parametrize("complete", [True, False])
+    def test_store_of_an_earlier_version_is_refused(self, images, tmp_path, monkeypatch, complete):
+        """Its options do not say that its matches share no point."""
+        path, add = tmp_path / "store.h5", collect.StoreWriter.add
+
+        def add_some(writer, place, pair):
+            if place == 5 and not complete:
+                raise KeyboardInterrupt
+            add(writer, place, pair)
+
+        monkeypatch.setattr(collect, "METHOD", {})
+        monkeypatch.setattr(collect.StoreWriter, "add", add_some)
+        with nullcontext() if complete else pytest.raises(KeyboardInterrupt):
+            collect_matches(pairs_of(images)[:8], path, OPTIONS)
+        monkeypatch.undo()
+        with pytest.raises(ValueError, match=r"made with other options, .*: matches was None and is 'one-to-one'"):
+            collect_matches(pairs_of(images)[:8], path, OPTIONS)
+
     @pytest.mark.parametrize(
         ("place", "error", "jobs"),
         [
@@ -361,6 +382,20 @@ def matched(pair: FramePair, seed: int, most: int | None) -> CorrespondenceStore
 
 
 class TestMatchPair:
+    def test_matches_are_one_to_one(self, images):
+        """Against the nearest neighbours, of which several share a feature, counted with dictionaries."""
+        (pair, *_) = pairs_of(images)
+        features = [detect_sift(read_frame(frame)) for frame in pair]
+        store = match_pair(pair, *features, options=MatchOptions(max_matches=None))
+        rows = np.column_stack([part.numpy() for part in match_nearest(*features)]).tolist()
+        for view in (slice(0, 2), slice(2, 4)):
+            best: dict[tuple, list] = {}
+            for row in sorted(rows, key=lambda row: row[::-1]):
+                best.setdefault(tuple(row[view]), row)
+            rows = list(best.values())
+        assert sorted(np.column_stack([store.points1, store.points2, store.ratio]).tolist()) == sorted(rows)
+        assert len(rows) < len(features[0].points)
+
     @given(seed=st.integers(0, 1000), most=st.integers(8, 40))
     def test_cut_is_a_subset_with_at_most_so_many_of_each_class(self, images, seed, most):
         (pair, *_) = pairs_of(images)

@@ -7,9 +7,12 @@ import urllib.error
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from kornia.feature import DISK, LightGlue
 from make_sequences import texture
 
+from kornia_learnnorm.data.images import content_mask
 from kornia_learnnorm.data.matching import features as module
 from kornia_learnnorm.data.matching import matchers as matching
 from kornia_learnnorm.data.matching.features import (
@@ -18,6 +21,7 @@ from kornia_learnnorm.data.matching.features import (
     detect_keynet,
     detect_rootsift,
     detect_sift,
+    keep_features,
     pretrained,
 )
 
@@ -130,3 +134,50 @@ def test_without_network(monkeypatch, detect):
         monkeypatch.setattr(f"kornia.feature.{place}.load_state_dict_from_url", none)
     with pytest.raises(OSError, match=r"could not be loaded: <urlopen error no network>"):
         detect(texture(), 10)
+
+
+class TestKeepFeatures:
+    @staticmethod
+    def features(points: np.ndarray, size: tuple[int, int]) -> Features:
+        return Features(points.astype(np.float32), np.arange(len(points))[:, None], size)
+
+    @given(seed=st.integers(0, 10**6), width=st.integers(1, 60), height=st.integers(1, 50), share=st.floats(0, 0.02))
+    def test_against_distances(self, seed, width, height, share):
+        rng = np.random.default_rng(seed)
+        mask = rng.random((height, width)) >= share
+        points = rng.uniform(-0.5, (width - 0.5, height - 0.5), (40, 2))
+        masked = np.argwhere(~mask)[:, ::-1]
+        away = np.abs(points.astype(np.float32).round()[:, None] - masked).max(-1).min(-1, initial=np.inf) > 8
+        found = keep_features(self.features(points, (width, height)), mask)
+        assert found.descriptors[:, 0].tolist() == np.flatnonzero(away).tolist()
+        assert np.array_equal(found.points, points[away].astype(np.float32))
+        assert found.size == (width, height)
+
+    def test_border_of_the_image_drops_nothing(self):
+        points = np.array([[0, 0], [-0.5, 20.4], [29.49, 39.49]])
+        found = keep_features(self.features(points, (30, 40)), np.ones((40, 30), bool))
+        assert len(found.points) == 3
+
+    def test_letterbox(self):
+        """No feature of the frame's edge is left, and those of the content are."""
+        content = detect_sift(texture())
+        framed = np.pad(texture(), ((40, 40), (0, 0)))
+        found = keep_features(detect_sift(framed), content_mask(framed))
+        y = found.points[:, 1] - 40
+        assert y.min() >= 7.5  # rows 0 to 7 of the content are within 8 of the frame
+        assert y.max() <= 171.5
+        inner = content.points[(content.points[:, 1] > 30) & (content.points[:, 1] < 149)]
+        distance = np.abs(inner[:, None] + [0, 40] - found.points[None]).max(-1).min(1)
+        assert (distance < 0.1).mean() > 0.95
+
+    @pytest.mark.parametrize(
+        ("mask", "error", "message"),
+        [
+            (np.ones((40, 30), np.uint8), TypeError, "a mask must be an array of bool, got uint8"),
+            ([[True]], TypeError, "a mask must be an array of bool, got .*list"),
+            (np.ones((30, 40), bool), ValueError, r"shape of its image, \(40, 30\), got \(30, 40\)"),
+        ],
+    )
+    def test_wrong_masks(self, mask, error, message):
+        with pytest.raises(error, match=message):
+            keep_features(self.features(np.zeros((2, 2)), (30, 40)), mask)

@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from make_sequences import texture
 
-from kornia_learnnorm.data.matching.matchers import match_images
+from kornia_learnnorm.data.matching.features import Features
+from kornia_learnnorm.data.matching.matchers import match_both_ways, match_images, match_nearest, one_to_one
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
@@ -56,3 +60,88 @@ class TestMatchImages:
     def test_wrong_arguments(self, changes, error, message):
         with pytest.raises(error, match=message):
             match_images(**{"image1": texture(), "image2": texture(), **changes})
+
+
+@st.composite
+def shared_matches(draw) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Matches among few pixels, so that many are shared, with few ratios, so that some are equal."""
+    number = draw(st.integers(0, 30))
+    pixels = st.lists(st.tuples(st.integers(0, 3), st.integers(0, 1)), min_size=number, max_size=number)
+    ratios = draw(st.lists(st.integers(0, 8), min_size=number, max_size=number))
+    points1, points2 = (torch.tensor(draw(pixels), dtype=torch.float32).reshape(-1, 2) + 0.1 for _ in range(2))
+    return points1, points2, torch.tensor(ratios, dtype=torch.float32) / 8
+
+
+def greedy(rows: list[tuple]) -> list[tuple]:
+    """The rows, best first, that share no pixel with a better one that is kept."""
+    kept: list[tuple] = []
+    for row in rows:
+        if not any(row[:2] == other[:2] or row[2:4] == other[2:4] for other in kept):
+            kept.append(row)
+    return kept
+
+
+class TestOneToOne:
+    def test_by_hand(self):
+        points1 = torch.tensor([[float(10 * i), 5.0] for i in range(6)])
+        points2 = points1 + 1
+        ratio = torch.tensor([0.5, 0.1, 0.3, 0.2, 0.6, 0.4])
+        points2[4] = points2[1]  # 4 loses to 1
+        points1[2] = points1[3]  # 2 loses to 3
+        points1[5] = torch.nextafter(points1[0], points1[0] + 1)  # nearly equal is not equal
+        assert one_to_one(points1, points2, ratio).tolist() == [1, 3, 5, 0]
+
+    @given(matches=shared_matches(), seed=st.integers(0, 99))
+    def test_against_a_loop(self, matches, seed):
+        kept = one_to_one(*matches)
+        assert kept.dtype == torch.int64
+        rows = [(*p1, *p2, r) for p1, p2, r in zip(*(part.tolist() for part in matches), strict=True)]
+        ranked = sorted(rows, key=lambda row: row[::-1])
+        wanted = greedy(ranked)
+        assert [rows[index] for index in kept.tolist()] == wanted
+        # no pixel twice, and no effect of the order
+        assert len({row[:2] for row in wanted}) == len({row[2:4] for row in wanted}) == len(wanted)
+        order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
+        again = order[one_to_one(*(part[order] for part in matches))]
+        assert [rows[index] for index in again.tolist()] == wanted
+
+    @given(matches=shared_matches(), limit=st.integers(0, 8))
+    def test_ratio_test_before_or_after(self, matches, limit):
+        points1, points2, ratio = matches
+        below = (ratio < limit / 8).nonzero()[:, 0]
+        kept = one_to_one(points1, points2, ratio)
+        before = below[one_to_one(points1[below], points2[below], ratio[below])]
+        rows = torch.cat([points1, points2, ratio[:, None]], 1)
+        assert torch.equal(rows[before], rows[kept[ratio[kept] < limit / 8]])
+
+    def test_features_with_several_orientations(self):
+        matches = match_images(texture(), texture()[:, 15:].copy())
+        kept = one_to_one(*matches)
+        assert 50 < len(kept) < len(matches.ratio)
+        for points in matches[:2]:
+            assert len(torch.unique(points[kept], dim=0)) == len(kept)
+
+    def test_types(self):
+        points = torch.rand(5, 2, dtype=torch.float64)
+        assert len(one_to_one(points, points.float().requires_grad_(), torch.zeros(5))) == 5
+
+    @pytest.mark.parametrize("shapes", [((5, 3), (5, 2), (5,)), ((5, 2), (4, 2), (5,)), ((5, 2), (5, 2), (5, 1))])
+    def test_wrong_shapes(self, shapes):
+        with pytest.raises(ShapeError):
+            one_to_one(*(torch.zeros(shape) for shape in shapes))
+
+
+def test_both_ways():
+    """Against a table of all distances."""
+    rng = np.random.default_rng(0)
+    descriptors = [rng.integers(0, 256, (number, 128), dtype=np.uint8) for number in (40, 30)]
+    descriptors[1][:20] = descriptors[0][:20] + rng.integers(0, 3, (20, 128), dtype=np.uint8)
+    views = [Features(rng.uniform(0, 99, (len(d), 2)).astype(np.float32), d, (100, 100)) for d in descriptors]
+    matches, back = match_both_ways(*views)
+    for ours, expected in zip(matches, match_nearest(*views), strict=True):
+        assert torch.equal(ours, expected)
+    table = np.linalg.norm(descriptors[0][:, None].astype(float) - descriptors[1], axis=2)
+    for i, ratio in enumerate(back.tolist()):
+        j = table[i].argmin()
+        first, second = np.sort(table[:, j])[:2]
+        assert ratio == pytest.approx(first / second if table[:, j].argmin() == i else 1.0, abs=1e-6)
