@@ -10,12 +10,16 @@ Example:
 """
 
 from kornia_learnnorm.estimators.eight_point import EightPoint, TwoViewEstimate
+from kornia_learnnorm.estimators.essential import EssentialRefinement, refine_essential
 from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedEstimate, StageEstimate
 from kornia_learnnorm.estimators.refinement import Refinement, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated, squared_loss
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
+from kornia_learnnorm.evaluation.pair import estimate_pair
+from kornia_learnnorm.evaluation.reliability import PairWarning
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
+from kornia_learnnorm.evaluation.two_view import NoReliableMatrixError, PairEstimate, estimate_matches
 from kornia_learnnorm.geometry.distances import (
     algebraic_distance,
     sampson_distance,
@@ -55,6 +59,7 @@ __all__ = [
     "Diagnostics",
     "EightPoint",
     "EpipolarLoss",
+    "EssentialRefinement",
     "GemanMcClure",
     "Hartley",
     "Huber",
@@ -64,6 +69,9 @@ __all__ = [
     "LearnedEstimate",
     "LearnedNormalizer",
     "LogEpipolarLoss",
+    "NoReliableMatrixError",
+    "PairEstimate",
+    "PairWarning",
     "PairedDifference",
     "PaperNetwork",
     "PerView",
@@ -84,6 +92,8 @@ __all__ = [
     "design_matrix",
     "diagnose",
     "epipolar_error",
+    "estimate_matches",
+    "estimate_pair",
     "expected_loss",
     "f1_score",
     "find_fundamental",
@@ -96,6 +106,7 @@ __all__ = [
     "pose_auc",
     "pose_error",
     "rank2_projection",
+    "refine_essential",
     "refine_fundamental",
     "relative_pose",
     "sample_minimal_sets",

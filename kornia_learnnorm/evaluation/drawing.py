@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from kornia_learnnorm.evaluation.pair import PairEstimate
+from kornia_learnnorm.evaluation.two_view import PairEstimate
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import import_extra
 
@@ -31,6 +33,10 @@ DPI = 150  # pixels per inch: pictures are 1,200 pixels wide
 CAPTION = 0.26  # inches, height
 GAP = 0.08  # inches, between images
 WIDE = 1.8  # width over height from which two images are stacked
+UNEQUAL = 2.5  # ratio of the images' aspects from which they are stacked
+LINE = 0.17  # inches, height of a line of warnings
+WARNING_COLUMNS = 120  # characters in a line of warnings
+MAX_HEIGHT = 6.0  # inches, of a stacked image
 
 
 def import_matplotlib() -> Any:
@@ -72,42 +78,51 @@ def draw_pair(
     """Draw the matches in image 1 and epipolar lines in image 2, and write the picture whole or not at all.
 
     Image 1 shows the inliers in blue, each with its motion to image 2, and the outliers in red. Image 2 shows the
-    epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10). Wide
-    images are stacked, other images stand side by side. The images are grey, uint8; the suffix of ``path`` decides the
-    format.
+    epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10), and the
+    predicted error. Warnings are written below. The images are grey or RGB, uint8, and may be reduced. Wide images and
+    those of unequal shapes are stacked, others stand side by side. The suffix of ``path`` decides the format.
     """
     for image, size in ((image1, estimate.size1), (image2, estimate.size2)):
-        if image.shape != size[::-1]:
-            raise ValueError(f"the estimate is of an image of shape {size[::-1]}, got {image.shape}")
+        if abs(image.shape[1] * size[1] - image.shape[0] * size[0]) > max(size) + max(image.shape[:2]):
+            raise ValueError(f"the estimate is of an image of {size[0]} x {size[1]} pixels, got shape {image.shape}")
     if num_lines < 0:
         raise ValueError(f"num_lines must not be negative, got {num_lines}")
-    figure, (axes1, axes2) = _panels(image1, image2)
+    warnings = [
+        line
+        for warning in estimate.warnings
+        for line in textwrap.wrap(f"Warning ({warning.code}): {warning.text}.", WARNING_COLUMNS)
+    ]
+    figure, (axes1, axes2) = _panels((image1, image2), (estimate.size1, estimate.size2), LINE * len(warnings))
     draw_matches(axes1, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
     motion, outliers = f"{estimate.num_inliers} inliers and their motion", estimate.num_matches - estimate.num_inliers
     _caption(axes1, [("image 1", TEXT), (motion, INLIER), (f"{outliers} outliers", OUTLIER)])
     _draw_lines(axes2, estimate, num_lines, seed)
+    if warnings:
+        x, y = (GAP / figure.get_size_inches()).tolist()
+        figure.text(x, y, "\n".join(warnings), color=OUTLIER, fontsize=9, va="bottom", linespacing=1.2)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor=figure.get_facecolor())
 
 
-def _panels(image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8]) -> tuple[Figure, list[Axes]]:
-    """Return a figure that shows each image in its own axes, stacked if both images are wide."""
-    aspects = [image.shape[1] / image.shape[0] for image in (image1, image2)]
-    stacked = min(aspects) > WIDE
-    if stacked:
-        heights = [(WIDTH - 2 * GAP) / aspect for aspect in aspects]
-        boxes = [(GAP, heights[1] + CAPTION + GAP), (GAP, GAP)]
-        total = sum(heights) + 2 * CAPTION + GAP
+def _panels(
+    images: Sequence[npt.NDArray[np.uint8]], sizes: Sequence[tuple[int, int]], footer: float
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure that shows each image in its own axes, in pixels of its full size, above a footer (inches)."""
+    aspects = [width / height for width, height in sizes]
+    if min(aspects) > WIDE or max(aspects) > UNEQUAL * min(aspects):
+        heights = [min((WIDTH - 2 * GAP) / aspect, MAX_HEIGHT) for aspect in aspects]
+        boxes = [(GAP, footer + heights[1] + CAPTION + GAP), (GAP, footer + GAP)]
+        total = footer + sum(heights) + 2 * CAPTION + GAP
     else:
         heights = [(WIDTH - 3 * GAP) / sum(aspects)] * 2
-        boxes = [(GAP, GAP), (2 * GAP + heights[0] * aspects[0], GAP)]
-        total = heights[0] + CAPTION + GAP
+        boxes = [(GAP, footer + GAP), (2 * GAP + heights[0] * aspects[0], footer + GAP)]
+        total = footer + heights[0] + CAPTION + GAP
     figure = import_matplotlib().figure.Figure(figsize=(WIDTH, total), dpi=DPI, facecolor=BACKGROUND)
     axes = []
-    for image, (left, bottom), height, aspect in zip((image1, image2), boxes, heights, aspects, strict=True):
-        size = (left / WIDTH, bottom / total, height * aspect / WIDTH, height / total)
-        axes.append(figure.add_axes(size))
-        axes[-1].imshow(image, cmap="gray", vmin=-60, vmax=300, aspect="auto", interpolation="lanczos")
+    for image, size, (left, bottom), height, aspect in zip(images, sizes, boxes, heights, aspects, strict=True):
+        axes.append(figure.add_axes((left / WIDTH, bottom / total, height * aspect / WIDTH, height / total)))
+        extent = (-0.5, size[0] - 0.5, size[1] - 0.5, -0.5)
+        axes[-1].imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto", interpolation="lanczos", extent=extent)
         axes[-1].set_axis_off()
         axes[-1].set_autoscale_on(False)
     return figure, axes
@@ -125,7 +140,7 @@ def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -
     for line, color in zip(lines, rgb, strict=True):
         draw_line(axes, line, color=color, linewidth=1.0)
     axes.scatter(points2[:, 0], points2[:, 1], s=20, c=rgb, edgecolors="black", linewidths=0.7, zorder=3)
-    error = f"median error {estimate.median_distance:.2f} px"
+    error = f"predicted error {estimate.predicted_error:.2f} px"
     _caption(axes, [("image 2", TEXT), (f"{len(chosen)} epipolar lines", TEXT), (error, TEXT)])
 
 

@@ -1,222 +1,163 @@
-"""The fundamental matrix of two image files: one-to-one matches, RANSAC or the learned layer, and what they support."""
+"""The fundamental matrix of two images: features, one-to-one matches, and the estimate that they give."""
 
 from __future__ import annotations
 
-import json
-import math
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.images import import_cv2, read_image
-from kornia_learnnorm.data.matching.matchers import match_images
+from kornia_learnnorm.data.images import content_mask, image_size, import_cv2, read_image, resize_image, scaling
+from kornia_learnnorm.data.matching.features import DETECTORS, Features, keep_features
+from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.files import write_text
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.evaluation.reliability import check_ambiguity, mutual_share
+from kornia_learnnorm.evaluation.two_view import (
+    NoReliableMatrixError,
+    PairEstimate,
+    Points,
+    check_threshold,
+    estimate_matches,
+    float_tensor,
+)
+from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points, unit_fundamental
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
-from kornia_learnnorm.ransac.ransac import RANSAC
 
-__all__ = ["PairEstimate", "estimate_pair", "write_json"]
+__all__ = ["MAX_SIZE", "estimate_pair"]
 
-MIN_DISPLACEMENT = 0.1  # pixels, median over the matches; with a smaller one the camera has not moved
-MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of models with as many inliers among random matches
-MIN_PARALLAX = 0.05  # share of the inliers that the best homography must leave unexplained
+MAX_SIZE = 2000  # pixels of the longer side at which images are matched: SIFT then takes up to 0.5 GB and seconds
+NUM_FEATURES = 4000  # of an image
 
-
-@dataclass(frozen=True, eq=False)
-class PairEstimate:
-    """The fundamental matrix of two images and the correspondences behind it."""
-
-    F_mat: Tensor  # (3, 3), float64, unit Frobenius norm, x2^T F x1 = 0 in pixels
-    estimator: str  # what made F_mat: "RANSAC" or "LearnedEightPoint"
-    points1: Tensor  # pixels of the matches in image 1, (N, 2), float64
-    points2: Tensor  # pixels of the matches in image 2, (N, 2), float64
-    inliers: Tensor  # mask of the matches with a distance to F_mat below the threshold, (N,), bool
-    mean_distance: float  # mean symmetric epipolar distance of the inliers, pixels
-    median_distance: float  # median symmetric epipolar distance of the inliers, pixels
-    path1: Path
-    path2: Path
-    size1: tuple[int, int]  # width and height of image 1
-    size2: tuple[int, int]  # width and height of image 2
-    ratio: float  # largest ratio of the nearest to the second-nearest descriptor distance of the matches
-    threshold: float  # largest symmetric epipolar distance of an inlier, pixels
-
-    @property
-    def num_matches(self) -> int:
-        """Number of one-to-one matches that passed the ratio test."""
-        return len(self.points1)
-
-    @property
-    def num_inliers(self) -> int:
-        """Number of matches within the threshold."""
-        return int(self.inliers.sum())
-
-    def summary(self) -> str:
-        """Return F row by row, the counts and the errors as text."""
-        rows = [" ".join(f"{value: .9e}" for value in row) for row in self.F_mat.tolist()]
-        share = self.num_inliers / self.num_matches
-        return "\n".join(
-            [
-                "F (x2^T F x1 = 0 in pixels, unit Frobenius norm)",
-                *(f"  {row}" for row in rows),
-                f"by       {self.estimator}",
-                f"matches  {self.num_matches} (ratio test {self.ratio:g})",
-                f"inliers  {self.num_inliers} ({share:.1%}, symmetric epipolar distance < {self.threshold:g} px)",
-                f"distance of the inliers: mean {self.mean_distance:.3f} px, median {self.median_distance:.3f} px",
-            ]
-        )
+Image = str | Path | NDArray[np.uint8] | Tensor
 
 
 def estimate_pair(
-    path1: str | Path,
-    path2: str | Path,
+    image1: Image,
+    image2: Image,
     layer: LearnedEightPoint | None = None,
     ratio: float = RATIO,
     threshold: float = INLIER_THRESHOLD,
     seed: int = 0,
+    K1: Points | None = None,
+    K2: Points | None = None,
+    mask1: NDArray[np.bool_] | None = None,
+    mask2: NDArray[np.bool_] | None = None,
+    max_size: int = MAX_SIZE,
+    detector: str = "sift",
+    matcher: str = "nearest",
 ) -> PairEstimate:
-    """Return the fundamental matrix of two image files with its matches and inliers.
+    """Return the fundamental matrix of two images with its matches, its predicted error and the reasons to doubt it.
 
-    SIFT matches that pass the ratio test are made one-to-one: of those that share a point, the one of smallest ratio
-    counts. :class:`~kornia_learnnorm.RANSAC`, or a learned layer, reads them with their scores, 1 minus the ratio.
+    Matches are nearest neighbours in both directions that pass the ratio test in both, one-to-one: of those that share
+    a point, the one of smallest ratio counts. :class:`~kornia_learnnorm.RANSAC`, or a learned layer, reads them with
+    their scores, 1 minus the larger ratio.
+    Features on a constant black frame around an image are dropped.
 
     Args:
-        path1: file of image 1.
-        path2: file of image 2.
+        image1: file of image 1, or its values: grey with shape (H, W) or RGB with shape (H, W, 3), uint8.
+        image2: file of image 2, or its values.
         layer: estimates the matrix in the place of RANSAC.
         ratio: largest ratio of the nearest to the second-nearest descriptor distance.
-        threshold: largest symmetric epipolar distance of an inlier, and RANSAC's threshold, pixels.
-        seed: seed of RANSAC; equal files and seeds give equal estimates.
+        threshold: largest symmetric epipolar distance of an inlier, and RANSAC's threshold, pixels of the images as
+            they are matched.
+        seed: seed of RANSAC and of the parts of the matches that tell how stable the matrix is; equal images and seeds
+            give equal estimates.
+        K1: camera of image 1, (3, 3), pixels of the full image; with both, the result has an essential matrix and pose.
+        K2: camera of image 2; both or none.
+        mask1: true for the pixels of image 1 whose features count, (H, W) bool.
+        mask2: the same of image 2.
+        max_size: images with a longer side are matched reduced to it; points and F are those of the full images.
+        detector: a key of ``kornia_learnnorm.data.matching.features.DETECTORS``.
+        matcher: a key of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
 
     Returns:
         the estimate; all its numbers are finite.
 
     Raises:
         FileNotFoundError: if a file does not exist.
-        ValueError: if a file is not an image, ``ratio`` or ``threshold`` is out of range, or the images do not
-            determine a fundamental matrix: a blank image, fewer than eight matches or inliers, no motion, all inliers
-            on one homography, or no more inliers than random matches would have.
+        NoReliableMatrixError: if the images do not determine a matrix: a blank image, fewer than eight matches, no
+            motion, or fewer than nine inliers.
+        TypeError: if an image or a camera is not of the kinds above.
+        ValueError: if a file is not an image, an argument is out of range, or only one camera is given.
         ImportError: if OpenCV is not installed.
 
     """
     if not 0 < ratio <= 1:
         raise ValueError(f"ratio must be above 0 and at most 1, got {ratio:g}")
-    if not 0 < threshold < float("inf"):
-        raise ValueError(f"threshold must be positive and finite, got {threshold:g} px")
-    image1, image2 = read_image(path1), read_image(path2)
+    for name, given, known in (("detector", detector, DETECTORS), ("matcher", matcher, MATCHERS)):
+        if given not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {given!r}")
+    if max_size < 64:
+        raise ValueError(f"max_size must be at least 64 pixels, got {max_size}")
+    check_threshold(threshold)
+    names = [
+        str(image) if isinstance(image, str | Path) else f"image {i}" for i, image in enumerate((image1, image2), 1)
+    ]
+    view1, size1 = _view(image1, mask1, max_size, detector)
+    view2, size2 = _view(image2, mask2, max_size, detector)
+    S1, S2 = scaling(size1, view1.size), scaling(size2, view2.size)
+    cameras = [None if K is None else S @ float_tensor("camera", K) for K, S in ((K1, S1), (K2, S2))]
     try:
-        points1, points2, scores = _one_to_one_matches(*match_images(image1, image2), ratio)
-        if layer is None:
-            F_mat = RANSAC(inl_th=threshold, seed=seed)(points1, points2, scores)[0]
-        else:
-            with torch.no_grad():
-                F_mat = layer(points1[None], points2[None], scores=scores[None])[0]
-        inliers = symmetric_epipolar_distance(points1, points2, F_mat) < threshold
-        _check_inliers(inliers, threshold)
-        _check_parallax(points1[inliers], points2[inliers], threshold)
-        _check_chance(len(inliers), int(inliers.sum()), threshold, image2.shape)
-    except ValueError as error:
-        raise ValueError(f"{path1} and {path2}: {error}") from error
-    distances = symmetric_epipolar_distance(points1[inliers], points2[inliers], F_mat)
-    return PairEstimate(
-        F_mat=F_mat,
-        estimator=type(layer).__name__ if layer is not None else RANSAC.__name__,
-        points1=points1,
-        points2=points2,
-        inliers=inliers,
-        mean_distance=distances.mean().item(),
-        median_distance=median(distances).item(),
-        path1=Path(path1),
-        path2=Path(path2),
-        size1=(image1.shape[1], image1.shape[0]),
-        size2=(image2.shape[1], image2.shape[0]),
+        for number, view in enumerate((view1, view2), 1):
+            if len(view.points) < 2:
+                text = f"image {number} is blank or nearly so: {len(view.points)} features, expected 2 or more"
+                raise NoReliableMatrixError("blank", text)
+        matches, back = (
+            match_both_ways(view1, view2) if matcher == "nearest" else (MATCHERS[matcher](view1, view2), None)
+        )
+        points1, points2, ratios = (value.double() for value in matches)
+        one_way = ratios < ratio
+        worse = ratios if back is None else torch.maximum(ratios, back.double())
+        kept = worse < ratio
+        estimate = estimate_matches(
+            points1[kept], points2[kept], 1 - worse[kept], view1.size, view2.size, layer, threshold, seed, *cameras
+        )
+        share = mutual_share(points1[one_way], points2[one_way], kept[one_way], estimate.F_mat, threshold)
+    except NoReliableMatrixError as error:
+        raise NoReliableMatrixError(error.code, f"{names[0]} and {names[1]}: {error}") from error
+    factor = float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
+    return replace(
+        estimate,
+        F_mat=unit_fundamental(transform_fundamental(estimate.F_mat, S1, S2)),
+        points1=transform_points(estimate.points1[None], torch.linalg.inv(S1)[None])[0],
+        points2=transform_points(estimate.points2[None], torch.linalg.inv(S2)[None])[0],
+        predicted_error=estimate.predicted_error / factor,
+        warnings=estimate.warnings + check_ambiguity(share),
+        size1=size1,
+        size2=size2,
         ratio=ratio,
-        threshold=threshold,
+        path1=Path(image1) if isinstance(image1, str | Path) else None,
+        path2=Path(image2) if isinstance(image2, str | Path) else None,
     )
 
 
-def _one_to_one_matches(
-    points1: Tensor, points2: Tensor, ratios: Tensor, ratio: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the matches below the ratio that share no point, and their scores, float64.
-
-    Raise ValueError for too few matches or no motion.
-    """
-    rows = torch.cat([points1, points2, ratios[:, None]], -1).double().numpy()
-    rows = rows[np.lexsort(rows.T)]  # by ratio
-    rows = rows[rows[:, 4] < ratio]
-    for columns in (slice(0, 2), slice(2, 4)):
-        rows = rows[np.sort(np.unique(rows[:, columns], axis=0, return_index=True)[1])]
-    kept = torch.from_numpy(rows)
-    if len(kept) < 8:
-        raise ValueError(
-            f"{len(kept)} distinct matches of {len(ratios)} pass the ratio test {ratio:g}, at least 8 are needed"
-        )
-    displacement = median((kept[:, 2:4] - kept[:, :2]).norm(dim=-1)).item()
-    if displacement < MIN_DISPLACEMENT:
-        raise ValueError(
-            f"no motion between the images (median displacement {displacement:.2g} px of {len(kept)} matches): the "
-            "fundamental matrix is not determined"
-        )
-    return kept[:, :2], kept[:, 2:4], 1 - kept[:, 4]
+def _view(
+    image: Image, mask: NDArray[np.bool_] | None, max_size: int, detector: str
+) -> tuple[Features, tuple[int, int]]:
+    """Return the features of an image at the size at which it is matched, and its full size."""
+    grey, size = _grey(image, max_size)
+    frame = content_mask(grey)
+    if mask is not None:
+        if mask.shape != size[::-1]:
+            raise ValueError(f"a mask must have the shape of its image, {size[::-1]}, got {mask.shape}")
+        small = import_cv2().resize(mask.astype(np.uint8), grey.shape[::-1], interpolation=0) > 0
+        frame = small if frame is None else small & frame
+    features = DETECTORS[detector](grey, NUM_FEATURES)
+    return (features if frame is None else keep_features(features, frame)), size
 
 
-def _check_inliers(inliers: Tensor, threshold: float) -> None:
-    if inliers.sum() < 8:
-        raise ValueError(
-            f"{int(inliers.sum())} of {len(inliers)} matches agree on a fundamental matrix within {threshold:g} px, at "
-            "least 8 are needed"
-        )
-
-
-def _check_parallax(points1: Tensor, points2: Tensor, threshold: float) -> None:
-    """Raise ValueError if one homography explains the inliers: a plane, or a camera that only rotates."""
-    cv2 = import_cv2()
-    try:
-        _, mask = cv2.findHomography(points1.numpy(), points2.numpy(), cv2.USAC_MAGSAC, threshold)
-    except cv2.error:  # OpenCV 4 raises when too few points are left to sample from
-        mask = None
-    explained = 0 if mask is None else int(mask.sum())
-    if len(points1) - explained < max(2, MIN_PARALLAX * len(points1)):
-        raise ValueError(
-            f"degenerate: one homography explains {explained} of {len(points1)} inliers within {threshold:g} px (a "
-            "plane, or a camera that only rotates): the fundamental matrix is not determined"
-        )
-
-
-def _check_chance(matches: int, inliers: int, threshold: float, shape: tuple[int, ...]) -> None:
-    """Raise ValueError if random matches are likely to have as many inliers.
-
-    The expected number of false alarms is that of Moisan and Stival (A probabilistic criterion to detect rigid point
-    matches between two images and estimate the fundamental matrix, IJCV 2004): models from seven matches, and the
-    probability that a random point lies within the threshold of a line.
-    """
-    strip = min(1.0, 2 * threshold * math.hypot(*shape) / math.prod(shape))
-    tests = (matches - 7) * math.comb(matches, inliers) * math.comb(inliers, 7)
-    log_false_alarms = math.log10(max(1, tests)) + (inliers - 7) * math.log10(strip)
-    if log_false_alarms > MAX_LOG_FALSE_ALARMS:
-        raise ValueError(
-            f"{inliers} of {matches} matches agree on a fundamental matrix within {threshold:g} px, no more than "
-            "chance would give: the fundamental matrix is not determined"
-        )
-
-
-def write_json(path: str | Path, estimate: PairEstimate) -> None:
-    """Write an estimate as a JSON file, whole or not at all."""
-    content = {
-        "F": estimate.F_mat.tolist(),
-        "convention": "x2^T F x1 = 0, x = (column, row, 1) in pixels, unit Frobenius norm",
-        "image1": {"file": str(estimate.path1), "width": estimate.size1[0], "height": estimate.size1[1]},
-        "image2": {"file": str(estimate.path2), "width": estimate.size2[0], "height": estimate.size2[1]},
-        "estimator": estimate.estimator,
-        "matches": estimate.num_matches,
-        "inliers": estimate.num_inliers,
-        "inlier_symmetric_epipolar_distance_px": {"mean": estimate.mean_distance, "median": estimate.median_distance},
-        "ratio": estimate.ratio,
-        "threshold_px": estimate.threshold,
-    }
-    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+def _grey(image: Image, max_size: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
+    """Return the grey values of an image of at most a size, and its full size."""
+    if isinstance(image, str | Path):
+        return read_image(image, max_size), image_size(image)
+    values = image.numpy() if isinstance(image, Tensor) else image
+    if not isinstance(values, np.ndarray) or values.dtype != np.uint8:
+        raise TypeError(f"an image must be a path or an array of uint8, got {getattr(values, 'dtype', type(values))}")
+    if values.ndim == 3 and values.shape[2] == 3:
+        values = np.asarray(import_cv2().cvtColor(np.ascontiguousarray(values), import_cv2().COLOR_RGB2GRAY), np.uint8)
+    if values.ndim != 2 or values.size == 0:
+        raise ValueError(f"an image must have shape (H, W) or (H, W, 3), got {values.shape}")
+    return resize_image(values, max_size), (values.shape[1], values.shape[0])

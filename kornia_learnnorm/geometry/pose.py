@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_mask, check_tensor, solve_dtype
 
-__all__ = ["relative_pose"]
+__all__ = ["in_front", "relative_pose"]
 
 
 def relative_pose(
@@ -66,6 +66,24 @@ def relative_pose(
     row, best = torch.arange(len(R), device=R.device), votes.argmax(-1)
     R = torch.where(known[:, None, None], R[row, best], torch.nan)
     return R.to(dtype), torch.where(known[:, None], t[row, best], torch.nan).to(dtype)
+
+
+def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor) -> Tensor:
+    r"""Return which correspondences are triangulated in front of both cameras.
+
+    Args:
+        R: rotations with shape :math:`(B, 3, 3)`, :math:`X_2 = R X_1 + t`.
+        t: translations with shape :math:`(B, 3)`, any length.
+        K1: cameras of the first images with shape :math:`(B, 3, 3)`.
+        K2: cameras of the second images with shape :math:`(B, 3, 3)`.
+        points1: pixels in the first images with shape :math:`(B, N, 2)`.
+        points2: pixels in the second images with shape :math:`(B, N, 2)`.
+
+    Returns:
+        booleans with shape :math:`(B, N)`; false where a pose is NaN.
+
+    """
+    return _in_front(R[:, None], t[:, None], _rays(points1, K1), _rays(points2, K2))[:, 0]
 
 
 def _check(F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None) -> None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from kornia_learnnorm.evaluation.drawing import draw_line, draw_pair, import_matplotlib
-from kornia_learnnorm.evaluation.pair import PairEstimate
+from kornia_learnnorm.evaluation.reliability import PairWarning
+from kornia_learnnorm.evaluation.two_view import PairEstimate
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 image_module = pytest.importorskip("matplotlib.image")
@@ -28,7 +28,24 @@ def make_pair(width: int = 160, height: int = 120, points: int = 30) -> tuple[np
     F_mat = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / 2**0.5
     size = (width, height)
     estimate = PairEstimate(
-        F_mat, "RANSAC", points1, points2, inliers, 0.2, 0.1, Path("1.png"), Path("2.png"), size, size, 0.8, 1.0
+        F_mat=F_mat,
+        E_mat=None,
+        R=None,
+        t=None,
+        estimator="RANSAC",
+        points1=points1,
+        points2=points2,
+        scores=torch.ones(points),
+        weights=inliers.double(),
+        inliers=inliers,
+        front=None,
+        predicted_error=0.1,
+        warnings=(),
+        size1=size,
+        size2=size,
+        ratio=0.8,
+        threshold=1.0,
+        seed=0,
     )
     return image1, image2, estimate
 
@@ -85,6 +102,23 @@ class TestDrawPair:
         estimate = dataclasses.replace(estimate, size2=(70, 100), inliers=torch.ones(30, dtype=torch.bool))
         draw_pair(image1, image2[:, :70], estimate, tmp_path / "pair.png", num_lines=1000)
 
+    def test_colours_of_the_images(self, tmp_path):
+        _, image2, estimate = make_pair()
+        green = np.zeros((60, 80, 3), np.uint8)  # half of the size: where the image was large
+        green[..., 1] = 255
+        draw_pair(green, image2, estimate, tmp_path / "pair.png")
+        picture = image_module.imread(tmp_path / "pair.png")[..., :3]
+        assert (picture == [0, 1, 0]).all(2).mean() > 0.3
+
+    def test_warnings_are_written_below(self, tmp_path):
+        image1, image2, estimate = make_pair()
+        draw_pair(image1, image2, estimate, tmp_path / "good.png")
+        doubted = dataclasses.replace(estimate, warnings=(PairWarning("planar", "a plane " * 30),))
+        draw_pair(image1, image2, doubted, tmp_path / "doubted.png")
+        good, bad = (image_module.imread(tmp_path / f"{name}.png") for name in ("good", "doubted"))
+        assert bad.shape[0] > good.shape[0] + 40
+        assert (np.abs(bad[good.shape[0] :, :, :3] - np.array([0xFF, 0x5C, 0x5C]) / 255).max(2) < 0.1).any()
+
     @pytest.mark.parametrize("suffix", ["jpg", "webp", "tiff", "pdf", "svg"])
     def test_formats(self, tmp_path, suffix):
         draw_pair(*make_pair(), tmp_path / f"pair.{suffix}")
@@ -101,7 +135,7 @@ class TestDrawPair:
 
     def test_wrong_arguments(self, tmp_path):
         image1, image2, estimate = make_pair()
-        with pytest.raises(ValueError, match=r"shape \(120, 160\), got \(120, 80\)"):
+        with pytest.raises(ValueError, match=r"160 x 120 pixels, got shape \(120, 80\)"):
             draw_pair(image1, image2[:, :80], estimate, tmp_path / "pair.png")
         with pytest.raises(ValueError, match="num_lines must not be negative, got -1"):
             draw_pair(image1, image2, estimate, tmp_path / "pair.png", num_lines=-1)

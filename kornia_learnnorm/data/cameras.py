@@ -1,0 +1,88 @@
+"""Camera matrices from what a person can give: four numbers, a file, or the EXIF data of a photograph."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_learnnorm.data.images import image_size
+from kornia_learnnorm.optional import import_extra
+
+__all__ = ["exif_camera", "read_camera"]
+
+EXIF_IFD = 0x8769  # tag of EXIF 2.32, section 4.6.3
+FOCAL_LENGTH_35MM = 0xA405  # section 4.6.5, millimetres on a frame of 36 x 24 mm; zero for unknown
+FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
+
+
+def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float64]:
+    """Return a camera matrix with shape (3, 3), pixels.
+
+    Args:
+        text: ``fx,fy,cx,cy``; a text file of these four or of all nine numbers; or ``exif``.
+        image: the photograph that ``exif`` is read from, see :func:`exif_camera`.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the text is none of these, the numbers are not finite, or a focal length is not positive.
+
+    Example:
+        >>> read_camera("700,700,320,240")
+        array([[700.,   0., 320.],
+               [  0., 700., 240.],
+               [  0.,   0.,   1.]])
+
+    """
+    if text == "exif":
+        if image is None:
+            raise ValueError("camera exif: an image file expected, got none")
+        return exif_camera(image)
+    expected = "expected fx,fy,cx,cy, a file of four or nine numbers, or exif"
+    content = text
+    if "," not in text or Path(text).exists():
+        if not Path(text).is_file():
+            raise FileNotFoundError(f"camera {text}: no such file; {expected}")
+        try:
+            content = Path(text).read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"camera {text}: not a text file; {expected}") from error
+    try:
+        numbers = np.array(content.replace(",", " ").split(), float)
+    except ValueError as error:
+        raise ValueError(f"camera {text}: {expected}: {error}") from error
+    if numbers.size == 4:
+        fx, fy, cx, cy = numbers
+        numbers = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])
+    if numbers.size != 9:
+        raise ValueError(f"camera {text}: {expected}, got {numbers.size} numbers")
+    K: NDArray[np.float64] = numbers.reshape(3, 3)
+    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K[2], [0, 0, 1]):
+        raise ValueError(f"camera {text}: positive focal lengths and a last row of 0 0 1 expected, got {K.tolist()}")
+    return K
+
+
+def exif_camera(path: str | Path) -> NDArray[np.float64]:
+    """Return the camera matrix (3, 3) that the EXIF data of a photograph suggest, pixels.
+
+    The focal length is EXIF's equivalent on 35 mm film, by the images' diagonals; the principal point is the centre.
+    It is wrong for photographs that were cropped.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file holds no such focal length.
+
+    """
+    size = image_size(path)
+    Image = import_extra("PIL.Image", "images", "reading images")
+    try:
+        with Path(path).open("rb") as file, Image.open(file) as image:
+            focal = float(image.getexif().get_ifd(EXIF_IFD).get(FOCAL_LENGTH_35MM, 0))
+    except Image.UnidentifiedImageError as error:
+        raise ValueError(f"camera exif: {path} is not an image") from error
+    if not 0 < focal < math.inf:
+        raise ValueError(f"camera exif: {path} has no focal length on 35 mm film; give --K fx,fy,cx,cy")
+    pixels = focal * math.hypot(*size) / FILM_DIAGONAL
+    return np.array([[pixels, 0, (size[0] - 1) / 2], [0, pixels, (size[1] - 1) / 2], [0, 0, 1]])

@@ -1,0 +1,162 @@
+"""Estimates of many image pairs, one JSON line each; a run that was stopped continues where it was."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from kornia_learnnorm.data.cameras import read_camera
+from kornia_learnnorm.data.images import import_cv2
+from kornia_learnnorm.data.matching.workers import open_workers
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.evaluation.pair import MAX_SIZE, estimate_pair
+from kornia_learnnorm.evaluation.two_view import NoReliableMatrixError
+from kornia_learnnorm.files import write_text
+from kornia_learnnorm.optional import import_extra
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+
+__all__ = ["PairOptions", "estimate_pairs", "read_pair_list"]
+
+RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
+OPTIONS = "options.json"
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """How image pairs are estimated; see :func:`~kornia_learnnorm.evaluation.pair.estimate_pair`.
+
+    Attributes:
+        weights: weights of the learned layer, by name or file; None for RANSAC.
+        K: a camera for each image, or one for both, see :func:`~kornia_learnnorm.data.cameras.read_camera`.
+    """
+
+    weights: str | None = None
+    ratio: float = RATIO
+    threshold: float = INLIER_THRESHOLD
+    seed: int = 0
+    K: tuple[str, ...] = ()
+    max_size: int = MAX_SIZE
+    detector: str = "sift"
+    matcher: str = "nearest"
+
+    def arguments(self, image1: Path, image2: Path) -> dict[str, Any]:
+        """Return the keyword arguments of ``estimate_pair`` for two image files."""
+        cameras = (
+            [
+                read_camera(text, image)
+                for text, image in zip(self.K * (2 // len(self.K)), (image1, image2), strict=True)
+            ]
+            if self.K
+            else [None, None]
+        )
+        options = {
+            name: getattr(self, name) for name in ("ratio", "threshold", "seed", "max_size", "detector", "matcher")
+        }
+        return {**options, "layer": _layer(self.weights), "K1": cameras[0], "K2": cameras[1]}
+
+
+@lru_cache(maxsize=1)
+def _layer(weights: str | None) -> LearnedEightPoint | None:
+    return None if weights is None else LearnedEightPoint.from_pretrained(weights)
+
+
+def read_pair_list(path: str | Path) -> list[tuple[Path, Path]]:
+    """Return the image files of a list, two names a line, relative to the folder of the list.
+
+    Raises:
+        FileNotFoundError: if there is no such list.
+        ValueError: if a line does not have two names, or there is none.
+
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no list of pairs at {path}")
+    lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+    for number, line in enumerate(lines, 1):
+        if line and len(line) != 2:
+            raise ValueError(f"{path}, line {number}: two image files expected, got {len(line)} names")
+    pairs = list(dict.fromkeys((path.parent / line[0], path.parent / line[1]) for line in lines if line))
+    if not pairs:
+        raise ValueError(f"{path} lists no pairs")
+    return pairs
+
+
+def estimate_pairs(
+    pairs: list[tuple[Path, Path]], folder: str | Path, options: PairOptions, jobs: int = -1, dask: str | None = None
+) -> tuple[int, int]:
+    """Estimate the pairs that are not done yet and append one JSON line each to ``pairs.jsonl``.
+
+    A line has what :meth:`~kornia_learnnorm.evaluation.two_view.PairEstimate.as_dict` returns. Where there is no
+    matrix or an image cannot be read, ``F`` is null and ``warnings`` says why.
+
+    Args:
+        pairs: image files.
+        folder: created where it does not exist; keeps the options, and a later run must have the same.
+        options: of all pairs.
+        jobs: processes on this machine; -1 for as many as it has cores.
+        dask: address of a Dask scheduler whose workers estimate instead.
+
+    Returns:
+        the number of pairs without and with warnings.
+
+    Raises:
+        ValueError: if the folder holds results with other options.
+        OSError: if a file cannot be written.
+
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    given = json.loads(json.dumps(asdict(options)))
+    if (folder / OPTIONS).exists():
+        had = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
+        if had != given:
+            raise ValueError(f"{folder} holds results with other options: {had}, got {given}")
+    else:
+        write_text(folder / OPTIONS, json.dumps(given, indent=2) + "\n")
+    done = {(line["image1"]["file"], line["image2"]["file"]): line for line in _done(folder / RESULTS)}
+    todo = [pair for pair in pairs if (str(pair[0]), str(pair[1])) not in done]
+    tqdm = import_extra("tqdm", "images", "estimating many pairs").tqdm
+    with (
+        open_workers(jobs, dask) as workers,
+        (folder / RESULTS).open("a", encoding="utf-8") as file,
+        tqdm(total=len(pairs), initial=len(pairs) - len(todo), unit="pair", file=sys.stderr) as bar,
+        workers.results(_estimate, ((*pair, options) for pair in todo)) as results,
+    ):
+        for pair, line in zip(todo, results, strict=True):
+            file.write(json.dumps(line, allow_nan=False) + "\n")
+            file.flush()
+            done[str(pair[0]), str(pair[1])] = line
+            bar.update()
+    warned = sum(bool(done[str(first), str(second)]["warnings"]) for first, second in pairs)
+    return len(pairs) - warned, warned
+
+
+def _estimate(image1: Path, image2: Path, options: PairOptions) -> dict[str, Any]:
+    """Return the JSON object of a pair."""
+    import_cv2().setNumThreads(1)
+    try:
+        return estimate_pair(image1, image2, **options.arguments(image1, image2)).as_dict()
+    except (ValueError, OSError) as error:
+        code = error.code if isinstance(error, NoReliableMatrixError) else "unreadable"
+        files = {"image1": {"file": str(image1)}, "image2": {"file": str(image2)}}
+        return {"F": None, "warnings": [{"code": code, "text": str(error)}], **files}
+
+
+def _done(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the objects of a file of JSON lines; cut off a last line that was not written whole."""
+    if not path.exists():
+        return
+    whole = 0
+    with path.open("rb") as file:
+        for line in file:
+            if not line.endswith(b"\n"):
+                break
+            whole += len(line)
+            yield json.loads(line)
+    with path.open("rb+") as file:
+        file.truncate(whole)

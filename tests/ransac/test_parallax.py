@@ -1,0 +1,74 @@
+"""The matrix of a plane and parallax, and the evidence for an epipole."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from two_view import epipolar_distances
+
+from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax, parallax_evidence
+
+K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+R = np.array([[0.9998, 0, 0.02], [0, 1, 0], [-0.02, 0, 0.9998]])
+t = np.array([0.4, 0.05, 0.1])
+H = torch.from_numpy(K @ (R + np.outer(t, [0, 0, 1]) / 5) @ np.linalg.inv(K))  # of the plane Z = 5
+
+
+def make_scene(plane: int, off: int, outliers: int, noise: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Matches of points on the plane, off it, and random ones."""
+    rng = np.random.default_rng(seed)
+    depth = np.concatenate([np.full(plane, 5.0), rng.uniform(3, 4.7, off)])
+    x1 = rng.uniform([0, 0], [640, 480], (plane + off, 2))
+    X = np.c_[x1, np.ones(len(x1))] @ np.linalg.inv(K).T * depth[:, None]
+    x2 = (X @ R.T + t) @ K.T
+    x2 = x2[:, :2] / x2[:, 2:]
+    x1, x2 = (x + rng.normal(0, noise, x.shape) for x in (x1, x2))
+    wrong = rng.uniform([0, 0, 0, 0], [640, 480, 640, 480], (outliers, 4))
+    return torch.from_numpy(np.r_[x1, wrong[:, :2]]), torch.from_numpy(np.r_[x2, wrong[:, 2:]])
+
+
+class TestFit:
+    def test_exact(self):
+        points1, points2 = make_scene(200, 5, 0, 0.0)
+        F_mat = fit_plane_and_parallax(points1, points2, H, 1.0, 0)
+        assert np.abs(epipolar_distances(points1, points2, F_mat)).max() < 1e-5
+        assert float(F_mat.norm()) == pytest.approx(1)
+
+    def test_few_matches_off_the_plane_among_outliers(self):
+        points1, points2 = make_scene(300, 15, 60, 0.3)
+        F_mat = fit_plane_and_parallax(points1, points2, H, 1.0, 0)
+        assert np.median(epipolar_distances(points1[300:315], points2[300:315], F_mat)) < 1.0
+
+    def test_nothing_off_the_plane(self):
+        assert fit_plane_and_parallax(*make_scene(50, 2, 0, 0.0), H, 1.0, 0) is None
+
+
+class TestEvidence:
+    def test_parallax_is_the_distance_from_the_homography(self):
+        points1, points2 = make_scene(3, 3, 0, 0.0)
+        moved = np.c_[points1, np.ones(6)] @ H.numpy().T
+        expected = np.linalg.norm(moved[:, :2] / moved[:, 2:] - points2.numpy(), axis=1)
+        assert np.allclose(parallax(points1, points2, H), expected, atol=1e-9)
+        assert torch.isinf(parallax(torch.zeros(1, 2), torch.zeros(1, 2), torch.diag(torch.tensor([1.0, 1, 0]))))
+
+    def test_by_hand(self):
+        """Ten matches at 20 px, six of them inliers at 1 px: 45 epipoles; 0.0318 * 8 agree by chance, 4 do."""
+        inliers = torch.arange(10) < 6
+        mean = 2 / math.pi * math.asin(1 / 20) * 8
+        expected = math.log10(45) + (4 - mean - 4 * math.log(4 / mean)) / math.log(10)
+        assert parallax_evidence(torch.full((10,), 20.0), inliers, 1.0) == pytest.approx(expected)
+
+    def test_none_where_all_are_on_the_plane_or_disagree(self):
+        assert parallax_evidence(torch.full((50,), 0.5), torch.ones(50, dtype=torch.bool), 1.0) == math.inf
+        assert parallax_evidence(torch.full((50,), 9.0), torch.arange(50) < 2, 1.0) == math.inf
+
+    @given(st.integers(3, 40), st.integers(0, 40))
+    def test_more_inliers_are_stronger_evidence(self, inliers, outliers):
+        distance = torch.full((inliers + outliers + 1,), 30.0)
+        less, more = (torch.arange(len(distance)) < number for number in (inliers, inliers + 1))
+        assert parallax_evidence(distance, more, 1.0) <= parallax_evidence(distance, less, 1.0)

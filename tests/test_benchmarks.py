@@ -1,0 +1,185 @@
+"""The scores of benchmarks/pairs.py on cases whose outcome is known, and its tables."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.evaluation.two_view import NoReliableMatrixError
+
+pytest.importorskip("cv2")
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """Import the benchmark as when it is run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        return importlib.import_module("pairs")
+
+
+@pytest.fixture(scope="module")
+def case(pairs):
+    """A rendered room."""
+    return pairs.rendered("room", 0, (160, 120), None)
+
+
+class Warned:
+    """A warning of an estimate, as far as the benchmark reads it."""
+
+    code = "planar"
+
+
+class Answer:
+    """An estimate, as far as the benchmark reads it."""
+
+    def __init__(self, case, F_mat: Tensor, warnings: tuple = (), predicted_error: float = 1.0) -> None:
+        self.F_mat, self.warnings, self.predicted_error = F_mat, warnings, predicted_error
+        self.points1, self.points2 = case.points1, case.points2
+        self.inliers = torch.ones(len(case.points1), dtype=torch.bool)
+
+
+def true_matrix(case) -> Tensor:
+    x, y, z = case.t.tolist()
+    K_inverse = torch.linalg.inv(case.K)
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return K_inverse.mT @ cross @ case.R @ K_inverse
+
+
+def sideways(case) -> Tensor:
+    """The matrix of a camera that moves along y, far from the truth."""
+    return true_matrix(case._replace(R=torch.eye(3).double(), t=torch.tensor([0.0, 1.0, 0.0]).double()))
+
+
+def test_the_truth_is_right(pairs, case):
+    record = pairs.score(case, lambda case: Answer(case, true_matrix(case)))
+    assert record["determined"]
+    assert record["pose_error"] < 1e-6
+    assert record["true_error"] < 1e-6
+    assert record["inliers"] == record["matches"] == len(case.points1)
+    assert pairs.outcome(record) == "right"
+    flagged = pairs.score(case, lambda case: Answer(case, true_matrix(case), warnings=(Warned(),)))
+    assert flagged["warnings"] == ["planar"]
+    assert pairs.outcome(flagged) == "right, flagged"
+
+
+def test_another_motion_is_wrong(pairs, case):
+    record = pairs.score(case, lambda case: Answer(case, sideways(case)))
+    assert record["pose_error"] > 45
+    assert record["true_error"] > 1
+    assert pairs.outcome(record) == "wrong"
+    assert pairs.outcome(record | {"warnings": ["planar"]}) == "wrong, flagged"
+
+
+def test_a_refusal(pairs, case):
+    def refuse(case):
+        raise NoReliableMatrixError("blank", "image 1 is blank")
+
+    record = pairs.score(case, refuse)
+    assert record["refused"] == "blank"
+    assert pairs.outcome(record) == "refused"
+    assert pairs.described(record) == "refused (blank)"
+
+
+def test_a_fault_of_the_estimator_is_no_refusal(pairs, case, capsys):
+    def fail(case):
+        raise ZeroDivisionError("oops")
+
+    record = pairs.score(case, fail)
+    assert pairs.outcome(record) == "crashed"
+    assert "oops" in record["crashed"]
+    assert "room 0: ZeroDivisionError('oops')" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["plane", "rotation"])
+def test_undetermined_pairs(pairs, kind):
+    case = pairs.rendered(kind, 0, (160, 120), None)
+    record = pairs.score(case, lambda case: Answer(case, sideways(case)))
+    assert not record["determined"]
+    assert pairs.outcome(record) == "wrong"
+    if kind == "rotation":
+        assert record["pose_error"] == math.inf
+
+
+@pytest.mark.parametrize("seed", [0, 4, 8, 9])
+def test_contaminated_matches(pairs, seed):
+    case = pairs.contaminated(seed)
+    again = pairs.contaminated(seed)
+    assert all(torch.equal(a, b) for a, b in zip(case.read, again.read, strict=True))
+    distance = kln.symmetric_epipolar_distance(*case.read, true_matrix(case))
+    share = (10, 50, 90, 10)[(0, 4, 8, 9).index(seed)] / 100
+    # The distance, a sum of one in each image, has a standard deviation of about 1.4 px for noise of 0.5 px, and a
+    # random match comes within 6 px in about 1 % of the cases.
+    assert (distance > 6).double().mean().item() == pytest.approx(share, abs=0.03)
+    assert kln.symmetric_epipolar_distance(case.points1, case.points2, true_matrix(case)).max() < 1e-6
+    assert pairs.is_determined(case.points1, case.points2)
+
+
+def test_a_cached_pair_is_the_rendered_one(pairs, case, tmp_path):
+    for _ in range(2):
+        cached = pairs.rendered("room", 0, (160, 120), tmp_path)
+        for field in ("points1", "points2", "K", "R", "t"):
+            assert torch.equal(getattr(cached, field), getattr(case, field))
+        assert all((a == b).all() for a, b in zip(cached.read, case.read, strict=True))
+    assert [path.name for path in tmp_path.iterdir()] == ["room_0_160x120.npz"]
+
+
+def test_tables(pairs):
+    def record(kind, determined, pose=0.0, warnings=(), refused=None, predicted=1.0, true=1.0):
+        return {
+            "kind": kind,
+            "seed": 3,
+            "determined": determined,
+            "refused": refused,
+            "crashed": None,
+            "warnings": list(warnings),
+            "pose_error": pose,
+            "predicted_error": predicted,
+            "true_error": true,
+            "matches": 20,
+            "inliers": 9,
+        }
+
+    records = [
+        record("room", True, predicted=3.0, true=1.5),
+        record("room", True, warnings=["planar"]),
+        record("room", True, refused="blank"),
+        record("room", True, pose=11.0),
+        record("plane", False, pose=math.inf, warnings=["planar"]),
+        record("plane", False, pose=2.0, warnings=["planar"]),
+        record("plane", False, refused="no_motion"),
+    ]
+    _, _, *lines = pairs.count_table(records).splitlines()
+    numbers = {line.split()[1]: [int(cell) for cell in line.strip("|").split("|")[1:]] for line in lines}
+    # Pairs, determined, right, wrong, refused, crashed, warned, silently wrong; determined: flagged, refused.
+    assert numbers == {
+        "room": [4, 4, 2, 1, 1, 0, 1, 1, 1, 1],
+        "plane": [3, 0, 1, 1, 1, 0, 2, 0, 0, 0],
+        "all": [7, 4, 3, 2, 2, 0, 3, 1, 1, 1],
+    }
+    _, _, *lines = pairs.calibration_table(records).splitlines()
+    room, plane, _ = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    assert room == ["room", "2", "1.25", "2", "1.1", "1.5", "1.9"]  # ratios 2 and 1
+    assert plane == ["plane", "0", *["-"] * 5]
+    (line,) = pairs.failures(records)
+    assert line.startswith("room 3: pose error 11.0 degrees")
+
+
+def test_the_benchmark_runs(pairs, tmp_path, capsys):
+    arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
+    pairs.main([*arguments, "--json", str(tmp_path / "pairs.json")])
+    printed = capsys.readouterr()
+    assert "| rotation |" in printed.out
+    assert "3/3 outliers 0" in printed.err
+    records = json.loads((tmp_path / "pairs.json").read_text())
+    assert [record["kind"] for record in records] == ["plane", "rotation", "outliers"]
+    assert [record["determined"] for record in records] == [False, False, True]
