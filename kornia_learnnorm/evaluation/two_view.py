@@ -40,7 +40,7 @@ from kornia_learnnorm.ransac.scoring import PairScorer
 
 __all__ = ["NoReliableMatrixError", "PairEstimate", "Points", "check_threshold", "estimate_matches", "float_tensor"]
 
-MIN_SCORE_GAIN = 1.02  # of a part's matrix over that of all matches, which otherwise stays
+MIN_SCORE_GAIN = 1.02  # of another hypothesis over the estimate of all matches, which otherwise stays
 ERROR_CALIBRATION = 1.0  # true over predicted error, median over rendered pairs
 
 Points = Tensor | NDArray[np.floating[Any]]
@@ -336,7 +336,7 @@ def _try_plane_and_parallax(points1: Tensor, points2: Tensor, F_mat: Tensor, thr
         return F_mat
     scorer = PairScorer(points1, points2, threshold)
     score, other_score = (scorer.best(scorer.from_pixels(F[None]), 1).score.sum() for F in (F_mat, other))
-    return other if other_score > score else F_mat
+    return other if other_score > MIN_SCORE_GAIN * score else F_mat
 
 
 def float_tensor(name: str, value: Points) -> Tensor:

@@ -1,0 +1,138 @@
+"""The estimate of matches, its errors and its invariances."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from two_view import epipolar_distances
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.synthetic import handheld
+from kornia_learnnorm.evaluation.reliability import check_ambiguity, mutual_share
+
+pytest.importorskip("cv2", reason="OpenCV is not installed")
+
+
+def make_matches(inliers: int = 160, outliers: int = 40, noise: float = 0.3, seed: int = 0):
+    """Matches of a scene with random ones among them, and the scene."""
+    generator = torch.Generator().manual_seed(seed)
+    scene = handheld(1, inliers, generator, noise=noise)
+    size = scene.image_size[0]
+    wrong = torch.rand(outliers, 4, generator=generator, dtype=torch.float64) * size.repeat(2)
+    matches = torch.cat([torch.cat([scene.points1[0], scene.points2[0]], -1), wrong])
+    return matches[:, :2], matches[:, 2:], scene
+
+
+class TestEstimateMatches:
+    def test_finds_the_geometry(self):
+        points1, points2, _ = make_matches()
+        exact = handheld(1, 160, torch.Generator().manual_seed(0), noise=0.0)
+        found = kln.estimate_matches(points1, points2)
+        assert found.warnings == ()
+        error = np.median(epipolar_distances(exact.points1[0], exact.points2[0], found.F_mat))
+        assert error < 0.3
+        assert 0.2 < found.predicted_error / error < 5
+        json.dumps(found.as_dict(), allow_nan=False)
+
+    def test_cameras_give_the_pose(self):
+        points1, points2, scene = make_matches()
+        found = kln.estimate_matches(points1, points2, K1=scene.K1[0], K2=scene.K2[0])
+        error = kln.pose_error(found.R[None], found.t[None], scene.R, scene.t)
+        assert float(error) < 5
+        assert found.front[found.inliers].double().mean() > 0.9
+
+    def test_cameras_solve_a_plane(self):
+        """Points of the plane Z = 5: not determined without cameras."""
+        rng = np.random.default_rng(0)
+        K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+        x1 = rng.uniform([0, 0], [640, 480], (150, 2))
+        X = np.c_[x1, np.ones(150)] @ np.linalg.inv(K).T * 5
+        t = np.array([0.8, 0.1, 0.1])
+        x2 = (X + t) @ K.T
+        x2 = x2[:, :2] / x2[:, 2:] + rng.normal(0, 0.2, (150, 2))
+        without = kln.estimate_matches(x1, x2, size1=(640, 480), size2=(640, 480))
+        assert "planar" in [warning.code for warning in without.warnings]
+        found = kln.estimate_matches(x1, x2, size1=(640, 480), size2=(640, 480), K1=K, K2=K)
+        assert "planar" not in [warning.code for warning in found.warnings]
+
+    def test_the_learned_layer(self):
+        points1, points2, _ = make_matches()
+        found = kln.estimate_matches(points1, points2, layer=kln.LearnedEightPoint.from_pretrained())
+        assert found.estimator == "LearnedEightPoint"
+        assert found.weights[found.inliers].mean() > found.weights[~found.inliers].mean() + 0.3
+
+    def test_order_has_no_effect(self):
+        points1, points2, _ = make_matches()
+        scores = torch.rand(len(points1), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        order = torch.randperm(len(points1), generator=torch.Generator().manual_seed(2))
+        first, second = (kln.estimate_matches(points1[o], points2[o], scores[o]) for o in (slice(None), order))
+        assert torch.equal(first.F_mat, second.F_mat)
+        assert first.predicted_error == second.predicted_error
+
+    def test_what_stands_still_is_left_out(self):
+        points1, points2, _ = make_matches(outliers=0)
+        overlay = torch.rand(60, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 400
+        found = kln.estimate_matches(torch.cat([points1, overlay]), torch.cat([points2, overlay]))
+        assert found.num_matches <= len(points1)
+        assert found.num_inliers > 100
+
+    def test_shared_points_count_once(self):
+        points1, points2, _ = make_matches(inliers=8, outliers=92)
+        points2 = torch.where(torch.arange(100)[:, None] < 60, points2[:1], points2)
+        try:
+            found = kln.estimate_matches(points1, points2)
+        except kln.NoReliableMatrixError:
+            return
+        assert found.num_matches == 41
+        assert found.warnings
+
+    @pytest.mark.parametrize(
+        ("changes", "code"),
+        [
+            ({"points1": np.zeros((5, 2)), "points2": np.ones((5, 2))}, "few_matches"),
+            ({"points1": np.random.default_rng(0).uniform(0, 500, (50, 2)), "points2": None}, "no_motion"),
+        ],
+    )
+    def test_no_matrix(self, changes, code):
+        if changes["points2"] is None:
+            changes = {**changes, "points2": changes["points1"] + 0.01}
+        with pytest.raises(kln.NoReliableMatrixError) as caught:
+            kln.estimate_matches(**changes)
+        assert caught.value.code == code
+
+    @pytest.mark.parametrize(
+        ("changes", "error", "message"),
+        [
+            ({"points1": torch.zeros(9, 3)}, ValueError, "shape"),
+            ({"points2": torch.zeros(8, 2)}, ValueError, "shape"),
+            ({"scores": torch.full((9,), 2.0)}, ValueError, "from 0 to 1, got 2 to 2"),
+            ({"points1": torch.full((9, 2), torch.nan)}, ValueError, "finite"),
+            ({"points1": [[0.0, 1.0]]}, TypeError, "points1"),
+            ({"threshold": -1.0}, ValueError, "threshold must be positive"),
+            ({"K1": torch.eye(3)}, ValueError, "given together"),
+            ({"K1": torch.zeros(3, 3), "K2": torch.eye(3)}, ValueError, "invertible"),
+        ],
+    )
+    def test_wrong_arguments(self, changes, error, message):
+        points = {"points1": torch.rand(9, 2) * 100, "points2": torch.rand(9, 2) * 100}
+        with pytest.raises(error, match=message):
+            kln.estimate_matches(**{**points, **changes})
+
+
+class TestAmbiguity:
+    def test_share_of_mutual_matches(self):
+        """Of the matches that fit and lie off the plane, every second one is mutual."""
+        scene = handheld(1, 100, torch.Generator().manual_seed(0), noise=0.0)
+        mutual = torch.arange(100) % 2 == 0
+        share = mutual_share(scene.points1[0], scene.points2[0], mutual, scene.F_mat[0], 1.0)
+        assert 0.3 < share < 0.7
+        assert mutual_share(scene.points1[0], scene.points2[0], mutual, torch.eye(3).double(), 1e-9) == 1.0
+
+    def test_warning(self):
+        assert check_ambiguity(0.95) == ()
+        (warning,) = check_ambiguity(0.6)
+        assert warning.code == "ambiguous"
+        assert "60%" in warning.text
