@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 NUM_PARTS = 12  # random parts of the matches that are solved again
-PART_SIZE = 48  # matches in a part, where this is more than half and less than four fifths of all
+PART_INLIERS = 48  # expected in a part, where these are more than half and less than four fifths of all inliers
 MAX_ANGLE = 6.0  # degrees; a pose that moves by more in half of the parts is unstable
 NOMINAL_FOCAL = 1.2  # of the longer image side: focal length where no camera is given
 MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
@@ -76,23 +76,28 @@ class Stability(NamedTuple):
     angle: float
 
 
-def random_parts(number: int, seed: int) -> list[Tensor]:
-    """Return the rows of random parts of a number of matches."""
+def random_parts(number: int, inliers: int, seed: int) -> Tensor:
+    """Return the rows (P, M) of random parts of the matches: half of them, or so many that 48 inliers are expected.
+
+    Args:
+        number: number of matches.
+        inliers: number of inliers among them.
+        seed: seed of the parts.
+    """
+    share = min(max(0.5, PART_INLIERS / max(1, inliers)), 0.8)
+    size = min(max(8, round(share * number)), number - 1)
     generator = torch.Generator().manual_seed(seed)
-    return [torch.randperm(number, generator=generator)[: _part_size(number)] for _ in range(NUM_PARTS)]
-
-
-def _part_size(number: int) -> int:
-    return min(max(8, number // 2, min(PART_SIZE, 4 * number // 5)), number - 1)
+    return torch.stack([torch.randperm(number, generator=generator)[:size] for _ in range(NUM_PARTS)])
 
 
 def measure_stability(
-    F_parts: Tensor, points1: Tensor, points2: Tensor, F_mat: Tensor, inliers: Tensor, K1: Tensor, K2: Tensor
+    F_parts: Tensor, size: int, points1: Tensor, points2: Tensor, F_mat: Tensor, inliers: Tensor, K1: Tensor, K2: Tensor
 ) -> Stability:
     """Return how far the matrices of random parts of the matches differ from ``F_mat``.
 
     Args:
         F_parts: matrices of the parts of :func:`random_parts`, (P, 3, 3); zeros where there is none.
+        size: matches in a part.
         points1: pixels of all matches in image 1, (N, 2), float64.
         points2: pixels of all matches in image 2, (N, 2).
         F_mat: matrix of all matches, (3, 3).
@@ -100,7 +105,6 @@ def measure_stability(
         K1: camera of image 1, (3, 3), or a guess.
         K2: camera of image 2, (3, 3), or a guess.
     """
-    size = _part_size(len(points1))
     unit = math.sqrt(1 / min(len(points1), COMMON_ERRORS) / (1 / size - 1 / len(points1)))
     x1 = points1[inliers].expand(len(F_parts), -1, -1)
     x2 = _onto_lines(points1[inliers], points2[inliers], F_mat).expand(len(F_parts), -1, -1)

@@ -41,7 +41,6 @@ from kornia_learnnorm.ransac.scoring import PairScorer
 __all__ = ["NoReliableMatrixError", "PairEstimate", "Points", "check_threshold", "estimate_matches", "float_tensor"]
 
 MIN_SCORE_GAIN = 1.02  # of another hypothesis over the estimate of all matches, which otherwise stays
-ERROR_CALIBRATION = 1.0  # true over predicted error, median over rendered pairs
 
 Points = Tensor | NDArray[np.floating[Any]]
 
@@ -220,14 +219,16 @@ def estimate_matches(
     size1, size2 = size1 or _extent(points1), size2 or _extent(points2)
     solve = _solver(points1, points2, scores, layer, threshold, seed, cameras)
     F_mat, weights = solve(torch.arange(len(scores)))
-    F_parts = torch.stack([solve(rows)[0] for rows in random_parts(len(scores), seed)])
+    agree = symmetric_epipolar_distance(points1, points2, F_mat) < threshold
+    parts = random_parts(len(scores), int(agree.sum()), seed)
+    F_parts = torch.stack([solve(rows)[0] for rows in parts])
     F_mat = _best_of(points1, points2, F_mat, F_parts, threshold, cameras)
     inliers = symmetric_epipolar_distance(points1, points2, F_mat) < threshold
     if int(inliers.sum()) <= 8:
         found = f"{int(inliers.sum())} of {len(scores)} matches agree on a fundamental matrix within {threshold:g} px"
         raise NoReliableMatrixError("no_consensus", f"{found}, at least 9 are needed")
     K_near1, K_near2 = cameras or (nominal_camera(size1), nominal_camera(size2))
-    stability = measure_stability(F_parts, points1, points2, F_mat, inliers, K_near1, K_near2)
+    stability = measure_stability(F_parts, parts.shape[1], points1, points2, F_mat, inliers, K_near1, K_near2)
     H = None if cameras else find_homography(points1[inliers], points2[inliers], threshold)
     E_mat = R = t = front = None
     if cameras:
@@ -248,7 +249,7 @@ def estimate_matches(
         weights=weights,
         inliers=inliers,
         front=front,
-        predicted_error=ERROR_CALIBRATION * min(stability.error, float(max(size2))),
+        predicted_error=min(stability.error, float(max(size2))),
         warnings=assess(points1, points2, inliers, H, threshold, size2, stability),
         size1=size1,
         size2=size2,

@@ -79,10 +79,11 @@ class TestStability:
                 return kln.refine_fundamental(x1[None, rows], x2[None, rows], F_mat).F_mat[0]
 
             F_mat = solve(torch.arange(number))
-            parts = torch.stack([solve(rows) for rows in random_parts(number, 0)])
+            rows = random_parts(number, number, 0)
+            parts = torch.stack([solve(part) for part in rows])
             inliers = torch.ones(number, dtype=torch.bool)
             K = exact.K1[i]
-            predicted.append(measure_stability(parts, x1, x2, F_mat, inliers, K, K).error)
+            predicted.append(measure_stability(parts, rows.shape[1], x1, x2, F_mat, inliers, K, K).error)
             true.append(np.median(epipolar_distances(exact.points1[i, number:], exact.points2[i, number:], F_mat)))
         assert 0.5 < np.median(predicted) / np.median(true) < 2
 
@@ -91,6 +92,7 @@ class TestStability:
         scene = handheld(1, 50, generator, noise=0.0)
         found = measure_stability(
             torch.zeros(12, 3, 3, dtype=torch.float64),
+            40,
             scene.points1[0],
             scene.points2[0],
             scene.F_mat[0],
