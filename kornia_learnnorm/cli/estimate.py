@@ -119,7 +119,7 @@ def _run_pair(args: argparse.Namespace, image1: Path, image2: Path, options: Pai
     for path in (args.out, json_path):
         if path is not None and not to_stdout:
             print(f"wrote    {path}")
-    for warning in estimate.warnings:
+    for warning in estimate.warnings if to_stdout else ():
         print(f"warning ({warning.code}): {warning.text}", file=sys.stderr)
     return UNRELIABLE if estimate.warnings else 0
 
@@ -135,7 +135,8 @@ def _check_options(args: argparse.Namespace) -> None:
         raise ValueError(f"--weights {args.weights}: only --estimator learned has weights")
     for name, values in (("K", args.K), ("mask", args.mask)):
         if len(values) > 2:
-            raise ValueError(f"--{name}: one value for both images or one for each expected, got {len(values)}")
+            got = f"got {len(values)}; give the images before it"
+            raise ValueError(f"--{name}: one value for both images or one for each expected, {got}")
     if args.pairs is not None:
         if args.images or args.json is not None or args.mask:
             raise ValueError("--pairs: neither images, --json nor --mask go with it")
@@ -143,6 +144,8 @@ def _check_options(args: argparse.Namespace) -> None:
             raise ValueError("--pairs: --out FOLDER is needed for the results")
         check_jobs(args.jobs)
         return
+    if args.jobs != -1 or args.dask is not None:
+        raise ValueError("--jobs and --dask go with --pairs")
     if len(args.images) != 2:
         raise ValueError(f"two image files expected, got {len(args.images)}; --pairs LIST for many")
     if args.out is not None and args.out.suffix.lower() not in PICTURE_SUFFIXES:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -24,6 +24,7 @@ __all__ = ["PairOptions", "estimate_pairs", "read_pair_list"]
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
 OPTIONS = "options.json"
+UNREADABLE = "unreadable"  # code of a pair of which an image cannot be read; tried again by the next run
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ def _layer(weights: str | None) -> LearnedEightPoint | None:
 def read_pair_list(path: str | Path) -> list[tuple[Path, Path]]:
     """Return the image files of a list, two names a line, relative to the folder of the list.
 
+    Names with spaces stand in quotation marks; a # begins a comment.
+
     Raises:
         FileNotFoundError: if there is no such list.
         ValueError: if a line does not have two names, or there is none.
@@ -76,14 +79,21 @@ def read_pair_list(path: str | Path) -> list[tuple[Path, Path]]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no list of pairs at {path}")
-    lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
-    for number, line in enumerate(lines, 1):
-        if line and len(line) != 2:
-            raise ValueError(f"{path}, line {number}: two image files expected, got {len(line)} names")
-    pairs = list(dict.fromkeys((path.parent / line[0], path.parent / line[1]) for line in lines if line))
+    pairs = []
+    try:
+        for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            try:
+                names = shlex.split(text, comments=True)
+            except ValueError as error:
+                raise ValueError(f"{path}, line {number}: {error}") from error
+            if names and len(names) != 2:
+                raise ValueError(f"{path}, line {number}: two image files expected, got {len(names)} names")
+            pairs += [(path.parent / names[0], path.parent / names[1])] if names else []
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not a text file, a list of pairs expected") from error
     if not pairs:
         raise ValueError(f"{path} lists no pairs")
-    return pairs
+    return list(dict.fromkeys(pairs))
 
 
 def estimate_pairs(
@@ -110,8 +120,9 @@ def estimate_pairs(
 
     """
     folder = Path(folder)
+    cameras = [text if text == "exif" else read_camera(text).tolist() for text in options.K]
+    given = json.loads(json.dumps({**asdict(options), "K": cameras}))
     folder.mkdir(parents=True, exist_ok=True)
-    given = json.loads(json.dumps(asdict(options)))
     if (folder / OPTIONS).exists():
         had = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
         if had != given:
@@ -142,21 +153,18 @@ def _estimate(image1: Path, image2: Path, options: PairOptions) -> dict[str, Any
     try:
         return estimate_pair(image1, image2, **options.arguments(image1, image2)).as_dict()
     except (ValueError, OSError) as error:
-        code = error.code if isinstance(error, NoReliableMatrixError) else "unreadable"
+        code = error.code if isinstance(error, NoReliableMatrixError) else UNREADABLE
         files = {"image1": {"file": str(image1)}, "image2": {"file": str(image2)}}
         return {"F": None, "warnings": [{"code": code, "text": str(error)}], **files}
 
 
-def _done(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the objects of a file of JSON lines; cut off a last line that was not written whole."""
+def _done(path: Path) -> list[dict[str, Any]]:
+    """Return the results of a file of JSON lines; drop a last line that was not written whole, and unreadable pairs."""
     if not path.exists():
-        return
-    whole = 0
-    with path.open("rb") as file:
-        for line in file:
-            if not line.endswith(b"\n"):
-                break
-            whole += len(line)
-            yield json.loads(line)
-    with path.open("rb+") as file:
-        file.truncate(whole)
+        return []
+    lines = [
+        json.loads(line) for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line[-1] == "\n"
+    ]
+    kept = [line for line in lines if not any(warning["code"] == UNREADABLE for warning in line["warnings"])]
+    write_text(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in kept))
+    return kept

@@ -78,8 +78,8 @@ def estimate_pair(
 
     Raises:
         FileNotFoundError: if a file does not exist.
-        NoReliableMatrixError: if the images do not determine a matrix: a blank image, fewer than eight matches, no
-            motion, or fewer than nine inliers.
+        NoReliableMatrixError: if the images do not determine a matrix: a blank image, no motion, or fewer than nine
+            matches or inliers.
         TypeError: if an image or a camera is not of the kinds above.
         ValueError: if a file is not an image, an argument is out of range, or only one camera is given.
         ImportError: if OpenCV is not installed.
@@ -103,7 +103,7 @@ def estimate_pair(
     try:
         for number, view in enumerate((view1, view2), 1):
             if len(view.points) < 2:
-                text = f"image {number} is blank or nearly so: {len(view.points)} features, expected 2 or more"
+                text = f"image {number} is blank, nearly so, or masked: {len(view.points)} features, expected 2 or more"
                 raise NoReliableMatrixError("blank", text)
         matches, back = (
             match_both_ways(view1, view2) if matcher == "nearest" else (MATCHERS[matcher](view1, view2), None)

@@ -40,6 +40,7 @@ from kornia_learnnorm.ransac.scoring import PairScorer
 
 __all__ = ["NoReliableMatrixError", "PairEstimate", "Points", "check_threshold", "estimate_matches", "float_tensor"]
 
+MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
 MIN_SCORE_GAIN = 1.02  # of another hypothesis over the estimate of all matches, which otherwise stays
 
 Points = Tensor | NDArray[np.floating[Any]]
@@ -184,7 +185,7 @@ def estimate_matches(
         those that do not move at all, as on an overlay.
 
     Raises:
-        NoReliableMatrixError: if there are fewer than eight matches or nine inliers, or no motion.
+        NoReliableMatrixError: if there are fewer than nine matches or inliers, or no motion.
         TypeError: if an argument is neither a floating-point array nor a tensor.
         ValueError: if shapes do not pair up, a value is not finite or out of range, or only one camera is given.
 
@@ -199,23 +200,24 @@ def estimate_matches(
         raise ValueError("points and scores must be finite, got NaN or infinity")
     if len(scores) and not (float(scores.min()) >= 0 and float(scores.max()) <= 1):
         raise ValueError(f"scores must be from 0 to 1, got {float(scores.min()):g} to {float(scores.max()):g}")
-    camera1, camera2 = (None if K is None else float_tensor("camera", K) for K in (K1, K2))
+    camera1 = None if K1 is None else float_tensor("K1", K1)
+    camera2 = None if K2 is None else float_tensor("K2", K2)
     check_cameras(camera1, camera2)
     cameras = None if camera1 is None or camera2 is None else (camera1, camera2)
     kept = one_to_one(points1, points2, 1 - scores)
     given, points1, points2, scores = len(scores), points1[kept], points2[kept], scores[kept]
-    if len(scores) < 8:
-        raise NoReliableMatrixError(
-            "few_matches", f"{len(scores)} distinct matches of {given} are left, at least 8 are needed"
-        )
+    if len(scores) < MIN_MATCHES:
+        text = f"{len(scores)} distinct matches of {given} are left, at least {MIN_MATCHES} are needed"
+        raise NoReliableMatrixError("few_matches", text)
     displacement = median((points2 - points1).norm(dim=-1)).item()
     if displacement < MIN_MOTION:
         text = f"no motion between the images (median displacement {displacement:.2g} px of {len(scores)} matches)"
         raise NoReliableMatrixError("no_motion", f"{text}: the fundamental matrix is not determined")
     moving = (points2 - points1).norm(dim=-1) >= MIN_MOTION  # what stands still lies on an overlay or a dirty lens
     points1, points2, scores = points1[moving], points2[moving], scores[moving]
-    if len(scores) < 8:
-        raise NoReliableMatrixError("few_matches", f"only {len(scores)} matches move, at least 8 are needed")
+    if len(scores) < MIN_MATCHES:
+        text = f"only {len(scores)} matches move, at least {MIN_MATCHES} are needed"
+        raise NoReliableMatrixError("few_matches", text)
     size1, size2 = size1 or _extent(points1), size2 or _extent(points2)
     solve = _solver(points1, points2, scores, layer, threshold, seed, cameras)
     F_mat, weights = solve(torch.arange(len(scores)))
@@ -224,9 +226,9 @@ def estimate_matches(
     F_parts = torch.stack([solve(rows)[0] for rows in parts])
     F_mat = _best_of(points1, points2, F_mat, F_parts, threshold, cameras)
     inliers = symmetric_epipolar_distance(points1, points2, F_mat) < threshold
-    if int(inliers.sum()) <= 8:
+    if int(inliers.sum()) < MIN_MATCHES:
         found = f"{int(inliers.sum())} of {len(scores)} matches agree on a fundamental matrix within {threshold:g} px"
-        raise NoReliableMatrixError("no_consensus", f"{found}, at least 9 are needed")
+        raise NoReliableMatrixError("no_consensus", f"{found}, at least {MIN_MATCHES} are needed")
     K_near1, K_near2 = cameras or (nominal_camera(size1), nominal_camera(size2))
     stability = measure_stability(F_parts, parts.shape[1], points1, points2, F_mat, inliers, K_near1, K_near2)
     H = None if cameras else find_homography(points1[inliers], points2[inliers], threshold)
