@@ -49,8 +49,8 @@ class PairWarning(NamedTuple):
     """A reason to doubt a fundamental matrix.
 
     Attributes:
-        code: one word for programs: ``few_inliers``, ``chance``, ``clustered``, ``planar``, ``unstable`` or
-            ``ambiguous``.
+        code: one word for programs: ``few_inliers``, ``chance``, ``clustered``, ``planar``, ``unstable``,
+            ``ambiguous`` or ``no_pose``.
         text: one sentence for people.
     """
 

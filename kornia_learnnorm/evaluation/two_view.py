@@ -59,8 +59,8 @@ class PairEstimate:
     r"""The fundamental matrix of two images and the correspondences behind it; pixels are those of the full images."""
 
     F_mat: Tensor  # (3, 3), float64, unit Frobenius norm, x2^T F x1 = 0 in pixels
-    E_mat: Tensor | None  # (3, 3), unit Frobenius norm; None without cameras
-    R: Tensor | None  # rotation (3, 3) of X2 = R X1 + t; None without cameras
+    E_mat: Tensor | None  # (3, 3), unit Frobenius norm, any sign; None without cameras
+    R: Tensor | None  # rotation (3, 3) of X2 = R X1 + t; None without cameras, and where two poses tie
     t: Tensor | None  # direction of translation (3,); None without cameras
     estimator: str  # what made F_mat: "RANSAC" or "LearnedEightPoint"
     points1: Tensor  # pixels of the matches in image 1, (N, 2), float64
@@ -191,33 +191,12 @@ def estimate_matches(
 
     """
     check_threshold(threshold)
-    points1, points2 = float_tensor("points1", points1), float_tensor("points2", points2)
-    scores = torch.ones(len(points1), dtype=torch.float64) if scores is None else float_tensor("scores", scores)
-    if points1.shape != points2.shape or points1.shape[1:] != (2,) or scores.shape != points1.shape[:1]:
-        shapes = " and ".join(str([*value.shape]) for value in (points1, points2, scores))
-        raise ValueError(f"points of shape (N, 2) and scores of shape (N,) expected, got {shapes}")
-    if not all(bool(value.isfinite().all()) for value in (points1, points2, scores)):
-        raise ValueError("points and scores must be finite, got NaN or infinity")
-    if len(scores) and not (float(scores.min()) >= 0 and float(scores.max()) <= 1):
-        raise ValueError(f"scores must be from 0 to 1, got {float(scores.min()):g} to {float(scores.max()):g}")
+    points1, points2, scores = _check_matches(points1, points2, scores)
     camera1 = None if K1 is None else float_tensor("K1", K1)
     camera2 = None if K2 is None else float_tensor("K2", K2)
     check_cameras(camera1, camera2)
     cameras = None if camera1 is None or camera2 is None else (camera1, camera2)
-    kept = one_to_one(points1, points2, 1 - scores)
-    given, points1, points2, scores = len(scores), points1[kept], points2[kept], scores[kept]
-    if len(scores) < MIN_MATCHES:
-        text = f"{len(scores)} distinct matches of {given} are left, at least {MIN_MATCHES} are needed"
-        raise NoReliableMatrixError("few_matches", text)
-    displacement = median((points2 - points1).norm(dim=-1)).item()
-    if displacement < MIN_MOTION:
-        text = f"no motion between the images (median displacement {displacement:.2g} px of {len(scores)} matches)"
-        raise NoReliableMatrixError("no_motion", f"{text}: the fundamental matrix is not determined")
-    moving = (points2 - points1).norm(dim=-1) >= MIN_MOTION  # what stands still lies on an overlay or a dirty lens
-    points1, points2, scores = points1[moving], points2[moving], scores[moving]
-    if len(scores) < MIN_MATCHES:
-        text = f"only {len(scores)} matches move, at least {MIN_MATCHES} are needed"
-        raise NoReliableMatrixError("few_matches", text)
+    points1, points2, scores = _usable_matches(points1, points2, scores)
     size1, size2 = size1 or _extent(points1), size2 or _extent(points2)
     solve = _solver(points1, points2, scores, layer, threshold, seed, cameras)
     F_mat, weights = solve(torch.arange(len(scores)))
@@ -232,33 +211,70 @@ def estimate_matches(
     K_near1, K_near2 = cameras or (nominal_camera(size1), nominal_camera(size2))
     stability = measure_stability(F_parts, parts.shape[1], points1, points2, F_mat, inliers, K_near1, K_near2)
     H = None if cameras else find_homography(points1[inliers], points2[inliers], threshold)
-    E_mat = R = t = front = None
-    if cameras:
-        E_mat = unit_fundamental(transform_fundamental(F_mat, *cameras))
-        pair = (cameras[0][None], cameras[1][None], points1[None], points2[None])
-        R, t = relative_pose(F_mat[None], *pair, inliers[None])
-        front = in_front(R, t, *pair)[0]
-        R, t = R[0], t[0]
+    warnings = assess(points1, points2, inliers, H, threshold, size2, stability)
+    pose = None if cameras is None else _pose(points1, points2, F_mat, inliers, cameras)
+    if cameras is not None and pose is None:
+        warnings += (
+            PairWarning("no_pose", "the matches do not decide between the four poses of the essential matrix"),
+        )
+    R, t, front = pose or (None, None, None)
     return PairEstimate(
         F_mat=F_mat,
-        E_mat=E_mat,
+        E_mat=None if cameras is None else unit_fundamental(transform_fundamental(F_mat, *cameras)),
         R=R,
         t=t,
         estimator=type(layer).__name__ if layer is not None else RANSAC.__name__,
         points1=points1,
         points2=points2,
         scores=scores,
-        weights=weights,
+        weights=weights if layer is not None else inliers.double(),
         inliers=inliers,
         front=front,
         predicted_error=min(stability.error, float(max(size2))),
-        warnings=assess(points1, points2, inliers, H, threshold, size2, stability),
+        warnings=warnings,
         size1=size1,
         size2=size2,
         ratio=1.0,
         threshold=threshold,
         seed=seed,
     )
+
+
+def _check_matches(points1: Points, points2: Points, scores: Points | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return matches in float64, with scores of one where there are none; raise a clear error for anything else."""
+    x1, x2 = float_tensor("points1", points1), float_tensor("points2", points2)
+    score = torch.ones(len(x1), dtype=torch.float64) if scores is None else float_tensor("scores", scores)
+    if x1.shape != x2.shape or x1.shape[1:] != (2,) or score.shape != x1.shape[:1]:
+        shapes = " and ".join(str([*value.shape]) for value in (x1, x2, score))
+        raise ValueError(f"points of shape (N, 2) and scores of shape (N,) expected, got {shapes}")
+    if not all(bool(value.isfinite().all()) for value in (x1, x2, score)):
+        raise ValueError("points and scores must be finite, got NaN or infinity")
+    if len(score) and not (float(score.min()) >= 0 and float(score.max()) <= 1):
+        raise ValueError(f"scores must be from 0 to 1, got {float(score.min()):g} to {float(score.max()):g}")
+    return x1, x2, score
+
+
+def _usable_matches(points1: Tensor, points2: Tensor, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the matches that move and share no point, best first; raise NoReliableMatrixError for too few."""
+    kept = one_to_one(points1, points2, 1 - scores)
+    motion = (points2 - points1).norm(dim=-1)[kept]
+    if len(kept) >= MIN_MATCHES and median(motion).item() < MIN_MOTION:
+        text = f"no motion between the images (median displacement {median(motion):.2g} px of {len(kept)} matches)"
+        raise NoReliableMatrixError("no_motion", f"{text}: the fundamental matrix is not determined")
+    kept = kept[motion >= MIN_MOTION]  # what stands still lies on an overlay or a dirty lens
+    if len(kept) < MIN_MATCHES:
+        text = f"{len(kept)} distinct matches of {len(scores)} are left, at least {MIN_MATCHES} are needed"
+        raise NoReliableMatrixError("few_matches", text)
+    return points1[kept], points2[kept], scores[kept]
+
+
+def _pose(
+    points1: Tensor, points2: Tensor, F_mat: Tensor, inliers: Tensor, cameras: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Return rotation, translation and which matches are in front of both cameras; None where two poses tie."""
+    pair = (cameras[0][None], cameras[1][None], points1[None], points2[None])
+    R, t = relative_pose(F_mat[None], *pair, inliers[None])
+    return (R[0], t[0], in_front(R, t, *pair)[0]) if bool(R.isfinite().all()) else None
 
 
 def _solver(

@@ -11,6 +11,7 @@ from two_view import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
+from kornia_learnnorm.evaluation import two_view as two_view_module
 from kornia_learnnorm.evaluation.reliability import check_ambiguity, mutual_share
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
@@ -57,6 +58,15 @@ class TestEstimateMatches:
         assert "planar" in [warning.code for warning in without.warnings]
         found = kln.estimate_matches(x1, x2, size1=(640, 480), size2=(640, 480), K1=K, K2=K)
         assert "planar" not in [warning.code for warning in found.warnings]
+
+    def test_a_tie_between_poses(self, monkeypatch):
+        points1, points2, scene = make_matches()
+        nothing = torch.full((1, 3, 3), torch.nan).double()
+        monkeypatch.setattr(two_view_module, "relative_pose", lambda *_: (nothing, nothing[:, 0]))
+        found = kln.estimate_matches(points1, points2, K1=scene.K1[0], K2=scene.K2[0])
+        assert (found.R, found.t, found.front) == (None, None, None)
+        assert [warning.code for warning in found.warnings] == ["no_pose"]
+        json.dumps(found.as_dict(), allow_nan=False)
 
     def test_the_learned_layer(self):
         points1, points2, _ = make_matches()
