@@ -383,18 +383,20 @@ def matched(pair: FramePair, seed: int, most: int | None) -> CorrespondenceStore
 
 class TestMatchPair:
     def test_matches_are_one_to_one(self, images):
-        """Against the nearest neighbours, of which several share a feature, counted with dictionaries."""
+        """Against the nearest neighbours, of which several share a feature, chosen by a loop."""
         (pair, *_) = pairs_of(images)
         features = [detect_sift(read_frame(frame)) for frame in pair]
         store = match_pair(pair, *features, options=MatchOptions(max_matches=None))
         rows = np.column_stack([part.numpy() for part in match_nearest(*features)]).tolist()
-        for view in (slice(0, 2), slice(2, 4)):
-            best: dict[tuple, list] = {}
-            for row in sorted(rows, key=lambda row: row[::-1]):
-                best.setdefault(tuple(row[view]), row)
-            rows = list(best.values())
-        assert sorted(np.column_stack([store.points1, store.points2, store.ratio]).tolist()) == sorted(rows)
-        assert len(rows) < len(features[0].points)
+        kept: list[list] = []
+        seen: tuple[set, set] = (set(), set())
+        for row in sorted(rows, key=lambda row: row[::-1]):
+            if tuple(row[:2]) not in seen[0] and tuple(row[2:4]) not in seen[1]:
+                kept.append(row)
+                seen[0].add(tuple(row[:2]))
+                seen[1].add(tuple(row[2:4]))
+        assert sorted(np.column_stack([store.points1, store.points2, store.ratio]).tolist()) == sorted(kept)
+        assert len(kept) < len(features[0].points)
 
     @given(seed=st.integers(0, 1000), most=st.integers(8, 40))
     def test_cut_is_a_subset_with_at_most_so_many_of_each_class(self, images, seed, most):
