@@ -197,9 +197,9 @@ def assess(
 def mutual_share(points1: Tensor, points2: Tensor, mutual: Tensor, F_mat: Tensor, threshold: float) -> float:
     """Return which share of the nearest neighbours that fit a matrix are nearest neighbours in both directions.
 
-    Nearly all true matches are (95 % and more on KITTI 00 and rendered rooms), and about half of the false ones. The
-    reverse match has no part in which matches fit, so a low share tells of false matches that agree with each other.
-    Only matches off the plane that explains most count, since they determine the epipole.
+    Nearly all true matches are, and far fewer of the false ones. The reverse match has no part in which matches fit, so
+    a low share means false matches that agree with each other. Only matches off the plane that explains most count,
+    since they determine the epipole.
     """
     fits = symmetric_epipolar_distance(points1, points2, F_mat) < threshold
     H = find_homography(points1[fits], points2[fits], threshold) if int(fits.sum()) >= 8 else None

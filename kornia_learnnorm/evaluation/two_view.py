@@ -34,7 +34,8 @@ from kornia_learnnorm.geometry.pose import in_front, relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
-from kornia_learnnorm.ransac.parallax import FINAL_LOSS_SCALE, fit_plane_and_parallax, parallax
+from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
+from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.scoring import PairScorer
 

@@ -16,13 +16,13 @@ from torch import Tensor
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.transforms import unit_fundamental
+from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 
 __all__ = ["fit_plane_and_parallax", "parallax", "parallax_evidence"]
 
 OFF_PLANE = 2.0  # thresholds; a match that the homography misses by more lies off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
-FINAL_LOSS_SCALE = 0.7  # scale of the final fit's loss, in thresholds
 MIN_PARALLAX_INLIERS = 3  # matches off the plane that a matrix must have to be more than a choice of two
 
 
