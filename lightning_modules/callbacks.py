@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytorch_lightning as pl
@@ -24,25 +27,64 @@ __all__ = ["Checkpoints", "ExportWeights", "WritePredictions"]
 class Checkpoints(ModelCheckpoint):
     """Keep the last checkpoint as ``checkpoints/last.ckpt`` in the trainer's default root directory.
 
+    A training that is interrupted (Ctrl-C) ends after the current step with a checkpoint; a second Ctrl-C ends it at
+    once. Several processes end at once, since they would not agree on the step.
+
     Args:
         every_n_train_steps: steps between checkpoints.
     """
 
     def __init__(self, every_n_train_steps: int = 100) -> None:
         super().__init__(save_last=True, every_n_train_steps=every_n_train_steps, enable_version_counter=False)
+        self._previous_handler: Any = None
+        self._interrupted = False
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Choose the folder."""
         self.dirpath = str(Path(trainer.default_root_dir) / "checkpoints")
         super().setup(trainer, pl_module, stage)
 
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Handle interrupts, in the main thread of a single process."""
+        super().on_train_start(trainer, pl_module)
+        self._interrupted = False
+        if trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
+            self._previous_handler = signal.signal(signal.SIGINT, self._interrupt)
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Save a checkpoint where one is due, or where the training was interrupted, which ends here."""
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        if self._interrupted:
+            self.last_model_path = str(Path(str(self.dirpath)) / "last.ckpt")
+            trainer.save_checkpoint(self.last_model_path)
+            raise KeyboardInterrupt
+
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
-        """Say from where an interrupted run can be resumed."""
+        """Say how an interrupted run can be resumed."""
         super().on_exception(trainer, pl_module, exception)
-        last = (
-            f"resume with --ckpt_path {self.last_model_path}" if self.last_model_path else "no checkpoint was written"
-        )
-        rank_zero_info(f"stopped at step {trainer.global_step}; {last}")
+        self._restore_handler()
+        last = self.last_model_path
+        how = f"to go on, repeat the command with --ckpt_path {last}" if last else "no checkpoint was written"
+        rank_zero_info(f"stopped at step {trainer.global_step}; {how}")
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Give interrupts back."""
+        super().on_train_end(trainer, pl_module)
+        self._restore_handler()
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        """Ask for the end of the training; the second time, end it."""
+        if self._interrupted:
+            raise KeyboardInterrupt
+        self._interrupted = True
+        rank_zero_info("\ninterrupted: the run ends with a checkpoint after this step; Ctrl-C again ends it at once")
+
+    def _restore_handler(self) -> None:
+        if self._previous_handler is not None:
+            signal.signal(signal.SIGINT, self._previous_handler)
+            self._previous_handler = None
 
 
 class ExportWeights(Callback):

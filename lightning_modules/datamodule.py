@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, Protocol
@@ -130,7 +131,10 @@ class SampleLoader:
             # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
             indices: Any = range(first, number)
             draw = partial(self.source.draw, self._seed(epoch))
-            yield from DataLoader(indices, batch_size=None, collate_fn=draw, num_workers=self.workers)
+            loader = DataLoader(
+                indices, batch_size=None, collate_fn=draw, num_workers=self.workers, worker_init_fn=_ignore_interrupts
+            )
+            yield from loader
         else:
             for block in range(first, number):
                 yield self._draw(epoch, block)
@@ -143,6 +147,11 @@ class SampleLoader:
 
     def _seed(self, epoch: int) -> int:
         return self.seed + (epoch if self.shuffle else 0)
+
+
+def _ignore_interrupts(_: int) -> None:
+    """Leave Ctrl-C, which reaches workers too, to the process that trains."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class CorrespondenceDataModule(pl.LightningDataModule):

@@ -98,6 +98,18 @@ class Stop(pl.Callback):
             raise InterruptedError("as if the machine had stopped")
 
 
+class Interrupt(pl.Callback):
+    """Interrupt as Ctrl-C does, in the middle of a step."""
+
+    def __init__(self, step, times=1):
+        self.step, self.times = step, times
+
+    def on_after_backward(self, trainer, *_):
+        if trainer.global_step == self.step:
+            for _ in range(self.times):
+                os.kill(os.getpid(), signal.SIGINT)
+
+
 def task_and_data(case):
     torch.manual_seed(0)
     task = NormalizerTask(

@@ -1,5 +1,8 @@
 """The task, the datamodule, the callbacks: a few steps of training on small data."""
 
+import functools
+import signal
+
 import pytest
 import pytorch_lightning as pl
 import torch
@@ -85,6 +88,33 @@ def test_resumes_to_the_same_curve(tmp_path, interrupted_at, source, arguments):
     torch.testing.assert_close(second.state_dict(), whole.state_dict(), rtol=0, atol=0)
     expected, got = (watch.seen["train/loss"] for watch in watches)
     assert got == expected[interrupted_at // 2 * 2 :]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_interrupted_run_saves_its_step_and_goes_on_to_the_same_curve(tmp_path, workers, caplog):
+    """Ctrl-C comes in the middle of step 5; no checkpoint is due before step 100."""
+    source = Blocks(number=96, num_heldout=4, max_residual=None)
+    whole, watches = make_task(), [train_processes.Watch(), train_processes.Watch()]
+    data = functools.partial(make_data, source, workers=workers)
+    make_trainer(tmp_path / "whole", watches[:1], max_steps=20, enable_checkpointing=False).fit(whole, data())
+    first, second, last = make_task(), make_task(), tmp_path / "cut/checkpoints/last.ckpt"
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(SystemExit), caplog.at_level("INFO"):
+        make_trainer(tmp_path / "cut", [Checkpoints(), train_processes.Interrupt(4)], max_steps=20).fit(first, data())
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert f"stopped at step 5; to go on, repeat the command with --ckpt_path {last}" in caplog.text
+    make_trainer(tmp_path / "cut", [watches[1], Checkpoints()], max_steps=20).fit(second, data(), ckpt_path=last)
+    assert signal.getsignal(signal.SIGINT) is handler
+    torch.testing.assert_close(second.state_dict(), whole.state_dict(), rtol=0, atol=0)
+    expected, got = (watch.seen["train/loss"] for watch in watches)
+    assert got == expected[5:]
+
+
+def test_a_second_interrupt_ends_the_run_at_once(tmp_path):
+    callbacks = [Checkpoints(), train_processes.Interrupt(4, times=2)]
+    with pytest.raises(SystemExit):
+        make_trainer(tmp_path, callbacks, max_steps=20).fit(make_task(), make_data())
+    assert not (tmp_path / "checkpoints/last.ckpt").exists()
 
 
 @pytest.mark.parametrize("log", [True, False])
