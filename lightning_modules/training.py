@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import warnings
 import zipfile
@@ -13,9 +14,11 @@ from pathlib import Path
 import pytorch_lightning as pl
 import torch
 import yaml
-from pytorch_lightning.cli import LightningCLI
+from jsonargparse import ArgumentError
+from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from torch import Tensor
 
+from lightning_modules.config_files import with_config_paths
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import NormalizerTask
 
@@ -24,6 +27,13 @@ __all__ = ["TrainingCLI", "run"]
 
 class TrainingCLI(LightningCLI):
     """LightningCLI that refuses a missing or foreign checkpoint before anything runs."""
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
+        """Parse the arguments; a configuration that ships with the package can be given by its name."""
+        if args is None or isinstance(args, list):
+            self.config = parser.parse_args(with_config_paths(sys.argv[1:] if args is None else args))
+        else:
+            super().parse_arguments(parser, args)
 
     def _parse_ckpt_path(self) -> None:
         """Take no configuration from a checkpoint: it could name any class to be made."""
@@ -78,17 +88,45 @@ def _names_its_classes(args: Sequence[str]) -> bool:
     return False
 
 
+def _short_message(message: str) -> str:
+    """Return what is wrong with the arguments, of all that jsonargparse says about it, on one line."""
+    unknown = re.search(r"(?:Option|does not accept option|unrecognized arguments:) '?([\w.-]+)", message)
+    if unknown:
+        classes = re.findall(r"Problem with given class_path '([\w.]+)'", message[: unknown.end()])
+        of = f" of {classes[-1]}" if classes else ""
+        return f"unknown option {unknown[1]}{of}"
+    # Of the types that were tried, the first is the one that was meant.
+    first = re.search(r"Does not validate against.*?Errors:\s*- (.*?)\n", message, flags=re.DOTALL)
+    return " ".join((first[1] if first else message).split())
+
+
 def run(args: list[str] | None) -> None:
-    """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict``; ``args`` is ``sys.argv`` when None."""
+    """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict``; ``args`` is ``sys.argv`` when None.
+
+    Raises:
+        ValueError: if the arguments or a configuration are wrong.
+        KeyboardInterrupt: if the run was interrupted.
+
+    """
+    words = with_config_paths(sys.argv[1:] if args is None else args)
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")  # Lightning's own call of torch
-    named = _names_its_classes(sys.argv[1:] if args is None else args)
-    TrainingCLI(
-        pl.LightningModule if named else NormalizerTask,
-        pl.LightningDataModule if named else CorrespondenceDataModule,
-        subclass_mode_model=named,
-        subclass_mode_data=named,
-        args=args,
-        auto_configure_optimizers=False,
-        parser_kwargs={"prog": "learnnorm"},
-        save_config_kwargs={"overwrite": True},
-    )
+    named = _names_its_classes(words)
+    raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines
+    try:
+        TrainingCLI(
+            pl.LightningModule if named else NormalizerTask,
+            pl.LightningDataModule if named else CorrespondenceDataModule,
+            subclass_mode_model=named,
+            subclass_mode_data=named,
+            args=args,
+            auto_configure_optimizers=False,
+            parser_kwargs={"prog": "learnnorm", **raises, **dict.fromkeys(LightningCLI.subcommands(), raises)},
+            save_config_kwargs={"overwrite": True},
+        )
+    except ArgumentError as error:
+        command = next(iter(words), "fit")
+        raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help lists the options") from error
+    except SystemExit as error:  # Lightning exits so when it was interrupted
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        raise

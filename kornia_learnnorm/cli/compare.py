@@ -12,7 +12,11 @@ from kornia_learnnorm.evaluation.runs.record import temporary_run
 from kornia_learnnorm.evaluation.runs.run import Cell
 from kornia_learnnorm.evaluation.tables import format_table
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm compare one.h5 two.h5@0:9
+learnnorm compare store.h5 --weights runs/own/weights.safetensors paper"""
 
 # Error and baseline of each table.
 COMPARISONS = {

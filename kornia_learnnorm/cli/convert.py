@@ -9,7 +9,11 @@ from kornia_learnnorm.data.formats.hloc import export_hloc, import_hloc
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.writer import write_store
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm convert FOLDER store.h5 --from hloc
+learnnorm convert store.h5 FOLDER --to hloc"""
 
 FEATURES = "features.h5"  # file of keypoints in the folder
 MATCHES = "matches.h5"  # file of matches in the folder

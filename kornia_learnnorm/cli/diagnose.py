@@ -9,7 +9,11 @@ from kornia_learnnorm.evaluation.runs.record import temporary_run
 from kornia_learnnorm.evaluation.tables import DIAGNOSTICS, diagnostic_rows, format_table
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm diagnose store.h5 --sizes 8 20 100
+learnnorm diagnose store.h5 --methods Hartley crossview --max-residual inf"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -14,7 +14,11 @@ from kornia_learnnorm.evaluation.runs.run import Run, read_run
 from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows, names_of
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["add_arguments", "add_run_arguments", "run", "run_arguments"]
+__all__ = ["EXAMPLES", "add_arguments", "add_run_arguments", "run", "run_arguments"]
+
+EXAMPLES = """\
+learnnorm evaluate store.h5 --methods Hartley crossview Hartley+LM --size 16
+learnnorm evaluate store.h5 --out run && learnnorm report run"""
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import re
+import shutil
 import sys
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any
 
 import kornia_learnnorm
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["main"]
+__all__ = ["main", "make_parser"]
 
 TRAINING = {
     "fit": "train a normaliser",
@@ -29,6 +31,7 @@ TOOLS = {
     "match": ("kornia_learnnorm.cli.match", "a store of correspondences from folders of images"),
     "convert": ("kornia_learnnorm.cli.convert", "a store from or to the files of hloc"),
     "synthesize": ("kornia_learnnorm.cli.synthesize", "a synthetic store and a rendered image pair"),
+    "config": ("kornia_learnnorm.cli.config", "print a configuration for training"),
 }
 
 
@@ -52,27 +55,49 @@ def main(args: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _run_tool(words: list[str]) -> int:
+def make_parser(names: Collection[str] = tuple(TOOLS)) -> argparse.ArgumentParser:
+    """Return the parser of the command line, with the arguments of the named tools only, whose modules are imported."""
     parser = argparse.ArgumentParser(prog="learnnorm", description="Learned normalisation of the eight-point algorithm")
     parser.add_argument("--version", action="version", version=f"%(prog)s {kornia_learnnorm.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in TRAINING.items():
         commands.add_parser(name, help=text, add_help=False)
     for name, (module, text) in TOOLS.items():
-        command = commands.add_parser(name, help=text, description=text)
-        if words[:1] == [name]:
+        command = commands.add_parser(name, help=text, description=text, formatter_class=HelpFormatter)
+        if name in names:
             tool = importlib.import_module(module)
             tool.add_arguments(command)
+            if examples := getattr(tool, "EXAMPLES", ""):
+                command.epilog = "examples:\n" + textwrap.indent(examples, "  ")
             command.set_defaults(run=tool.run)
-    parsed = parser.parse_args(words)
+    return parser
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Format the help of a command for one screen: only required arguments in the usage, examples as they stand."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=32, width=min(shutil.get_terminal_size().columns, 120) - 2)
+
+    def add_usage(
+        self, usage: str | None, actions: Iterable[argparse.Action], groups: Iterable[Any], prefix: str | None = None
+    ) -> None:
+        """Name optional arguments by one word: they are listed below."""
+        required = [group for group in groups if group.required]
+        members = {id(action) for group in required for action in group._group_actions}  # noqa: SLF001
+        shown = [a for a in actions if a.required or id(a) in members or (not a.option_strings and a.nargs == "?")]
+        rest = argparse.Action([], "options", metavar="[options]")
+        super().add_usage(usage, [*shown, rest], required, prefix)
+
+
+def _run_tool(words: list[str]) -> int:
+    parsed = make_parser(words[:1]).parse_args(words)
     return int(parsed.run(parsed))
 
 
 def _one_line(error: Exception) -> str:
     """Return the message of an error on one line."""
-    # jsonargparse lists what each type that it tried had to say: the first is the one that was meant.
-    first = re.search(r"Does not validate against.*?Errors:\s*- (.*?)\n", str(error), flags=re.DOTALL)
-    return " ".join((first[1] if first else str(error)).split())
+    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

@@ -18,7 +18,11 @@ from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.writer import check_target
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm match folder PHOTOS --out photos.h5
+learnnorm match kitti ROOT --sequences 00 03 --out kitti.h5 --jobs 2"""
 
 MAX_LISTED = 10  # skipped pairs that are printed
 READER_OPTIONS = ("sequences", "split", "camera", "max_difference", "model")  # arguments that a reader takes
@@ -43,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-difference",
         metavar="S",
         type=float,
-        help="tum: largest difference in time of image and pose, seconds (default: 0.02)",
+        help="tum: seconds between an image and its pose, at most (default: 0.02)",
     )
     frames.add_argument("--resize", metavar=("WIDTH", "HEIGHT"), nargs=2, type=int, help="resize images and cameras")
     pairs = parser.add_argument_group("pairs").add_mutually_exclusive_group()
@@ -51,11 +55,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pairs.add_argument("--pairs", metavar="FILE", type=Path, help="two names a line, as hloc lists them")
     pairs.add_argument("--min-points", metavar="N", type=int, help="colmap: pairs that share at least N points")
     match = parser.add_argument_group("matching")
-    match.add_argument("--detector", choices=DETECTORS, default=options.detector, help="(default: %(default)s)")
-    match.add_argument("--num-features", type=int, default=options.num_features, help="(default: %(default)s)")
-    match.add_argument("--matcher", choices=MATCHERS, default=options.matcher, help="(default: %(default)s)")
+    for option, names, default in (
+        ("--detector", DETECTORS, options.detector),
+        ("--matcher", MATCHERS, options.matcher),
+    ):
+        text = f"{', '.join(names)} (default: %(default)s)"
+        match.add_argument(option, metavar="NAME", choices=names, default=default, help=text)
+    match.add_argument(
+        "--num-features", metavar="N", type=int, default=options.num_features, help="of an image (default: %(default)s)"
+    )
     match.add_argument(
         "--max-matches",
+        metavar="N",
         type=int,
         default=options.max_matches,
         help="per pair, of those that pass the ratio test and of those that fail; 0 keeps all (default: %(default)s)",
@@ -63,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     match.add_argument(
         "--seed", type=int, default=options.seed, help="seed of the order of matches (default: %(default)s)"
     )
-    where = parser.add_argument_group("where").add_mutually_exclusive_group()
+    where = match.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=int, default=-1, help="processes here; -1 for all cores (default: %(default)s)")
     where.add_argument("--dask", metavar="ADDRESS", help="Dask scheduler, as tcp://host:8786; its workers match")
 

@@ -8,7 +8,11 @@ from pathlib import Path
 
 from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm evaluate store.h5 --out run && learnnorm report run
+learnnorm robust store.h5 --out run && learnnorm report run"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

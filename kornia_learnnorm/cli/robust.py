@@ -9,7 +9,11 @@ from kornia_learnnorm.evaluation.robust.estimators import DEFAULT_ESTIMATORS, DE
 from kornia_learnnorm.evaluation.robust.record import DEFAULT_OPTIONS, record_robust
 from kornia_learnnorm.evaluation.tables import names_of
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm robust store.h5 --out run && learnnorm report run
+learnnorm robust store.h5 --out run --estimators RANSAC poselib learned:robust --solvers"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

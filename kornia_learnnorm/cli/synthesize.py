@@ -9,7 +9,11 @@ from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 from kornia_learnnorm.data.synthetic.stores import SCENES, synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm synthesize folder
+learnnorm synthesize folder --pairs 5 --scenes orbit --points 200"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,18 +3,22 @@
 import contextlib
 import functools
 import io
+import re
+import shlex
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+import train_processes
 import yaml
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.cli.main import TOOLS, main, make_parser
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
+from lightning_modules.config_files import find_config
 
 pytestmark = pytest.mark.usefixtures("program")
 
@@ -275,7 +279,80 @@ def test_a_missing_package_is_one_line(blocked, extra, tmp_path, monkeypatch, re
         refused(command, f"needs {blocked}: run pip install '.[{extra}]'")
 
 
-@pytest.mark.parametrize("arguments", [[], ["unknown"], ["evaluate"], ["compare"], ["fit", "--nonsense"]])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--nonsense"], "unknown option --nonsense"),
+        (["--trainer.max_stepz", "3"], "unknown option --trainer.max_stepz"),
+        ([f"--{NETWORK}.widht=3"], "unknown option widht of kornia_learnnorm.CrossViewNetwork"),
+        (["--config", "bad.yaml"], "unknown option model.nomalizer"),
+        (["--trainer.max_steps", "many"], "trainer.max_steps"),
+        (["--config", "unknown"], "no configuration unknown: expected a file, or one of crossview, "),
+    ],
+)
+def test_wrong_options_of_a_training_are_one_line(options, message, tmp_path, monkeypatch, refused):
+    monkeypatch.chdir(tmp_path)
+    Path("bad.yaml").write_text("model: {nomalizer: 3}")
+    refused(["fit", "--config", "crossview-synthetic", *options], message)
+
+
+def test_an_interrupted_training_exits_as_interrupted(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    interrupt = train_processes.Interrupt(1)
+    monkeypatch.setattr("lightning_modules.callbacks.ExportWeights.on_after_backward", interrupt.on_after_backward)
+    options = ["--data.batch_size=16", "--trainer.max_steps=3", "--trainer.enable_progress_bar=false"]
+    assert main(["fit", "--config=crossview-synthetic", *options]) == 130
+    assert capsys.readouterr().err.endswith("interrupted\n")
+    assert Path("runs/crossview-synthetic/checkpoints/last.ckpt").is_file()
+    assert not Path("runs/crossview-synthetic/weights.safetensors").exists()
+
+
+def test_configurations_are_found_by_name_from_any_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["config"]) == 0
+    names = capsys.readouterr().out.split()
+    assert sorted(names) == sorted(p.relative_to(FOLDER).with_suffix("").as_posix() for p in FOLDER.rglob("*.yaml"))
+    assert main(["config", "ablations/base"]) == 0
+    assert capsys.readouterr().out == (FOLDER / "ablations/base.yaml").read_text()
+    assert settings("ablations/base") == settings(FOLDER / "ablations/base.yaml")
+    Path("crossview").write_text("seed_everything: 7")  # a file comes before a name
+    assert settings(FOLDER / "crossview-synthetic.yaml", "crossview")["seed_everything"] == 7
+
+
+def test_configurations_of_an_installed_wheel(tmp_path, monkeypatch):
+    (tmp_path / "own.yaml").write_text("seed_everything: 1")
+    monkeypatch.setattr("lightning_modules.config_files.PACKAGED", tmp_path)
+    assert find_config("own") == tmp_path / "own.yaml"
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.yaml")), ids=lambda path: path.stem)
+def test_configurations_take_the_accelerator_that_is_there(path):
+    trainer = yaml.safe_load(path.read_text()).get("trainer", {})
+    assert trainer.get("accelerator", "auto") == "auto"
+    assert "accelerator" in trainer or path.parent != FOLDER
+
+
+@pytest.mark.parametrize("command", sorted(TOOLS))
+def test_help_fits_a_screen_and_ends_with_examples_that_parse(command, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--help"])
+    assert caught.value.code == 0
+    lines = capsys.readouterr().out.rstrip().splitlines()
+    assert len(lines) <= 40
+    if command == "estimate":
+        return
+    start = lines.index("examples:")
+    assert len(lines) == start + 3
+    parser = make_parser()
+    for example in re.split(r" && |\n", "\n".join(lines[start + 1 :])):
+        words = shlex.split(example.partition(">")[0])
+        assert words[0] == "learnnorm"
+        if words[1] in TOOLS:
+            assert parser.parse_args(words[1:]).command == words[1]
+
+
+@pytest.mark.parametrize("arguments", [[], ["unknown"], ["evaluate"], ["compare"]])
 def test_bad_usage_exits_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         main(arguments)

@@ -1,0 +1,26 @@
+"""Print a training configuration, to edit: ``learnnorm config``."""
+
+from __future__ import annotations
+
+import argparse
+
+from lightning_modules.config_files import config_names, find_config
+
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm config crossview > own.yaml
+learnnorm fit --config own.yaml --trainer.default_root_dir runs/own"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``learnnorm config`` to a parser."""
+    parser.add_argument("name", metavar="NAME", nargs="?", help="configuration to print; without it, list the names")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a configuration, or the names of all."""
+    print(
+        "\n".join(config_names()) if args.name is None else find_config(args.name).read_text(encoding="utf-8").rstrip()
+    )
+    return 0

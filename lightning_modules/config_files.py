@@ -1,0 +1,53 @@
+"""The training configurations that ship with the package, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["config_names", "find_config", "with_config_paths"]
+
+OPTIONS = ("-c", "--config")
+PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
+REPOSITORY = Path(__file__).parents[1] / "configs"  # where a checkout has them
+
+
+def config_names() -> list[str]:
+    """Return the names of the configurations, such as ``crossview`` and ``ablations/base``."""
+    folder = _folder()
+    paths = [path.relative_to(folder).with_suffix("") for path in folder.rglob("*.yaml")]
+    return [path.as_posix() for path in sorted(paths, key=lambda path: (len(path.parts), path))]
+
+
+def find_config(name: str) -> Path:
+    """Return the file of a configuration, which is given by its name or by its path.
+
+    Raises:
+        FileNotFoundError: if there is neither such a file nor such a name.
+
+    """
+    if Path(name).is_file():
+        return Path(name)
+    stem = name.removesuffix(".yaml")
+    names = config_names()
+    if stem not in names:
+        known = ", ".join(known for known in names if "/" not in known)
+        raise FileNotFoundError(f"no configuration {name}: expected a file, or one of {known}, ablations/*, table1/*")
+    return _folder() / f"{stem}.yaml"
+
+
+def with_config_paths(args: Sequence[str]) -> list[str]:
+    """Return command-line arguments with the names of configurations replaced by their paths."""
+    replaced = list(args)
+    for i, arg in enumerate(args):
+        option, equals, value = arg.partition("=")
+        if i and args[i - 1] in OPTIONS:
+            replaced[i] = str(find_config(arg))
+        elif option == "--config" and equals:
+            replaced[i] = f"--config={find_config(value)}"
+    return replaced
+
+
+def _folder() -> Path:
+    """Return the folder of the configurations; an editable install uses that of the repository."""
+    return PACKAGED if PACKAGED.is_dir() else REPOSITORY
