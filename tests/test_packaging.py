@@ -1,0 +1,53 @@
+"""The wheel: the same bytes from the same files, configurations and weights in it, the version of the package."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import kornia_learnnorm as kln
+
+ROOT = Path(__file__).parents[1]
+BUILD = "from hatchling.build import build_wheel; import sys; build_wheel(sys.argv[1])"
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory):
+    """Two wheels of the repository."""
+    pytest.importorskip("hatchling", reason="hatchling is not installed")
+    folders = [tmp_path_factory.mktemp("wheel") for _ in range(2)]
+    for folder in folders:
+        subprocess.run([sys.executable, "-c", BUILD, folder], cwd=ROOT, check=True, capture_output=True, timeout=120)
+    return [next(folder.glob("*.whl")) for folder in folders]
+
+
+def test_two_builds_are_the_same(wheels):
+    assert wheels[0].name == wheels[1].name
+    assert wheels[0].name.startswith(f"kornia_learnnorm-{kln.__version__}-")
+    assert wheels[0].read_bytes() == wheels[1].read_bytes()
+    assert wheels[0].stat().st_size < 10e6
+
+
+def test_the_wheel_has_configurations_and_weights(wheels):
+    names = set(zipfile.ZipFile(wheels[0]).namelist())
+    for path in (ROOT / "configs").rglob("*.yaml"):
+        assert f"lightning_modules/{path.relative_to(ROOT).as_posix()}" in names
+    for path in (ROOT / "kornia_learnnorm/weights").iterdir():
+        assert path.relative_to(ROOT).as_posix() in names
+    tops = {name.partition("/")[0] for name in names}
+    assert tops == {"kornia_learnnorm", "lightning_modules", f"kornia_learnnorm-{kln.__version__}.dist-info"}
+
+
+def test_the_wheel_finds_its_configurations_in_any_folder(wheels, tmp_path):
+    zipfile.ZipFile(wheels[0]).extractall(tmp_path / "site")
+    command = [sys.executable, "-m", "kornia_learnnorm.cli.main", "config", "crossview"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+    found = subprocess.run(
+        command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True, timeout=120
+    )
+    assert found.stdout == (ROOT / "configs/crossview.yaml").read_text(encoding="utf-8")
