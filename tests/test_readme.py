@@ -1,4 +1,4 @@
-"""The README: its code prints what it shows, its links lead to files that read well, its numbers are those of the docs."""
+"""The README: its code prints what it shows, its links lead to plain Markdown, its numbers are those of the docs."""
 
 from __future__ import annotations
 
