@@ -4,6 +4,7 @@ Formulas are set by MathJax, which the reader's browser fetches.
 """
 
 import kornia_learnnorm
+from kornia_learnnorm.cli.main import make_parser
 
 project = "kornia_learnnorm"
 author = "the authors of kornia_learnnorm"
@@ -11,7 +12,9 @@ copyright = author
 release = version = kornia_learnnorm.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
+extensions += ["sphinx_copybutton", "sphinxarg.ext"]
 exclude_patterns = ["_build"]
+smartquotes = False  # they turn the two dashes of options into one
 html_theme = "furo"
 html_title = f"kornia-learnnorm {release}"
 
@@ -21,6 +24,8 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(?!kornia_learnnorm|lightning_modules).*"),
     ("py:class", r"kornia_learnnorm\.pretrained\.Module"),  # a type variable
 ]
+
+copybutton_selector = "div.highlight pre:not(div.cell_output pre)"  # code, not what it prints
 
 add_module_names = False
 autodoc_member_order = "bysource"
@@ -42,6 +47,15 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 120
 nb_merge_streams = True
 nb_render_markdown_format = "myst"
+
+
+def command_parser():
+    """Return the parser for the page of the command line, its examples as literal blocks."""
+    parser = make_parser()
+    (commands,) = (action.choices for action in parser._actions if action.dest == "command")  # noqa: SLF001
+    for command in commands.values():
+        command.epilog = command.epilog and command.epilog.replace("examples:\n", "Examples::\n\n")
+    return parser
 
 
 def _skip_tuple_fields(app, what, name, obj, skip, options):
