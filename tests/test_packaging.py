@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 import kornia_learnnorm as kln
 
@@ -51,3 +53,18 @@ def test_the_wheel_finds_its_configurations_in_any_folder(wheels, tmp_path):
         command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True, timeout=120
     )
     assert found.stdout == (ROOT / "configs/crossview.yaml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", [".github/workflows/test.yml", ".github/workflows/pages.yml", ".readthedocs.yaml"])
+def test_services_call_targets_of_the_makefile(path):
+    content = yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
+    jobs = content.get("jobs", {}).values()
+    commands = (
+        content["build"]["commands"] if "build" in content else [s.get("run", "") for j in jobs for s in j["steps"]]
+    )
+    called = [command.removeprefix("make ") for command in commands if command.startswith("make ")]
+    matrix = [target for job in jobs for target in job.get("strategy", {}).get("matrix", {}).get("target", [])]
+    targets = [*matrix, *(target for target in called if "{" not in target)]
+    assert targets
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert [target for target in targets if not re.search(rf"^{target}:", makefile, flags=re.MULTILINE)] == []
