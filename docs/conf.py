@@ -1,6 +1,6 @@
 """Configuration of Sphinx. `make docs` builds the pages and runs their code, without data and network.
 
-Formulas are set by MathJax, which the reader's browser fetches.
+Formulas are set by a MathJax that is copied into the site, so that the pages need no network either.
 """
 
 import kornia_learnnorm
@@ -12,7 +12,7 @@ copyright = author
 release = version = kornia_learnnorm.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
-extensions += ["sphinx_copybutton", "sphinxarg.ext"]
+extensions += ["sphinx_copybutton", "sphinxarg.ext", "sphinx-mathjax-offline"]
 exclude_patterns = ["_build"]
 smartquotes = False  # they turn the two dashes of options into one
 html_theme = "furo"

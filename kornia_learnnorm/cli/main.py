@@ -61,7 +61,7 @@ def make_parser(names: Collection[str] = tuple(TOOLS)) -> argparse.ArgumentParse
     parser.add_argument("--version", action="version", version=f"%(prog)s {kornia_learnnorm.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in TRAINING.items():
-        commands.add_parser(name, help=text, add_help=False)
+        commands.add_parser(name, help=text, add_help=False, usage=f"learnnorm {name} --config CONFIG [options]")
     for name, (module, text) in TOOLS.items():
         command = commands.add_parser(name, help=text, description=text, formatter_class=HelpFormatter)
         if name in names:
