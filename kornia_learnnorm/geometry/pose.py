@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_mask, check_tensor, solve_dtype
 
-__all__ = ["in_front", "relative_pose"]
+__all__ = ["in_front", "in_front_of_best_pose", "relative_pose"]
 
 
 def relative_pose(
@@ -84,6 +84,25 @@ def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, poin
 
     """
     return _in_front(R[:, None], t[:, None], _rays(points1, K1), _rays(points2, K2))[:, 0]
+
+
+def in_front_of_best_pose(E_mat: Tensor, rays1: Tensor, rays2: Tensor, weights: Tensor) -> Tensor:
+    r"""Return which correspondences are in front of both cameras under the best of the four poses.
+
+    Args:
+        E_mat: essential matrices with shape :math:`(B, 3, 3)`.
+        rays1: directions :math:`K_1^{-1} x_1` with shape :math:`(N, 3)`, shared by all matrices.
+        rays2: directions :math:`K_2^{-1} x_2` with the same shape.
+        weights: votes of the correspondences with shape :math:`(B, N)`; the pose with most in front is the best.
+
+    Returns:
+        booleans with shape :math:`(B, N)`.
+
+    """
+    R, t = motion_from_essential(E_mat)
+    front = _in_front(R, t[..., 0], rays1[None, None], rays2[None, None])
+    best = (front * weights[:, None]).sum(-1).argmax(-1)
+    return front[torch.arange(len(R), device=R.device), best]
 
 
 def _check(F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None) -> None:

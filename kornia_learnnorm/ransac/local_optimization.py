@@ -9,6 +9,7 @@ from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
 from kornia_learnnorm.estimators.refinement import minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
 from kornia_learnnorm.geometry.manifold import Calibrated, Rank2, decompose
+from kornia_learnnorm.geometry.pose import in_front_of_best_pose
 from kornia_learnnorm.ransac.constrained_fit import constrained_fit
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
@@ -23,6 +24,7 @@ FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; abo
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
 CALIBRATED_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages, with cameras
+CALIBRATED_LOSS_SCALE = 1.5  # thresholds at which the final fit with cameras truncates squared distances
 CALIBRATED_STEPS = 2  # steps of Levenberg-Marquardt in a stage
 
 
@@ -56,37 +58,41 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Rank2:
     if not float(fit.gain[best]) <= FINAL_GAIN:
         optimum = minimize(_objective(scorer, loss), state, MAX_LM_STEPS, LM_TOLERANCE)[1]
         state, cost = optimum.state, float(optimum.cost[0])
-    return state if cost <= _largest_cost(scorer, pool, SAMPLE_SIZE) else decompose(pool.F_mat[:1])
+    return state if cost <= _largest_cost(scorer, pool) else decompose(pool.F_mat[:1])
 
 
-def fit_final_calibrated(scorer: PairScorer, pool: Hypotheses, start: Calibrated, sample_size: int) -> Calibrated:
+def fit_final_calibrated(scorer: PairScorer, pool: Hypotheses, start: Calibrated) -> Calibrated:
     """Return the optimum (1, 3, 3) among essential matrices that is next to the best of the pool.
+
+    Correspondences behind a camera are mismatches: they neither vote nor count in the fit.
 
     Args:
         scorer: all correspondences.
         pool: the best hypotheses.
         start: the best of the pool as essential matrices, the first of them first.
-        sample_size: correspondences in a minimal sample.
 
     """
-    loss = GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold)
-    near = minimize(_objective(scorer, Truncated(scorer.threshold)), start, CALIBRATED_STEPS, LM_TOLERANCE)[1].state
-    optimum = minimize(_objective(scorer, loss), near, MAX_LM_STEPS, LM_TOLERANCE)[1]
-    best = int(optimum.cost.argmin())
-    if float(optimum.cost[best]) <= _largest_cost(scorer, pool, sample_size):
-        start, first = optimum.state, best
-    else:
-        first = 0
-    return Calibrated(*(value[first : first + 1] for value in start))
+    distances = torch.stack([scorer.distances(F) for F in pool.F_mat[: len(start.A)]])
+    gains = (1 - (distances / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
+    rays1, rays2 = (scorer.x1.mT @ start.C1[0].mT), (scorer.x2.mT @ start.C2[0].mT)
+    front = in_front_of_best_pose(start.essential(), rays1, rays2, gains)
+    best = int((gains * front).sum(-1).argmax())
+    state, weights = Calibrated(*(value[best : best + 1] for value in start)), front[best : best + 1].to(gains)
+    for scale, steps in ((1.0, CALIBRATED_STEPS), (CALIBRATED_LOSS_SCALE, MAX_LM_STEPS)):
+        objective = _objective(scorer, Truncated(scale * scorer.threshold), weights=weights)
+        state = minimize(objective, state, steps, LM_TOLERANCE)[1].state
+    return state
 
 
-def _objective(scorer: PairScorer, loss: Loss, rows: Tensor | slice = slice(None)) -> EpipolarCost:
+def _objective(
+    scorer: PairScorer, loss: Loss, rows: Tensor | slice = slice(None), weights: Tensor | None = None
+) -> EpipolarCost:
     x1, x2 = scorer.x1[None, :, rows], scorer.x2[None, :, rows]
-    return EpipolarCost(x1, x2, torch.ones_like(x1[:, 0]), scorer.scale, loss)
+    return EpipolarCost(x1, x2, torch.ones_like(x1[:, 0]) if weights is None else weights, scorer.scale, loss)
 
 
-def _largest_cost(scorer: PairScorer, pool: Hypotheses, sample_size: int) -> float:
+def _largest_cost(scorer: PairScorer, pool: Hypotheses) -> float:
     """Return what an optimum costs at most: the loss is nowhere above that of MSAC, up to a margin for the scores."""
     share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
-    most: float = scorer.threshold**2 * (1.1 * share * scorer.x1.shape[-1] + sample_size)
+    most: float = scorer.threshold**2 * (1.1 * share * scorer.x1.shape[-1] + SAMPLE_SIZE)
     return most

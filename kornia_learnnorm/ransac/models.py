@@ -110,7 +110,7 @@ class EssentialModel:
         """Return the final matrix (1, 3, 3), fitted to all inliers if ``refine``."""
         if not refine:
             return self._decompose(pool.F_mat[:1])
-        return fit_final_calibrated(self.scorer, pool, self._decompose(pool.F_mat[:FINAL_POOL_SIZE]), self.sample_size)
+        return fit_final_calibrated(self.scorer, pool, self._decompose(pool.F_mat[:FINAL_POOL_SIZE]))
 
     def _decompose(self, F_mat: Tensor) -> Calibrated:
         inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (self.C1, self.C2))
