@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_correspondences, check_rank2
+from kornia_learnnorm.geometry.checks import check_correspondences, check_rank2, needs_gradient
 from kornia_learnnorm.geometry.dlt import independence_gap
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2, rank2_projection
@@ -97,5 +97,7 @@ def solve_in_coordinates(
     else:
         R1, R2 = T1 @ torch.linalg.inv_ex(problem.T1)[0], T2 @ torch.linalg.inv_ex(problem.T2)[0]
         F_mat = correct_rank2(problem, transform_fundamental(F_hat, R1, R2))
+    if not needs_gradient(F_mat):
+        return F_mat
     # Rounding chose among the solutions; one with an epipole on a point makes the loss as steep as rounding is small.
     return torch.where((gap > independence_gap(gap.dtype))[:, None, None], F_mat, F_mat.detach())

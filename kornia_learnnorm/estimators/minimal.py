@@ -11,7 +11,8 @@ import torch
 from kornia.geometry.epipolar import find_essential
 from torch import Tensor
 
-from kornia_learnnorm.geometry.dlt import cofactors, design_matrix
+from kornia_learnnorm.geometry.dlt import design_matrix
+from kornia_learnnorm.geometry.matrices import cofactors
 
 __all__ = ["are_determined", "solve_calibrated_samples", "solve_samples"]
 

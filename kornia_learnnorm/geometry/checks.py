@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 __all__ = [
     "check_cameras",
@@ -16,6 +17,7 @@ __all__ = [
     "check_rank2",
     "check_tensor",
     "is_true",
+    "needs_gradient",
     "read_condition",
     "safe_divisor",
     "solve_dtype",
@@ -107,14 +109,14 @@ def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | No
         raise ValueError(f"points and weights must be on one device, got {' and '.join(sorted(devices))}")
     if points1.shape[1] < min_points:
         raise ValueError(f"at least {min_points} correspondences are needed, got {points1.shape[1]}")
-    valid = points1.isfinite().all() & points2.isfinite().all()
+    valid = (points1.sum() + points2.sum()).isfinite()  # or the sum overflows
     if weights is not None:
         if isinstance(weights, Tensor) and weights.dtype == torch.bool:
             raise TypeError("weights must be a floating-point tensor, got torch.bool; a boolean tensor is a mask")
         check_tensor("weights", weights)
         if weights.shape != points1.shape[:2]:
             raise ValueError(f"weights must have shape {[*points1.shape[:2]]}, got {[*weights.shape]}")
-        valid = valid & ((weights >= 0) & (weights < torch.inf)).all()
+        valid = valid & ~(weights < 0).any() & weights.sum().isfinite()
     if is_true(~valid):  # one look at the device for all values
         _complain_about_values(points1, points2, weights)
 
@@ -123,7 +125,7 @@ def _complain_about_values(points1: Tensor, points2: Tensor, weights: Tensor | N
     for name, values in (("points1", points1), ("points2", points2), ("weights", weights)):
         if values is not None and (bad := int((~values.isfinite()).sum())):
             raise ValueError(f"{name} must be finite, got {bad} NaN or infinite values")
-    if weights is not None:
+    if weights is not None and bool((weights < 0).any()):
         raise ValueError(f"weights must not be negative, got a minimum of {weights.min().item():g}")
 
 
@@ -169,6 +171,16 @@ def read_condition(condition: Tensor) -> bool | None:
 def is_true(condition: Tensor) -> bool:
     """Return a boolean scalar's value; False where it cannot be read."""
     return read_condition(condition) is True
+
+
+def needs_gradient(value: Tensor) -> bool:
+    """Return whether derivatives by a tensor may be asked for; true where that cannot be told, as inside ``vmap``."""
+    if not torch.is_grad_enabled():
+        return False
+    if torch.compiler.is_compiling() or value.requires_grad:
+        return True
+    wrapped: bool = torch._C._functorch.is_functorch_wrapped_tensor(value)  # noqa: SLF001 (there is no public name)
+    return wrapped or unpack_dual(value).tangent is not None  # type: ignore[no-untyped-call]
 
 
 def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:

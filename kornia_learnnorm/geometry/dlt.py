@@ -1,4 +1,4 @@
-r"""Linear algebra of the DLT: design matrix, null vector, and small matrices.
+r"""Linear algebra of the DLT: design matrix and null vector.
 
 Every function is batched and has derivatives that stay finite on degenerate input.
 """
@@ -10,22 +10,20 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import safe_divisor
+from kornia_learnnorm.geometry.checks import is_true, needs_gradient, safe_divisor
 
 __all__ = [
     "MIN_GAP",
-    "adjugate",
-    "cofactors",
     "design_matrix",
     "independence_gap",
     "null_vector",
     "sideways_null_vector",
     "smallest_right_singular_vector",
-    "smallest_singular_vectors",
     "solve_null_vector",
 ]
 
 MIN_GAP = 1e-6  # relative gap above which a null vector counts as unique; that of float32 pixels
+MIN_GRAM_RATIO = 1e-5  # of the last but one singular value to the first; below, a Gram matrix has lost too many digits
 MAX_ZERO_VALUE = 1e-10  # relative singular value up to which dependent rows have another null vector
 
 
@@ -49,7 +47,8 @@ def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
     """
     KORNIA_CHECK_SHAPE(x1, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(x2, ["*", "N", "3"])
-    return (x2[..., :, None] * x1[..., None, :]).flatten(-2)
+    # On a CPU, three products with a column are faster than one outer product.
+    return torch.cat([x2[..., i : i + 1] * x1 for i in range(3)], -1)
 
 
 def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -72,9 +71,9 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
 def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
     r"""Return the null vector and the relative gap that tells how well the rows determine it.
 
-    With eight rows, the gap is the smallest distance of a row from the span of the rows before it over the largest such
-    distance, both from the QR factorisation of :math:`A^\top` whose last column is the null vector. With more, it is
-    the eighth singular value of :math:`\sqrt w A` over the first. Derivatives of the null vector grow as its inverse.
+    Of eight rows, the gap is the smallest pivot over the largest of the LU factorisation of :math:`A^\top` with partial
+    pivoting, whose unit lower triangular factor gives the null vector. Of more, it is the eighth singular value of
+    :math:`\sqrt w A` over the first. Derivatives of the null vector grow as its inverse.
 
     Args:
         A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
@@ -86,23 +85,39 @@ def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor,
 
     """
     if A.shape[-2] > 8:
-        s, Vh = _decompose(A, weights)
-        return _attach_derivatives(A, weights, s, Vh), s[..., 7] / safe_divisor(s[..., 0])
+        h, s = _smallest(A, weights)
+        return h, s[..., 7] / safe_divisor(s[..., 0])
     if weights is not None:
         A = A * (weights > 0).to(A)[..., None]
     with torch.no_grad():
-        Q, R = torch.linalg.qr(A.mT, mode="complete")
-        h0, pivots = Q[..., -1], R.diagonal(dim1=-2, dim2=-1).abs()
+        h0, pivots = _eliminate(A)
         gap = pivots.amin(-1) / safe_divisor(pivots.amax(-1))
-        independent = gap > independence_gap(A.dtype)
-        scale = torch.where(independent, pivots.amax(-1), 1.0)
+    if not needs_gradient(A):
+        return h0, gap
     # The linear system [A; h0^T] h = e9, with h0 held fixed, has the solution h0 and gives its derivatives. The
     # substitute enters before the solve and its result is dropped after it: no derivative meets a singular matrix.
+    independent = gap > independence_gap(A.dtype)
+    scale = torch.where(independent, pivots.amax(-1), 1.0)
     bordered = torch.cat([A / scale[..., None, None], h0[..., None, :]], -2)
     eye = torch.eye(9, dtype=A.dtype, device=A.device)
     bordered = torch.where(independent[..., None, None], bordered, eye)
     h = torch.linalg.solve_ex(bordered, eye[:, 8].expand(*A.shape[:-2], 9).unsqueeze(-1))[0].squeeze(-1)
-    return normalize(torch.where(independent[..., None], h, h0), dim=-1), gap
+    h = normalize(torch.where(independent[..., None], h, h0), dim=-1)
+    return h0 + (h - h.detach()), gap  # the values do not depend on whether derivatives are wanted
+
+
+def _eliminate(A: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return unit null vectors (*, 9) of eight rows and the magnitudes of the pivots (*, 8).
+
+    With :math:`A^\top = P L U`, a vector :math:`P [y; 1]` with :math:`L_{1:8}^\top y = -L_9^\top` meets
+    :math:`L^\top P^\top h = 0` and so :math:`A h = 0`, also where :math:`U` is singular. No entry of :math:`L` exceeds
+    one.
+    """
+    LU, pivots, _ = torch.linalg.lu_factor_ex(A.mT)
+    y = torch.linalg.solve_triangular(LU[..., :8, :], -LU[..., 8:, :], upper=False, left=False, unitriangular=True)
+    P = torch.lu_unpack(LU, pivots, unpack_data=False)[0]
+    h = (P @ torch.cat([y, torch.ones_like(y[..., :1])], -1).mT)[..., 0]
+    return normalize(h, dim=-1), LU.diagonal(dim1=-2, dim2=-1).abs()
 
 
 def independence_gap(dtype: torch.dtype) -> float:
@@ -134,11 +149,11 @@ def sideways_null_vector(A: Tensor) -> Tensor:
 def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
     r"""Return the unit vector :math:`v` that minimises :math:`\sum_i w_i (A_i v)^2`, twice differentiable.
 
-    The value comes from a singular value decomposition held fixed, :math:`\sqrt{w} A = U \Sigma V^\top`; the
-    derivatives from two steps of the perturbation series of the last eigenvector of the Gram matrix, written in the
-    basis :math:`V`, where it is diagonal. So the condition number is never squared, other singular values may
-    coincide, the weights may be zero, and a last singular value that is not simple sends a zero gradient instead of an
-    infinite one.
+    The eigenvectors of the Gram matrix :math:`A^\top W A` are a start, and where it has lost the digits of small
+    singular values, the singular value decomposition of :math:`\sqrt w A`. Newton's steps from there, on residuals
+    :math:`A v`, give the digits and the derivatives. So the condition number is never squared, other singular values
+    may coincide, the weights may be zero, and a last singular value that is not simple sends a zero gradient instead of
+    an infinite one.
 
     Args:
         A: matrices with shape :math:`(*, M, n)`, :math:`M \ge n`.
@@ -152,60 +167,44 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
         tensor([0., 1., 0.])
 
     """
-    return _attach_derivatives(A, weights, *_decompose(A, weights))
+    return _smallest(A, weights)[0]
 
 
-def smallest_singular_vectors(A: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return the left and right singular vectors of the smallest singular value, twice differentiable."""
+def _smallest(A: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the vector of :func:`smallest_right_singular_vector` and all singular values of ``sqrt(weights) A``."""
+    gram = A.mT @ (A if weights is None else A * weights[..., None])
     with torch.no_grad():
-        U, s, Vh = torch.linalg.svd(A)
-    return _attach_derivatives(A.mT, None, s, U.mT), _attach_derivatives(A, None, s, Vh)
-
-
-@torch.no_grad()
-def _decompose(A: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return singular values and right singular vectors of ``sqrt(weights) A``."""
-    weighted = A if weights is None else A * weights.sqrt()[..., None]
-    _, s, Vh = torch.linalg.svd(weighted, full_matrices=False)
-    return s, Vh
-
-
-def _attach_derivatives(A: Tensor, weights: Tensor | None, s: Tensor, Vh: Tensor) -> Tensor:
-    """Return the last row of ``Vh`` with its derivatives by ``A`` and the weights."""
-    with torch.no_grad():
+        s, Vh = _decompose(gram, A, weights)
+        others, v = Vh[..., :-1, :], Vh[..., -1, :]
         gap = s[..., :-1].square() - s[..., -1:].square()
         simple = gap > 64 * torch.finfo(A.dtype).eps * s[..., :-1] * s[..., :1]
         inverse_gap = torch.where(simple, gap, torch.inf).reciprocal()
-    C = A @ Vh.mT
-    G = C.mT @ (C if weights is None else C * weights[..., None])
-    G11, g = G[..., :-1, :-1], G[..., :-1, -1]
-    x = -inverse_gap * g
-    eigenvalue = G[..., -1:, -1] + (g * x).sum(-1, keepdim=True)
-    x = x - inverse_gap * ((G11 @ x[..., None]).squeeze(-1) - eigenvalue * x + g)
-    v = (Vh.mT @ torch.cat([x, torch.ones_like(x[..., :1])], -1)[..., None]).squeeze(-1)
-    return normalize(v, dim=-1)
+        residual = A @ v[..., None]
+        gradient = (A.mT @ (residual if weights is None else residual * weights[..., None]))[..., 0]
+        v = normalize(_newton_step(v, gradient, others, inverse_gap), dim=-1)
+    if not needs_gradient(gram):
+        return v, s
+    x = v
+    for _ in range(2):  # each makes the derivatives of one more order right
+        x = _newton_step(x, (gram @ x[..., None])[..., 0], others, inverse_gap)
+    x = normalize(x, dim=-1)
+    return v + (x - x.detach()), s  # the values do not depend on whether derivatives are wanted
 
 
-def adjugate(A: Tensor) -> Tensor:
-    r"""Return the adjugate of matrices :math:`(*, 3, 3)`: :math:`\mathrm{adj}(A)\, A = \det(A)\, I`.
+def _decompose(gram: Tensor, A: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return singular values and right singular vectors of ``sqrt(weights) A``, the last a good start."""
+    values, vectors = torch.linalg.eigh(gram)
+    s, Vh = values.clamp(min=0).sqrt().flip(-1), vectors.mT.flip(-2)
+    safe = s[..., -2] > MIN_GRAM_RATIO * s[..., 0]
+    if is_true(safe.all()):
+        return s, Vh
+    _, s_exact, Vh_exact = torch.linalg.svd(
+        A if weights is None else A * weights.sqrt()[..., None], full_matrices=False
+    )
+    return torch.where(safe[..., None], s, s_exact), torch.where(safe[..., None, None], Vh, Vh_exact)
 
-    Example:
-        >>> adjugate(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
-        tensor([[6., 0., 0.],
-                [0., 3., 0.],
-                [0., 0., 2.]])
 
-    """
-    return cofactors(A).mT
-
-
-def cofactors(A: Tensor) -> Tensor:
-    r"""Return the cofactors of matrices :math:`(*, 3, 3)`, the gradient of the determinant.
-
-    Example:
-        >>> cofactors(torch.diag(torch.tensor([1.0, 2.0, 3.0]))).diagonal()
-        tensor([6., 3., 2.])
-
-    """
-    rows: Tensor = torch.linalg.cross(A.roll(-1, -2), A.roll(-2, -2))
-    return rows
+def _newton_step(v: Tensor, image: Tensor, others: Tensor, inverse_gap: Tensor) -> Tensor:
+    """Return the vector after a step to the last eigenvector of a Gram matrix, of which ``image`` is the product."""
+    image = image - (v * image).sum(-1, keepdim=True) / (v * v).sum(-1, keepdim=True) * v
+    return v - (others.mT @ (inverse_gap * (others @ image[..., None])[..., 0])[..., None])[..., 0]

@@ -9,7 +9,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import read_condition, solve_dtype
+from kornia_learnnorm.geometry.checks import needs_gradient, read_condition, solve_dtype
 from kornia_learnnorm.geometry.dlt import (
     MIN_GAP,
     design_matrix,
@@ -17,7 +17,7 @@ from kornia_learnnorm.geometry.dlt import (
     sideways_null_vector,
     solve_null_vector,
 )
-from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental
+from kornia_learnnorm.geometry.transforms import hartley_coordinates, transform_fundamental
 
 __all__ = ["LinearProblem"]
 
@@ -64,9 +64,7 @@ class LinearProblem:
         r"""Return the problem of correspondences, in float64 where the device has it."""
         dtype = solve_dtype(points1.device)
         points1, points2, weights = points1.to(dtype), points2.to(dtype), None if weights is None else weights.to(dtype)
-        T1, T2 = hartley_transform(points1, weights), hartley_transform(points2, weights)
-        x1 = convert_points_to_homogeneous(points1) @ T1.mT
-        x2 = convert_points_to_homogeneous(points2) @ T2.mT
+        (x1, x2), (T1, T2) = hartley_coordinates(torch.stack([points1, points2]), weights)
         return cls(points1, points2, weights, T1, T2, x1, x2)
 
     @property
@@ -111,10 +109,11 @@ class LinearProblem:
         if T1 is self.T1 and T2 is self.T2:
             return self._solve()
         if self.points1.shape[1] == 8:
-            R1, R2 = self.T1 @ torch.linalg.inv_ex(T1)[0], self.T2 @ torch.linalg.inv_ex(T2)[0]
+            R1, R2 = torch.stack([self.T1, self.T2]) @ torch.linalg.inv_ex(torch.stack([T1, T2]))[0]
             F = transform_fundamental(self.null_matrix, R1, R2)
             # A null matrix without gradient must not get one by way of Hartley's transforms either.
-            F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
+            if needs_gradient(F):
+                F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
             return F / torch.linalg.matrix_norm(F, keepdim=True), self.gap
         x1, x2 = convert_points_to_homogeneous(self.points1), convert_points_to_homogeneous(self.points2)
         return self._solve_between(x1 @ T1.mT, x2 @ T2.mT)[0]

@@ -13,7 +13,8 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, check_tensor
 from kornia_learnnorm.geometry.distances import line_norms
-from kornia_learnnorm.geometry.dlt import cofactors, design_matrix, smallest_right_singular_vector
+from kornia_learnnorm.geometry.dlt import design_matrix
+from kornia_learnnorm.geometry.matrices import cofactors, smallest_right_singular_vector_3x3
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
 
@@ -43,7 +44,7 @@ def rank2_projection(F_mat: Tensor) -> Tensor:
 
     """
     check_tensor("F_mat", F_mat, ["*", "3", "3"])
-    v = smallest_right_singular_vector(F_mat)[..., None]
+    v = smallest_right_singular_vector_3x3(F_mat)[..., None]
     return F_mat - (F_mat @ v) @ v.mT
 
 

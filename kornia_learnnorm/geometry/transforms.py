@@ -7,11 +7,13 @@ import math
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
+from torch.nn.functional import pad
 
 from kornia_learnnorm.geometry.checks import solve_dtype, weighted_mean
 
 __all__ = [
     "affine_transform",
+    "hartley_coordinates",
     "hartley_transform",
     "inverse_sqrt",
     "paper_transform",
@@ -81,20 +83,29 @@ def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:
     Coincident points keep their scale.
 
     Args:
-        points: points with shape :math:`(B, N, 2)`.
-        weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+        points: points with shape :math:`(*, N, 2)`.
+        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
 
     Returns:
-        transforms with shape :math:`(B, 3, 3)`.
+        transforms with shape :math:`(*, 3, 3)`.
 
     Reference:
         R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; Fan et al., Eq. 4.
 
     """
+    return hartley_coordinates(points, weights)[1]
+
+
+def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Return homogeneous points (*, N, 3) in Hartley's coordinates, and :func:`hartley_transform`."""
     origin = weighted_mean(points, weights)
-    radius = weighted_mean((points - origin[:, None]).norm(dim=-1, keepdim=True), weights)[..., 0]
+    centred = points - origin[..., None, :]
+    radius = weighted_mean(torch.linalg.vector_norm(centred, dim=-1, keepdim=True), weights)[..., 0]
     scale = math.sqrt(2) / torch.where(radius > _rounding(origin), radius, math.sqrt(2))
-    return affine_transform(scale[:, None, None] * torch.eye(2).to(points), origin)
+    shift_x, shift_y = (-scale[..., None] * origin).unbind(-1)
+    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
+    entries = torch.stack([scale, zero, shift_x, zero, scale, shift_y, zero, zero, one], -1)
+    return pad(centred * scale[..., None, None], (0, 1), value=1.0), torch.unflatten(entries, -1, (3, 3))
 
 
 def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: float = 1e-6) -> Tensor:
@@ -103,22 +114,22 @@ def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: fl
     :math:`T = [\Sigma^{-1/2}, -\Sigma^{-1/2} o; 0, 1]` with the symmetric root (ZCA), in closed form.
 
     Args:
-        points: points with shape :math:`(B, N, 2)`.
-        weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
+        points: points with shape :math:`(*, N, 2)`.
+        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
         floor: smallest ratio of the eigenvalues of :math:`\Sigma`.
 
     Returns:
-        transforms with shape :math:`(B, 3, 3)`.
+        transforms with shape :math:`(*, 3, 3)`.
 
     """
     dtype = solve_dtype(points.device)
     x, w = points.to(dtype), None if weights is None else weights.to(dtype)
     origin = weighted_mean(x, w)
-    centred = x - origin[:, None]
-    products = (centred[..., :, None] * centred[..., None, :]).flatten(-2)
+    centred = x - origin[..., None, :]
+    products = torch.cat([centred[..., :1] * centred, centred[..., 1:] * centred], -1)
     covariance = torch.unflatten(weighted_mean(products, w), -1, (2, 2))
     spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-    covariance = torch.where((spread > _rounding(origin))[:, None, None], covariance, 0.0)
+    covariance = torch.where((spread > _rounding(origin))[..., None, None], covariance, 0.0)
     return affine_transform(inverse_sqrt(covariance, floor), origin).to(points.dtype)
 
 

@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import safe_divisor, weighted_mean
 from kornia_learnnorm.geometry.distances import line_norms
-from kornia_learnnorm.geometry.dlt import adjugate, smallest_right_singular_vector
+from kornia_learnnorm.geometry.matrices import adjugate, smallest_right_singular_vector_3x3
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, whitening_transform
 from kornia_learnnorm.normalizers.contract import ProblemNormalizer
@@ -68,47 +68,49 @@ class ReweightedWhitening(ProblemNormalizer):
             held = problem.detach(~problem.determined)
         else:
             held = problem
-        w1, w2 = self._weigh(held)
+        x = torch.stack([held.x1, held.x2])
         # Hartley's coordinates keep the shape of the pixels, which the distances to lines need.
-        T1, T2 = whitening_transform(held.x1[..., :2], w1), whitening_transform(held.x2[..., :2], w2)
-        return T1 @ problem.T1, T2 @ problem.T2
+        T1, T2 = whitening_transform(x[..., :2], self._weigh(x, held)) @ torch.stack([problem.T1, problem.T2])
+        return T1, T2
 
     def extra_repr(self) -> str:
         """Return the parameters."""
         return f"iterations={self.iterations}, damping={self.damping:g}"
 
-    def _weigh(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
-        """Return the weights of the last whitening, of both views, ``(B, N)``."""
-        x1, x2, weights, F0 = problem.x1, problem.x2, problem.weights, problem.null_matrix
+    def _weigh(self, x: Tensor, problem: LinearProblem) -> Tensor:
+        """Return the weights of the last whitening of both views, ``(2, B, N)``, for their points ``(2, B, N, 3)``."""
+        weights, F0 = problem.weights, problem.null_matrix
         given: Tensor | float = 1.0 if weights is None else weights
-        w1 = w2 = given * _distance_scale(x1, x2, F0, weights)
+        w = (given * _distance_scale(problem.x1, problem.x2, F0, weights)).expand(x.shape[:-1])
         if self.iterations == 0:
-            return w1, w2
+            return w
         # Adjugates stand for inverses: a line has no scale, and they exist where inverses do not.
         inverse = adjugate(F0)
-        b = _first_line(x1, x2, F0, w1)
-        a = _solve(x2, w2, inverse.mT, b)
+        inverses = torch.stack([inverse, inverse.mT])
+        b = _first_line(x, F0, w)
+        lines = torch.stack([b, _solve(x[1], w[1], inverse.mT, b)])
         for iteration in range(self.iterations):
             if iteration:
-                b, a = _solve(x1, w1, inverse, a), _solve(x2, w2, inverse.mT, b)
-            r1, r2 = (x1 @ b[..., None]).squeeze(-1).abs(), (x2 @ a[..., None]).squeeze(-1).abs()
-            w = _distance_scale(x1, x2, _corrected(F0, inverse, a, b), weights)
-            residual = w * r1 * r2
+                lines = _solve(x, w, inverses, lines.flip(0))
+            b, a = lines
+            r = (x @ lines[..., None]).squeeze(-1).abs()
+            scale = _distance_scale(problem.x1, problem.x2, _corrected(F0, inverse, a, b), weights)
+            residual = scale * r[0] * r[1]
             floor = self.damping * safe_divisor(weighted_mean(residual[..., None], weights))
-            factor = given * w.square() / (residual + floor)
-            w1, w2 = _unit_mean(factor * r2.square()), _unit_mean(factor * r1.square())
-        return w1, w2
+            factor = given * scale.square() / (residual + floor)
+            w = _unit_mean(factor * r.flip(0).square())
+        return w
 
 
-def _first_line(x1: Tensor, x2: Tensor, F0: Tensor, w: Tensor) -> Tensor:
+def _first_line(x: Tensor, F0: Tensor, w: Tensor) -> Tensor:
     """Return view 1's line of the rank-2 correction in the coordinates whitened with ``w``, ``(B, 3)``, unit norm."""
-    T1, T2 = whitening_transform(x1[..., :2], w), whitening_transform(x2[..., :2], w)
-    F_hat = transform_fundamental(F0, torch.linalg.inv_ex(T1)[0], torch.linalg.inv_ex(T2)[0])
-    return normalize((T1.mT @ smallest_right_singular_vector(F_hat)[..., None]).squeeze(-1), dim=-1)
+    T = whitening_transform(x[..., :2], w)
+    F_hat = transform_fundamental(F0, *torch.linalg.inv_ex(T)[0])
+    return normalize((T[0].mT @ smallest_right_singular_vector_3x3(F_hat)[..., None]).squeeze(-1), dim=-1)
 
 
 def _solve(x: Tensor, w: Tensor, inverse: Tensor, line: Tensor) -> Tensor:
-    """Return the best line of one view for the other view's ``line``: weighted least squares, ``(B, 3)``, unit norm."""
+    """Return the best line of a view for the other view's ``line``: weighted least squares, ``(*, 3)``, unit norm."""
     moments = x.mT @ (w[..., None] * x)
     solution = (adjugate(moments) @ (inverse @ line[..., None])).squeeze(-1)
     # Not `normalize`, whose floor leaves short lines short: from singular moments, shorter with every iteration.

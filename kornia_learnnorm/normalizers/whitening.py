@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -39,10 +40,8 @@ class Whitening(ProblemNormalizer):
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views."""
-        return (
-            whitening_transform(problem.points1, problem.weights, self.floor),
-            whitening_transform(problem.points2, problem.weights, self.floor),
-        )
+        T1, T2 = whitening_transform(torch.stack([problem.points1, problem.points2]), problem.weights, self.floor)
+        return T1, T2
 
     def extra_repr(self) -> str:
         """Return the parameters."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.robust_losses import Loss
 from kornia_learnnorm.geometry.distances import DistanceScale, sampson_scale
-from kornia_learnnorm.geometry.dlt import cofactors
+from kornia_learnnorm.geometry.matrices import cofactors
 
 __all__ = ["Fit", "constrained_fit"]
 

@@ -10,7 +10,8 @@ from torch.autograd import gradcheck, gradgradcheck
 from two_view import SCENES, correspondences, homogeneous, numpy_hartley, signless, uniform
 
 from kornia_learnnorm import design_matrix, null_vector
-from kornia_learnnorm.geometry.dlt import adjugate, sideways_null_vector, smallest_right_singular_vector
+from kornia_learnnorm.geometry.dlt import sideways_null_vector, smallest_right_singular_vector
+from kornia_learnnorm.geometry.matrices import adjugate
 
 
 class TestDesignMatrix:

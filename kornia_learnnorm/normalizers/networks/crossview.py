@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import weighted_mean
-from kornia_learnnorm.geometry.dlt import design_matrix, null_vector, smallest_singular_vectors
+from kornia_learnnorm.geometry.dlt import design_matrix, null_vector
+from kornia_learnnorm.geometry.matrices import smallest_singular_vectors
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 
@@ -102,7 +103,10 @@ class CrossViewNetwork(nn.Module):
             null_matrix = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
         F = null_matrix * _sign(null_matrix)
         u, v = smallest_singular_vectors(F)
-        return _epipolar_features(x1, x2, F, v, u, weights), _epipolar_features(x2, x1, F.mT, u, v, weights)
+        own, other, doubled = torch.stack([x1, x2]), torch.stack([x2, x1]), torch.stack([F, F.mT])
+        features = _epipolar_features(own, other, doubled, torch.stack([v, u]), torch.stack([u, v]), weights)
+        points, sets = (part.unbind(0) for part in features)
+        return (points[0], sets[0]), (points[1], sets[1])
 
     @property
     def dtype(self) -> torch.dtype:

@@ -1,0 +1,133 @@
+r"""Closed forms for matrices of three rows and columns: cofactors, and the vectors of the smallest singular value.
+
+A batch of them costs a few elementwise operations, where a decomposition loops over the batch.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from kornia_learnnorm.geometry.checks import needs_gradient, safe_divisor
+
+__all__ = ["adjugate", "cofactors", "determinant", "smallest_right_singular_vector_3x3", "smallest_singular_vectors"]
+
+RANK1_WEIGHT = 1e-27  # of the complement of the rows, above the square of what rounding leaves of vanishing cofactors
+MIN_RELATIVE_GAP = 1e-14  # of the two largest eigenvalues of the cofactors' Gram matrix, for a unique vector
+
+
+def adjugate(A: Tensor) -> Tensor:
+    r"""Return the adjugate of matrices :math:`(*, 3, 3)`: :math:`\mathrm{adj}(A)\, A = \det(A)\, I`.
+
+    Example:
+        >>> adjugate(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
+        tensor([[6., 0., 0.],
+                [0., 3., 0.],
+                [0., 0., 2.]])
+
+    """
+    return cofactors(A).mT
+
+
+def cofactors(A: Tensor) -> Tensor:
+    r"""Return the cofactors of matrices :math:`(*, 3, 3)`, the gradient of the determinant.
+
+    Example:
+        >>> cofactors(torch.diag(torch.tensor([1.0, 2.0, 3.0]))).diagonal()
+        tensor([6., 3., 2.])
+
+    """
+    rows: Tensor = torch.linalg.cross(A.roll(-1, -2), A.roll(-2, -2))
+    return rows
+
+
+def determinant(A: Tensor) -> Tensor:
+    r"""Return the determinants of matrices :math:`(*, 3, 3)`.
+
+    Example:
+        >>> determinant(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
+        tensor(6.)
+
+    """
+    value: Tensor = (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(-1)
+    return value
+
+
+def smallest_right_singular_vector_3x3(A: Tensor) -> Tensor:
+    r"""Return the right singular vector of the smallest singular value, twice differentiable.
+
+    The cofactors :math:`C = \det(A) A^{-\top}` have the singular vectors of :math:`A`, with singular values
+    :math:`\sigma_1 \sigma_2 \ge \sigma_1 \sigma_3 \ge \sigma_2 \sigma_3`. So the vector belongs to the **largest**
+    eigenvalue of :math:`C^\top C`, which the trigonometric solution of the characteristic polynomial gives with all its
+    digits: no condition number is squared.
+
+    Args:
+        A: matrices with shape :math:`(*, 3, 3)`.
+
+    Returns:
+        unit vectors with shape :math:`(*, 3)`, sign arbitrary. Where the smallest singular value is not simple it is
+        one of its vectors and sends no gradient.
+
+    Example:
+        >>> smallest_right_singular_vector_3x3(torch.diag(torch.tensor([3.0, 0.5, 2.0]))).abs()
+        tensor([0., 1., 0.])
+
+    """
+    return _smallest(A)[0]
+
+
+def smallest_singular_vectors(A: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return the left and right singular vectors of the smallest singular value, twice differentiable.
+
+    As :func:`smallest_right_singular_vector_3x3`, with :math:`u \propto C v`.
+    """
+    v, C = _smallest(A)
+    return _unit((C @ v[..., None])[..., 0]), v
+
+
+def _smallest(A: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the vector, and the cofactors up to scale."""
+    A = A / safe_divisor(torch.linalg.matrix_norm(A.detach(), keepdim=True))
+    C, eye = cofactors(A), torch.eye(3, dtype=A.dtype, device=A.device)
+    # All that a matrix of rank one leaves are the vectors orthogonal to its rows.
+    M = C.mT @ C + RANK1_WEIGHT * (eye - A.mT @ A)
+    with torch.no_grad():
+        v, largest = _largest_eigenvector(M, eye)
+    if not needs_gradient(M):
+        return v, C
+    with torch.no_grad():
+        # The inverse of H on the complement of its null vector v, where it has two eigenvalues: (tr H - H) / product.
+        H = largest * eye - M
+        trace = H.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        product = (trace.square() - H.square().sum((-2, -1), keepdim=True)) / 2
+        simple = product > MIN_RELATIVE_GAP * largest * trace
+        P = eye - v[..., :, None] * v[..., None, :]
+        inverse = torch.where(simple, (trace * P - H) / torch.where(simple, product, 1.0), 0.0)
+    x = v
+    for _ in range(2):  # Newton's steps from the solution; each makes the derivatives of one more order right
+        image = (M @ x[..., None])[..., 0]
+        eigenvalue = (x * image).sum(-1, keepdim=True) / (x * x).sum(-1, keepdim=True)
+        x = x + (inverse @ (image - eigenvalue * x)[..., None])[..., 0]
+    x = normalize(x, dim=-1)
+    return v + (x - x.detach()), C  # the values do not depend on whether derivatives are wanted
+
+
+def _largest_eigenvector(M: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
+    """Return unit vectors (*, 3) and eigenvalues (*, 1, 1) of positive semidefinite matrices."""
+    mean = M.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / 3
+    B = M - mean * eye
+    spread = torch.linalg.matrix_norm(B, keepdim=True) / 6**0.5
+    cosine = determinant(B / safe_divisor(spread)).div_(2).clamp_(-1, 1)[..., None, None]
+    largest = mean + 2 * spread * torch.cos(torch.acos(cosine) / 3)
+    columns = adjugate(M - largest * eye)  # a multiple of v v^T
+    # Of a double largest eigenvalue nothing is left; all columns of M are its vectors.
+    unique = columns.diagonal(dim1=-2, dim2=-1).amax(-1) > MIN_RELATIVE_GAP * largest[..., 0, 0].square()
+    columns = torch.where(unique[..., None, None], columns, M)
+    best = columns.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    v = columns.gather(-1, best[..., None, None].expand(*best.shape, 3, 1))[..., 0]
+    return _unit((M @ v[..., None])[..., 0]), largest
+
+
+def _unit(v: Tensor) -> Tensor:
+    return v / safe_divisor(torch.linalg.vector_norm(v, dim=-1, keepdim=True))
