@@ -118,7 +118,7 @@ def _largest_eigenvector(M: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
     mean = M.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / 3
     B = M - mean * eye
     spread = torch.linalg.matrix_norm(B, keepdim=True) / 6**0.5
-    cosine = determinant(B / safe_divisor(spread)).div_(2).clamp_(-1, 1)[..., None, None]
+    cosine = (determinant(B / safe_divisor(spread)) / 2).clamp(-1, 1)[..., None, None]
     largest = mean + 2 * spread * torch.cos(torch.acos(cosine) / 3)
     columns = adjugate(M - largest * eye)  # a multiple of v v^T
     # Of a double largest eigenvalue nothing is left; all columns of M are its vectors.
