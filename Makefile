@@ -4,6 +4,7 @@
 # make lint   set up, run the linters and the type checker
 # make docs   set up, build the documentation in docs/_build/html
 # make audit  report known vulnerabilities of the locked packages; never fails
+# make bench   set up, time all estimators beside Kornia's; DEVICE=cuda on a GPU
 # make wheel  build wheel and sdist in dist/, the same bytes for the same commit; make check-wheel checks their metadata
 # make ablations DATA=<folder>, make table1 DATA=<folder>   train what is not trained yet, print the tables; -j 2 for two at once
 # make layer-ablations DATA=<folder>   those of the learned layer alone
@@ -21,7 +22,7 @@ AUDIT := .venv-audit
 TWINE := .venv-twine
 comma := ,
 
-.PHONY: demo test test-cpus lint docs audit wheel check-wheel clean ablations layer-ablations table1
+.PHONY: bench demo test test-cpus lint docs audit wheel check-wheel clean ablations layer-ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -128,6 +129,10 @@ runs/table1/paper-%/weights.safetensors: | $(VENV)/.ready
 
 runs/table1/crossview-%/weights.safetensors: | $(VENV)/.ready
 	$(FIT) --config configs/crossview.yaml --config configs/table1/crossview-$*.yaml $(INTO)
+
+DEVICE ?= cpu
+bench: $(VENV)/.ready
+	$(BIN)/python benchmarks/speed.py --device $(DEVICE) --out runs/speed-$(DEVICE).json
 
 # Two builds of one commit give the same bytes: files are dated by the commit.
 wheel: export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct 2>/dev/null || echo 1577836800)

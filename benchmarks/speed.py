@@ -1,0 +1,220 @@
+"""Time estimators of the fundamental matrix side by side: eights and larger sets, forward and backward, one and many.
+
+    python benchmarks/speed.py [--out speed.json] [--device cpu] [--dtype float32] [--compile] [--quick]
+
+All methods take turns in one process on the same synthetic correspondences, with 40 % outliers in sets of more than
+eight. The tables have the median time of a batch in milliseconds and, in brackets, its ratio to Kornia's
+``find_fundamental``. Estimators of single pairs (OpenCV, PoseLib, RANSAC) are called once for each set of the batch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.epipolar import find_fundamental
+from torch import Tensor, nn
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.synthetic import random_scenes
+from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.files import write_text
+
+KORNIA = "kornia"
+SECONDS = 1.5  # spent on a method in a table's cell, at most
+MIN_TURNS, MAX_TURNS = 5, 101
+LARGE_FOR_PAIRS = 64  # sets in a batch, above which estimators of single pairs are left out
+
+Method = Callable[[Tensor, Tensor], Tensor]
+
+
+class Case(NamedTuple):
+    """A size of the input."""
+
+    batch: int
+    number: int  # of correspondences in a set
+
+    def __str__(self) -> str:
+        """Return the size as the tables print it."""
+        return f"{self.batch} x {self.number}"
+
+
+EIGHTS = [Case(batch, 8) for batch in (1, 64, 2048, 16384)]
+SETS = [Case(batch, number) for number in (32, 128, 512, 2000) for batch in (1, 32)] + [Case(64, 128), Case(64, 1000)]
+
+
+def solvers(device: str) -> dict[str, Method]:
+    """Return differentiable solvers without outlier rejection."""
+
+    def ours(normalizer: nn.Module, **options: str) -> Method:
+        module = normalizer.to(device)
+        return lambda x1, x2: kln.find_fundamental(x1, x2, normalizer=module, **options)
+
+    return {
+        KORNIA: find_fundamental,
+        "Hartley": ours(kln.Hartley()),
+        "whitening": ours(kln.Whitening()),
+        "optimal": ours(kln.Hartley(), rank2="optimal"),
+        "reweighted": ours(kln.ReweightedWhitening()),
+        "crossview": ours(kln.LearnedNormalizer.from_pretrained("crossview")),
+        "paper": ours(kln.LearnedNormalizer.from_pretrained("paper")),
+    }
+
+
+def robust(device: str) -> dict[str, Method]:
+    """Return estimators for correspondences with outliers."""
+    start = kln.EightPoint()
+
+    def refined(x1: Tensor, x2: Tensor) -> Tensor:
+        return kln.refine_fundamental(x1, x2, start(x1, x2), loss=kln.GemanMcClure(1.0)).F_mat
+
+    return {
+        KORNIA: find_fundamental,
+        "Hartley + LM": refined,
+        "learned": kln.LearnedEightPoint.from_pretrained().to(device),
+    }
+
+
+def single_pairs() -> dict[str, Method]:
+    """Return the estimators of single pairs that are installed, without gradients."""
+    ransac = kln.RANSAC(seed=0)
+    methods: dict[str, Method] = {"RANSAC": lambda x1, x2: ransac(x1, x2)[0]}
+    try:
+        import cv2
+
+        def opencv(x1: Tensor, x2: Tensor) -> Tensor:
+            return torch.from_numpy(cv2.findFundamentalMat(x1.numpy(), x2.numpy(), cv2.FM_8POINT)[0])
+
+        methods["OpenCV FM_8POINT"] = opencv
+    except ImportError:
+        pass
+    try:
+        import poselib
+
+        def lo_ransac(x1: Tensor, x2: Tensor) -> Tensor:
+            return torch.from_numpy(poselib.estimate_fundamental(x1.double().numpy(), x2.double().numpy(), {}, {})[0])
+
+        methods["PoseLib"] = lo_ransac
+    except ImportError:
+        pass
+    return {name: _one_by_one(method) for name, method in methods.items()}
+
+
+def _one_by_one(method: Method) -> Method:
+    return lambda x1, x2: torch.stack([method(*pair).to(x1) for pair in zip(x1, x2, strict=True)])
+
+
+def correspondences(case: Case, device: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Return noisy correspondences of synthetic scenes, two fifths of them outliers where there are more than eight."""
+    generator = torch.Generator().manual_seed(0)
+    scenes = random_scenes(case.batch, case.number, generator)
+    points1, points2 = scenes.points1.to(dtype), scenes.points2.to(dtype)
+    if case.number > 8:
+        wrong = 2 * case.number // 5
+        drawn = torch.rand(case.batch, wrong, 2, generator=generator).to(dtype) * scenes.image_size[:, None].to(dtype)
+        points2 = torch.cat([drawn, points2[:, wrong:]], 1)
+    return points1.to(device), points2.to(device)
+
+
+def measure(methods: dict[str, Method], case: Case, args: argparse.Namespace, backward: bool) -> dict[str, float]:
+    """Return the median milliseconds of each method on one batch, taken in turns."""
+    points = correspondences(case, args.device, getattr(torch, args.dtype))
+
+    def run(method: Method) -> float:
+        leaves = [p.clone().requires_grad_(backward) for p in points]
+        start = time.perf_counter()
+        with torch.set_grad_enabled(backward):
+            F_mat = method(*leaves)
+        if backward:
+            F_mat[:, 0].sum().backward()
+        if args.device != "cpu":
+            torch.cuda.synchronize()
+        return 1e3 * (time.perf_counter() - start)
+
+    first = {name: (run(method), run(method))[1] for name, method in methods.items()}
+    budget = 1e3 * SECONDS / (5 if args.quick else 1)
+    turns = int(min(MAX_TURNS, max(MIN_TURNS, budget / statistics.mean(first.values()))))
+    times: dict[str, list[float]] = {name: [] for name in methods}
+    for _ in range(turns):
+        for name, method in methods.items():
+            times[name].append(run(method))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def machine(args: argparse.Namespace) -> dict[str, object]:
+    """Return what the times depend on."""
+    processor = platform.processor()
+    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
+        if line.startswith("model name"):
+            processor = line.partition(":")[2].strip()
+            break
+    card = torch.cuda.get_device_name() if args.device.startswith("cuda") else None
+    return {
+        "processor": processor,
+        "threads": torch.get_num_threads(),
+        "load": round(os.getloadavg()[0], 1),
+        "torch": torch.__version__,
+        "device": card or args.device,
+        "dtype": args.dtype,
+        "compiled": args.compile,
+    }
+
+
+def table(results: dict[str, dict[str, float]]) -> str:
+    """Return a table with a row for each method and a column for each size: milliseconds, and the ratio to Kornia's."""
+    methods = list(dict.fromkeys(name for times in results.values() for name in times))
+
+    def cell(times: dict[str, float], name: str) -> str:
+        if name not in times:
+            return "-"
+        return f"{times[name]:.3g} ({times[name] / times[KORNIA]:.2f})"
+
+    rows = [[name, *(cell(times, name) for times in results.values())] for name in methods]
+    return format_table(["method", *results], rows)
+
+
+def main() -> None:
+    """Measure, print the tables and write the file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="JSON file for the results")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--dtype", choices=["float32", "float64"], default="float32")
+    parser.add_argument("--compile", action="store_true", help="torch.compile the solvers, Kornia's too")
+    parser.add_argument("--quick", action="store_true", help="fewer turns and sizes")
+    args = parser.parse_args()
+    differentiable, outliers = solvers(args.device), robust(args.device)
+    pairs = single_pairs() if args.device == "cpu" else {}
+    if args.compile:
+        differentiable = {name: torch.compile(method) for name, method in differentiable.items()}
+    eights, sets = (EIGHTS[:3], [SETS[3], SETS[5]]) if args.quick else (EIGHTS, SETS)
+    groups = {
+        "sets of eight": (eights, differentiable, ("OpenCV FM_8POINT",)),
+        "larger sets": (sets, {name: differentiable[name] for name in (KORNIA, "Hartley", "whitening", "optimal")}, ()),
+        "larger sets with outliers": (sets, outliers, ("RANSAC", "PoseLib")),
+    }
+    found: dict[str, object] = {"machine": machine(args)}
+    print(json.dumps(found["machine"]), flush=True)
+    for group, (cases, methods, others) in groups.items():
+        for backward in (False, True):
+            results = {}
+            for case in cases:
+                alone = {name: pairs[name] for name in others if name in pairs and not backward}
+                chosen = methods | (alone if case.batch <= LARGE_FOR_PAIRS else {})
+                results[str(case)] = measure(chosen, case, args, backward)
+            title = f"{group}, {'forward and backward' if backward else 'forward'}"
+            found[title] = results
+            print(f"\n{title}: ms a batch (ratio to Kornia)\n\n{table(results)}", flush=True)
+    if args.out is not None:
+        write_text(args.out, json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
