@@ -14,7 +14,8 @@ from kornia_learnnorm.geometry.checks import needs_gradient, safe_divisor
 __all__ = ["adjugate", "cofactors", "determinant", "smallest_right_singular_vector_3x3", "smallest_singular_vectors"]
 
 RANK1_WEIGHT = 1e-27  # of the complement of the rows, above the square of what rounding leaves of vanishing cofactors
-MIN_RELATIVE_GAP = 1e-14  # of the two largest eigenvalues of the cofactors' Gram matrix, for a unique vector
+EPSILON = 1e-15  # of the mean eigenvalue, which a threefold one leaves of itself
+MIN_RELATIVE_GAP = 1e-10  # of the two largest eigenvalues of the cofactors' Gram matrix, for a unique vector
 
 
 def adjugate(A: Tensor) -> Tensor:
@@ -88,6 +89,7 @@ def smallest_singular_vectors(A: Tensor) -> tuple[Tensor, Tensor]:
 
 def _smallest(A: Tensor) -> tuple[Tensor, Tensor]:
     """Return the vector, and the cofactors up to scale."""
+    A = A / safe_divisor(A.detach().abs().amax((-2, -1), keepdim=True))  # a norm could over- or underflow
     A = A / safe_divisor(torch.linalg.matrix_norm(A.detach(), keepdim=True))
     C, eye = cofactors(A), torch.eye(3, dtype=A.dtype, device=A.device)
     # All that a matrix of rank one leaves are the vectors orthogonal to its rows.
@@ -121,9 +123,10 @@ def _largest_eigenvector(M: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
     cosine = (determinant(B / safe_divisor(spread)) / 2).clamp(-1, 1)[..., None, None]
     largest = mean + 2 * spread * torch.cos(torch.acos(cosine) / 3)
     columns = adjugate(M - largest * eye)  # a multiple of v v^T
-    # Of a double largest eigenvalue nothing is left; all columns of M are its vectors.
+    # Of a double largest eigenvalue nothing is left; less the smallest one, all columns of M are its vectors.
+    smallest = (1 - EPSILON) * mean - 2 * spread
     unique = columns.diagonal(dim1=-2, dim2=-1).amax(-1) > MIN_RELATIVE_GAP * largest[..., 0, 0].square()
-    columns = torch.where(unique[..., None, None], columns, M)
+    columns = torch.where(unique[..., None, None], columns, M - smallest * eye)
     best = columns.diagonal(dim1=-2, dim2=-1).argmax(-1)
     v = columns.gather(-1, best[..., None, None].expand(*best.shape, 3, 1))[..., 0]
     return _unit((M @ v[..., None])[..., 0]), largest

@@ -11,7 +11,6 @@ from two_view import SCENES, correspondences, homogeneous, numpy_hartley, signle
 
 from kornia_learnnorm import design_matrix, null_vector
 from kornia_learnnorm.geometry.dlt import sideways_null_vector, smallest_right_singular_vector
-from kornia_learnnorm.geometry.matrices import adjugate
 
 
 class TestDesignMatrix:
@@ -132,26 +131,3 @@ class TestSmallestRightSingularVector:
         with torch.no_grad():
             slope = (square(A, weights + step) - square(A, weights)).sum(-1) / 1e-6
         assert gradient[:, 0].numpy() == pytest.approx(slope.numpy(), rel=1e-3)
-
-
-class TestAdjugate:
-    def test_is_determinant_times_inverse(self, dtype):
-        A = uniform(20, 3, 3, low=-1, dtype=dtype)
-        expected = np.linalg.det(A.numpy())[:, None, None] * np.linalg.inv(A.numpy())
-        np.testing.assert_allclose(adjugate(A).numpy(), expected, atol=2e-6 if dtype == torch.float32 else 1e-14)
-
-    def test_of_singular_matrices(self):
-        """Of rank 2, the product of both null vectors; of rank 1, zero."""
-        F_mat = uniform(20, 3, 2, low=-1) @ uniform(20, 2, 3, low=-1, seed=1)
-        U, s, Vh = np.linalg.svd(F_mat.numpy())
-        expected = (
-            np.linalg.det(U @ Vh)[:, None, None]
-            * (s[:, 0] * s[:, 1])[:, None, None]
-            * Vh[:, 2, :, None]
-            * U[:, None, :, 2]
-        )
-        np.testing.assert_allclose(adjugate(F_mat).numpy(), expected, atol=1e-14)
-        assert adjugate(uniform(20, 3, 1) @ uniform(20, 1, 3, seed=1)).abs().max() < 1e-15
-
-    def test_gradcheck(self):
-        assert gradcheck(adjugate, [uniform(2, 3, 3, low=-1).requires_grad_()])

@@ -1,0 +1,46 @@
+"""Guards of the speed that do not depend on the machine: operations and factorisations of a forward pass."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from two_view import correspondences
+
+from kornia_learnnorm import EightPoint, Hartley, LearnedEightPoint, LearnedNormalizer, ReweightedWhitening, Whitening
+
+FACTORISATIONS = ("linalg_lu_factor_ex", "_linalg_eigh", "_linalg_svd", "linalg_qr", "_linalg_det", "linalg_inv_ex")
+
+
+class Operations(TorchDispatchMode):
+    """Counts the operations that reach the device, by name."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = Counter()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.names[function.overloadpacket._qualified_op_name.partition("::")[2]] += 1
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(
+    ("layer", "num_points", "most", "factorisations"),
+    [
+        (EightPoint(Hartley()), 8, 245, 1),
+        (EightPoint(Whitening()), 8, 390, 2),
+        (EightPoint(Hartley(), rank2="optimal"), 8, 520, 2),
+        (EightPoint(ReweightedWhitening()), 8, 2100, 3),
+        (EightPoint(LearnedNormalizer.from_pretrained()), 8, 2600, 4),
+        (EightPoint(Hartley()), 128, 300, 1),
+        (LearnedEightPoint.from_pretrained(), 128, 6900, 10),
+    ],
+)
+def test_operations_of_a_forward_pass(layer, num_points, most, factorisations):
+    points = correspondences("handheld", 64, num_points)
+    with torch.no_grad(), Operations() as operations:
+        layer(*points)
+    assert sum(operations.names.values()) <= most
+    assert sum(operations.names[name] for name in FACTORISATIONS) <= factorisations

@@ -1,0 +1,111 @@
+"""Closed forms of matrices of three rows and columns against NumPy's decompositions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck, gradgradcheck
+from two_view import uniform
+
+from kornia_learnnorm.geometry.matrices import (
+    adjugate,
+    determinant,
+    smallest_right_singular_vector_3x3,
+    smallest_singular_vectors,
+)
+
+
+def with_singular_values(values: list[float], number: int = 50) -> torch.Tensor:
+    """Return random matrices (number, 3, 3) with these singular values."""
+    rng = np.random.default_rng(0)
+    U, V = (np.linalg.qr(rng.normal(size=(number, 3, 3)))[0] for _ in range(2))
+    return torch.from_numpy(U @ np.diag(values) @ V)
+
+
+class TestSmallestSingularVectors:
+    @pytest.mark.parametrize(
+        "values",
+        [
+            [1, 0.5, 0.1],
+            [1, 1, 0.2],
+            [1, 1e-3, 0],
+            [1, 1e-4, 0.99e-4],
+            [1, 1e-8, 1e-10],
+            [1e-200, 1e-201, 0],
+            [1e200, 1e199, 1e198],
+        ],
+    )
+    def test_agree_with_the_decomposition(self, values):
+        A = with_singular_values(values)
+        U, s, Vh = np.linalg.svd(A.numpy())
+        u, v = smallest_singular_vectors(A)
+        error = np.abs(np.stack([(u.numpy() * U[..., 2]).sum(-1), (v.numpy() * Vh[:, 2]).sum(-1)]))
+        # Rounding turns the vectors by its size over that of the gap.
+        bound = 1e-14 * s[:, 0] / (s[:, 1] - s[:, 2])
+        assert (np.sqrt(2 * np.abs(1 - error)) < np.maximum(100 * bound, 1e-7)).all()
+        assert torch.equal(v, smallest_right_singular_vector_3x3(A))
+
+    @pytest.mark.parametrize("values", [[1, 0.3, 0.3], [1, 1, 1], [1, 0, 0], [1e-5, 0, 0]])
+    def test_minimise_where_not_simple(self, values):
+        A = with_singular_values(values)
+        v = smallest_right_singular_vector_3x3(A.requires_grad_())
+        image = torch.linalg.vector_norm(A @ v[..., None], dim=(1, 2))
+        assert (image - values[2]).abs().max() < 1e-6 * values[0]
+        assert (v.norm(dim=-1) - 1).abs().max() < 1e-14
+        (gradient,) = torch.autograd.grad(v @ uniform(3), A, torch.ones(50, dtype=torch.float64))
+        assert gradient.isfinite().all()
+
+    def test_zero(self):
+        v = smallest_right_singular_vector_3x3(torch.zeros(2, 3, 3, dtype=torch.float64))
+        assert v.norm(dim=-1).tolist() == [1, 1]
+
+    @pytest.mark.parametrize("index", [0, 1])
+    def test_gradients(self, index):
+        A = uniform(3, 3, 3, low=-1).requires_grad_()
+
+        def outer(A):
+            vector = smallest_singular_vectors(A)[index]
+            return vector[:, :, None] * vector[:, None]
+
+        assert gradcheck(outer, [A])
+        assert gradgradcheck(outer, [A])
+
+    def test_values_do_not_depend_on_whether_gradients_are_wanted(self):
+        A = uniform(100, 3, 3, low=-1)
+        plain = smallest_right_singular_vector_3x3(A)
+        assert torch.equal(smallest_right_singular_vector_3x3(A.clone().requires_grad_()).detach(), plain)
+
+    def test_any_batch_shape(self):
+        assert smallest_right_singular_vector_3x3(uniform(3, 3)).shape == (3,)
+        assert smallest_right_singular_vector_3x3(uniform(2, 4, 3, 3)).shape == (2, 4, 3)
+        assert smallest_right_singular_vector_3x3(uniform(0, 3, 3)).shape == (0, 3)
+
+
+class TestDeterminant:
+    def test_agrees_with_numpy(self, dtype):
+        A = uniform(20, 3, 3, low=-1, dtype=dtype)
+        np.testing.assert_allclose(determinant(A).numpy(), np.linalg.det(A.numpy()), atol=1e-6)
+
+
+class TestAdjugate:
+    def test_is_determinant_times_inverse(self, dtype):
+        A = uniform(20, 3, 3, low=-1, dtype=dtype)
+        expected = np.linalg.det(A.numpy())[:, None, None] * np.linalg.inv(A.numpy())
+        np.testing.assert_allclose(adjugate(A).numpy(), expected, atol=2e-6 if dtype == torch.float32 else 1e-14)
+
+    def test_of_singular_matrices(self):
+        """Of rank 2, the product of both null vectors; of rank 1, zero."""
+        F_mat = uniform(20, 3, 2, low=-1) @ uniform(20, 2, 3, low=-1, seed=1)
+        U, s, Vh = np.linalg.svd(F_mat.numpy())
+        expected = (
+            np.linalg.det(U @ Vh)[:, None, None]
+            * (s[:, 0] * s[:, 1])[:, None, None]
+            * Vh[:, 2, :, None]
+            * U[:, None, :, 2]
+        )
+        np.testing.assert_allclose(adjugate(F_mat).numpy(), expected, atol=1e-14)
+        assert adjugate(uniform(20, 3, 1) @ uniform(20, 1, 3, seed=1)).abs().max() < 1e-15
+
+    def test_gradcheck(self):
+        assert gradcheck(adjugate, [uniform(2, 3, 3, low=-1).requires_grad_()])
