@@ -17,9 +17,10 @@ from kornia_learnnorm.estimators.refinement import Refinement, refine_fundamenta
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated, squared_loss
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
 from kornia_learnnorm.evaluation.pair import estimate_pair
+from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.evaluation.reliability import PairWarning
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
-from kornia_learnnorm.evaluation.two_view import NoReliableMatrixError, PairEstimate, estimate_matches
+from kornia_learnnorm.evaluation.two_view import estimate_matches
 from kornia_learnnorm.geometry.distances import (
     algebraic_distance,
     sampson_distance,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.evaluation.two_view import NoReliableMatrixError
+from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError
 
 pytest.importorskip("cv2")
 

@@ -15,7 +15,7 @@ from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.evaluation.many_pairs import PairOptions, estimate_pairs, read_pair_list
 from kornia_learnnorm.evaluation.pair import estimate_pair
-from kornia_learnnorm.evaluation.two_view import NoReliableMatrixError
+from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError
 from kornia_learnnorm.files import atomic_write, write_text
 
 __all__ = ["add_arguments", "run"]

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from kornia_learnnorm.evaluation.two_view import PairEstimate
+from kornia_learnnorm.evaluation.pair_estimate import PairEstimate
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import import_extra
 
@@ -140,7 +140,7 @@ def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -
     for line, color in zip(lines, rgb, strict=True):
         draw_line(axes, line, color=color, linewidth=1.0)
     axes.scatter(points2[:, 0], points2[:, 1], s=20, c=rgb, edgecolors="black", linewidths=0.7, zorder=3)
-    error = f"predicted error {estimate.predicted_error:.2f} px"
+    error = f"predicted error of F {estimate.predicted_error:.2f} px (typical error of these lines)"
     _caption(axes, [("image 2", TEXT), (f"{len(chosen)} epipolar lines", TEXT), (error, TEXT)])
 
 

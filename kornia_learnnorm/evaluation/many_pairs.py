@@ -15,7 +15,7 @@ from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation.pair import MAX_SIZE, estimate_pair
-from kornia_learnnorm.evaluation.two_view import NoReliableMatrixError
+from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError
 from kornia_learnnorm.files import write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
@@ -101,7 +101,7 @@ def estimate_pairs(
 ) -> tuple[int, int]:
     """Estimate the pairs that are not done yet and append one JSON line each to ``pairs.jsonl``.
 
-    A line has what :meth:`~kornia_learnnorm.evaluation.two_view.PairEstimate.as_dict` returns. Where there is no
+    A line has what :meth:`~kornia_learnnorm.evaluation.pair_estimate.PairEstimate.as_dict` returns. Where there is no
     matrix or an image cannot be read, ``F`` is null and ``warnings`` says why.
 
     Args:

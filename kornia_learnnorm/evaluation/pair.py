@@ -14,24 +14,21 @@ from kornia_learnnorm.data.images import content_mask, image_size, import_cv2, r
 from kornia_learnnorm.data.matching.features import DETECTORS, Features, keep_features
 from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.evaluation.inputs import Points, check_number, check_settings, check_whole, read_cameras
+from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.evaluation.reliability import check_ambiguity, mutual_share
-from kornia_learnnorm.evaluation.two_view import (
-    NoReliableMatrixError,
-    PairEstimate,
-    Points,
-    check_threshold,
-    estimate_matches,
-    float_tensor,
-)
+from kornia_learnnorm.evaluation.two_view import estimate_matches
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points, unit_fundamental
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
-__all__ = ["MAX_SIZE", "estimate_pair"]
+__all__ = ["MAX_SIZE", "check_matching", "estimate_pair"]
 
 MAX_SIZE = 2000  # pixels of the longer side at which images are matched: SIFT then takes up to 0.5 GB and seconds
+MIN_SIZE = 64  # pixels of the longer side; smaller ones have too few features
 NUM_FEATURES = 4000  # of an image
 
 Image = str | Path | NDArray[np.uint8] | Tensor
+Mask = NDArray[np.bool_] | Tensor
 
 
 def estimate_pair(
@@ -43,8 +40,8 @@ def estimate_pair(
     seed: int = 0,
     K1: Points | None = None,
     K2: Points | None = None,
-    mask1: NDArray[np.bool_] | None = None,
-    mask2: NDArray[np.bool_] | None = None,
+    mask1: Mask | None = None,
+    mask2: Mask | None = None,
     max_size: int = MAX_SIZE,
     detector: str = "sift",
     matcher: str = "nearest",
@@ -80,44 +77,30 @@ def estimate_pair(
         FileNotFoundError: if a file does not exist.
         NoReliableMatrixError: if the images do not determine a matrix: a blank image, no motion, or fewer than nine
             matches or inliers.
-        TypeError: if an image or a camera is not of the kinds above.
-        ValueError: if a file is not an image, an argument is out of range, or only one camera is given.
+        TypeError: if an argument is not of the kinds above.
+        ValueError: if a file is not an image, an argument is out of range, only one camera is given, or one is not a
+            finite and invertible (3, 3) matrix.
         ImportError: if OpenCV is not installed.
 
     """
-    if not 0 < ratio <= 1:
-        raise ValueError(f"ratio must be above 0 and at most 1, got {ratio:g}")
-    for name, given, known in (("detector", detector, DETECTORS), ("matcher", matcher, MATCHERS)):
-        if given not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, got {given!r}")
-    if max_size < 64:
-        raise ValueError(f"max_size must be at least 64 pixels, got {max_size}")
-    check_threshold(threshold)
-    names = [
-        str(image) if isinstance(image, str | Path) else f"image {i}" for i, image in enumerate((image1, image2), 1)
-    ]
-    view1, size1 = _view(image1, mask1, max_size, detector)
-    view2, size2 = _view(image2, mask2, max_size, detector)
+    check_settings(threshold, seed, layer)
+    check_matching(ratio, max_size, detector, matcher)
+    cameras = read_cameras(K1, K2)
+    images = (image1, image2)
+    paths = [Path(image) if isinstance(image, str | Path) else None for image in images]
+    (view1, size1), (view2, size2) = (
+        _view(image, mask, max_size, detector) for image, mask in zip(images, (mask1, mask2), strict=True)
+    )
     S1, S2 = scaling(size1, view1.size), scaling(size2, view2.size)
-    cameras = [None if K is None else S @ float_tensor("camera", K) for K, S in ((K1, S1), (K2, S2))]
+    scaled = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
     try:
-        for number, view in enumerate((view1, view2), 1):
-            if len(view.points) < 2:
-                text = f"image {number} is blank, nearly so, or masked: {len(view.points)} features, expected 2 or more"
-                raise NoReliableMatrixError("blank", text)
-        matches, back = (
-            match_both_ways(view1, view2) if matcher == "nearest" else (MATCHERS[matcher](view1, view2), None)
-        )
-        points1, points2, ratios = (value.double() for value in matches)
-        one_way = ratios < ratio
-        worse = ratios if back is None else torch.maximum(ratios, back.double())
-        kept = worse < ratio
-        estimate = estimate_matches(
-            points1[kept], points2[kept], 1 - worse[kept], view1.size, view2.size, layer, threshold, seed, *cameras
-        )
-        share = mutual_share(points1[one_way], points2[one_way], kept[one_way], estimate.F_mat, threshold)
+        points1, points2, ratios, mutual = _match(view1, view2, ratio, matcher)
+        matches = points1[mutual], points2[mutual], 1 - ratios[mutual]
+        estimate = estimate_matches(*matches, view1.size, view2.size, layer, threshold, seed, *scaled)
     except NoReliableMatrixError as error:
-        raise NoReliableMatrixError(error.code, f"{names[0]} and {names[1]}: {error}") from error
+        names = " and ".join(str(path or f"image {number}") for number, path in enumerate(paths, 1))
+        raise NoReliableMatrixError(error.code, f"{names}: {error}") from error
+    share = mutual_share(points1, points2, mutual, estimate.F_mat, threshold)
     factor = float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
     return replace(
         estimate,
@@ -128,19 +111,48 @@ def estimate_pair(
         warnings=estimate.warnings + check_ambiguity(share),
         size1=size1,
         size2=size2,
-        ratio=ratio,
-        path1=Path(image1) if isinstance(image1, str | Path) else None,
-        path2=Path(image2) if isinstance(image2, str | Path) else None,
+        ratio=float(ratio),
+        path1=paths[0],
+        path2=paths[1],
     )
 
 
-def _view(
-    image: Image, mask: NDArray[np.bool_] | None, max_size: int, detector: str
-) -> tuple[Features, tuple[int, int]]:
+def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> None:
+    """Raise a clear error for options of matching that are of a wrong type, out of range or do not go together."""
+    check_number("ratio", ratio)
+    if not 0 < ratio <= 1:
+        raise ValueError(f"ratio must be above 0 and at most 1, got {ratio:g}")
+    check_whole("max_size", max_size)
+    if max_size < MIN_SIZE:
+        raise ValueError(f"max_size must be at least {MIN_SIZE} pixels, got {max_size}")
+    for name, given, known in (("detector", detector, DETECTORS), ("matcher", matcher, MATCHERS)):
+        if given not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {given!r}")
+    if matcher == "lightglue" and detector != "disk":
+        raise ValueError(f"matcher lightglue needs detector disk, got {detector}")
+
+
+def _match(view1: Features, view2: Features, ratio: float, matcher: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the nearest neighbours that pass the ratio test, their larger ratios, and which pass it both ways."""
+    for number, view in enumerate((view1, view2), 1):
+        if len(view.points) < 2:
+            text = f"image {number} is blank, nearly so, or masked: {len(view.points)} features, expected 2 or more"
+            raise NoReliableMatrixError("blank", text)
+    matches, back = match_both_ways(view1, view2) if matcher == "nearest" else (MATCHERS[matcher](view1, view2), None)
+    points1, points2, ratios = (value.double() for value in matches)
+    larger = ratios if back is None else torch.maximum(ratios, back.double())
+    kept = ratios < ratio
+    return points1[kept], points2[kept], larger[kept], larger[kept] < ratio
+
+
+def _view(image: Image, mask: Mask | None, max_size: int, detector: str) -> tuple[Features, tuple[int, int]]:
     """Return the features of an image at the size at which it is matched, and its full size."""
     grey, size = _grey(image, max_size)
     frame = content_mask(grey)
     if mask is not None:
+        mask = mask.cpu().numpy() if isinstance(mask, Tensor) else mask
+        if not isinstance(mask, np.ndarray) or mask.dtype != bool:
+            raise TypeError(f"a mask must be an array of bool, got {getattr(mask, 'dtype', type(mask))}")
         if mask.shape != size[::-1]:
             raise ValueError(f"a mask must have the shape of its image, {size[::-1]}, got {mask.shape}")
         small = import_cv2().resize(mask.astype(np.uint8), grey.shape[::-1], interpolation=0) > 0
@@ -153,11 +165,11 @@ def _grey(image: Image, max_size: int) -> tuple[NDArray[np.uint8], tuple[int, in
     """Return the grey values of an image of at most a size, and its full size."""
     if isinstance(image, str | Path):
         return read_image(image, max_size), image_size(image)
-    values = image.numpy() if isinstance(image, Tensor) else image
+    values = image.cpu().numpy() if isinstance(image, Tensor) else image
     if not isinstance(values, np.ndarray) or values.dtype != np.uint8:
         raise TypeError(f"an image must be a path or an array of uint8, got {getattr(values, 'dtype', type(values))}")
     if values.ndim == 3 and values.shape[2] == 3:
         values = np.asarray(import_cv2().cvtColor(np.ascontiguousarray(values), import_cv2().COLOR_RGB2GRAY), np.uint8)
     if values.ndim != 2 or values.size == 0:
         raise ValueError(f"an image must have shape (H, W) or (H, W, 3), got {values.shape}")
-    return resize_image(values, max_size), (values.shape[1], values.shape[0])
+    return resize_image(np.ascontiguousarray(values), max_size), (values.shape[1], values.shape[0])

@@ -19,9 +19,10 @@ from kornia_learnnorm.cli.estimate import add_arguments, run
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.evaluation import pair as pair_module
 from kornia_learnnorm.evaluation.many_pairs import read_pair_list
 from kornia_learnnorm.evaluation.pair import estimate_pair
-from kornia_learnnorm.evaluation.two_view import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.files import atomic_write
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
@@ -139,6 +140,12 @@ class TestEstimatePair:
         with pytest.raises(ValueError, match=r"shape of its image, \(240, 320\), got \(320, 240\)"):
             estimate_pair(scene.left, scene.right, mask2=left.T)
 
+    def test_arrays_of_any_strides(self, scene, result):
+        images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[::-1, ::-1].copy() for path in (scene.left, scene.right)]
+        mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+        found = estimate_pair(*(image[::-1, ::-1] for image in images), mask1=mask)
+        assert torch.equal(found.F_mat, result.F_mat)
+
     def test_cameras(self, scene):
         found = estimate_pair(scene.left, scene.right, K1=K, K2=torch.from_numpy(K))
         angle = np.rad2deg(np.arccos((np.trace(found.R.numpy().T @ scene.R) - 1) / 2))
@@ -173,6 +180,30 @@ class TestErrors:
         with pytest.raises(ValueError, match=message) as caught:
             estimate_pair(scene.folder / f"{first}.png", scene.folder / f"{second}.png", **options)
         assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("options", "error", "message"),
+        [
+            ({"K1": np.zeros((3, 3)), "K2": K}, ValueError, "K1 must be finite and invertible"),
+            ({"K1": K, "K2": K * np.nan}, ValueError, "K2 must be finite and invertible"),
+            ({"K1": K[None], "K2": K}, ValueError, r"K1 must have shape \[3, 3\], got \[1, 3, 3\]"),
+            ({"K1": K}, ValueError, "K1 and K2 must be given together"),
+            ({"threshold": "x"}, TypeError, "threshold must be a number, got 'x'"),
+            ({"ratio": "x"}, TypeError, "ratio must be a number, got 'x'"),
+            ({"max_size": 99.5}, TypeError, "max_size must be a whole number, got 99.5"),
+            ({"seed": -1}, ValueError, "seed must lie in"),
+            ({"layer": K}, TypeError, "layer must be a LearnedEightPoint or None"),
+            ({"matcher": "lightglue"}, ValueError, "matcher lightglue needs detector disk, got sift"),
+        ],
+    )
+    def test_options_are_checked_before_the_work(self, options, error, message, monkeypatch):
+        monkeypatch.setattr(pair_module, "read_image", lambda *_: pytest.fail("an image was read"))
+        with pytest.raises(error, match=message):
+            estimate_pair("left.png", "right.png", **options)
+
+    def test_masks_of_other_types(self, scene):
+        with pytest.raises(TypeError, match="a mask must be an array of bool, got uint8"):
+            estimate_pair(scene.left, scene.right, mask1=np.ones((HEIGHT, WIDTH), np.uint8))
 
     @pytest.mark.parametrize(("second", "code"), [("blank", "blank"), ("left", "no_motion"), ("noisy", "no_motion")])
     def test_images_without_a_matrix(self, scene, second, code):
@@ -241,7 +272,7 @@ class TestCommand:
         assert re.match(r"by +RANSAC, seed 0", lines[4])
         assert re.match(rf"matches +{result.num_matches} \(ratio test 0\.8\)", lines[5])
         assert re.match(rf"inliers +{result.num_inliers} ", lines[6])
-        assert f"{result.predicted_error:.2f} px predicted" in lines[7]
+        assert f"predicted error of F: {result.predicted_error:.2f} px (typical error of epipolar lines" in lines[7]
         assert len(lines) == 8
         assert not list(Path().iterdir())
 

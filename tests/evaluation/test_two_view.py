@@ -82,6 +82,36 @@ class TestEstimateMatches:
         assert torch.equal(first.F_mat, second.F_mat)
         assert first.predicted_error == second.predicted_error
 
+    def test_rows_that_are_not_finite_or_far_away_are_left_out(self):
+        """As in RANSAC; their scores do not matter."""
+        points1, points2, _ = make_matches()
+        wrong = torch.tensor([[torch.nan, 5.0], [5.0, torch.inf], [1e12, 5.0]], dtype=torch.float64)
+        scores = torch.cat([torch.ones(len(points1)), torch.tensor([torch.nan, 0.5, 0.5])])
+        found = kln.estimate_matches(torch.cat([points1, wrong]), torch.cat([points2, wrong + 1]), scores)
+        expected = kln.estimate_matches(points1, points2)
+        assert torch.equal(found.F_mat, expected.F_mat)
+        assert found.num_matches == expected.num_matches
+        assert found.size1 == expected.size1
+
+    def test_arrays_of_any_number_type(self):
+        """Whole numbers, other strides and byte orders are what float64 of the same values is."""
+        points1, points2 = (points.round().numpy() for points in make_matches(noise=0.0)[:2])
+        expected = kln.estimate_matches(points1, points2)
+        for convert in (
+            lambda points: points.astype(np.int32),
+            lambda points: points.astype(">f4"),
+            lambda points: points[::-1, ::-1].copy()[::-1, ::-1],
+            lambda points: torch.from_numpy(points).int(),
+            lambda points: torch.from_numpy(points).requires_grad_(),
+        ):
+            assert torch.equal(kln.estimate_matches(convert(points1), convert(points2)).F_mat, expected.F_mat)
+
+    def test_no_ratio_test_is_reported_where_none_was_made(self):
+        found = kln.estimate_matches(*make_matches()[:2])
+        assert (found.ratio, found.as_dict()["ratio"]) == (None, None)
+        assert "ratio" not in found.summary()
+        assert f"predicted error of F: {found.predicted_error:.2f} px (typical error" in found.summary()
+
     def test_what_stands_still_is_left_out(self):
         points1, points2, _ = make_matches(outliers=0)
         overlay = torch.rand(60, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 400
@@ -115,16 +145,27 @@ class TestEstimateMatches:
         [
             ({"points1": torch.zeros(9, 3)}, ValueError, "shape"),
             ({"points2": torch.zeros(8, 2)}, ValueError, "shape"),
-            ({"scores": torch.full((9,), 2.0)}, ValueError, "from 0 to 1, got 2 to 2"),
-            ({"points1": torch.full((9, 2), torch.nan)}, ValueError, "finite"),
-            ({"points1": [[0.0, 1.0]]}, TypeError, "points1"),
+            ({"scores": torch.full((9,), 2.0)}, ValueError, "from 0 to 1, got 9 others, the first 2"),
+            ({"scores": torch.full((9,), torch.nan)}, ValueError, "from 0 to 1, got 9 others, the first nan"),
+            ({"points1": [[0.0, 1.0]]}, TypeError, r"points1 must be .* got <class 'list'>; numpy\.array\(points1"),
+            ({"points1": np.zeros((9, 2), bool)}, TypeError, "points1 must be .* of bool"),
+            ({"points1": torch.zeros(9, 2, dtype=torch.complex64)}, TypeError, "points1 must be .* of torch.complex64"),
+            ({"points1": np.full((9, 2), "a")}, TypeError, "points1 must be .* of <U1"),
             ({"threshold": -1.0}, ValueError, "threshold must be positive"),
+            ({"threshold": "x"}, TypeError, "threshold must be a number, got 'x'"),
+            ({"seed": -1}, ValueError, r"seed must lie in \[0, 2\^63\), got -1"),
+            ({"seed": None}, TypeError, "seed must be a whole number, got None"),
+            ({"layer": "robust"}, TypeError, "layer must be a LearnedEightPoint or None, got <class 'str'>"),
+            ({"size1": (0, 0)}, ValueError, r"size1 must be a positive width and height, got \(0, 0\)"),
+            ({"size2": (640.5, 480)}, TypeError, "width and height of size2 must be a whole number, got 640.5"),
+            ({"size2": (640,)}, ValueError, r"size2 must be a width and a height, got \(640,\)"),
             ({"K1": torch.eye(3)}, ValueError, "given together"),
-            ({"K1": torch.zeros(3, 3), "K2": torch.eye(3)}, ValueError, "invertible"),
+            ({"K1": torch.zeros(3, 3), "K2": torch.eye(3)}, ValueError, "K1 must be finite and invertible"),
+            ({"K1": torch.eye(3), "K2": torch.eye(3)[None]}, ValueError, r"K2 must have .* got \[1, 3, 3\]"),
         ],
     )
     def test_wrong_arguments(self, changes, error, message):
-        points = {"points1": torch.rand(9, 2) * 100, "points2": torch.rand(9, 2) * 100}
+        points = dict(zip(("points1", "points2"), torch.rand(2, 9, 2) * 100, strict=True))
         with pytest.raises(error, match=message):
             kln.estimate_matches(**{**points, **changes})
 

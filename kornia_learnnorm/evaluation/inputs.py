@@ -1,0 +1,124 @@
+"""Input checks of the estimates of matches and images, all made before the work begins."""
+
+from __future__ import annotations
+
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.geometry.checks import check_cameras
+
+__all__ = [
+    "Cameras",
+    "Points",
+    "as_float64",
+    "check_number",
+    "check_settings",
+    "check_whole",
+    "read_cameras",
+    "read_matches",
+    "read_size",
+]
+
+Points = Tensor | NDArray[Any]
+Cameras = tuple[Tensor, Tensor]
+
+
+def as_float64(name: str, value: object) -> Tensor:
+    """Return an array or tensor of floating-point or whole numbers as a tensor on the CPU, float64.
+
+    Raises:
+        TypeError: if it is anything else, such as a list.
+
+    """
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
+        return torch.from_numpy(np.array(value, np.float64))  # a copy: strides and byte order may be any
+    if isinstance(value, Tensor) and not (value.dtype == torch.bool or value.is_complex()):
+        return value.detach().cpu().double()
+    got = f"one of {value.dtype}" if isinstance(value, np.ndarray | Tensor) else str(type(value))
+    hint = f"; numpy.array({name}, float) makes one" if isinstance(value, list | tuple) else ""
+    raise TypeError(f"{name} must be a NumPy array or a tensor of numbers, got {got}{hint}")
+
+
+def read_matches(points1: Points, points2: Points, scores: Points | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return matches (N, 2), (N, 2) and scores (N,) in float64; scores of one where there are none.
+
+    Rows of points that are not finite may have any score.
+
+    Raises:
+        TypeError: if an argument is neither an array nor a tensor of numbers.
+        ValueError: if shapes do not pair up, or the score of finite points is not from 0 to 1.
+
+    """
+    x1, x2 = as_float64("points1", points1), as_float64("points2", points2)
+    score = torch.ones(len(x1), dtype=torch.float64) if scores is None else as_float64("scores", scores)
+    if x1.shape != x2.shape or x1.shape[1:] != (2,) or score.shape != x1.shape[:1]:
+        shapes = " and ".join(str([*value.shape]) for value in (x1, x2, score))
+        raise ValueError(f"points of shape (N, 2) and scores of shape (N,) expected, got {shapes}")
+    known = score[(x1.isfinite() & x2.isfinite()).all(-1)]
+    wrong = known[~((known >= 0) & (known <= 1))]
+    if len(wrong):
+        raise ValueError(f"scores must be from 0 to 1, got {len(wrong)} others, the first {float(wrong[0]):g}")
+    return x1, x2, score
+
+
+def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
+    """Return the cameras (3, 3) of both images in float64, or None where none is given.
+
+    Raises:
+        TypeError: if a camera is neither an array nor a tensor of numbers.
+        ValueError: if only one is given, or one is not a finite and invertible matrix of shape (3, 3).
+
+    """
+    camera1, camera2 = (None if K is None else as_float64(name, K) for name, K in (("K1", K1), ("K2", K2)))
+    check_cameras(camera1, camera2)
+    return None if camera1 is None or camera2 is None else (camera1, camera2)
+
+
+def read_size(name: str, size: tuple[int, int] | None, points: Tensor) -> tuple[int, int]:
+    """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given.
+
+    Raises:
+        TypeError: if a number is not whole.
+        ValueError: if there are not two, or one is not positive.
+
+    """
+    if size is None:
+        width, height = (points.amax(0).clamp(min=1.0).ceil() + 1).tolist()
+        return int(width), int(height)
+    if len(size) != 2:
+        raise ValueError(f"{name} must be a width and a height, got {size}")
+    for value in size:
+        check_whole(f"width and height of {name}", value)
+    if min(size) < 1:
+        raise ValueError(f"{name} must be a positive width and height, got {tuple(size)}")
+    return int(size[0]), int(size[1])
+
+
+def check_settings(threshold: float, seed: int, layer: object = None) -> None:
+    """Raise a clear error for a threshold that is not positive, a seed out of range, or a layer of another class."""
+    check_number("threshold", threshold)
+    if not 0 < threshold < float("inf"):
+        raise ValueError(f"threshold must be positive and finite, got {threshold:g} px")
+    check_whole("seed", seed)
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
+    if not isinstance(layer, LearnedEightPoint | None):
+        raise TypeError(f"layer must be a LearnedEightPoint or None, got {type(layer)}")
+
+
+def check_number(name: str, value: object) -> None:
+    """Raise a TypeError for anything but a real number."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+
+
+def check_whole(name: str, value: object) -> None:
+    """Raise a TypeError for anything but a whole number."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise TypeError(f"{name} must be a whole number, got {value!r}")

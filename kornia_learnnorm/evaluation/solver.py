@@ -1,0 +1,117 @@
+"""The fundamental matrix of matches, or of some of them, by RANSAC or a learned layer, with plane and parallax."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.estimators.essential import refine_essential
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.refinement import refine_fundamental
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm.evaluation.inputs import Cameras
+from kornia_learnnorm.evaluation.reliability import MIN_PLANAR_SHARE, find_homography
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
+from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
+from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax
+from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.ransac.scoring import PairScorer
+
+__all__ = ["TwoViewSolver"]
+
+MIN_SCORE_GAIN = 1.02  # of another hypothesis over the one found first, which otherwise stays
+MIN_SCORE = 1e-3  # a match of weight zero would never be sampled
+
+
+@dataclass(frozen=True, eq=False)
+class TwoViewSolver:
+    """The matches of an image pair and how their fundamental matrix is estimated."""
+
+    points1: Tensor  # pixels in image 1, (N, 2), float64
+    points2: Tensor  # pixels in image 2, (N, 2), float64
+    scores: Tensor  # from 0 to 1, (N,), float64
+    threshold: float  # largest distance of an inlier, pixels
+    seed: int
+    layer: LearnedEightPoint | None = None  # estimates in the place of RANSAC
+    cameras: Cameras | None = None
+
+    @property
+    def estimator(self) -> str:
+        """Name of the class that estimates."""
+        return RANSAC.__name__ if self.layer is None else type(self.layer).__name__
+
+    @cached_property
+    def _ransac(self) -> RANSAC:
+        return RANSAC(inl_th=self.threshold, seed=self.seed)
+
+    def inliers(self, F_mat: Tensor) -> Tensor:
+        """Return which matches lie within the threshold of a matrix (3, 3), (N,) bool."""
+        return symmetric_epipolar_distance(self.points1, self.points2, F_mat) < self.threshold
+
+    def solve(self, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the matrix (3, 3) of all matches or of some rows (M,), and the weights (M,) of these matches."""
+        rows = torch.arange(len(self.points1)) if rows is None else rows
+        x1, x2, score = self.points1[rows], self.points2[rows], self.scores[rows]
+        if self.layer is None:
+            found = self._ransac.estimate(x1, x2, score.clamp(min=MIN_SCORE), *(self.cameras or ()))
+            F_mat, weights = found.F_mat, found.inliers.double()
+        else:
+            with torch.no_grad():
+                estimate = self.layer.estimate(x1[None], x2[None], scores=score[None])
+            F_mat, weights = estimate.F_mat[0], estimate.weights[0]
+        if self.cameras is None:
+            F_mat = self._try_plane_and_parallax(x1, x2, F_mat)
+        elif self.layer is not None:
+            F_mat = self._refine(x1, x2, F_mat)
+        return F_mat, weights
+
+    def best_of(self, F_mat: Tensor, F_parts: Tensor) -> Tensor:
+        """Return the matrix of all matches, or that of a part, refined on all, where it scores higher on all.
+
+        Args:
+            F_mat: matrix of all matches, (3, 3).
+            F_parts: matrices of parts of the matches, (P, 3, 3).
+        """
+        scorer = PairScorer(self.points1, self.points2, self.threshold)
+        best = scorer.best(scorer.from_pixels(F_parts), 1)
+        least = MIN_SCORE_GAIN * _score(scorer, F_mat)
+        if float(best.score.sum()) <= least:
+            return F_mat
+        other = self._refine(self.points1, self.points2, scorer.to_pixels(best.F_mat)[0])
+        return other if _score(scorer, other) > least else F_mat
+
+    def _refine(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+        """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
+        loss = GemanMcClure(FINAL_LOSS_SCALE * self.threshold)
+        x1, x2 = points1[None], points2[None]
+        if self.cameras is None:
+            return refine_fundamental(x1, x2, F_mat[None], loss=loss).F_mat[0]
+        K1, K2 = self.cameras[0][None], self.cameras[1][None]
+        E_mat = unit_fundamental(transform_fundamental(F_mat[None], K1, K2))
+        return refine_essential(x1, x2, E_mat, K1, K2, loss=loss).F_mat[0]
+
+    def _try_plane_and_parallax(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+        """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher."""
+        inliers = symmetric_epipolar_distance(points1, points2, F_mat) < self.threshold
+        if int(inliers.sum()) < 8:
+            return F_mat
+        H = find_homography(points1[inliers], points2[inliers], self.threshold)
+        if H is None:
+            return F_mat
+        on_plane = parallax(points1, points2, H)[inliers] < 3 * self.threshold
+        if float(on_plane.double().mean()) <= MIN_PLANAR_SHARE:
+            return F_mat
+        other = fit_plane_and_parallax(points1, points2, H, self.threshold, self.seed)
+        if other is None:
+            return F_mat
+        scorer = PairScorer(points1, points2, self.threshold)
+        return other if _score(scorer, other) > MIN_SCORE_GAIN * _score(scorer, F_mat) else F_mat
+
+
+def _score(scorer: PairScorer, F_mat: Tensor) -> float:
+    """Return the MSAC score of a matrix (3, 3) in pixels; zero for a matrix of zeros."""
+    return float(scorer.best(scorer.from_pixels(F_mat[None]), 1).score.sum())
