@@ -13,21 +13,30 @@ from kornia_learnnorm.data.images import image_size, read_colour, read_mask
 from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
-from kornia_learnnorm.evaluation.many_pairs import PairOptions, estimate_pairs, read_pair_list
+from kornia_learnnorm.evaluation.many_pairs import PairOptions, describe_failure, estimate_pairs, read_pair_list
 from kornia_learnnorm.evaluation.pair import estimate_pair
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError
+from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.files import atomic_write, write_text
 
 __all__ = ["add_arguments", "run"]
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf", ".svg")
+EPILOG = """\
+exit codes: 0 solved; 2 wrong use or an unreadable image; 3 no matrix, or one with warnings
+
+examples:
+  learnnorm estimate left.png right.png --K 700,700,320,240 --out pair.png --json pair.json
+  learnnorm estimate --pairs pairs.txt --out results --estimator learned
+"""
 UNRELIABLE = 3  # exit code where there is no matrix, or reasons to doubt it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm estimate`` to a parser."""
     options = PairOptions()
-    parser.epilog = "Exit codes: 0 solved; 2 wrong use or an unreadable image; 3 no matrix, or one with warnings."
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.usage = "%(prog)s IMG1 IMG2 [options]\n       %(prog)s --pairs LIST --out FOLDER [options]"
+    parser.epilog = EPILOG
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
     parser.add_argument(
         "--out", metavar="PATH", type=Path, help="picture of matches and epipolar lines; with --pairs, a folder"
@@ -35,45 +44,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE", help="write everything to this file; - for standard output")
     estimation = parser.add_argument_group("estimation")
     estimation.add_argument(
-        "--estimator",
-        choices=("ransac", "learned"),
-        default="ransac",
-        help="RANSAC, or the learned layer in one pass (default: %(default)s)",
+        "--estimator", choices=("ransac", "learned"), default="ransac", help="(default: %(default)s)"
     )
-    estimation.add_argument("--weights", metavar="NAME_OR_PATH", help="weights of the learned layer (default: robust)")
+    estimation.add_argument("--weights", metavar="NAME_OR_PATH", help="weights of the learned one (default: robust)")
     estimation.add_argument(
         "--threshold",
+        metavar="PX",
         type=float,
         default=options.threshold,
-        help="symmetric epipolar distance of an inlier, and RANSAC's threshold, px (default: %(default)s)",
+        help="largest symmetric epipolar distance of an inlier (default: %(default)s)",
     )
-    estimation.add_argument("--seed", type=int, default=options.seed, help="(default: %(default)s)")
-    estimation.add_argument(
-        "--K",
-        metavar="CAMERA",
-        nargs="+",
-        default=[],
-        help="one camera or two: fx,fy,cx,cy, a file of 4 or 9 numbers, or exif; adds E, R and t",
-    )
+    estimation.add_argument("--seed", type=_seed, default=options.seed, help="(default: %(default)s)")
+    camera = "one or two of fx,fy,cx,cy, a file of 4 or 9 numbers, KITTI's calib.txt, exif; adds E, R, t"
+    estimation.add_argument("--K", metavar="CAMERA", nargs="+", default=[], help=camera)
     matching = parser.add_argument_group("matching")
     matching.add_argument("--detector", choices=DETECTORS, default=options.detector, help="(default: %(default)s)")
     matching.add_argument("--matcher", choices=MATCHERS, default=options.matcher, help="(default: %(default)s)")
     matching.add_argument("--ratio", type=float, default=options.ratio, help="ratio test (default: %(default)s)")
-    matching.add_argument(
-        "--max-size", type=int, default=options.max_size, help="match images reduced to it, px (default: %(default)s)"
-    )
-    matching.add_argument(
-        "--mask",
-        metavar="FILE",
-        type=Path,
-        nargs="+",
-        default=[],
-        help="one mask or two: features count where it is white",
-    )
+    size = "match images reduced to this longer side (default: %(default)s)"
+    matching.add_argument("--max-size", metavar="PX", type=int, default=options.max_size, help=size)
+    mask = "one mask or two: features count where it is white"
+    matching.add_argument("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
     many = parser.add_argument_group("many pairs")
     many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line; one JSON line a pair in --out")
     many.add_argument("--jobs", type=int, default=-1, help="processes; -1 for all cores (default: %(default)s)")
     many.add_argument("--dask", metavar="ADDRESS", help="Dask scheduler, as tcp://host:8786; its workers estimate")
+
+
+def _seed(text: str) -> int:
+    """Return a seed of the command line."""
+    if not text.isdecimal() or int(text) >= 2**63:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 to 2^63 - 1 expected, got {text}")
+    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -88,16 +90,32 @@ def run(args: argparse.Namespace) -> int:
         return UNRELIABLE if warned else 0
     image1, image2 = args.images
     try:
-        return _run_pair(args, image1, image2, options)
+        estimate = _estimate(args, options)
     except NoReliableMatrixError as error:
+        failure = describe_failure(error.code, str(error), image1, image2, options)
+        if (path := _json_path(args)) is not None:
+            write_text(path, _to_json(failure))
+            print(f"wrote    {path}")
+        if args.json == "-":
+            print(_to_json(failure), end="")
         print(f"no reliable matrix ({error.code}): {error}", file=sys.stderr)
         return UNRELIABLE
+    if args.json == "-":
+        print(_to_json(estimate.as_dict()), end="")
+        for warning in estimate.warnings:
+            print(f"warning ({warning.code}): {warning.text}", file=sys.stderr)
+    else:
+        print(estimate.summary())
+        for written in (args.out, _json_path(args)):
+            if written is not None:
+                print(f"wrote    {written}")
+    return UNRELIABLE if estimate.warnings else 0
 
 
-def _run_pair(args: argparse.Namespace, image1: Path, image2: Path, options: PairOptions) -> int:
-    to_stdout = args.json == "-"
-    json_path = None if args.json is None or to_stdout else Path(args.json)
+def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
+    """Return the estimate of one pair after its picture and its JSON file are written, both or neither."""
     with ExitStack() as stack:
+        json_path = _json_path(args)
         picture = None if args.out is None else stack.enter_context(atomic_write(args.out))
         report = None if json_path is None else stack.enter_context(atomic_write(json_path))
         if picture is not None:
@@ -108,20 +126,22 @@ def _run_pair(args: argparse.Namespace, image1: Path, image2: Path, options: Pai
             read_mask(path, image_size(image)) for path, image in zip(_both(args.mask), args.images, strict=False)
         ]
         mask1, mask2 = masks or (None, None)
+        image1, image2 = args.images
         estimate = estimate_pair(image1, image2, **options.arguments(image1, image2), mask1=mask1, mask2=mask2)
         if picture is not None:
             first, second = (read_colour(image, options.max_size) for image in args.images)
             draw_pair(first, second, estimate, picture)
-        content = json.dumps(estimate.as_dict(), allow_nan=False) + "\n"
         if report is not None:
-            write_text(report, content)
-    print(content if to_stdout else estimate.summary(), end="" if to_stdout else "\n")
-    for path in (args.out, json_path):
-        if path is not None and not to_stdout:
-            print(f"wrote    {path}")
-    for warning in estimate.warnings if to_stdout else ():
-        print(f"warning ({warning.code}): {warning.text}", file=sys.stderr)
-    return UNRELIABLE if estimate.warnings else 0
+            write_text(report, _to_json(estimate.as_dict()))
+    return estimate
+
+
+def _json_path(args: argparse.Namespace) -> Path | None:
+    return None if args.json in (None, "-") else Path(args.json)
+
+
+def _to_json(content: dict[str, Any]) -> str:
+    return json.dumps(content, allow_nan=False) + "\n"
 
 
 def _both(values: list[Path]) -> list[Path]:
@@ -138,21 +158,30 @@ def _check_options(args: argparse.Namespace) -> None:
             got = f"got {len(values)}; give the images before it"
             raise ValueError(f"--{name}: one value for both images or one for each expected, {got}")
     if args.pairs is not None:
-        if args.images or args.json is not None or args.mask:
-            raise ValueError("--pairs: neither images, --json nor --mask go with it")
-        if args.out is None:
-            raise ValueError("--pairs: --out FOLDER is needed for the results")
-        check_jobs(args.jobs)
+        _check_many(args)
         return
-    if args.jobs != -1 or args.dask is not None:
-        raise ValueError("--jobs and --dask go with --pairs")
+    if many := [f"--{name}" for name, default in (("jobs", -1), ("dask", None)) if getattr(args, name) != default]:
+        raise ValueError(f"{' and '.join(many)}: only for --pairs LIST, which was not given")
     if len(args.images) != 2:
         raise ValueError(f"two image files expected, got {len(args.images)}; --pairs LIST for many")
     if args.out is not None and args.out.suffix.lower() not in PICTURE_SUFFIXES:
         raise ValueError(f"--out {args.out}: expected a name that ends in one of {' '.join(PICTURE_SUFFIXES)}")
     taken = [path.resolve() for path in (*args.images, *args.mask)]
-    json_path = None if args.json in (None, "-") else Path(args.json)
-    for option, path in (("--out", args.out), ("--json", json_path)):
+    for option, path in (("--out", args.out), ("--json", _json_path(args))):
         if path is not None and path.resolve() in taken:
             raise ValueError(f"{option} {path}: would overwrite another file of this command")
         taken += [] if path is None else [path.resolve()]
+
+
+def _check_many(args: argparse.Namespace) -> None:
+    """Raise ValueError for options that do not go with a list of pairs."""
+    given = {"image files": args.images, "--json": args.json, "--mask": args.mask}
+    if wrong := [name for name, value in given.items() if value]:
+        raise ValueError(f"--pairs {args.pairs}: cannot be combined with {' and '.join(wrong)}")
+    if args.out is None:
+        raise ValueError("--pairs: --out FOLDER is needed for the results")
+    if args.out.exists() and not args.out.is_dir():
+        raise ValueError(f"--out {args.out}: a folder expected with --pairs, got a file")
+    if args.jobs != -1 and args.dask is not None:
+        raise ValueError(f"--jobs {args.jobs} and --dask {args.dask} exclude each other")
+    check_jobs(args.jobs)

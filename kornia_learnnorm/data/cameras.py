@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_learnnorm.data.datasets.kitti import read_calibration
 from kornia_learnnorm.data.images import image_size
 from kornia_learnnorm.optional import import_extra
 
 __all__ = ["exif_camera", "read_camera"]
 
+KITTI_CAMERA = "P0"  # projection of image_0 in a calib.txt
 EXIF_IFD = 0x8769  # tag of EXIF 2.32, section 4.6.3
 FOCAL_LENGTH_35MM = 0xA405  # section 4.6.5, millimetres on a frame of 36 x 24 mm; zero for unknown
 FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
@@ -22,7 +24,8 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
     """Return a camera matrix with shape (3, 3), pixels.
 
     Args:
-        text: ``fx,fy,cx,cy``; a text file of these four or of all nine numbers; or ``exif``.
+        text: ``fx,fy,cx,cy``; a text file of these four or of all nine numbers; a ``calib.txt`` of KITTI, of which
+            ``P0`` counts, the camera of ``image_0``; or ``exif``.
         image: the photograph that ``exif`` is read from, see :func:`exif_camera`.
 
     Raises:
@@ -40,7 +43,7 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
         if image is None:
             raise ValueError("camera exif: an image file expected, got none")
         return exif_camera(image)
-    expected = "expected fx,fy,cx,cy, a file of four or nine numbers, or exif"
+    expected = "expected fx,fy,cx,cy, a file of four or nine numbers, KITTI's calib.txt, or exif"
     content = text
     if "," not in text or Path(text).exists():
         if not Path(text).is_file():
@@ -49,6 +52,8 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
             content = Path(text).read_text(encoding="utf-8")
         except UnicodeDecodeError as error:
             raise ValueError(f"camera {text}: not a text file; {expected}") from error
+        if any(line.startswith(f"{KITTI_CAMERA}:") for line in content.splitlines()):
+            return read_calibration(Path(text), KITTI_CAMERA)[0]
     try:
         numbers = np.array(content.replace(",", " ").split(), float)
     except ValueError as error:

@@ -11,16 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from kornia_learnnorm.data.cameras import read_camera
-from kornia_learnnorm.data.images import import_cv2
+from kornia_learnnorm.data.images import image_size, import_cv2
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.evaluation.pair import MAX_SIZE, estimate_pair
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError
+from kornia_learnnorm.evaluation.inputs import check_settings
+from kornia_learnnorm.evaluation.pair import MAX_SIZE, check_matching, estimate_pair
+from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, package_versions
+from kornia_learnnorm.evaluation.reliability import PairWarning
 from kornia_learnnorm.files import write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+from kornia_learnnorm.ransac.ransac import RANSAC
 
-__all__ = ["PairOptions", "estimate_pairs", "read_pair_list"]
+__all__ = ["PairOptions", "describe_failure", "estimate_pairs", "read_pair_list"]
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
 OPTIONS = "options.json"
@@ -44,6 +47,11 @@ class PairOptions:
     max_size: int = MAX_SIZE
     detector: str = "sift"
     matcher: str = "nearest"
+
+    def __post_init__(self) -> None:
+        """Raise a clear error for options that are out of range or do not go together."""
+        check_settings(self.threshold, self.seed)
+        check_matching(self.ratio, self.max_size, self.detector, self.matcher)
 
     def arguments(self, image1: Path, image2: Path) -> dict[str, Any]:
         """Return the keyword arguments of ``estimate_pair`` for two image files."""
@@ -101,8 +109,8 @@ def estimate_pairs(
 ) -> tuple[int, int]:
     """Estimate the pairs that are not done yet and append one JSON line each to ``pairs.jsonl``.
 
-    A line has what :meth:`~kornia_learnnorm.evaluation.pair_estimate.PairEstimate.as_dict` returns. Where there is no
-    matrix or an image cannot be read, ``F`` is null and ``warnings`` says why.
+    A line has what :meth:`~kornia_learnnorm.evaluation.pair_estimate.PairEstimate.as_dict` returns, or
+    :func:`describe_failure` where there is no matrix or an image cannot be read.
 
     Args:
         pairs: image files.
@@ -121,6 +129,7 @@ def estimate_pairs(
     """
     folder = Path(folder)
     cameras = [text if text == "exif" else read_camera(text).tolist() for text in options.K]
+    _layer(options.weights)  # wrong weights are an error of the options, not of each pair
     given = json.loads(json.dumps({**asdict(options), "K": cameras}))
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / OPTIONS).exists():
@@ -147,6 +156,38 @@ def estimate_pairs(
     return len(pairs) - warned, warned
 
 
+def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> dict[str, Any]:
+    """Return the JSON object of a pair without a matrix: ``F`` is null and ``warnings`` says why.
+
+    Args:
+        code: one word for programs.
+        text: one sentence for people.
+        image1: file of image 1.
+        image2: file of image 2.
+        options: of the estimate.
+    """
+    return {
+        **dict.fromkeys(("F", "E", "R", "t", "predicted_error_px")),
+        "warnings": [PairWarning(code, text)._asdict()],
+        "image1": _describe_image(image1),
+        "image2": _describe_image(image2),
+        "estimator": (RANSAC if options.weights is None else LearnedEightPoint).__name__,
+        "seed": options.seed,
+        "ratio": options.ratio,
+        "threshold_px": options.threshold,
+        "versions": package_versions(),
+    }
+
+
+def _describe_image(path: Path) -> dict[str, Any]:
+    """Return the file and its width and height, null where it cannot be read."""
+    try:
+        width, height = image_size(path)
+    except OSError:
+        width = height = 0
+    return {"file": str(path), "width": width or None, "height": height or None}
+
+
 def _estimate(image1: Path, image2: Path, options: PairOptions) -> dict[str, Any]:
     """Return the JSON object of a pair."""
     import_cv2().setNumThreads(1)
@@ -154,8 +195,7 @@ def _estimate(image1: Path, image2: Path, options: PairOptions) -> dict[str, Any
         return estimate_pair(image1, image2, **options.arguments(image1, image2)).as_dict()
     except (ValueError, OSError) as error:
         code = error.code if isinstance(error, NoReliableMatrixError) else UNREADABLE
-        files = {"image1": {"file": str(image1)}, "image2": {"file": str(image2)}}
-        return {"F": None, "warnings": [{"code": code, "text": str(error)}], **files}
+        return describe_failure(code, str(error), image1, image2, options)
 
 
 def _done(path: Path) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from kornia_learnnorm.evaluation.reliability import PairWarning
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.summary import median
 
-__all__ = ["NoReliableMatrixError", "PairEstimate"]
+__all__ = ["NoReliableMatrixError", "PairEstimate", "package_versions"]
 
 
 class NoReliableMatrixError(ValueError):
@@ -96,7 +96,7 @@ class PairEstimate:
             "weights": rows(self.weights),
             "inliers": rows(self.inliers),
             "in_front": rows(self.front),
-            "versions": {name: version(name) for name in ("kornia-learnnorm", "kornia", "torch")},
+            "versions": package_versions(),
         }
 
     def summary(self) -> str:
@@ -122,3 +122,8 @@ class PairEstimate:
                 *(f"warning  {warning.code}: {warning.text}" for warning in self.warnings),
             ]
         )
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that an estimate depends on."""
+    return {name: version(name) for name in ("kornia-learnnorm", "kornia", "torch")}

@@ -20,6 +20,20 @@ def test_numbers_and_files(tmp_path):
         assert read_camera(text).tolist() == expected
 
 
+def test_calibration_of_kitti(tmp_path):
+    """P0 counts, with the numbers of sequence 00."""
+    path = tmp_path / "calib.txt"
+    rows = "{0} 0 607.1928 {1} 0 {0} 185.2157 0 0 0 1 0"
+    path.write_text(f"P0: {rows.format(718.856, 0)}\nP1: {rows.format(700, -386.1448)}\n")
+    assert read_camera(str(path)).tolist() == [[718.856, 0, 607.1928], [0, 718.856, 185.2157], [0, 0, 1]]
+    path.write_text("P0: 1 2 3\n")
+    with pytest.raises(ValueError, match=r"calib\.txt, line 1.*12 numbers"):
+        read_camera(str(path))
+    path.write_text(f"P2: {rows.format(718.856, 0)}\n")
+    with pytest.raises(ValueError, match=r"calib\.txt: expected .* KITTI's calib\.txt"):
+        read_camera(str(path))
+
+
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [

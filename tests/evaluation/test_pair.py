@@ -16,6 +16,7 @@ from two_view import epipolar_distances
 
 from kornia_learnnorm.cli import estimate as command_module
 from kornia_learnnorm.cli.estimate import add_arguments, run
+from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
@@ -306,9 +307,22 @@ class TestCommand:
         Path("F.json").unlink()
         assert command("--json", "F.json", images=(scene.left, scene.left)) == 3
         captured = capsys.readouterr()
-        assert captured.out == ""
+        assert captured.out == "wrote    F.json\n"
         assert "no reliable matrix (no_motion): " in captured.err
-        assert not list(Path().iterdir())
+        failure = json.loads(Path("F.json").read_text())
+        assert [failure[name] for name in ("F", "E", "R", "t", "predicted_error_px")] == [None] * 5
+        assert [warning["code"] for warning in failure["warnings"]] == ["no_motion"]
+        assert "no motion" in failure["warnings"][0]["text"]
+        assert failure["image1"] == {"file": str(scene.left), "width": WIDTH, "height": HEIGHT}
+        assert (failure["estimator"], failure["seed"], failure["ratio"], failure["threshold_px"]) == (
+            "RANSAC",
+            0,
+            0.8,
+            1,
+        )
+        assert command("--json", "-", "--out", "pair.png", images=(scene.left, scene.left)) == 3
+        assert json.loads(capsys.readouterr().out) == failure
+        assert [path.name for path in Path().iterdir()] == ["F.json"]
 
     def test_masks(self, command, result, capsys):
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
@@ -331,8 +345,12 @@ class TestCommand:
             (["--K", "1,2"], ValueError, "camera 1,2: expected fx,fy,cx,cy, .* got 2 numbers"),
             (["--K", "a", "b", "c"], ValueError, "--K: one value for both images or one for each expected, got 3"),
             (["--mask", "none.png"], FileNotFoundError, "none.png"),
-            (["--jobs", "3"], ValueError, "--jobs and --dask go with --pairs"),
-            (["--pairs", "list.txt"], ValueError, "neither images, --json nor --mask go with it"),
+            (["--jobs", "3"], ValueError, "--jobs: only for --pairs LIST, which was not given"),
+            (["--jobs", "3", "--dask", "tcp://a:1"], ValueError, "--jobs and --dask: only for --pairs"),
+            (["--pairs", "l.txt"], ValueError, r"--pairs l\.txt: cannot be combined with image files$"),
+            (["--pairs", "l.txt", "--json", "-"], ValueError, "cannot be combined with image files and --json$"),
+            (["--matcher", "lightglue"], ValueError, "matcher lightglue needs detector disk, got sift"),
+            (["--ratio", "2"], ValueError, "ratio must be above 0 and at most 1, got 2"),
             (["--weights", "robust"], ValueError, "--weights robust: only --estimator learned has weights"),
         ],
     )
@@ -343,6 +361,21 @@ class TestCommand:
             command(*arguments)
         assert not list(Path().iterdir())
         assert capsys.readouterr().out == ""
+
+    @pytest.mark.parametrize("seed", ["-1", "1.5", "x", str(2**63)])
+    def test_seeds_are_checked_while_parsing(self, command, seed, capsys):
+        with pytest.raises(SystemExit, match="2"):
+            command("--seed", seed)
+        assert f"a whole number from 0 to 2^63 - 1 expected, got {seed}" in capsys.readouterr().err
+
+    def test_help_fits_a_screen(self, monkeypatch, capsys):
+        monkeypatch.setenv("COLUMNS", "100")
+        with pytest.raises(SystemExit, match="0"):
+            main(["estimate", "--help"])
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) <= 45
+        assert max(map(len, lines)) <= 100
+        assert [line.split()[:2] for line in lines[-2:]] == [["learnnorm", "estimate"]] * 2
 
     def test_images_are_not_overwritten(self, command, scene):
         with pytest.raises(ValueError, match=r"--out .*left\.png: would overwrite"):
@@ -384,6 +417,8 @@ class TestManyPairs:
         ]
         assert np.allclose(lines[0]["F"], result.F_mat)
         assert lines[1]["F"] is None
+        assert lines[1]["image2"] == {"file": str(scene.blank), "width": WIDTH, "height": HEIGHT}
+        assert lines[1]["versions"] == lines[0]["versions"]
         with pytest.raises(ValueError, match="results with other options"):
             command(*many, "--ratio", "0.7", images=())
 
@@ -400,6 +435,24 @@ class TestManyPairs:
         assert command(*many, images=()) == 0
         (line,) = Path("found/pairs.jsonl").read_text().splitlines()
         assert json.loads(line)["warnings"] == []
+
+    @pytest.mark.parametrize(
+        ("options", "error", "message"),
+        [
+            (["--out", "file"], ValueError, "--out file: a folder expected with --pairs, got a file"),
+            ([], ValueError, "--out FOLDER is needed"),
+            (["--out", "found", "--mask", "a.png"], ValueError, r"--pairs list\.txt: cannot be combined with --mask$"),
+            (["--out", "found", "--jobs", "2", "--dask", "tcp://a:1"], ValueError, "exclude each other"),
+            (["--out", "found", "--threshold", "-1"], ValueError, "threshold must be positive"),
+            (["--out", "found", "--estimator", "learned", "--weights", "no"], (ValueError, OSError), "no"),
+        ],
+    )
+    def test_bad_options_are_refused_before_the_work(self, command, scene, options, error, message):
+        Path("list.txt").write_text(f"{scene.left} {scene.right}\n")
+        Path("file").write_text("")
+        with pytest.raises(error, match=message):
+            command("--pairs", "list.txt", *options, images=())
+        assert not Path("found").exists()
 
     def test_cameras_are_read_before_the_work(self, command, scene):
         Path("list.txt").write_text(f"{scene.left} {scene.right}\n")

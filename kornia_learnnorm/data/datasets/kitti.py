@@ -13,7 +13,7 @@ from kornia_learnnorm.data.datasets.splits import choose_sequences
 from kornia_learnnorm.data.datasets.textfiles import parse_numbers, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 
-__all__ = ["read_kitti"]
+__all__ = ["read_calibration", "read_kitti"]
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera:
         raise ValueError(f"a camera of KITTI must be one of image_0 to image_3, got {camera!r}")
     frames = []
     for name, folder in choose_sequences("kitti", root, sequences).items():
-        K, shift = _camera(folder / "calib.txt", f"P{camera[-1]}")
+        K, shift = read_calibration(folder / "calib.txt", f"P{camera[-1]}")
         path = root / "poses" / f"{name}.txt"
         poses = _poses(path) if path.exists() else None
         for number, image in _images(folder / camera):
@@ -53,8 +53,18 @@ def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera:
     return frames
 
 
-def _camera(path: Path, key: str) -> tuple[Array, Array]:
-    """Return a camera's matrix (3, 3) and its pose in camera 0 (4, 4) from its projection K (I | b)."""
+def read_calibration(path: Path, key: str) -> tuple[Array, Array]:
+    """Return a camera's matrix (3, 3) and its pose in camera 0 (4, 4) from its projection K (I | b).
+
+    Args:
+        path: a file ``calib.txt``.
+        key: the projection's name, ``P0`` to ``P3`` for ``image_0`` to ``image_3``.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it has no such projection, or the projection is malformed.
+
+    """
     for number, line in text_lines(path, "calibration"):
         name, _, rest = line.partition(":")
         if name.strip() != key:
