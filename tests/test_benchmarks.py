@@ -7,11 +7,13 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError
 
 pytest.importorskip("cv2")
@@ -183,3 +185,69 @@ def test_the_benchmark_runs(pairs, tmp_path, capsys):
     records = json.loads((tmp_path / "pairs.json").read_text())
     assert [record["kind"] for record in records] == ["plane", "rotation", "outliers"]
     assert [record["determined"] for record in records] == [False, False, True]
+
+
+@pytest.fixture(scope="module")
+def real_pairs():
+    """Import the benchmark of real pairs as when it is run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        return importlib.import_module("real_pairs")
+
+
+@pytest.fixture(scope="module")
+def real_pair(real_pairs, case):
+    """The rendered room as a pair of frames."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = case.R.mT, -case.R.mT @ case.t  # camera 2 to camera 1, which is the world
+    first = Frame(Path("1.png"), "1.png", "room", (160, 120), case.K.numpy(), np.eye(4))
+    second = Frame(Path("2.png"), "2.png", "room", (160, 120), case.K.numpy(), pose)
+    return real_pairs.Pair("tum", 3, FramePair(first, second), calibrated=True)
+
+
+class TestRealPairs:
+    def test_errors_of_poses(self, real_pairs, real_pair, case):
+        points = case.points1, case.points2
+        assert real_pairs.error_of_pose(real_pair, true_matrix(case), *points) < 1e-5
+        assert real_pairs.error_of_pose(real_pair, sideways(case), *points) > 45
+        assert real_pairs.error_of_pose(real_pair, torch.full((3, 3), torch.nan).double(), *points) == math.inf
+
+    def test_subsets_and_what_other_packages_find(self, real_pairs, real_pair, case, monkeypatch):
+        """Every estimator gets the same matches, and cameras only where they are known."""
+        order = torch.randperm(len(case.points1), generator=torch.Generator().manual_seed(0))[:60]
+        matches = case.points1[order], case.points2[order]
+        found = kln.estimate_matches(*matches, size1=(160, 120), size2=(160, 120))
+        monkeypatch.setattr(kln, "estimate_pair", lambda *_, **__: found)
+        given = []
+
+        def peer(x1, x2, sizes, seed, threshold, *cameras):
+            given.append((len(x1), len(cameras)))
+            return true_matrix(case).numpy() if len(x1) > 20 else None
+
+        records = real_pairs.measure(real_pair, {"poselib": peer}, (8, 20, 0))
+        assert [record["size"] for record in records] == [0, 8, 20]
+        assert given == [(60, 1), (8, 1), (20, 1)]
+        assert records[0]["poselib"] < 1e-5
+        assert [record["poselib"] for record in records[1:]] == [math.inf] * 2
+        assert records[0]["estimate_pair"]["inliers"] == found.num_inliers
+        assert records[1]["estimate_pair"]["refused"] == "few_matches"
+        assert real_pairs.measure(real_pair._replace(calibrated=False), {"poselib": peer}, ())
+        assert given[-1] == (60, 0)
+
+    def test_tables(self, real_pairs, capsys):
+        own = {"refused": None, "error": 12.0, "warnings": [], "inliers": 50, "matches": 70, "predicted": 0.5}
+        refused = {"refused": "few_matches", "error": math.inf, "warnings": ["few_matches"]}
+        base = {"dataset": "tum", "calibrated": False, "size": 0}
+        records = [
+            {**base, "pair": 0, "estimate_pair": own, "RANSAC": 11.0, "poselib": 1.0},
+            {**base, "pair": 1, "estimate_pair": refused},
+            {**base, "pair": 0, "size": 8, "estimate_pair": refused, "RANSAC": 20.0, "poselib": 30.0},
+        ]
+        real_pairs.print_tables(records, ["poselib"])
+        rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines()]
+        assert ["0", "12.00", "11.00", "50 of 70", "0.50", "none"] in rows
+        assert ["1", "inf", "inf", "-", "-", "few_matches"] in rows
+        assert ["tum", "without", "estimate_pair", "2", "inf", "inf", "1", "1", "1"] in rows
+        assert ["tum", "without", "estimate_pair", "inf (0)", "-", "-", "-", "12.00 (1)"] in rows
+        assert ["tum", "without", "estimate_pair: flagged", "1 of 1", "0 of 0", "0 of 0", "0 of 0", "0 of 1"] in rows
+        assert ["tum", "without", "PoseLib", "30.00 (1)", "-", "-", "-", "1.00 (0)"] in rows

@@ -1,0 +1,249 @@
+"""Measure the pose errors of `estimate_pair` on real image pairs, beside RANSAC and other packages on its matches.
+
+The pairs are consecutive frames of TUM RGB-D (poses up to 0.1 s away) and of KITTI odometry 06. Every estimator gets
+the one-to-one matches of `estimate_pair`; poses are taken from F, the true cameras and the matches within 1 px of F.
+The error is the larger of the angles of rotation and translation; an answer is wrong above 10 degrees, or without a
+pose. With cameras, as with `--K`, F has five parameters instead of seven. The last table is of random subsets of the
+matches of every fourth pair. Prints progress to stderr.
+
+    python benchmarks/real_pairs.py DATA [--datasets tum kitti] [--pairs 50] [--every 4] [--json FILE]
+
+DATA holds the folders `tum/SEQUENCE` and `kitti/sequences/06`, `kitti/poses/06.txt`.
+"""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.datasets.frames import FramePair
+from kornia_learnnorm.data.datasets.reading import read_dataset
+from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, find_peer
+from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.files import write_text
+
+DATASETS: dict[str, dict[str, Any]] = {"tum": {"max_difference": 0.1}, "kitti": {"sequences": ["06"]}}
+PEERS = {"opencv-usac-magsac": "OpenCV USAC_MAGSAC", "poselib": "PoseLib"}  # where installed
+OWN = "estimate_pair"
+SIZES = (8, 32, 128, 512, 0)  # matches of a subset; 0 for all
+THRESHOLD = 1.0  # pixels
+MAX_RATIO = 1.1  # of an error to that of RANSAC
+MAX_POSE_ERROR = 10.0  # degrees; an answer with a larger one is wrong
+
+Record = dict[str, Any]
+
+
+class Pair(NamedTuple):
+    """An image pair with its truth, and the cameras that the estimators may use."""
+
+    dataset: str
+    number: int
+    frames: FramePair
+    calibrated: bool
+
+    @property
+    def cameras(self) -> dict[str, Tensor]:
+        """Return the arguments K1 and K2; none without cameras."""
+        return dict(zip(("K1", "K2"), self.K, strict=True)) if self.calibrated else {}
+
+    @property
+    def K(self) -> tuple[Tensor, Tensor]:  # noqa: N802
+        """Return the true cameras."""
+        return torch.from_numpy(self.frames.frame1.K), torch.from_numpy(self.frames.frame2.K)
+
+
+def error_of_pose(pair: Pair, F_mat: Tensor, points1: Tensor, points2: Tensor) -> float:
+    """Return the larger error of rotation and translation, degrees; infinite without a matrix or pose."""
+    near = kln.symmetric_epipolar_distance(points1, points2, F_mat) < THRESHOLD
+    if int(near.sum()) == 0:
+        return math.inf
+    K1, K2 = pair.K
+    R, t = kln.relative_pose(F_mat[None], K1[None], K2[None], points1[near][None], points2[near][None])
+    true_R, true_t = (torch.from_numpy(value)[None] for value in pair.frames.motion)
+    return kln.pose_error(R, t, true_R, true_t).nan_to_num(nan=math.inf).item()
+
+
+def run_own(pair: Pair, solve: Callable[..., kln.PairEstimate]) -> tuple[Record, kln.PairEstimate | None]:
+    """Return the record of an estimate of this package, and the estimate where there is one."""
+    try:
+        found = solve(**pair.cameras)
+    except kln.NoReliableMatrixError as error:
+        return {"refused": error.code, "error": math.inf, "warnings": [error.code]}, None
+    return {
+        "refused": None,
+        "error": error_of_pose(pair, found.F_mat, found.points1, found.points2),
+        "warnings": [warning.code for warning in found.warnings],
+        "inliers": found.num_inliers,
+        "matches": found.num_matches,
+        "predicted": found.predicted_error,
+    }, found
+
+
+def run_others(pair: Pair, peers: dict[str, Any], size: Tensor, *matches: Tensor) -> dict[str, float]:
+    """Return the pose errors of RANSAC and other packages on matches."""
+    points1, points2, scores = matches
+    found = kln.RANSAC(inl_th=THRESHOLD, seed=0).estimate(points1, points2, scores.clamp(min=1e-3), **pair.cameras)
+    errors = {"RANSAC": error_of_pose(pair, found.F_mat, points1, points2)}
+    cameras = [torch.stack(pair.K).numpy()] if pair.calibrated else []
+    for name, estimate in peers.items():
+        try:
+            F = estimate(points1.numpy(), points2.numpy(), size.numpy(), 0, THRESHOLD, *cameras)
+        except Exception as error:  # OpenCV raises its own for too few matches
+            print(f"{name}: {error}", file=sys.stderr)
+            F = None
+        known = F is not None and np.shape(F) == (3, 3) and np.isfinite(F).all()
+        errors[name] = error_of_pose(pair, torch.from_numpy(np.array(F)), points1, points2) if known else math.inf
+    return errors
+
+
+def measure(pair: Pair, peers: dict[str, Any], sizes: Sequence[int]) -> list[Record]:
+    """Return the records of all matches and of random subsets of them, with their number as `size`, 0 for all."""
+    own, found = run_own(pair, lambda **cameras: kln.estimate_pair(*(f.path for f in pair.frames), **cameras))
+    base = {"dataset": pair.dataset, "pair": pair.number, "calibrated": pair.calibrated}
+    if found is None:
+        return [{**base, "size": 0, OWN: own}]
+    pixels = torch.tensor([found.size1, found.size2], dtype=torch.int32)
+    matches = (found.points1, found.points2, found.scores)
+    records = [{**base, "size": 0, OWN: own, **run_others(pair, peers, pixels, *matches)}]
+    order = torch.randperm(found.num_matches, generator=torch.Generator().manual_seed(pair.number))
+    for size in sizes:
+        if 0 < size < found.num_matches:
+            chosen = tuple(value[order[:size]] for value in matches)
+
+            def solve(chosen: tuple[Tensor, ...] = chosen, **cameras: Tensor) -> kln.PairEstimate:
+                return kln.estimate_matches(*chosen, found.size1, found.size2, **cameras)
+
+            records.append(
+                {**base, "size": size, OWN: run_own(pair, solve)[0], **run_others(pair, peers, pixels, *chosen)}
+            )
+    return records
+
+
+def error_of(record: Record, name: str) -> float:
+    """Return the pose error of an estimator in a record; infinite where there is none."""
+    return float(record[OWN]["error"] if name == OWN else record.get(name, math.inf))
+
+
+def pair_table(records: Sequence[Record]) -> str:
+    """Return a row for each pair: errors, inliers, predicted error and warnings."""
+    rows = []
+    for record in records:
+        own = record[OWN]
+        numbers = [f"{error_of(record, name):.2f}" for name in (OWN, "RANSAC")]
+        counts = f"{own['inliers']} of {own['matches']}" if not own["refused"] else "-"
+        predicted = f"{own['predicted']:.2f}" if not own["refused"] else "-"
+        rows.append([str(record["pair"]), *numbers, counts, predicted, ", ".join(own["warnings"]) or "none"])
+    header = ["pair", f"{OWN}: degrees", "RANSAC: degrees", "inliers", "predicted px", "warnings"]
+    return format_table(header, rows)
+
+
+def is_silent(record: Record, name: str) -> bool:
+    """Return whether an answer is wrong without a warning; only this package's estimate can warn or refuse."""
+    return error_of(record, name) > MAX_POSE_ERROR and not (name == OWN and record[OWN]["warnings"])
+
+
+def summary_rows(records: Sequence[Record], names: Sequence[str], label: Sequence[str]) -> list[list[str]]:
+    """Return a row for each estimator."""
+    rows = []
+    reference = np.array([error_of(record, "RANSAC") for record in records])
+    for name in names:
+        errors = np.array([error_of(record, name) for record in records])
+        numbers = [f"{value:.2f}" for value in (np.median(errors), errors.max())]
+        near = str(int(((errors <= MAX_RATIO * reference) & np.isfinite(errors)).sum()))
+        flagged = str(sum(bool(record[OWN]["warnings"]) for record in records)) if name == OWN else "-"
+        silent = str(sum(is_silent(record, name) for record in records))
+        rows.append([*label, PEERS.get(name, name), str(len(records)), *numbers, near, flagged, silent])
+    return rows
+
+
+def subset_rows(records: Sequence[Record], names: Sequence[str], label: Sequence[str]) -> list[list[str]]:
+    """Return a row for each estimator: for each size the median error and the number of silently wrong answers."""
+    drawn = {record["pair"] for record in records if record["size"]}
+    groups = [[r for r in records if r["size"] == size and r["pair"] in drawn] for size in SIZES]
+    rows = []
+    for name in names if drawn else ():
+        cells = [
+            f"{np.median([error_of(r, name) for r in group]):.2f} ({sum(is_silent(r, name) for r in group)})"
+            if group
+            else "-"
+            for group in groups
+        ]
+        rows.append([*label, PEERS.get(name, name), *cells])
+    if drawn:
+        flagged = [f"{sum(bool(r[OWN]['warnings']) for r in group)} of {len(group)}" for group in groups]
+        rows.insert(1, [*label, f"{OWN}: flagged", *flagged])
+    return rows
+
+
+def print_tables(records: Sequence[Record], peers: Sequence[str]) -> None:
+    """Print a table of pairs for each dataset, then the summary and the subsets."""
+    names = [OWN, "RANSAC", *peers]
+    summary: list[list[str]] = []
+    subsets: list[list[str]] = []
+    for dataset, calibrated in ((d, c) for d in DATASETS for c in (False, True)):
+        mine = [r for r in records if (r["dataset"], r["calibrated"]) == (dataset, calibrated)]
+        whole = [record for record in mine if record["size"] == 0]
+        if not whole:
+            continue
+        cameras = "with" if calibrated else "without"
+        print(f"{dataset}, {cameras} cameras\n\n{pair_table(whole)}\n")
+        summary += summary_rows(whole, names, [dataset, cameras])
+        subsets += subset_rows(mine, names, [dataset, cameras])
+    counts = ["pairs", "median degrees", "largest", f"within {MAX_RATIO:g} times RANSAC", "flagged", "silently wrong"]
+    print("Summary\n\n" + format_table(["set", "cameras", "estimator", *counts], summary))
+    if subsets:
+        sizes = [f"{size or 'all'} matches" for size in SIZES]
+        print("\nSubsets: median degrees (silently wrong)\n")
+        print(format_table(["set", "cameras", "estimator", *sizes], subsets))
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Estimate the pairs, print the tables and write the numbers."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="folder with tum/ and kitti/")
+    parser.add_argument("--datasets", nargs="+", choices=[*DATASETS], default=[*DATASETS])
+    parser.add_argument("--pairs", type=int, default=50, help="first pairs of each set")
+    parser.add_argument("--every", type=int, default=4, help="subsets are drawn of each so many-th pair; 0 for none")
+    parser.add_argument("--json", help="write a record of every pair to this file")
+    options = parser.parse_args(args)
+    peers = {name: {} for name in PEERS}
+    for name in PEERS:
+        try:
+            peers[name] = {False: find_peer(name), True: find_peer(name + CALIBRATED)}
+        except ImportError as error:
+            print(error, file=sys.stderr)
+            del peers[name]
+    records: list[Record] = []
+    for dataset in options.datasets:
+        frames = read_dataset(dataset, options.data / dataset, **DATASETS[dataset])[: options.pairs + 1]
+        for number, both in enumerate(pairwise(frames)):
+            for calibrated in (False, True):
+                sizes = SIZES if options.every and number % options.every == 0 else ()
+                solvers = {name: solver[calibrated] for name, solver in peers.items()}
+                records += measure(Pair(dataset, number, FramePair(*both), calibrated), solvers, sizes)
+            print(f"{dataset} {number}", file=sys.stderr, flush=True)
+    print_tables(records, [*peers])
+    if options.json:
+        write_text(options.json, json.dumps(_finite(records), indent=1, allow_nan=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    """Return records with null in the place of infinite errors."""
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+if __name__ == "__main__":
+    main()
