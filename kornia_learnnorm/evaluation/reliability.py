@@ -24,6 +24,7 @@ __all__ = [
     "Stability",
     "assess",
     "check_ambiguity",
+    "choose_found",
     "find_homography",
     "log_false_alarms",
     "measure_stability",
@@ -34,6 +35,8 @@ __all__ = [
 
 NUM_PARTS = 12  # random parts of the matches that are solved again
 PART_INLIERS = 48  # expected in a part, where these are more than half and less than four fifths of all inliers
+MIN_SUPPORT = 0.75  # of the inliers; the matrix of a part with fewer is that of a search that failed
+MIN_FOUND = 4  # parts; with fewer matrices of as much support, all of them count
 MAX_ANGLE = 6.0  # degrees; a pose that moves by more in half of the parts is unstable
 NOMINAL_FOCAL = 1.2  # of the longer image side: focal length where no camera is given
 MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
@@ -88,6 +91,21 @@ def random_parts(number: int, inliers: int, seed: int) -> Tensor:
     size = min(max(8, round(share * number)), number - 1)
     generator = torch.Generator().manual_seed(seed)
     return torch.stack([torch.randperm(number, generator=generator)[:size] for _ in range(NUM_PARTS)])
+
+
+def choose_found(F_parts: Tensor, support: Tensor, inliers: int) -> Tensor:
+    """Return the matrices of parts that most inliers agree with; all of them where these are few.
+
+    Among many outliers the search in a part can fail. Its matrix has little support among all matches then, and says
+    nothing about how well the inliers determine theirs, unlike another matrix with as much support.
+
+    Args:
+        F_parts: matrices of the parts, (P, 3, 3).
+        support: number of all matches that agree with each, (P,).
+        inliers: number that agree with the matrix of all.
+    """
+    found = support >= MIN_SUPPORT * inliers
+    return F_parts[found] if int(found.sum()) >= MIN_FOUND else F_parts
 
 
 def measure_stability(

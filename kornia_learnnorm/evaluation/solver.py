@@ -52,6 +52,14 @@ class TwoViewSolver:
         """Return which matches lie within the threshold of a matrix (3, 3), (N,) bool."""
         return symmetric_epipolar_distance(self.points1, self.points2, F_mat) < self.threshold
 
+    def support(self, F_mat: Tensor) -> Tensor:
+        """Return how many matches lie within the threshold of each matrix (P, 3, 3), (P,)."""
+        number = len(F_mat)
+        distance = symmetric_epipolar_distance(
+            self.points1.expand(number, -1, -1), self.points2.expand(number, -1, -1), F_mat
+        )
+        return (distance < self.threshold).sum(-1)
+
     def solve(self, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the matrix (3, 3) of all matches or of some rows (M,), and the weights (M,) of these matches."""
         rows = torch.arange(len(self.points1)) if rows is None else rows

@@ -12,11 +12,14 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.evaluation.reliability import (
+    MAX_LOG_FALSE_ALARMS,
     MIN_MOTION,
     PairWarning,
     Stability,
     assess,
+    choose_found,
     find_homography,
+    log_false_alarms,
     measure_stability,
     nominal_camera,
     random_parts,
@@ -31,6 +34,8 @@ from kornia_learnnorm.ransac.scoring import finite_and_bounded
 __all__ = ["estimate_matches"]
 
 MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
+FEW_MATCHES = 400  # so few determine a matrix only with more inliers than RANSAC misses again and again
+MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as all matches, before the search ends
 
 Size = tuple[int, int]  # width and height, pixels
 
@@ -106,7 +111,7 @@ def _estimate(solver: TwoViewSolver, size1: Size, size2: Size) -> PairEstimate:
     """Return the estimate of matches from the matrix of all and those of random parts."""
     F_mat, weights = solver.solve()
     parts = random_parts(len(weights), int(solver.inliers(F_mat).sum()), solver.seed)
-    F_parts = torch.stack([solver.solve(rows)[0] for rows in parts])
+    F_parts = _solve_parts(solver, F_mat, parts, size2)
     F_mat = solver.best_of(F_mat, F_parts)
     inliers = solver.inliers(F_mat)
     if int(inliers.sum()) < MIN_MATCHES:
@@ -115,7 +120,8 @@ def _estimate(solver: TwoViewSolver, size1: Size, size2: Size) -> PairEstimate:
         raise NoReliableMatrixError("no_consensus", text)
     K1, K2 = solver.cameras or (nominal_camera(size1), nominal_camera(size2))
     matches = solver.points1, solver.points2
-    stability = measure_stability(F_parts, parts.shape[1], *matches, F_mat, inliers, K1, K2)
+    found_parts = choose_found(F_parts, solver.support(F_parts), int(inliers.sum()))
+    stability = measure_stability(found_parts, parts.shape[1], *matches, F_mat, inliers, K1, K2)
     pose = _find_pose(solver, F_mat, inliers)
     return PairEstimate(
         F_mat=F_mat,
@@ -134,6 +140,23 @@ def _estimate(solver: TwoViewSolver, size1: Size, size2: Size) -> PairEstimate:
         threshold=solver.threshold,
         seed=solver.seed,
     )
+
+
+def _solve_parts(solver: TwoViewSolver, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
+    """Return the matrices of the parts; of few matches, only those before too many are no better than chance."""
+    found: list[Tensor] = []
+
+    def fails(F_mat: Tensor) -> bool:
+        support = int(solver.support(F_mat[None]))
+        return log_false_alarms(len(solver.scores), support, solver.threshold, size2) > MAX_LOG_FALSE_ALARMS
+
+    hopeless = len(solver.scores) <= FEW_MATCHES and fails(F_mat)
+    for rows in parts:
+        found.append(solver.solve(rows)[0])
+        hopeless = hopeless and fails(found[-1])
+        if hopeless and len(found) == MAX_FAILED_PARTS:
+            break
+    return torch.stack(found)
 
 
 class _Pose(NamedTuple):

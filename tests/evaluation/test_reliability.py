@@ -14,6 +14,7 @@ from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.evaluation.reliability import (
     Stability,
     assess,
+    choose_found,
     find_homography,
     log_false_alarms,
     measure_stability,
@@ -63,6 +64,14 @@ class TestAssess:
 
 
 class TestStability:
+    def test_failed_searches_do_not_count(self):
+        """Of 100 inliers, a matrix of a part must have 75; with fewer than four such matrices all count."""
+        F_parts = torch.eye(3).double() * torch.arange(1.0, 7.0)[:, None, None]
+        support = torch.tensor([110, 75, 74, 20, 90, 80])
+        assert choose_found(F_parts, support, 100)[:, 0, 0].tolist() == [1, 2, 5, 6]
+        assert len(choose_found(F_parts, support, 101)) == 6
+        assert torch.equal(choose_found(F_parts, support, 10), F_parts)
+
     @pytest.mark.parametrize("number", [40, 200])
     def test_predicts_the_error_of_noisy_matches(self, number):
         """Against the true error on exact correspondences, over scenes: their medians agree within a factor of two."""

@@ -13,6 +13,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.evaluation import two_view as two_view_module
 from kornia_learnnorm.evaluation.reliability import check_ambiguity, mutual_share
+from kornia_learnnorm.evaluation.solver import TwoViewSolver
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 
@@ -67,6 +68,26 @@ class TestEstimateMatches:
         assert (found.R, found.t, found.front) == (None, None, None)
         assert [warning.code for warning in found.warnings] == ["no_pose"]
         json.dumps(found.as_dict(), allow_nan=False)
+
+    @pytest.mark.parametrize(("number", "solved"), [(60, 1 + 6), (450, 1 + 12)])
+    def test_random_matches_are_given_up_early(self, number, solved, monkeypatch):
+        """After all matches and six parts without more support than chance, unless there are many matches."""
+        solve, calls = TwoViewSolver.solve, []
+
+        def counted(self, rows=None):
+            calls.append(rows)
+            return torch.zeros(3, 3).double(), torch.zeros(number).double()  # of RANSAC without a result
+
+        points = torch.rand(2, number, 2, generator=torch.Generator().manual_seed(0)).double() * 500
+        monkeypatch.setattr(TwoViewSolver, "solve", counted)
+        with pytest.raises(kln.NoReliableMatrixError, match=f"0 of {number} matches agree"):
+            kln.estimate_matches(*points, size1=(500, 500), size2=(500, 500))
+        assert len(calls) == solved
+
+        calls.clear()
+        monkeypatch.setattr(TwoViewSolver, "solve", lambda self, rows=None: calls.append(rows) or solve(self, rows))
+        kln.estimate_matches(*make_matches()[:2])
+        assert len(calls) == 13
 
     def test_the_learned_layer(self):
         points1, points2, _ = make_matches()
