@@ -140,7 +140,7 @@ def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -
     for line, color in zip(lines, rgb, strict=True):
         draw_line(axes, line, color=color, linewidth=1.0)
     axes.scatter(points2[:, 0], points2[:, 1], s=20, c=rgb, edgecolors="black", linewidths=0.7, zorder=3)
-    error = f"predicted error of F {estimate.predicted_error:.2f} px (typical error of these lines)"
+    error = f"predicted error of F: typically {estimate.predicted_error:.2f} px"
     _caption(axes, [("image 2", TEXT), (f"{len(chosen)} epipolar lines", TEXT), (error, TEXT)])
 
 
