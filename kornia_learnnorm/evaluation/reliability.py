@@ -43,6 +43,8 @@ MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
 MIN_SPREAD = 0.02  # of the image diagonal; standard deviation of the inliers across their longest direction
 MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of random models with as much support
 MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
+PARALLAX_SCALES = (1.0, 0.5)  # of the threshold at which parallax is sought; SIFT's errors are below half a pixel
+MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
 MIN_MUTUAL_SHARE = 0.85  # of the matches off the plane that fit; below, false ones agree with each other
 COMMON_ERRORS = 400  # matches beyond which more do not help: the errors of neighbours are alike
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
@@ -168,7 +170,7 @@ def find_homography(points1: Tensor, points2: Tensor, threshold: float) -> Tenso
 def assess(
     points1: Tensor,
     points2: Tensor,
-    inliers: Tensor,
+    distance: Tensor,
     H: Tensor | None,
     threshold: float,
     size2: tuple[int, int],
@@ -179,12 +181,13 @@ def assess(
     Args:
         points1: pixels of all matches in image 1, (N, 2), float64.
         points2: pixels of all matches in image 2, (N, 2).
-        inliers: mask of the inliers, (N,).
+        distance: symmetric epipolar distances of the matches to the matrix, (N,), pixels.
         H: the homography that explains most inliers, or None.
         threshold: largest distance of an inlier, pixels.
         size2: width and height of image 2.
         stability: of the matrix, see :func:`measure_stability`.
     """
+    inliers = distance < threshold
     found, total, matches = [], int(inliers.sum()), len(inliers)
     if total < MIN_INLIERS:
         found.append(PairWarning("few_inliers", f"only {total} of {matches} matches agree on the matrix"))
@@ -196,20 +199,32 @@ def assess(
         text = f"the inliers lie close to one line or one point: {spread:.1%} of the image diagonal apart"
         found.append(PairWarning("clustered", text))
     if H is not None:
-        distance = parallax(points1, points2, H)
-        shares = [float((distance[inliers] < scale * threshold).double().mean()) for scale in (1, 3)]
-        evidence = parallax_evidence(distance, inliers, threshold)
-        if shares[1] > MIN_PLANAR_SHARE and evidence > MAX_LOG_FALSE_ALARMS:
-            text = (
-                f"one homography explains {shares[0]:.0%} of the inliers within {threshold:g} px and {shares[1]:.0%} "
-                f"within {3 * threshold:g} px (a plane, or a camera that only rotates), and the rest do not determine "
-                "the epipole"
-            )
-            found.append(PairWarning("planar", text))
+        found += _check_plane(parallax(points1, points2, H), distance, threshold)
     if stability.angle > MAX_ANGLE:
         text = f"the pose changes by {stability.angle:.0f} degrees when the matches are drawn anew"
         found.append(PairWarning("unstable", text))
     return tuple(found)
+
+
+def _check_plane(off_plane: Tensor, distance: Tensor, threshold: float) -> list[PairWarning]:
+    """Return a warning where most inliers lie on a plane and the parallax of the others is no more than chance.
+
+    Args:
+        off_plane: distances of the matches from where the homography moves them, (N,), pixels.
+        distance: symmetric epipolar distances, (N,), pixels.
+        threshold: largest distance of an inlier, pixels.
+    """
+    shares = [float((off_plane[distance < threshold] < scale * threshold).double().mean()) for scale in (1, 3)]
+    evidence = min(
+        parallax_evidence(off_plane, distance < scale * threshold, scale * threshold) for scale in PARALLAX_SCALES
+    )
+    if shares[1] <= MIN_PLANAR_SHARE or evidence <= MAX_LOG_CHANCE_PARALLAX:
+        return []
+    text = (
+        f"one homography explains {shares[0]:.0%} of the inliers within {threshold:g} px and {shares[1]:.0%} within "
+        f"{3 * threshold:g} px (a plane, or a camera that only rotates), and the rest do not determine the epipole"
+    )
+    return [PairWarning("planar", text)]
 
 
 def mutual_share(points1: Tensor, points2: Tensor, mutual: Tensor, F_mat: Tensor, threshold: float) -> float:

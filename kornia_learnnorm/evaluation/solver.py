@@ -48,9 +48,13 @@ class TwoViewSolver:
     def _ransac(self) -> RANSAC:
         return RANSAC(inl_th=self.threshold, seed=self.seed)
 
+    def distance(self, F_mat: Tensor) -> Tensor:
+        """Return the symmetric epipolar distances of the matches to a matrix (3, 3), (N,), pixels."""
+        return symmetric_epipolar_distance(self.points1, self.points2, F_mat)
+
     def inliers(self, F_mat: Tensor) -> Tensor:
         """Return which matches lie within the threshold of a matrix (3, 3), (N,) bool."""
-        return symmetric_epipolar_distance(self.points1, self.points2, F_mat) < self.threshold
+        return self.distance(F_mat) < self.threshold
 
     def support(self, F_mat: Tensor) -> Tensor:
         """Return how many matches lie within the threshold of each matrix (P, 3, 3), (P,)."""

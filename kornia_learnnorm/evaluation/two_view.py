@@ -133,7 +133,7 @@ def _estimate(solver: TwoViewSolver, size1: Size, size2: Size) -> PairEstimate:
         weights=inliers.double() if solver.layer is None else weights,
         inliers=inliers,
         predicted_error=min(stability.error, float(max(size2))),
-        warnings=_find_warnings(solver, inliers, size2, stability, pose),
+        warnings=_find_warnings(solver, F_mat, size2, stability, pose),
         size1=size1,
         size2=size2,
         ratio=None,
@@ -179,11 +179,13 @@ def _find_pose(solver: TwoViewSolver, F_mat: Tensor, inliers: Tensor) -> _Pose:
 
 
 def _find_warnings(
-    solver: TwoViewSolver, inliers: Tensor, size2: Size, stability: Stability, pose: _Pose
+    solver: TwoViewSolver, F_mat: Tensor, size2: Size, stability: Stability, pose: _Pose
 ) -> tuple[PairWarning, ...]:
     points1, points2, threshold = solver.points1, solver.points2, solver.threshold
-    H = None if solver.cameras else find_homography(points1[inliers], points2[inliers], threshold)
-    warnings = assess(points1, points2, inliers, H, threshold, size2, stability)
+    distance = solver.distance(F_mat)
+    near = distance < threshold
+    H = None if solver.cameras else find_homography(points1[near], points2[near], threshold)
+    warnings = assess(points1, points2, distance, H, threshold, size2, stability)
     if solver.cameras is None or pose.R is not None:
         return warnings
     return (

@@ -29,7 +29,8 @@ STABLE = Stability(0.1, 0.1)
 
 
 def codes(points1, points2, inliers, H=None, stability=STABLE) -> list[str]:
-    found = assess(points1, points2, inliers, H, 1.0, SIZE, stability)
+    distance = torch.where(inliers, 0.3, 5.0).double()
+    found = assess(points1, points2, distance, H, 1.0, SIZE, stability)
     assert all(warning.text and "\n" not in warning.text for warning in found)
     return [warning.code for warning in found]
 
@@ -58,6 +59,15 @@ class TestAssess:
         assert codes(points1, points2, inliers, H) == ["planar"]
         points2[:40, 0] += torch.linspace(10, 60, 40)  # forty matches with parallax along one direction
         assert codes(points1, points2, inliers, H) == []
+
+    @pytest.mark.parametrize(("distance", "found"), [(0.3, []), (0.7, ["planar"])])
+    def test_little_relief(self, points, distance, found):
+        """Parallax of 1.5 px in one direction is evidence where the matches fit within half the threshold."""
+        points2 = points[0].clone()
+        points2[:60, 0] += 1.5
+        distances = torch.full((100,), distance, dtype=torch.float64)
+        warnings = assess(points[0], points2, distances, torch.eye(3).double(), 1.0, SIZE, STABLE)
+        assert [warning.code for warning in warnings] == found
 
     def test_unstable(self, points):
         assert codes(*points, torch.arange(100) < 80, stability=Stability(0.1, 20.0)) == ["unstable"]
