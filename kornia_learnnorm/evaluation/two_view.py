@@ -109,19 +109,11 @@ def _usable_matches(
 
 def _estimate(solver: TwoViewSolver, size1: Size, size2: Size) -> PairEstimate:
     """Return the estimate of matches from the matrix of all and those of random parts."""
-    F_mat, weights = solver.solve()
-    parts = random_parts(len(weights), int(solver.inliers(F_mat).sum()), solver.seed)
-    F_parts = _solve_parts(solver, F_mat, parts, size2)
-    F_mat = solver.best_of(F_mat, F_parts)
-    inliers = solver.inliers(F_mat)
-    if int(inliers.sum()) < MIN_MATCHES:
-        found = f"{int(inliers.sum())} of {len(inliers)} matches agree on a fundamental matrix"
-        text = f"{found} within {solver.threshold:g} px, at least {MIN_MATCHES} are needed"
-        raise NoReliableMatrixError("no_consensus", text)
-    K1, K2 = solver.cameras or (nominal_camera(size1), nominal_camera(size2))
+    found = _search(solver, size2)
+    F_mat, inliers = found.F_mat, solver.inliers(found.F_mat)
+    cameras = solver.cameras or (nominal_camera(size1), nominal_camera(size2))
     matches = solver.points1, solver.points2
-    found_parts = choose_found(F_parts, solver.support(F_parts), int(inliers.sum()))
-    stability = measure_stability(found_parts, parts.shape[1], *matches, F_mat, inliers, K1, K2)
+    stability = measure_stability(found.F_parts, found.part_size, *matches, F_mat, inliers, *cameras)
     pose = _find_pose(solver, F_mat, inliers)
     return PairEstimate(
         F_mat=F_mat,
@@ -130,7 +122,7 @@ def _estimate(solver: TwoViewSolver, size1: Size, size2: Size) -> PairEstimate:
         points1=solver.points1,
         points2=solver.points2,
         scores=solver.scores,
-        weights=inliers.double() if solver.layer is None else weights,
+        weights=inliers.double() if solver.layer is None else found.weights,
         inliers=inliers,
         predicted_error=min(stability.error, float(max(size2))),
         warnings=_find_warnings(solver, F_mat, size2, stability, pose),
@@ -140,6 +132,28 @@ def _estimate(solver: TwoViewSolver, size1: Size, size2: Size) -> PairEstimate:
         threshold=solver.threshold,
         seed=solver.seed,
     )
+
+
+class _Found(NamedTuple):
+    """The matrix of all matches, and what tells how stable it is."""
+
+    F_mat: Tensor
+    weights: Tensor  # of the matches as the estimator sees them, (N,)
+    F_parts: Tensor  # matrices of random parts, without those of failed searches, (P, 3, 3)
+    part_size: int  # matches in a part
+
+
+def _search(solver: TwoViewSolver, size2: Size) -> _Found:
+    """Return the matrix of all matches; raise NoReliableMatrixError where too few agree with it."""
+    F_mat, weights = solver.solve()
+    parts = random_parts(len(weights), int(solver.inliers(F_mat).sum()), solver.seed)
+    F_parts = _solve_parts(solver, F_mat, parts, size2)
+    F_mat = solver.best_of(F_mat, F_parts)
+    agree = int(solver.inliers(F_mat).sum())
+    if agree < MIN_MATCHES:
+        text = f"{agree} of {len(weights)} matches agree on a fundamental matrix within {solver.threshold:g} px"
+        raise NoReliableMatrixError("no_consensus", f"{text}, at least {MIN_MATCHES} are needed")
+    return _Found(F_mat, weights, choose_found(F_parts, solver.support(F_parts), agree), parts.shape[1])
 
 
 def _solve_parts(solver: TwoViewSolver, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
