@@ -18,15 +18,12 @@ from kornia_learnnorm.evaluation.pair import estimate_pair
 from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.files import atomic_write, write_text
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "run"]
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf", ".svg")
-EPILOG = """\
-exit codes: 0 solved; 2 wrong use or an unreadable image; 3 no matrix, or one with warnings
-
-examples:
-  learnnorm estimate left.png right.png --K 700,700,320,240 --out pair.png --json pair.json
-  learnnorm estimate --pairs pairs.txt --out results --estimator learned
+EXAMPLES = """\
+learnnorm estimate left.png right.png --K 700,700,320,240 --out pair.png --json pair.json
+learnnorm estimate --pairs pairs.txt --out results --estimator learned
 """
 UNRELIABLE = 3  # exit code where there is no matrix, or reasons to doubt it
 
@@ -34,9 +31,8 @@ UNRELIABLE = 3  # exit code where there is no matrix, or reasons to doubt it
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm estimate`` to a parser."""
     options = PairOptions()
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.usage = "%(prog)s IMG1 IMG2 [options]\n       %(prog)s --pairs LIST --out FOLDER [options]"
-    parser.epilog = EPILOG
+    parser.description = f"{parser.description}; exit codes: 0 solved, 2 wrong use or unreadable input, 3 unreliable"
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
     parser.add_argument(
         "--out", metavar="PATH", type=Path, help="picture of matches and epipolar lines; with --pairs, a folder"
