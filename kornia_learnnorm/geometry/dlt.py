@@ -24,6 +24,8 @@ __all__ = [
 
 MIN_GAP = 1e-6  # relative gap above which a null vector counts as unique; that of float32 pixels
 MIN_GRAM_RATIO = 1e-5  # of the last but one singular value to the first; below, a Gram matrix has lost too many digits
+# Generic numbers: no null vector of note is orthogonal to them.
+NINTH_ROW = (0.118, -0.264, 0.354, -0.028, -0.41, 0.208, -0.174, 0.444, 0.062)
 MAX_ZERO_VALUE = 1e-10  # relative singular value up to which dependent rows have another null vector
 
 
@@ -72,8 +74,8 @@ def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor,
     r"""Return the null vector and the relative gap that tells how well the rows determine it.
 
     Of eight rows, the gap is the smallest pivot over the largest of the LU factorisation of :math:`A^\top` with partial
-    pivoting, whose unit lower triangular factor gives the null vector. Of more, it is the eighth singular value of
-    :math:`\sqrt w A` over the first. Derivatives of the null vector grow as its inverse.
+    pivoting. Of more, it is the eighth singular value of :math:`\sqrt w A` over the first. Derivatives of the null
+    vector grow as its inverse.
 
     Args:
         A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
@@ -109,15 +111,20 @@ def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor,
 def _eliminate(A: Tensor) -> tuple[Tensor, Tensor]:
     r"""Return unit null vectors (*, 9) of eight rows and the magnitudes of the pivots (*, 8).
 
-    With :math:`A^\top = P L U`, a vector :math:`P [y; 1]` with :math:`L_{1:8}^\top y = -L_9^\top` meets
-    :math:`L^\top P^\top h = 0` and so :math:`A h = 0`, also where :math:`U` is singular. No entry of :math:`L` exceeds
-    one.
+    With a ninth row :math:`r` that is the same for all, the LU factorisation of :math:`[A^\top\; r]` gives the pivots
+    of the eight rows, and the solution of :math:`[A; r^\top] h = e_9` up to scale. The residual is as small as rounding
+    allows, whatever :math:`r`. A vanishing pivot is replaced by what rounding leaves: of several null vectors the
+    solution is one.
     """
-    LU, pivots, _ = torch.linalg.lu_factor_ex(A.mT)
-    y = torch.linalg.solve_triangular(LU[..., :8, :], -LU[..., 8:, :], upper=False, left=False, unitriangular=True)
-    P = torch.lu_unpack(LU, pivots, unpack_data=False)[0]
-    h = (P @ torch.cat([y, torch.ones_like(y[..., :1])], -1).mT)[..., 0]
-    return normalize(h, dim=-1), LU.diagonal(dim1=-2, dim2=-1).abs()
+    r = A.new_tensor(NINTH_ROW).expand(*A.shape[:-2], 1, 9)
+    LU, permutation, _ = torch.linalg.lu_factor_ex(torch.cat([A, r], -2).mT)
+    diagonal = LU.diagonal(dim1=-2, dim2=-1)
+    pivots = diagonal.abs()
+    least = torch.finfo(A.dtype).eps * pivots.amax(-1, keepdim=True)
+    diagonal.copy_(torch.where(pivots < least, safe_divisor(least), diagonal))
+    last = torch.eye(9, dtype=A.dtype, device=A.device)[:, 8:].expand(*A.shape[:-2], 9, 1)
+    h = torch.linalg.lu_solve(LU, permutation, last, adjoint=True)[..., 0]
+    return normalize(h, dim=-1), pivots[..., :8]
 
 
 def independence_gap(dtype: torch.dtype) -> float:

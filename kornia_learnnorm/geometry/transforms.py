@@ -71,8 +71,9 @@ def unit_fundamental(F_mat: Tensor) -> Tensor:
     """
     entries = F_mat.detach().flatten(-2)
     size = entries.abs()
-    first = (size >= size.amax(-1, keepdim=True) / 2).byte().argmax(-1, keepdim=True)
-    sign = torch.where(entries.gather(-1, first) < 0, -1.0, 1.0)[..., None]
+    large = torch.where(size >= size.amax(-1, keepdim=True) / 2, entries.sign(), 0.0)
+    powers = torch.arange(8, -1, -1, dtype=F_mat.dtype, device=F_mat.device).exp2()  # the first outweighs all others
+    sign = torch.where(large @ powers < 0, -1.0, 1.0)[..., None, None]
     F: Tensor = F_mat * (sign / torch.linalg.matrix_norm(F_mat, keepdim=True))
     return F
 
