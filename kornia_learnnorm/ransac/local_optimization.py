@@ -24,7 +24,6 @@ FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; abo
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
 CALIBRATED_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages, with cameras
-CALIBRATED_LOSS_SCALE = 1.5  # thresholds at which the final fit with cameras truncates squared distances
 CALIBRATED_STEPS = 2  # steps of Levenberg-Marquardt in a stage
 
 
@@ -78,10 +77,9 @@ def fit_final_calibrated(scorer: PairScorer, pool: Hypotheses, start: Calibrated
     front = in_front_of_best_pose(start.essential(), rays1, rays2, gains)
     best = int((gains * front).sum(-1).argmax())
     state, weights = Calibrated(*(value[best : best + 1] for value in start)), front[best : best + 1].to(gains)
-    for scale, steps in ((1.0, CALIBRATED_STEPS), (CALIBRATED_LOSS_SCALE, MAX_LM_STEPS)):
-        objective = _objective(scorer, Truncated(scale * scorer.threshold), weights=weights)
-        state = minimize(objective, state, steps, LM_TOLERANCE)[1].state
-    return state
+    near, loss = Truncated(scorer.threshold), GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold)
+    state = minimize(_objective(scorer, near, weights=weights), state, CALIBRATED_STEPS, LM_TOLERANCE)[1].state
+    return minimize(_objective(scorer, loss, weights=weights), state, MAX_LM_STEPS, LM_TOLERANCE)[1].state
 
 
 def _objective(
