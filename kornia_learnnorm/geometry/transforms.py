@@ -98,7 +98,7 @@ def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:
 
 
 def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return homogeneous points (*, N, 3) in Hartley's coordinates, and :func:`hartley_transform`."""
+    """Return homogeneous points :math:`(*, N, 3)` in Hartley's coordinates, and :func:`hartley_transform`."""
     origin = weighted_mean(points, weights)
     centred = points - origin[..., None, :]
     radius = weighted_mean(torch.linalg.vector_norm(centred, dim=-1, keepdim=True), weights)[..., 0]
