@@ -281,7 +281,7 @@ class LearnedEightPoint(nn.Module):
         """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
 
         Args:
-            name: ``"robust"``, ``"robust-synthetic"``, or the path of a ``.safetensors`` file.
+            name: ``"robust"``, ``"robust-synthetic"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
 
         Returns:
             the estimator, in evaluation mode.

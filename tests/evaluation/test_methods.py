@@ -80,7 +80,12 @@ class TestTrainedOn:
         assert find_method(name).trained_on == find_method(f"{name}+LM").trained_on == tuple(names_of(paths).values())
 
     def test_shipped_weights(self):
-        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {*SHIPPED, "robust", "robust-synthetic"}
+        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {
+            *SHIPPED,
+            "robust",
+            "robust-synthetic",
+            "robust-tiny",
+        }
         assert find_method("crossview-synthetic").trained_on == ("synthetic scenes",)
 
     def test_without_weights_or_without_names(self, tmp_path):
