@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
 import math
@@ -21,12 +22,16 @@ pytest.importorskip("cv2")
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
-@pytest.fixture(scope="module")
-def pairs():
-    """Import the benchmark as when it is run."""
+def import_benchmark(name: str):
+    """Import a benchmark as when it is run."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(BENCHMARKS)
-        return importlib.import_module("pairs")
+        return importlib.import_module(name)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return import_benchmark("pairs")
 
 
 @pytest.fixture(scope="module")
@@ -189,10 +194,7 @@ def test_the_benchmark_runs(pairs, tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def real_pairs():
-    """Import the benchmark of real pairs as when it is run."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(BENCHMARKS)
-        return importlib.import_module("real_pairs")
+    return import_benchmark("real_pairs")
 
 
 @pytest.fixture(scope="module")
@@ -251,3 +253,31 @@ class TestRealPairs:
         assert ["tum", "without", "estimate_pair", "inf (0)", "-", "-", "-", "12.00 (1)"] in rows
         assert ["tum", "without", "estimate_pair: flagged", "1 of 1", "0 of 0", "0 of 0", "0 of 0", "0 of 1"] in rows
         assert ["tum", "without", "PoseLib", "30.00 (1)", "-", "-", "-", "1.00 (0)"] in rows
+
+
+@pytest.fixture(scope="module")
+def speed():
+    return import_benchmark("speed")
+
+
+class TestSpeed:
+    @pytest.mark.parametrize("backward", [False, True])
+    def test_every_method_is_timed(self, speed, backward, monkeypatch):
+        monkeypatch.setattr(speed, "SECONDS", 1e-3)
+        monkeypatch.setattr(speed, "MIN_TURNS", 1)
+        args = argparse.Namespace(device="cpu", dtype="float64", quick=True)
+        methods = speed.solvers("cpu") | ({} if backward else speed.single_pairs())
+        times = speed.measure(methods, speed.Case(2, 12), args, backward)
+        assert times.keys() == methods.keys()
+        assert min(times.values()) > 0
+        results = {"2 x 12": times, "4 x 12": {speed.KORNIA: 2.0, "Hartley": 3.0}}
+        lines = speed.table(results).splitlines()
+        assert len(lines) == len(methods) + 2
+        assert "3 (1.50)" in next(line for line in lines if "Hartley" in line)
+        assert lines[-1].rstrip("| ").endswith("-")
+
+    def test_two_fifths_of_larger_sets_are_outliers(self, speed):
+        points1, points2 = speed.correspondences(speed.Case(3, 50), "cpu", torch.float64)
+        scenes = speed.random_scenes(3, 50, torch.Generator().manual_seed(0))
+        assert torch.equal(points1, scenes.points1.double())
+        assert (points2 == scenes.points2).all(-1).sum(-1).tolist() == [30, 30, 30]
