@@ -32,7 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm estimate`` to a parser."""
     options = PairOptions()
     parser.usage = "%(prog)s IMG1 IMG2 [options]\n       %(prog)s --pairs LIST --out FOLDER [options]"
-    parser.description = f"{parser.description}; exit codes: 0 solved, 2 wrong use or unreadable input, 3 unreliable"
+    parser.description = (
+        f"{parser.description}\nexit codes: 0 solved, 2 wrong use or unreadable input, 3 no matrix or a doubtful one"
+    )
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
     parser.add_argument(
         "--out", metavar="PATH", type=Path, help="picture of matches and epipolar lines; with --pairs, a folder"

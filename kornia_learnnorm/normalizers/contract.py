@@ -128,12 +128,12 @@ def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tu
 
     """
     result = transforms_of(normalizer, problem)
-    if result[0] is problem.T1 and result[1] is problem.T2:
-        return result
     expected = (len(problem.points1), 3, 3)
     shapes = [tuple(getattr(T, "shape", ())) for T in result] if isinstance(result, tuple | list) else [type(result)]
     if shapes != [expected, expected]:
         raise ValueError(f"a normalizer must return two transforms of shape {expected}, got {shapes}")
+    if result[0] is problem.T1 and result[1] is problem.T2:
+        return result
     T1, T2 = (T.to(problem.x1) for T in result)
     both = torch.stack([T1, T2]).detach()
     if is_true(~(both.sum().isfinite() & (determinant(both) != 0).all())):
