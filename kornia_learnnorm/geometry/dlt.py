@@ -157,8 +157,8 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
     r"""Return the unit vector :math:`v` that minimises :math:`\sum_i w_i (A_i v)^2`, twice differentiable.
 
     The eigenvectors of the Gram matrix :math:`A^\top W A` are a start, and where it has lost the digits of small
-    singular values, the singular value decomposition of :math:`\sqrt w A`. Newton's steps from there, on residuals
-    :math:`A v`, give the digits and the derivatives. So the condition number is never squared, other singular values
+    singular values, those of the singular value decomposition of :math:`\sqrt w A`. A Newton step with the residuals
+    :math:`A v` brings the digits back, and two more, on the Gram matrix, give the derivatives. Other singular values
     may coincide, the weights may be zero, and a last singular value that is not simple sends a zero gradient instead of
     an infinite one.
 
