@@ -14,6 +14,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_correspondences, check_rank2, needs_gradient
 from kornia_learnnorm.geometry.dlt import independence_gap
+from kornia_learnnorm.geometry.matrices import inverse
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2, rank2_projection
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
@@ -95,7 +96,7 @@ def solve_in_coordinates(
     if rank2 == "projection":
         F_mat = unit_fundamental(transform_fundamental(rank2_projection(F_hat), T1, T2))
     else:
-        R1, R2 = T1 @ torch.linalg.inv_ex(problem.T1)[0], T2 @ torch.linalg.inv_ex(problem.T2)[0]
+        R1, R2 = torch.stack([T1, T2]) @ inverse(torch.stack([problem.T1, problem.T2]))
         F_mat = correct_rank2(problem, transform_fundamental(F_hat, R1, R2))
     if not needs_gradient(F_mat):
         return F_mat

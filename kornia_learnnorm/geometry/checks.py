@@ -188,11 +188,12 @@ def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:
     if weights is None:
         return values.mean(-2)
     total = weights.sum(-1, keepdim=True)
-    empty = total <= 0
-    weights = torch.where(empty, 1.0, weights)
-    return (weights[..., None] * values).sum(-2) / torch.where(empty, weights.shape[-1], total)
+    empty = total == 0
+    # On a CPU, a product with a row is faster than a sum over the last axis but one.
+    mean: Tensor = ((weights + empty)[..., None, :] @ values)[..., 0, :] / (total + weights.shape[-1] * empty)
+    return mean
 
 
 def safe_divisor(values: Tensor) -> Tensor:
-    """Return the values where they are positive and 1 elsewhere, to divide by."""
-    return torch.where(values > 0, values, 1.0)
+    """Return non-negative values with 1 in place of zeros, to divide by."""
+    return values + (values == 0)  # cheaper than `where`, which makes a tensor of the number

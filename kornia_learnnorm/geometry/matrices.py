@@ -11,10 +11,18 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import needs_gradient, safe_divisor
 
-__all__ = ["adjugate", "cofactors", "determinant", "smallest_right_singular_vector_3x3", "smallest_singular_vectors"]
+__all__ = [
+    "adjugate",
+    "cofactors",
+    "determinant",
+    "inverse",
+    "smallest_right_singular_vector_3x3",
+    "smallest_singular_vectors",
+]
 
 RANK1_WEIGHT = 1e-27  # of the complement of the rows, above the square of what rounding leaves of vanishing cofactors
 EPSILON = 1e-15  # of the mean eigenvalue, which a threefold one leaves of itself
+COLUMN_PREFERENCE = 1.1893  # of the last diagonal entry over the first: equal entries are not tied
 MIN_RELATIVE_GAP = 1e-10  # of the two largest eigenvalues of the cofactors' Gram matrix, for a unique vector
 
 
@@ -53,6 +61,18 @@ def determinant(A: Tensor) -> Tensor:
     """
     value: Tensor = (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(-1)
     return value
+
+
+def inverse(A: Tensor) -> Tensor:
+    r"""Return the inverses of matrices :math:`(*, 3, 3)`.
+
+    Example:
+        >>> inverse(torch.diag(torch.tensor([1.0, 2.0, 4.0]))).diagonal()
+        tensor([1.0000, 0.5000, 0.2500])
+
+    """
+    C = cofactors(A)
+    return C.mT / (A[..., 0, :] * C[..., 0, :]).sum(-1)[..., None, None]
 
 
 def smallest_right_singular_vector_3x3(A: Tensor) -> Tensor:
@@ -127,9 +147,12 @@ def _largest_eigenvector(M: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
     smallest = (1 - EPSILON) * mean - 2 * spread
     unique = columns.diagonal(dim1=-2, dim2=-1).amax(-1) > MIN_RELATIVE_GAP * largest[..., 0, 0].square()
     columns = torch.where(unique[..., None, None], columns, M - smallest * eye)
-    best = columns.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    v = columns.gather(-1, best[..., None, None].expand(*best.shape, 3, 1))[..., 0]
-    return _unit((M @ v[..., None])[..., 0]), largest
+    # The column of about the largest diagonal entry. Columns of equal entries must not add up: they may cancel.
+    size = columns.diagonal(dim1=-2, dim2=-1) * torch.linspace(
+        1.0, COLUMN_PREFERENCE, 3, dtype=M.dtype, device=M.device
+    )
+    best = (size == size.amax(-1, keepdim=True)).to(M)
+    return _unit((M @ (columns @ best[..., None]))[..., 0]), largest
 
 
 def _unit(v: Tensor) -> Tensor:

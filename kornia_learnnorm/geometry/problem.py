@@ -17,6 +17,7 @@ from kornia_learnnorm.geometry.dlt import (
     sideways_null_vector,
     solve_null_vector,
 )
+from kornia_learnnorm.geometry.matrices import inverse
 from kornia_learnnorm.geometry.transforms import hartley_coordinates, transform_fundamental
 
 __all__ = ["LinearProblem"]
@@ -109,7 +110,7 @@ class LinearProblem:
         if T1 is self.T1 and T2 is self.T2:
             return self._solve()
         if self.points1.shape[1] == 8:
-            R1, R2 = torch.stack([self.T1, self.T2]) @ torch.linalg.inv_ex(torch.stack([T1, T2]))[0]
+            R1, R2 = torch.stack([self.T1, self.T2]) @ inverse(torch.stack([T1, T2]))
             F = transform_fundamental(self.null_matrix, R1, R2)
             # A null matrix without gradient must not get one by way of Hartley's transforms either.
             if needs_gradient(F):

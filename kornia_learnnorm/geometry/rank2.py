@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, check_tensor
+from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, check_tensor, safe_divisor
 from kornia_learnnorm.geometry.distances import line_norms
 from kornia_learnnorm.geometry.dlt import design_matrix
-from kornia_learnnorm.geometry.matrices import cofactors, smallest_right_singular_vector_3x3
+from kornia_learnnorm.geometry.matrices import cofactors, inverse, smallest_right_singular_vector_3x3
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
 
@@ -101,8 +101,7 @@ def optimal_rank2(
     if iterations < 0:
         raise ValueError(f"iterations must be >= 0, got {iterations}")
     problem = LinearProblem.from_points(points1, points2, weights)
-    inverse1, inverse2 = torch.linalg.inv_ex(problem.T1)[0], torch.linalg.inv_ex(problem.T2)[0]
-    F_hat = transform_fundamental(F_mat.to(problem.x1), inverse1, inverse2)
+    F_hat = transform_fundamental(F_mat.to(problem.x1), inverse(problem.T1), inverse(problem.T2))
     return correct_rank2(problem, F_hat, iterations).to(points1.dtype)
 
 
@@ -116,38 +115,43 @@ def correct_rank2(problem: LinearProblem, F_hat: Tensor, iterations: int = ITERA
 
 
 def _covariance(u: Tensor, problem: LinearProblem) -> Tensor:
-    """Return ``V_0`` of the unit vectors ``u`` up to scale, ``(B, 9, 9)``."""
+    """Return a matrix that equals ``V_0`` of the unit vectors ``u`` up to scale once projected, ``(B, 9, 9)``."""
     x1, x2, weights = problem.x1, problem.x2, problem.weights
     # (u, V_i u) is the sum of the squared normals of both epipolar lines; equal noise in pixels is not equal here.
     scale = (problem.T1[:, 0, 0] / problem.T2[:, 0, 0])[:, None]
     n1, n2 = line_norms(x1, x2, torch.unflatten(u, -1, (3, 3)), weights, floor=EPIPOLE_FLOOR)
     variance = scale * n1.square() + n2.square() / scale
     A = design_matrix(x1, x2)
-    A = A - (A @ u[..., None]) * u[..., None, :]
+    A = torch.addcmul(A, A @ u[..., None], u[:, None], value=-1)
     precision = A.mT @ ((1.0 if weights is None else weights) / variance)[..., None].mul(A)
-    size = precision.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
-    precision = precision / torch.where(size > 0, size, 1.0)
+    size = safe_divisor(precision.diagonal(dim1=-2, dim2=-1).sum(-1))[:, None, None]
     # The pseudo-inverse is the inverse once u itself is given some precision. The ridge is above rounding and lets the
     # directions that no correspondence sees move freely.
     ridge = 64 * torch.finfo(u.dtype).eps
-    eye = torch.eye(9, dtype=u.dtype, device=u.device)
-    inverse = torch.linalg.inv_ex(precision + u[..., :, None] * u[..., None, :] + ridge * eye)[0]
-    held = inverse.detach().diagonal(dim1=-2, dim2=-1).sum(-1) > 1 / (64 * ridge)
-    return _project(torch.where(held[:, None, None], inverse.detach(), inverse), u)
+    precision = torch.addcmul(precision, size * u[..., None], u[:, None])
+    precision = torch.addcmul(precision, size, ridge * torch.eye(9, dtype=u.dtype, device=u.device))
+    covariance = torch.linalg.inv_ex(precision)[0]
+    held = covariance.detach().diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * size > 1 / (64 * ridge)
+    return torch.where(held, covariance.detach(), covariance)
 
 
 def _correct(u: Tensor, covariance: Tensor, iterations: int) -> Tensor:
+    visited: list[Tensor] = []
     for _ in range(iterations):
-        gradient = cofactors(torch.unflatten(u, -1, (3, 3))).flatten(-2)
-        step = (covariance @ gradient[..., None]).squeeze(-1)
+        visited.append(u)
+        gradient = step = cofactors(torch.unflatten(u, -1, (3, 3))).flatten(-2)
+        # Projecting the vectors costs less than projecting V_0.
+        for direction in reversed(visited):
+            step = _project(step, direction)
+        step = (covariance @ step[..., None]).squeeze(-1)
+        for direction in visited:
+            step = _project(step, direction)
         slope = (gradient * step).sum(-1, keepdim=True)
         residual = (u * gradient).sum(-1, keepdim=True) / 3
         u = normalize(u - residual / torch.where(slope > 0, slope, 1.0) * step, dim=-1)
-        covariance = _project(covariance, u)
     return u
 
 
-def _project(covariance: Tensor, u: Tensor) -> Tensor:
-    """Return ``P_u V P_u``."""
-    covariance = covariance - u[..., :, None] * (u[..., None, :] @ covariance)
-    return covariance - (covariance @ u[..., None]) * u[..., None, :]
+def _project(vector: Tensor, u: Tensor) -> Tensor:
+    """Return ``P_u x`` of vectors ``x``, ``(B, 9)``."""
+    return torch.addcmul(vector, (vector * u).sum(-1, keepdim=True), u, value=-1)

@@ -21,6 +21,7 @@ __all__ = [
     "transform_fundamental",
     "transform_points",
     "unit_fundamental",
+    "whitening_from_moments",
     "whitening_transform",
 ]
 
@@ -129,9 +130,14 @@ def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: fl
     centred = x - origin[..., None, :]
     products = torch.cat([centred[..., :1] * centred, centred[..., 1:] * centred], -1)
     covariance = torch.unflatten(weighted_mean(products, w), -1, (2, 2))
+    return whitening_from_moments(origin, covariance, floor).to(points.dtype)
+
+
+def whitening_from_moments(mean: Tensor, covariance: Tensor, floor: float = 1e-6) -> Tensor:
+    r"""Return :func:`whitening_transform` of points with a mean :math:`(*, 2)` and covariance :math:`(*, 2, 2)`."""
     spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-    covariance = torch.where((spread > _rounding(origin))[..., None, None], covariance, 0.0)
-    return affine_transform(inverse_sqrt(covariance, floor), origin).to(points.dtype)
+    covariance = torch.where((spread > _rounding(mean))[..., None, None], covariance, 0.0)
+    return affine_transform(inverse_sqrt(covariance, floor), mean)
 
 
 def _rounding(origin: Tensor) -> Tensor:
@@ -215,17 +221,15 @@ def inverse_sqrt(covariance: Tensor, floor: float = 1e-6) -> Tensor:
     :math:`(\mathrm{adj}\,\Sigma + s I) / (s \sqrt{\mathrm{tr}\,\Sigma + 2 s})` with :math:`s^2 = \det\Sigma`: no
     eigenvectors, so smooth where the eigenvalues meet.
     """
-    a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    trace = a + c
-    empty = trace <= 0
+    a, b, _, c = covariance.flatten(-2).unbind(-1)
+    empty = a + c == 0
+    a, c = a + empty, c + empty
     # Both eigenvalues are raised together by what the smaller one lacks; it changes the larger by less than `floor`.
     spread = ((a - c) / 2).square() + b.square()
-    flat = spread <= 0
-    largest = trace / 2 + torch.where(flat, 0.0, torch.where(flat, 1.0, spread).sqrt())
-    largest = torch.where(empty, 1.0, largest)
+    round_ = spread == 0
+    largest = (a + c) / 2 + (spread + round_).sqrt() * ~round_  # the root of zero has no derivative
     lift = torch.relu(floor * largest - (a * c - b.square()) / largest)
-    a, c = torch.where(empty, 1.0, a + lift), torch.where(empty, 1.0, c + lift)
-    b = torch.where(empty, 0.0, b)
+    a, c = a + lift, c + lift
     s = (a * c - b.square()).sqrt()
-    adjugate_plus = torch.stack([torch.stack([c + s, -b], -1), torch.stack([-b, a + s], -1)], -2)
-    return adjugate_plus / (s * (a + c + 2 * s).sqrt())[..., None, None]
+    scale = s * (a + c + 2 * s).sqrt()
+    return torch.unflatten(torch.stack([c + s, -b, -b, a + s], -1) / scale[..., None], -1, (2, 2))

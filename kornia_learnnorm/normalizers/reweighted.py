@@ -15,14 +15,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import safe_divisor, weighted_mean
-from kornia_learnnorm.geometry.distances import line_norms
+from kornia_learnnorm.geometry.checks import safe_divisor
 from kornia_learnnorm.geometry.matrices import adjugate, smallest_right_singular_vector_3x3
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.transforms import transform_fundamental, whitening_transform
+from kornia_learnnorm.geometry.transforms import transform_fundamental, whitening_from_moments
 from kornia_learnnorm.normalizers.contract import ProblemNormalizer
 
 __all__ = ["ReweightedWhitening"]
+
+# A symmetric matrix of three rows as six entries, row by row. Its cofactors, in the same order, are products of two
+# entries less products of two others: one factor of all six, then another, twice.
+MINORS = (3, 2, 1, 0, 1, 0, 5, 4, 4, 5, 2, 3, 4, 1, 2, 2, 0, 1, 4, 5, 3, 2, 4, 1)
+ENTRIES = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # of the whole matrix
 
 
 class ReweightedWhitening(ProblemNormalizer):
@@ -68,69 +72,109 @@ class ReweightedWhitening(ProblemNormalizer):
             held = problem.detach(~problem.determined)
         else:
             held = problem
-        x = torch.stack([held.x1, held.x2])
         # Hartley's coordinates keep the shape of the pixels, which the distances to lines need.
-        T1, T2 = whitening_transform(x[..., :2], self._weigh(x, held)) @ torch.stack([problem.T1, problem.T2])
+        # The batch comes last, (2, N, 2, B) for coordinates and views: every operation runs along contiguous memory.
+        points = torch.stack([held.x1, held.x2])[..., :2].permute(3, 2, 0, 1).contiguous()
+        T1, T2 = _whitening(points, self._weigh(points, held)) @ torch.stack([problem.T1, problem.T2])
         return T1, T2
 
     def extra_repr(self) -> str:
         """Return the parameters."""
         return f"iterations={self.iterations}, damping={self.damping:g}"
 
-    def _weigh(self, x: Tensor, problem: LinearProblem) -> Tensor:
-        """Return the weights of the last whitening of both views, ``(2, B, N)``, for their points ``(2, B, N, 3)``."""
-        weights, F0 = problem.weights, problem.null_matrix
-        given: Tensor | float = 1.0 if weights is None else weights
-        w = (given * _distance_scale(problem.x1, problem.x2, F0, weights)).expand(x.shape[:-1])
+    def _weigh(self, points: Tensor, problem: LinearProblem) -> Tensor:
+        """Return the weights of the last whitening of both views, ``(N, 2, B)``, for their points ``(2, N, 2, B)``."""
+        F0 = problem.null_matrix
+        weights = None if problem.weights is None else problem.weights.mT[:, None]
+        share = None if weights is None else weights / safe_divisor(weights.sum(0))
+        both = torch.stack([F0, F0.mT]).permute(2, 3, 0, 1).contiguous()
+        normals = _evaluate(both[:, :2], points.flip(-2))  # of the epipolar lines in both views, (2, N, 2, B)
+        w = _distance_scale(normals, share).expand(points.shape[1:])
+        if weights is not None:
+            w = w * weights
         if self.iterations == 0:
             return w
         # Adjugates stand for inverses: a line has no scale, and they exist where inverses do not.
         inverse = adjugate(F0)
-        inverses = torch.stack([inverse, inverse.mT])
-        b = _first_line(x, F0, w)
-        lines = torch.stack([b, _solve(x[1], w[1], inverse.mT, b)])
+        inverses = torch.stack([inverse, inverse.mT]).permute(2, 3, 0, 1).contiguous()
+        determinant = (inverse[..., 0, :] * F0[..., :, 0]).sum(-1)
+        products = _products(points)
+        indices = torch.tensor(MINORS, device=w.device), torch.tensor(ENTRIES, device=w.device)
+        b = _first_line(points, F0, w)
+        a = _best_line(products[..., 1, :], w[:, 1], (inverse.mT @ b[..., None])[..., 0].mT, *indices)
+        lines = torch.stack([b.mT, a], 1)
         for iteration in range(self.iterations):
-            if iteration:
-                lines = _solve(x, w, inverses, lines.flip(0))
-            b, a = lines
-            r = (x @ lines[..., None]).squeeze(-1).abs()
-            scale = _distance_scale(problem.x1, problem.x2, _corrected(F0, inverse, a, b), weights)
-            residual = scale * r[0] * r[1]
-            floor = self.damping * safe_divisor(weighted_mean(residual[..., None], weights))
-            factor = given * scale.square() / (residual + floor)
-            w = _unit_mean(factor * r.flip(0).square())
+            target = (inverses * lines.flip(1)).sum(1)
+            # F0 - size a b^T is singular. It turns a view's epipolar line by the distance of the other view's point.
+            divisor = (lines[:, 0] * target[:, 0]).sum(0)
+            size = determinant / torch.where(divisor == 0, 1.0, divisor)
+            r = _evaluate(lines, points).flip(1)
+            scale = _distance_scale(normals - size * r * lines[:2, None], share)
+            residual = scale * (r[:, :1] * r[:, 1:]).abs()
+            floor = self.damping * safe_divisor(_mean(residual, share))
+            factor = scale.square() / (residual + floor)
+            w = (factor if weights is None else factor * weights) * r.square()
+            if iteration + 1 < self.iterations:
+                lines = _best_line(products, w, target, *indices)
         return w
 
 
-def _first_line(x: Tensor, F0: Tensor, w: Tensor) -> Tensor:
+def _whitening(points: Tensor, w: Tensor) -> Tensor:
+    """Return the whitening transforms ``(2, B, 3, 3)`` of points ``(2, N, 2, B)`` with weights ``(N, 2, B)``."""
+    total = w.sum(0)
+    w = (w + (total == 0)) / (total + len(w) * (total == 0))
+    weighted = w * points
+    mean = weighted.sum(1)
+    x, y = (weighted - w * mean[:, None]).unbind(0)
+    a, b, c = (x * points[0]).sum(0), (x * points[1]).sum(0), (y * points[1]).sum(0)
+    covariance = torch.unflatten(torch.stack([a, b, b, c], -1), -1, (2, 2))
+    return whitening_from_moments(torch.stack([*mean], -1), covariance)
+
+
+def _first_line(points: Tensor, F0: Tensor, w: Tensor) -> Tensor:
     """Return view 1's line of the rank-2 correction in the coordinates whitened with ``w``, ``(B, 3)``, unit norm."""
-    T = whitening_transform(x[..., :2], w)
-    F_hat = transform_fundamental(F0, *torch.linalg.inv_ex(T)[0])
+    T = _whitening(points, w)
+    F_hat = transform_fundamental(F0, *adjugate(T))
     return normalize((T[0].mT @ smallest_right_singular_vector_3x3(F_hat)[..., None]).squeeze(-1), dim=-1)
 
 
-def _solve(x: Tensor, w: Tensor, inverse: Tensor, line: Tensor) -> Tensor:
-    """Return the best line of a view for the other view's ``line``: weighted least squares, ``(*, 3)``, unit norm."""
-    moments = x.mT @ (w[..., None] * x)
-    solution = (adjugate(moments) @ (inverse @ line[..., None])).squeeze(-1)
+def _evaluate(lines: Tensor, points: Tensor) -> Tensor:
+    """Return the products of lines ``(3, *, B)`` and homogeneous points, given as ``(2, N, *, B)``."""
+    a, b, c = lines.unsqueeze(-3).unbind(0)
+    return torch.addcmul(torch.addcmul(c, a, points[0]), b, points[1])
+
+
+def _products(points: Tensor) -> Tensor:
+    """Return the six different products of the homogeneous coordinates of points ``(2, N, 2, B)``."""
+    x, y = points.unbind(0)
+    return torch.stack([x * x, x * y, x, y * y, y, torch.ones_like(x)], 1)
+
+
+def _best_line(products: Tensor, w: Tensor, target: Tensor, minors: Tensor, entries: Tensor) -> Tensor:
+    r"""Return the line :math:`S^{-1} t` of unit norm, ``(3, *)``, with the second moments :math:`S` of weighted points.
+
+    Args:
+        products: the points' coordinates' products, ``(N, 6, *)``.
+        w: weights, ``(N, *)``.
+        target: the other view's line by the inverse of ``F0``, ``(3, *)``.
+        minors: the indices ``MINORS`` on the device.
+        entries: the indices ``ENTRIES`` on the device.
+
+    """
+    moments = (products * w[:, None]).sum(0)
+    p, q, r, s = torch.unflatten(moments.index_select(0, minors), 0, (4, 6)).unbind(0)
+    cofactors = torch.addcmul(p * q, r, s, value=-1).index_select(0, entries)
+    line = (torch.unflatten(cofactors, 0, (3, 3)) * target).sum(1)
     # Not `normalize`, whose floor leaves short lines short: from singular moments, shorter with every iteration.
-    return solution / safe_divisor(solution.norm(dim=-1, keepdim=True))
+    return line / safe_divisor(line.square().sum(0).sqrt())
 
 
-def _corrected(F0: Tensor, inverse: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Return ``F0`` less the multiple of ``a b^T`` that leaves it singular; ``inverse`` is the adjugate of ``F0``."""
-    determinant = (inverse[..., 0, :] * F0[..., :, 0]).sum(-1)
-    divisor = (b * (inverse @ a[..., None]).squeeze(-1)).sum(-1)
-    scale = determinant / torch.where(divisor == 0, 1.0, divisor)
-    return F0 - scale[..., None, None] * a[..., :, None] * b[..., None, :]
+def _distance_scale(normals: Tensor, share: Tensor | None) -> Tensor:
+    """Return the scale from the algebraic residual to the symmetric epipolar distance, ``(N, 1, B)``."""
+    norms = normals.square().sum(0).sqrt()
+    norms = norms + 1e-3 * safe_divisor(_mean(norms, share))
+    return norms.reciprocal().sum(1, keepdim=True)
 
 
-def _distance_scale(x1: Tensor, x2: Tensor, F_mat: Tensor, weights: Tensor | None) -> Tensor:
-    """Return the scale from the algebraic residual to the symmetric epipolar distance, ``(*, N)``, with unit mean."""
-    first, second = line_norms(x1, x2, F_mat, weights)
-    factor = 1 / first + 1 / second
-    return factor / safe_divisor(weighted_mean(factor[..., None], weights))
-
-
-def _unit_mean(weights: Tensor) -> Tensor:
-    return weights / safe_divisor(weights.mean(-1, keepdim=True))
+def _mean(values: Tensor, share: Tensor | None) -> Tensor:
+    return values.mean(0) if share is None else (values * share).sum(0)
