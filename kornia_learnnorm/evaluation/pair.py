@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from kornia_learnnorm.evaluation.two_view import estimate_matches
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points, unit_fundamental
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
-__all__ = ["MAX_SIZE", "check_matching", "estimate_pair"]
+__all__ = ["MAX_SIZE", "MatchedPair", "check_matching", "estimate_pair", "match_pair"]
 
 MAX_SIZE = 2000  # pixels of the longer side at which images are matched: SIFT then takes up to 0.5 GB and seconds
 MIN_SIZE = 64  # pixels of the longer side; smaller ones have too few features
@@ -85,36 +85,96 @@ def estimate_pair(
     """
     check_settings(threshold, seed, layer)
     check_matching(ratio, max_size, detector, matcher)
-    cameras = read_cameras(K1, K2)
-    images = (image1, image2)
-    paths = [Path(image) if isinstance(image, str | Path) else None for image in images]
-    (view1, size1), (view2, size2) = (
-        _view(image, mask, max_size, detector) for image, mask in zip(images, (mask1, mask2), strict=True)
-    )
-    S1, S2 = scaling(size1, view1.size), scaling(size2, view2.size)
-    scaled = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
+    read_cameras(K1, K2)  # before the work begins
+    matched = match_pair(image1, image2, ratio, mask1, mask2, max_size, detector, matcher)
+    return matched.estimate(layer, threshold, seed, K1, K2)
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedPair:
+    """The matches of two images that pass the ratio test from image 1 to image 2, to be estimated by any method."""
+
+    points1: Tensor  # pixels of image 1 as it was matched, (N, 2), float64
+    points2: Tensor  # pixels of image 2 as it was matched, (N, 2), float64
+    ratios: Tensor  # larger ratio of the two directions, (N,), float64
+    mutual: Tensor  # mask of the matches that pass the ratio test in both directions, (N,), bool
+    size1: tuple[int, int]  # width and height of image 1 as it was matched
+    size2: tuple[int, int]  # width and height of image 2 as it was matched
+    full_size1: tuple[int, int]  # width and height of image 1
+    full_size2: tuple[int, int]  # width and height of image 2
+    ratio: float  # largest ratio of the nearest to the second-nearest descriptor distance
+    path1: Path | None = None
+    path2: Path | None = None
+
+    @property
+    def scale(self) -> float:
+        """Length of a full image as it was matched over its own, mean of both images and axes."""
+        S1, S2 = self._scalings()
+        return float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
+
+    def estimate(
+        self,
+        layer: LearnedEightPoint | None = None,
+        threshold: float = INLIER_THRESHOLD,
+        seed: int = 0,
+        K1: Points | None = None,
+        K2: Points | None = None,
+    ) -> PairEstimate:
+        """Return the estimate of the matches; arguments and errors are those of :func:`estimate_pair`."""
+        cameras = read_cameras(K1, K2)
+        S1, S2 = self._scalings()
+        scaled = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
+        matches = self.points1[self.mutual], self.points2[self.mutual], 1 - self.ratios[self.mutual]
+        try:
+            estimate = estimate_matches(*matches, self.size1, self.size2, layer, threshold, seed, *scaled)
+        except NoReliableMatrixError as error:
+            raise _named(error, (self.path1, self.path2)) from error
+        share = mutual_share(self.points1, self.points2, self.mutual, estimate.F_mat, threshold)
+        return replace(
+            estimate,
+            F_mat=unit_fundamental(transform_fundamental(estimate.F_mat, S1, S2)),
+            points1=transform_points(estimate.points1[None], torch.linalg.inv(S1)[None])[0],
+            points2=transform_points(estimate.points2[None], torch.linalg.inv(S2)[None])[0],
+            predicted_error=estimate.predicted_error / self.scale,
+            warnings=estimate.warnings + check_ambiguity(share),
+            size1=self.full_size1,
+            size2=self.full_size2,
+            ratio=self.ratio,
+            path1=self.path1,
+            path2=self.path2,
+        )
+
+    def _scalings(self) -> tuple[Tensor, Tensor]:
+        """Return the transforms of pixels from the full images to those that were matched, (3, 3) each."""
+        return scaling(self.full_size1, self.size1), scaling(self.full_size2, self.size2)
+
+
+def match_pair(
+    image1: Image,
+    image2: Image,
+    ratio: float = RATIO,
+    mask1: Mask | None = None,
+    mask2: Mask | None = None,
+    max_size: int = MAX_SIZE,
+    detector: str = "sift",
+    matcher: str = "nearest",
+) -> MatchedPair:
+    """Return the matches of two images; arguments and errors are those of :func:`estimate_pair`."""
+    check_matching(ratio, max_size, detector, matcher)
+    path1, path2 = (Path(image) if isinstance(image, str | Path) else None for image in (image1, image2))
+    view1, full_size1 = _view(image1, mask1, max_size, detector)
+    view2, full_size2 = _view(image2, mask2, max_size, detector)
     try:
-        points1, points2, ratios, mutual = _match(view1, view2, ratio, matcher)
-        matches = points1[mutual], points2[mutual], 1 - ratios[mutual]
-        estimate = estimate_matches(*matches, view1.size, view2.size, layer, threshold, seed, *scaled)
+        matches = _match(view1, view2, ratio, matcher)
     except NoReliableMatrixError as error:
-        names = " and ".join(str(path or f"image {number}") for number, path in enumerate(paths, 1))
-        raise NoReliableMatrixError(error.code, f"{names}: {error}") from error
-    share = mutual_share(points1, points2, mutual, estimate.F_mat, threshold)
-    factor = float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
-    return replace(
-        estimate,
-        F_mat=unit_fundamental(transform_fundamental(estimate.F_mat, S1, S2)),
-        points1=transform_points(estimate.points1[None], torch.linalg.inv(S1)[None])[0],
-        points2=transform_points(estimate.points2[None], torch.linalg.inv(S2)[None])[0],
-        predicted_error=estimate.predicted_error / factor,
-        warnings=estimate.warnings + check_ambiguity(share),
-        size1=size1,
-        size2=size2,
-        ratio=float(ratio),
-        path1=paths[0],
-        path2=paths[1],
-    )
+        raise _named(error, (path1, path2)) from error
+    return MatchedPair(*matches, view1.size, view2.size, full_size1, full_size2, float(ratio), path1, path2)
+
+
+def _named(error: NoReliableMatrixError, paths: tuple[Path | None, Path | None]) -> NoReliableMatrixError:
+    """Return the error with the names of both images before its text."""
+    names = " and ".join(str(path or f"image {number}") for number, path in enumerate(paths, 1))
+    return NoReliableMatrixError(error.code, f"{names}: {error}")
 
 
 def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> None:

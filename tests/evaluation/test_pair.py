@@ -22,7 +22,7 @@ from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation import pair as pair_module
 from kornia_learnnorm.evaluation.many_pairs import read_pair_list
-from kornia_learnnorm.evaluation.pair import estimate_pair
+from kornia_learnnorm.evaluation.pair import estimate_pair, match_pair
 from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.files import atomic_write
 
@@ -158,6 +158,19 @@ class TestEstimatePair:
         assert np.allclose(abs((E_mat / np.linalg.norm(E_mat) * found.E_mat.numpy()).sum()), 1)
         with pytest.raises(ValueError, match="K1 and K2 must be given together"):
             estimate_pair(scene.left, scene.right, K1=K)
+
+
+def test_matches_of_one_pair_are_estimated_by_several_methods(scene):
+    layer = LearnedEightPoint.from_pretrained("robust-tiny")
+    matched = match_pair(scene.left, scene.right, max_size=160)
+    assert (matched.size1, matched.full_size1, matched.scale) == ((160, 120), (WIDTH, HEIGHT), 0.5)
+    for method in (None, layer):
+        expected = estimate_pair(scene.left, scene.right, method, max_size=160)
+        found = matched.estimate(method)
+        assert found.estimator == expected.estimator
+        assert (found.size1, found.path1) == ((WIDTH, HEIGHT), scene.left)
+        assert torch.equal(found.points1, expected.points1)
+        assert torch.allclose(found.F_mat, expected.F_mat, atol=1e-9)
 
 
 class TestErrors:
