@@ -26,13 +26,14 @@ FLOORS = [
     {"ransac"},
     {"data"},
     {"evaluation", "lightning_modules"},
+    {"demo"},
     {"kornia_learnnorm"},  # the package's __init__, with the public names
     {"cli"},
 ]
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 CORE = set().union(*FLOORS[:5])
 CORE_NEEDS = {"kornia", "kornia_learnnorm", "numpy", "safetensors", "torch", *sys.stdlib_module_names}
-HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "rich"]
+HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "rich", "bokeh"]
 
 FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 NAMES = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in FILES}

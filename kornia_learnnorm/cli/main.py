@@ -23,6 +23,7 @@ TRAINING = {
 }
 TOOLS = {
     "estimate": ("kornia_learnnorm.cli.estimate", "the fundamental matrix of two images"),
+    "demo": ("kornia_learnnorm.cli.demo", "a page in the browser to try two images on"),
     "evaluate": ("kornia_learnnorm.cli.evaluate", "better rates and errors on stores of correspondences"),
     "diagnose": ("kornia_learnnorm.cli.diagnose", "condition number, rank-2 error and other diagnostics"),
     "compare": ("kornia_learnnorm.cli.compare", "methods side by side over several stores, with confidence intervals"),

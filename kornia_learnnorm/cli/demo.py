@@ -1,0 +1,42 @@
+"""The command ``learnnorm demo``: a page in the browser to try two images on."""
+
+from __future__ import annotations
+
+import argparse
+import webbrowser
+
+from kornia_learnnorm.optional import import_extra
+
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+PORT = 5006
+EXAMPLES = """\
+learnnorm demo
+learnnorm demo --port 8000 --no-browser"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``learnnorm demo`` to a parser."""
+    parser.description = f"{parser.description}; it is served to this computer alone, until Ctrl-C"
+    parser.add_argument("--port", type=int, default=PORT, help="port of the page on 127.0.0.1 (default: %(default)s)")
+    parser.add_argument("--no-browser", action="store_true", help="print the address, but open no browser")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C."""
+    if not 1 <= args.port <= 65535:
+        raise ValueError(f"--port: a number from 1 to 65535 expected, got {args.port}")
+    for module in ("bokeh", "cv2", "PIL"):
+        import_extra(module, "demo", "the page")
+    from kornia_learnnorm.demo.server import make_server
+
+    try:
+        server = make_server(args.port)
+    except OSError as error:
+        raise OSError(f"--port {args.port}: cannot listen there: {error.strerror}; choose another port") from error
+    address = f"http://127.0.0.1:{server.port}/"
+    print(f"the page is at {address}, Ctrl-C ends it", flush=True)
+    if not args.no_browser:
+        server.io_loop.add_callback(webbrowser.open, address)
+    server.run_until_shutdown()
+    return 0

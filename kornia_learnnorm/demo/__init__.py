@@ -1,0 +1,1 @@
+"""The page of ``learnnorm demo``: two images, their matches and epipolar lines by three methods, in a browser."""

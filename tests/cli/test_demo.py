@@ -1,0 +1,27 @@
+"""The command ``learnnorm demo`` where it cannot serve its page."""
+
+from __future__ import annotations
+
+import socket
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize("port", [0, -1, 65536])
+def test_a_port_out_of_range(refused, port):
+    refused(["demo", f"--port={port}"], f"from 1 to 65535 expected, got {port}")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Tornado leaves its socket open
+def test_a_port_in_use(refused):
+    pytest.importorskip("bokeh", reason="Bokeh is not installed")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        refused(["demo", "--no-browser", f"--port={port}"], f"--port {port}: cannot listen there")
+
+
+@pytest.mark.parametrize("missing", ["bokeh", "cv2", "PIL"])
+def test_a_missing_package_names_the_extra(refused, monkeypatch, missing):
+    monkeypatch.setitem(sys.modules, missing, None)
+    refused(["demo", "--no-browser"], f"needs {missing}: run pip install '.[demo]'")
