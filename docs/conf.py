@@ -3,6 +3,13 @@
 Formulas are set by a MathJax that is copied into the site, so that the pages need no network either.
 """
 
+import os
+import re
+import sys
+from pathlib import Path
+
+import nbformat
+
 import kornia_learnnorm
 from kornia_learnnorm.cli.main import make_parser
 
@@ -48,6 +55,8 @@ nb_execution_timeout = 120
 nb_merge_streams = True
 nb_render_markdown_format = "myst"
 
+ROLE = re.compile(r"\{[\w:-]+\}`[~./]*([^`<]+?)(\s*<[^`]*>)?`")  # text, and a target where the text is not it
+
 
 def command_parser():
     """Return the parser for the page of the command line, its examples as literal blocks."""
@@ -82,8 +91,25 @@ def _resolve_exported(app, env, node, contnode):
     return env.get_domain("py").resolve_xref(env, node["refdoc"], app.builder, role, target, node, contnode)
 
 
+def _plain_notebook(app, doctree):
+    """Rewrite the notebook that a tutorial offers for download: Jupyter does not know Sphinx's roles."""
+    if not app.env.docname.startswith("tutorials/"):
+        return
+    path = Path(app.env.mystnb_config.output_folder, f"{app.env.docname}.ipynb")
+    notebook = nbformat.read(path, as_version=4)
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            lines = [line for line in cell.source.splitlines() if "{nb-download}" not in line]
+            cell.source = ROLE.sub(lambda role: role[1] if role[2] else f"`{role[1]}`", "\n".join(lines))
+    nbformat.write(notebook, path)
+
+
 def setup(app):
     """Connect what the settings above cannot say."""
+    app.connect("doctree-read", _plain_notebook)
+    # The kernels that run the pages inherit the style of figures, and a path that has the command learnnorm.
+    os.environ["MATPLOTLIBRC"] = str(app.confdir)
+    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     app.connect("autodoc-skip-member", _skip_tuple_fields)
     app.connect("autodoc-process-signature", _no_arguments)
     app.connect("missing-reference", _resolve_exported)
