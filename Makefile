@@ -2,7 +2,7 @@
 # make test   set up, run all tests
 # make test-cpus   set up, run the numerical tests with the kernels of other processors
 # make lint   set up, run the linters and the type checker
-# make docs   set up, build the documentation in docs/_build/html
+# make docs   set up, build the documentation in docs/_build/html, check its links and notebooks
 # make audit  report known vulnerabilities of the locked packages; never fails
 # make bench   set up, time all estimators beside Kornia's; DEVICE=cuda on a GPU
 # make wheel  build wheel and sdist in dist/, the same bytes for the same commit; make check-wheel checks their metadata
@@ -72,6 +72,7 @@ lint: $(VENV)/.ready
 
 docs: $(VENV)/.ready
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+	$(BIN)/python docs/check_site.py docs/_build/html
 
 # The auditor has an environment of its own, and asks a database of vulnerabilities about each line of the lock.
 audit:

@@ -34,6 +34,7 @@ nitpick_ignore_regex = [
 
 copybutton_selector = "div.highlight pre:not(div.cell_output pre)"  # code, not what it prints
 
+viewcode_follow_imported_members = False  # NumPy has types without sources
 add_module_names = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"

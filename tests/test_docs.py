@@ -1,0 +1,105 @@
+"""The tutorials' sources, and the check of the built site that make docs runs."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+nbformat = pytest.importorskip("nbformat")
+DOCS = Path(__file__).parents[1] / "docs"
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
+MAX_COLUMNS = 82  # of code, at the width of the page
+SOURCE = "# Title\n\n```{code-cell}\n:tags: [hide-input]\n\nprint(1)\n```\n\n```{code-cell}\n%%bash\nls\n```\n"
+
+
+@pytest.fixture
+def check(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS)
+    return importlib.import_module("check_site")
+
+
+@pytest.fixture
+def site(tmp_path):
+    for name, body in {
+        "index": '<a href="sub/page.html#here">x</a><a href="#top">x</a><a href="https://example.org/none">x</a>',
+        "sub/page": '<h1 id="here">x</h1><a href="../index.html">x</a><img src="../picture%201.png">',
+    }.items():
+        path = tmp_path / f"{name}.html"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(f"<html><body>{body}</body></html>")
+    (tmp_path / "picture 1.png").touch()
+    return tmp_path
+
+
+def write_notebook(site, cells, text="# Title"):
+    notebook = nbformat.v4.new_notebook()
+    notebook.cells = [nbformat.v4.new_markdown_cell(text), *map(nbformat.v4.new_code_cell, cells)]
+    path = site / "_downloads" / "0" / "one.ipynb"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    nbformat.write(notebook, path)
+    return path
+
+
+@pytest.fixture
+def source(tmp_path):
+    path = tmp_path / "sources" / "one.md"
+    path.parent.mkdir()
+    path.write_text(SOURCE)
+    return path
+
+
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_tutorials_have_their_parts(path):
+    text = path.read_text(encoding="utf-8")
+    assert f"<{path.stem}.ipynb>`" in text
+    assert "\n## The result\n" in text
+    assert "\n## When not to use this\n" in text
+    assert f"\ntutorials/{path.stem}\n" in (DOCS / "index.md").read_text(encoding="utf-8")
+    code = re.findall(r"^```\{code-cell\}\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
+    assert [line for cell in code for line in cell.splitlines() if len(line) > MAX_COLUMNS] == []
+
+
+def test_there_are_six_tutorials():
+    assert len(TUTORIALS) == 6
+
+
+def test_a_site_without_faults(check, site, source, capsys):
+    write_notebook(site, ["print(1)", "%%bash\nls"])
+    assert check.main(site, source.parent) == 0
+    assert "0 faults" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("link", ["missing.html", "sub/page.html#there", "#there", "sub", "picture.png"])
+def test_broken_links_are_found(check, site, link):
+    page = site / "index.html"
+    page.write_text(page.read_text().replace("<body>", f'<body><a href="{link}">x</a>'))
+    assert check.broken_links(site) == [f"index.html: {link}"]
+
+
+@pytest.mark.parametrize(
+    ("cells", "text", "fault"),
+    [
+        (["print(1)"], "# Title", "code cells"),
+        (["print(1)", "%%bash\nls"], "see {doc}`there`", "{doc}"),
+    ],
+)
+def test_faults_of_notebooks_are_found(check, site, source, cells, text, fault, capsys):
+    write_notebook(site, cells, text)
+    assert check.main(site, source.parent) == 1
+    assert fault in capsys.readouterr().out
+
+
+def test_missing_and_damaged_notebooks_are_found(check, site, source):
+    assert "expected 1" in check.notebook_faults(source, site)[0]
+    write_notebook(site, []).write_text("{}")
+    assert "not a notebook" in check.notebook_faults(source, site)[0]
+    write_notebook(site, []).write_text("no JSON")
+    assert "not a notebook" in check.notebook_faults(source, site)[0]
+
+
+def test_a_folder_without_a_site_is_an_error(check, tmp_path, capsys):
+    assert check.main(tmp_path, tmp_path) == 2
+    assert str(tmp_path) in capsys.readouterr().err
