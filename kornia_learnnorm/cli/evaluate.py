@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("--out is empty: expected a folder")
     if not args.methods and not args.weights:
         methods = DEFAULT_METHODS
-    no_example = record_run(args.out, stores, methods, options)
+    no_example = record_run(args.out, stores, methods, options, command=args.command_line)
     _print_tables(read_run(args.out))
     if no_example:
         print(f"without Figures 10 and 11: {no_example}", file=sys.stderr)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import shlex
 import shutil
 import sys
 import textwrap
@@ -93,6 +94,7 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 def _run_tool(words: list[str]) -> int:
     parsed = make_parser(words[:1]).parse_args(words)
+    parsed.command_line = shlex.join(["learnnorm", *words])
     return int(parsed.run(parsed))
 
 

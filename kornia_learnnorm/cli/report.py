@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
+from kornia_learnnorm.evaluation.report.pages import print_summary, print_tables, write_report
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
 
@@ -21,8 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write ``report.md``, ``report.html`` and the pictures, print the tables that fit."""
+    """Write ``report.md``, ``report.html`` and the pictures; print the summary and the tables that fit."""
     report = write_report(args.folder)
+    print_summary(report.summary)
     print_tables(report.tables, args.folder / "report.html")
     if report.missing:
         print(f"not there yet, so left out: {'; '.join(report.missing)}", file=sys.stderr)

@@ -57,6 +57,6 @@ def run(args: argparse.Namespace) -> int:
     """Record a run of robust estimators and minimal solvers."""
     stores = {name: path for path, name in names_of(args.stores).items()}
     options = {name: getattr(args, name) for name in DEFAULT_OPTIONS}
-    record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo)
+    record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo, args.command_line)
     print(f"wrote {args.out}; learnnorm report {args.out} makes its tables and pictures")
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+from dataclasses import replace
 
 import pytest
 
@@ -73,8 +74,9 @@ def small_budgets():
 
 @pytest.fixture(scope="session")
 def robust_store(tmp_path_factory):
+    """A store that is called what the paper's data are."""
     path = tmp_path_factory.mktemp("store") / "kitti_06.h5"
-    write_store(path, synthetic_store(pairs=1, points=330, seed=1))
+    write_store(path, replace(synthetic_store(pairs=1, points=330, seed=1), dataset="KITTI odometry 06"))
     return path
 
 

@@ -1,4 +1,4 @@
-"""Tables of a report and the text of their cells: an empty cell stands for an unknown number."""
+"""Tables of a report and the text of their cells: an empty cell is an unknown number, ``-`` one that is not defined."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ __all__ = [
     "POSE_HEADER",
     "RESAMPLES",
     "Table",
+    "known_parts",
     "mean_text",
     "median_text",
     "number_text",
     "paired_text",
+    "percent_change",
     "pose_texts",
     "rate_text",
 ]
@@ -44,6 +46,27 @@ class Table(NamedTuple):
     rows: list[list[str]]  # cells as text
 
 
+def known_parts(table: Table) -> Table | None:
+    """Return a table without the columns and rows that have no number; None if there is none in the whole table.
+
+    The first column has names. Cells are empty where a number is unknown, and ``-`` for a method against itself.
+
+    Example:
+        >>> known_parts(Table("Errors", "", ["method", "own", "truth"], [["a", "1", ""], ["b", "", "-"]])).rows
+        [['a', '1']]
+
+    """
+    places = range(1, len(table.header))
+    columns = [0, *(place for place in places if any(row[place] not in ("", "-") for row in table.rows))]
+    rows = [[row[place] for place in columns] for row in table.rows if any(row[place] for place in columns[1:])]
+    return table._replace(header=[table.header[place] for place in columns], rows=rows) if rows else None
+
+
+def percent_change(log_ratio: float) -> str:
+    """Return the change of a geometric mean in % from the mean difference of logarithms."""
+    return f"{100 * math.expm1(log_ratio):+.1f}"
+
+
 def number_text(value: float, spec: str = ".3f") -> str:
     """Return a number as text, empty for NaN."""
     return "" if math.isnan(value) else format(value, spec)
@@ -57,8 +80,9 @@ def median_text(values: Tensor, spec: str = ".3f") -> str:
 def mean_text(values: Tensor, pair: Tensor) -> str:
     """Return the mean of shares (S,) with its 95 % bootstrap interval over image pairs, %.
 
-    There is no interval if all shares are of one pair, and no text if there are no shares.
+    NaN is left out. There is no interval if all shares are of one pair, and no text if there are no shares.
     """
+    values, pair = values[~values.isnan()], pair[~values.isnan()]
     if len(values) == 0:
         return ""
     mean = f"{100 * values.mean().item():.1f}"

@@ -30,8 +30,8 @@ TEXTS = {
 
 
 def hypothesis_tables(run: RobustRun) -> list[Table]:
-    """Return all tables of the hypotheses of minimal solvers."""
-    cells = [cell for cell in run.cells if cell.hypotheses]
+    """Return all tables of the hypotheses of minimal solvers, of the stores with ground truth."""
+    cells = [cell for cell in run.cells if cell.hypotheses and _has_truth(cell)]
     return [table for cell in cells for table in (_values(cell, "best"), _values(cell, "picked"), *_tests(cell))]
 
 

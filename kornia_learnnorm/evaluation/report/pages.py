@@ -1,19 +1,23 @@
-"""Report of a run as Markdown, as a self-contained HTML page and in the terminal; reads results and runs no model."""
+"""Report of a run as Markdown, as a self-contained HTML page and in the terminal; reads results and runs no model.
+
+It begins with what won, and has no table, column or row without a number.
+"""
 
 from __future__ import annotations
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from kornia_learnnorm.evaluation.report.figures import report_figures
-from kornia_learnnorm.evaluation.report.formatting import Table
+from kornia_learnnorm.evaluation.report.formatting import Table, known_parts
 from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_figures, hypothesis_tables
 from kornia_learnnorm.evaluation.report.rates import with_baseline
 from kornia_learnnorm.evaluation.report.robust import robust_tables
 from kornia_learnnorm.evaluation.report.style import Picture
+from kornia_learnnorm.evaluation.report.summary import robust_summary, run_summary
 from kornia_learnnorm.evaluation.report.tables import report_tables
 from kornia_learnnorm.evaluation.robust.run import RobustRun, read_robust
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
@@ -23,7 +27,7 @@ from kornia_learnnorm.files import write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["Report", "print_tables", "write_report"]
+__all__ = ["Report", "print_summary", "print_tables", "write_report"]
 
 GREY = "#808890"  # lines and letters of a picture in its own file: legible on white and on black
 PAGE_STYLE = """
@@ -36,6 +40,8 @@ th, td { padding: 0.25rem 0.6rem; text-align: right; white-space: nowrap;
 th:first-child, td:first-child { text-align: left; }
 th { white-space: normal; vertical-align: bottom; }
 .wide { overflow-x: auto; }
+code { overflow-wrap: anywhere; }
+a { color: light-dark(#0b63b0, #7cb8f2); }
 svg { width: 100%; height: auto; font-family: system-ui, sans-serif; }
 """
 
@@ -43,6 +49,7 @@ svg { width: 100%; height: auto; font-family: system-ui, sans-serif; }
 class Report(NamedTuple):
     """A written report."""
 
+    summary: list[str]  # which method won, by store and protocol, Markdown
     tables: list[Table]
     missing: list[str]  # results that the run does not have yet
 
@@ -63,24 +70,33 @@ def write_report(folder: str | Path) -> Report:
 
     """
     folder = Path(folder)
-    about, tables, pictures, missing = list[str](), list[Table](), list[Picture](), list[str]()
+    summary, about, tables = list[str](), list[str](), list[Table]()
+    pictures, missing = list[Picture](), list[str]()
     robust = read_robust(folder)
     if robust is None or read_section(folder, "evaluate") is not None:
         run = with_baseline(read_run(folder))
-        about.append(_about_run(run))
+        summary += run_summary(run)
+        about += [*_commands(run.about), _about_run(run)]
         tables += report_tables(run)
         pictures += report_figures(run)
         missing += run.missing
     if robust is not None:
-        about.append(_about_robust(robust))
+        summary += robust_summary(robust)
+        about += [*_commands(robust.about), _about_robust(robust)]
         tables += [*robust_tables(robust), *hypothesis_tables(robust)]
         pictures += hypothesis_figures(robust)
         missing += robust.missing
     for picture in pictures:
         write_text(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", GREY))
-    write_text(folder / "report.md", _markdown(about, tables, pictures))
-    write_text(folder / "report.html", _html(about, tables, pictures))
-    return Report(tables, missing)
+    page = _Page(summary, about, [known for table in tables if (known := known_parts(table))], pictures)
+    write_text(folder / "report.md", page.markdown())
+    write_text(folder / "report.html", page.html())
+    return Report(summary, page.tables, missing)
+
+
+def _commands(about: dict[str, Any]) -> list[str]:
+    """Return the commands that made a run with their dates; none where it was made from Python."""
+    return [f"{date}: `{command}`" for command, date in about["commands"].items()]
 
 
 def _about_run(run: Run) -> str:
@@ -91,7 +107,8 @@ def _about_run(run: Run) -> str:
     return (
         f"Stores: {_stores(about)}. Methods: {', '.join(about['methods'])}. {samples} of each store, filtered by the "
         f"ratio test (the nearest descriptor is less than {RATIO:g} times as far as the second nearest) and "
-        f"unfiltered, seed {about['seed']}. {', '.join(_versions(about))}.{_missing(run.missing)}"
+        f"unfiltered, seed {about['seed']}. {', '.join(_versions(about))}. Numbers of tables and figures are those of "
+        f"Fan et al.{_missing(run.missing)}"
     )
 
 
@@ -127,23 +144,56 @@ def _missing(missing: Sequence[str]) -> str:
     return f" Not there yet, so left out: {'; '.join(missing)}." if missing else ""
 
 
-def _markdown(about: Sequence[str], tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
-    parts = ["# Evaluation", *about]
-    parts += [f"## {t.title}\n\n{t.text}\n\n{format_table(t.header, t.rows)}" for t in tables]
-    parts += [f"## {p.title}\n\n{p.text}\n\n![{p.title}]({p.name}.svg)" for p in pictures]
-    return "\n\n".join(parts) + "\n"
+class _Page(NamedTuple):
+    """What a report consists of, and its two forms."""
+
+    summary: list[str]
+    about: list[str]
+    tables: list[Table]
+    pictures: list[Picture]
+
+    @property
+    def titles(self) -> list[str]:
+        """Titles of all sections after the contents."""
+        return ["Data and methods", *(table.title for table in self.tables), *(p.title for p in self.pictures)]
+
+    def markdown(self) -> str:
+        """Return the report as Markdown."""
+        contents = "\n".join(f"- [{title}](#{_anchor(title)})" for title in self.titles)
+        parts = ["# Evaluation", "## Summary", "\n".join(f"- {text}" for text in self.summary)]
+        parts += ["## Contents", contents, "## Data and methods", *self.about]
+        parts += [f"## {t.title}\n\n{t.text}\n\n{format_table(t.header, t.rows)}" for t in self.tables]
+        parts += [f"## {p.title}\n\n{p.text}\n\n![{p.title}]({p.name}.svg)" for p in self.pictures]
+        return "\n\n".join(parts) + "\n"
+
+    def html(self) -> str:
+        """Return the report as a self-contained page."""
+        contents = [f'<a href="#{_anchor(title)}">{_inline(title)}</a>' for title in self.titles]
+        body = ["<h1>Evaluation</h1><h2>Summary</h2>", _list(map(_inline, self.summary))]
+        body += ["<h2>Contents</h2>", f"<nav>{_list(contents)}</nav>", _heading("Data and methods")]
+        body += [f"<p>{_inline(text)}</p>" for text in self.about]
+        for table in self.tables:
+            rows = "".join(_row("td", row) for row in table.rows)
+            grid = f"<table><thead>{_row('th', table.header)}</thead><tbody>{rows}</tbody></table>"
+            body.append(f'{_heading(table.title)}<p>{_inline(table.text)}</p><div class="wide">{grid}</div>')
+        for picture in self.pictures:
+            body.append(f"{_heading(picture.title)}<p>{_inline(picture.text)}</p><figure>{picture.svg}</figure>")
+        head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>Evaluation</title>'
+        head += f"<style>{PAGE_STYLE}</style>"
+        return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>\n'
 
 
-def _html(about: Sequence[str], tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
-    body = ["<h1>Evaluation</h1>", *(f"<p>{_inline(text)}</p>" for text in about)]
-    for table in tables:
-        rows = "".join(_row("td", row) for row in table.rows)
-        grid = f"<table><thead>{_row('th', table.header)}</thead><tbody>{rows}</tbody></table>"
-        body.append(f'<h2>{_inline(table.title)}</h2><p>{_inline(table.text)}</p><div class="wide">{grid}</div>')
-    body += [f"<h2>{_inline(p.title)}</h2><p>{_inline(p.text)}</p><figure>{p.svg}</figure>" for p in pictures]
-    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>Evaluation</title>'
-    head += f"<style>{PAGE_STYLE}</style>"
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>\n'
+def _anchor(title: str) -> str:
+    """Return the anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
+
+
+def _heading(title: str) -> str:
+    return f'<h2 id="{_anchor(title)}">{_inline(title)}</h2>'
+
+
+def _list(items: Iterable[str]) -> str:
+    return f"<ul>{''.join(f'<li>{item}</li>' for item in items)}</ul>"
 
 
 def _row(tag: str, cells: Sequence[str]) -> str:
@@ -151,8 +201,15 @@ def _row(tag: str, cells: Sequence[str]) -> str:
 
 
 def _inline(text: str) -> str:
-    """Return a text as HTML, with the parts in backticks as code."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+    """Return a text as HTML, with the parts in backticks as code and those between two asterisks bold."""
+    text = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+    return re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", text)
+
+
+def print_summary(summary: Sequence[str]) -> None:
+    """Print the summary of a report as plain text."""
+    for text in summary:
+        print(text.replace("**", "").replace("`", ""), end="\n\n")
 
 
 def print_tables(tables: Sequence[Table], elsewhere: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from torch import Tensor
 
@@ -14,16 +15,17 @@ from kornia_learnnorm.evaluation.report.formatting import (
     paired_text,
     pose_texts,
 )
-from kornia_learnnorm.evaluation.report.rates import TESTS
+from kornia_learnnorm.evaluation.report.rates import papers_data
+from kornia_learnnorm.evaluation.robust.estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR
 from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
 from kornia_learnnorm.protocol import THRESHOLDS
 
-__all__ = ["robust_tables"]
+__all__ = ["pairs_with_truth", "robust_tables"]
 
 # Fan et al., Tables 2 and 3: share of inliers and F1 at 0.1 px, then at 1 px, %.
-PRINTED: dict[tuple[Sequence[str], str], dict[str, Sequence[str]]] = {
-    (TESTS[0], "filtered"): {
+PRINTED: dict[tuple[str, str], dict[str, Sequence[str]]] = {
+    ("KITTI", "filtered"): {
         "Ranftl and Koltun": ("24.61", "14.65", "85.87", "75.77"),
         "MLESAC": ("18.60", "12.54", "84.48", "75.15"),
         "LMEDS": ("20.01", "13.34", "84.23", "75.44"),
@@ -31,11 +33,11 @@ PRINTED: dict[tuple[Sequence[str], str], dict[str, Sequence[str]]] = {
         "RANSAC, Hartley": ("21.85", "13.84", "84.96", "75.65"),
         "RANSAC, learned": ("21.89", "13.86", "84.98", "75.66"),
     },
-    (TESTS[0], "unfiltered"): {
+    ("KITTI", "unfiltered"): {
         "RANSAC, Hartley": ("4.40", "", "30.50", ""),
         "RANSAC, learned": ("4.38", "", "30.55", ""),
     },
-    (TESTS[1], "unfiltered"): {
+    ("TUM", "unfiltered"): {
         "RANSAC, Hartley": ("7.60", "", "44.13", ""),
         "RANSAC, learned": ("7.64", "", "44.18", ""),
     },
@@ -45,53 +47,71 @@ SCALES = {"inliers": 100.0, "f1": 100.0, "error": 1.0}  # shares are printed in 
 
 
 def robust_tables(run: RobustRun) -> list[Table]:
-    """Return all tables of robust estimators of a run."""
-    cells = [cell for cell in run.cells if cell.estimates]
-    return [table for cell in cells for table in (_agreement(cell), _pose_and_time(cell), *_tests(cell))]
+    """Return all tables of robust estimators of a run.
+
+    Numbers that need a ground truth are empty cells where it is not known.
+    """
+    cells = [_without_unknown_truth(cell) for cell in run.cells if cell.estimates]
+    return [table for cell in cells for table in (_agreement(cell, run), _pose_and_time(cell), *_tests(cell))]
 
 
-def _known(cell: RobustCell, threshold: float) -> Tensor:
+def _without_unknown_truth(cell: RobustCell) -> RobustCell:
+    """Return a cell without the estimator that is the ground truth where that is not known."""
+    known = any(bool(pairs_with_truth(cell, threshold).any()) for threshold in THRESHOLDS)
+    return replace(cell, estimates={name: e for name, e in cell.estimates.items() if known or name != TRUTH})
+
+
+def pairs_with_truth(cell: RobustCell, threshold: float) -> Tensor:
     """Return a mask of the pairs whose ground truth has inliers at a threshold and at 1 px, (P,)."""
     results = next(iter(cell.estimates.values()))[threshold]
     return results["f1"][:, 0].isfinite() & ~results["error"][:, 0].isnan()
 
 
-def _agreement(cell: RobustCell) -> Table:
+def _kept(cell: RobustCell, threshold: float) -> Tensor:
+    """Return a mask of the pairs of the means, (P,): those with ground truth, all where no pair has one."""
+    known = pairs_with_truth(cell, threshold)
+    return known | ~known.any()
+
+
+def _agreement(cell: RobustCell, run: RobustRun) -> Table:
     """Return the table of inlier share, F1 and epipolar error."""
     names = ("inliers %", "F1 %", "error px")
     header = ["estimator", *(f"{name} @{t:g} px" for t in THRESHOLDS for name in names), "median error px @1 px"]
-    known = {threshold: _known(cell, threshold) for threshold in THRESHOLDS}
+    known = {threshold: pairs_with_truth(cell, threshold) for threshold in THRESHOLDS}
+    truth = any(bool(found.any()) for found in known.values())
     rows = []
     for name, by_threshold in cell.estimates.items():
         cells = []
         for threshold in THRESHOLDS:
-            inliers, f1, error = (by_threshold[threshold][key][known[threshold]] for key in SCALES)
+            inliers, f1, error = (by_threshold[threshold][key][_kept(cell, threshold)] for key in SCALES)
             error = error.clamp(max=MAX_ERROR)
             cells += [_mean_text(100 * inliers, 2), _mean_text(100 * f1, 2), _mean_text(error, 3)]
         rows.append([name, *cells, median_text(error.flatten())])
-    for (stores, protocol), printed in PRINTED.items():
-        if cell.store.startswith(tuple(stores)) and cell.protocol == protocol:
-            for name, (a, b, c, d) in printed.items():
-                rows.append([f"Fan et al., as printed: {name}", a, b, "", c, d, "", ""])
+    printed = PRINTED.get((papers_data(run.about["stores"][cell.store]), cell.protocol), {})
+    rows += [[f"Fan et al., as printed: {name}", a, b, "", c, d, "", ""] for name, (a, b, c, d) in printed.items()]
     dropped = " and ".join(f"{int((~kept).sum())} at {threshold:g} px" for threshold, kept in known.items())
+    agreement = (
+        "F1: agreement of these inliers with the ground truth's at the threshold. Error: mean distance of the ground "
+        f"truth's inliers at 1 px; {MAX_ERROR:g} px at most, also for a failure. Pairs without ground-truth inliers "
+        f"are left out: {dropped}. `ground-truth` is the true matrix: where it has few inliers, F1 says little."
+    )
     text = (
         "Mean over image pairs and runs, ± standard deviation of the mean of a run if there are several runs. Inliers: "
-        "share of the estimator's matches with a symmetric epipolar distance below the threshold. F1: agreement of "
-        "these inliers with the ground truth's at the threshold. Error: mean distance of the ground truth's inliers at "
-        f"1 px; {MAX_ERROR:g} px at most, also for a failure. Pairs without ground-truth inliers are left out: "
-        f"{dropped}. `count:` is the best of 1,000 minimal samples, which all methods share, without refinement. "
+        "share of the estimator's matches with a symmetric epipolar distance below the threshold. "
+        f"{agreement if truth else 'There is no ground truth: more inliers do not prove a more accurate matrix.'} "
+        "`count:` is the best of 1,000 minimal samples, which all methods share, without refinement. "
         "`time:` is the best of the samples drawn in 50 ms, which depends on the machine. `RANSAC` is the package's "
-        "own with its defaults. `ground-truth` is the true matrix: where it has few inliers, F1 says little. All other "
-        "estimators come from other packages and run with their defaults."
+        "own with its defaults. All other estimators come from other packages and run with their defaults."
     )
-    return Table(f"Robust estimation: {cell.title}{TABLE_NUMBER[cell.protocol]}", text, header, rows)
+    number = TABLE_NUMBER[cell.protocol] if printed else ""
+    return Table(f"Robust estimation: {cell.title}{number}", text, header, rows)
 
 
 def _mean_text(values: Tensor, digits: int) -> str:
-    """Return the mean of numbers (P, S) and the standard deviation of the mean over the S runs; empty if P is 0."""
-    if values.numel() == 0:
-        return ""
+    """Return the mean of numbers (P, S) and the standard deviation of the mean over the S runs; empty if unknown."""
     runs = values.mean(0)
+    if values.numel() == 0 or bool(runs.isnan().any()):
+        return ""
     text = f"{runs.mean().item():.{digits}f}"
     return text if len(runs) < 2 else f"{text} ± {runs.std().item():.{digits}f}"
 
@@ -108,13 +128,16 @@ def _pose_and_time(cell: RobustCell) -> Table:
             cells.append(median_text(1000 * results["seconds"].flatten(), ".1f"))
             cells.append(number_text(results["samples"].mean().item(), ".0f"))
         rows.append([name, *cells])
-    text = (
-        "Area under the recall curve of the pose error, the larger of the rotation and translation angles, up to 5, "
-        "10 and 20 degrees, and mAA(10), %, over all pairs and runs; failures count. `ms` is the median time of a run, "
-        "`samples` the mean number of minimal samples, empty if it is unknown. Estimators of other packages decide by "
-        "themselves how many samples they draw."
+    posed = any(row[1] for row in rows)
+    poses = (
+        "AUC: area under the recall curve of the pose error, the larger of the rotation and translation angles, up to "
+        "5, 10 and 20 degrees, and mAA(10), %, over all pairs and runs; failures count. "
     )
-    return Table(f"Pose and time: {cell.title}", text, header, rows)
+    text = (
+        f"{poses if posed else ''}`ms` is the median time of a run, `samples` the mean number of minimal samples, "
+        "empty if it is unknown. Estimators of other packages decide by themselves how many samples they draw."
+    )
+    return Table(f"{'Pose and time' if posed else 'Time'}: {cell.title}", text, header, rows)
 
 
 def _baseline(name: str) -> str:
@@ -134,7 +157,7 @@ def _tests(cell: RobustCell) -> list[Table]:
         baseline = _baseline(name)
         if name.startswith(("count:", "time:", "RANSAC")) and name != baseline and baseline in cell.estimates:
             other = cell.estimates[baseline]
-            cells = [_test(by_threshold[t], other[t], key, _known(cell, t)) for t in THRESHOLDS for key in SCALES]
+            cells = [_test(by_threshold[t], other[t], key, _kept(cell, t)) for t in THRESHOLDS for key in SCALES]
             rows.append([name, baseline, *cells])
     text = (
         "Change of the mean against another estimator, in percentage points and in px, with the 95 % interval and "

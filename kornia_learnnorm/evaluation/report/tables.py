@@ -17,10 +17,11 @@ from kornia_learnnorm.evaluation.report.formatting import (
     median_text,
     number_text,
     paired_text,
+    percent_change,
     pose_texts,
     rate_text,
 )
-from kornia_learnnorm.evaluation.report.rates import rate_tables
+from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import THRESHOLDS
@@ -40,10 +41,13 @@ MOTIONS = {
 
 
 def report_tables(run: Run) -> list[Table]:
-    """Return all tables of a run with predictions of Hartley's normalisation in every store and protocol."""
+    """Return all tables of a run with predictions of Hartley's normalisation in every store and protocol.
+
+    Numbers that need a ground truth are empty cells where it is not known.
+    """
     tables = rate_tables(run)
     for cell in run.cells:
-        tables += [_accuracy(cell), _consensus(cell), _tests(cell)]
+        tables += [_accuracy(cell), _consensus(cell, run), _tests(cell)]
     for cell in run.cells:
         learned = next((name for name in ("crossview", "paper", "whitening") if name in cell.predictions), None)
         if learned and cell.protocol == "filtered":
@@ -70,44 +74,66 @@ def _accuracy(cell: Cell) -> Table:
                 *(median_text(values, ".4g") for values in diagnostics),
             ]
         )
-    text = (
-        f"Medians over {len(cell.pair)} samples, of which {int(_with_truth(cell).sum())} have ground-truth inliers and "
-        f"{int(posed.sum())} a ground-truth pose. `own` is the error of the fit: the mean symmetric epipolar distance "
-        "of the sample's eight points. `held out` (16 other matches of the pair) and `truth` (the pair's ground-truth "
-        "inliers) are errors on other points: medians of the symmetric epipolar distance. The angles are errors of the "
-        "relative pose; AUC at 5, 10 and 20 degrees and mAA(10) summarise them, %. A pose that cannot be found counts "
-        "as a failure. `+LM` is refined on the eight points: no method fits them more closely. The condition number "
-        "of the design matrix is its largest over its eighth singular value. `rho` is the second over the third "
-        "singular value of the normalised matrix before the projection to rank 2: the larger it is, the less the "
-        "projection changes. Distances 1 and 2 are the mean distances of the normalised points from the origin in "
-        "views 1 and 2. The last four columns have no unit."
+    return Table(f"Fit and accuracy: {cell.title}", _accuracy_text(cell, int(posed.sum())), header, rows)
+
+
+def _accuracy_text(cell: Cell, posed: int) -> str:
+    """Return what the table of errors shows, of which the samples of ``posed`` have a ground-truth pose."""
+    truth = int(_with_truth(cell).sum())
+    count = f"of which {truth} have ground-truth inliers and {posed} a ground-truth pose"
+    others = "`held out` (16 other matches of the pair) and `truth` (the pair's ground-truth inliers) are errors on"
+    others += " other points: medians"
+    if not truth:
+        count = "without ground truth"
+        others = "`held out` (16 other matches of the pair, some of which may be wrong) is the error on other points:"
+        others += " the median"
+    angles = (
+        " The angles are errors of the relative pose; AUC at 5, 10 and 20 degrees and mAA(10) summarise them, %. A "
+        "pose that cannot be found counts as a failure."
     )
-    return Table(f"Fit and accuracy: {cell.title}", text, header, rows)
+    return (
+        f"Medians over {len(cell.pair)} samples, {count}. `own` is the error of the fit: the mean symmetric epipolar "
+        f"distance of the sample's eight points. {others} of the symmetric epipolar distance."
+        f"{angles if posed else ''} `+LM` is refined on the eight points: no method fits "
+        "them more closely. The condition number of the design matrix is its largest over its eighth singular value. "
+        "`rho` is the second over the third singular value of the normalised matrix before the projection to rank 2: "
+        "the larger it is, the less the projection changes. Distances 1 and 2 are the mean distances of the normalised "
+        "points from the origin in views 1 and 2. The last four columns have no unit."
+    )
 
 
-def _consensus(cell: Cell) -> Table:
-    """Return the table of inlier shares and F1 of the matrices of samples."""
+def _consensus(cell: Cell, run: Run) -> Table:
+    """Return the table of inlier shares and F1 of the matrices of samples.
+
+    Samples without ground truth are left out, unless no sample has one.
+    """
     header = ["method", *(f"{name} @{threshold:g} px" for threshold in THRESHOLDS for name in ("inliers %", "F1 %"))]
     known = next(iter(cell.predictions.values()))["f1"].isfinite()
-    rows = []
+    kept, rows = known | ~known.any(0), []
     for name, prediction in cell.predictions.items():
         cells = [
             mean_text(prediction[key][keep, place], cell.pair[keep])
-            for place, keep in enumerate(known.T)
+            for place, keep in enumerate(kept.T)
             for key in ("inliers", "f1")
         ]
         rows.append([name, *cells])
+    truth = bool(known.any())
     kind = "that pass the ratio test" if cell.protocol == "filtered" else "with or without the ratio test"
     dropped = " and ".join(f"{int((~keep).sum())} at {t:g} px" for t, keep in zip(THRESHOLDS, known.T, strict=True))
     text = (
         f"Each sample's matrix on all matches of its pair {kind}: mean over samples with the 95 % bootstrap interval "
         "over image pairs. `inliers` is the share of the matches with a symmetric epipolar distance below the "
-        "threshold. `F1` is the harmonic mean of the precision and recall of these inliers against those of the ground "
-        "truth at the same threshold. Samples of pairs without ground-truth inliers are left out: "
-        f"{dropped}. No RANSAC and no refinement on inliers take place: Fan et al., Tables 2 and 3, measure something "
-        "else."
+        "threshold."
     )
-    return Table(f"Inliers and F1: {cell.title}", text, header, rows)
+    if truth:
+        text += (
+            " `F1` is the harmonic mean of the precision and recall of these inliers against those of the ground truth "
+            f"at the same threshold. Samples of pairs without ground-truth inliers are left out: {dropped}."
+        )
+    text += " No RANSAC and no refinement on inliers take place."
+    if papers_data(run.about["stores"][cell.store]):
+        text += " Fan et al., Tables 2 and 3, measure something else."
+    return Table(f"Inliers{' and F1' * truth}: {cell.title}", text, header, rows)
 
 
 def _with_truth(cell: Cell) -> Tensor:
@@ -129,22 +155,18 @@ def _tests(cell: Cell) -> Table:
         name: {key: p[key].clamp(min=MIN_DISTANCE).log() for key in quantities} for name, p in cell.predictions.items()
     }
     rows = [
-        [name, *(paired_text(log[key], logs[BASELINE][key], cell.pair, show=_percent) for key in quantities)]
+        [name, *(paired_text(log[key], logs[BASELINE][key], cell.pair, show=percent_change) for key in quantities)]
         for name, log in logs.items()
         if name != BASELINE
     ]
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "
         f"p-value of a paired bootstrap over image pairs with {RESAMPLES:,} resamples, which cannot resolve p-values "
-        f"below {MIN_P_VALUE:g}. Negative is better. `own` and `held out` use {_count(cell.pair)}, `truth` uses "
-        f"{_count(cell.pair[_with_truth(cell)])}."
+        f"below {MIN_P_VALUE:g}. Negative is better. `own` and `held out` use {_count(cell.pair)}"
     )
+    truth = cell.pair[_with_truth(cell)]
+    text += f", `truth` uses {_count(truth)}." if len(truth) else "."
     return Table(f"Paired tests: {cell.title}", text, header, rows)
-
-
-def _percent(log_ratio: float) -> str:
-    """Return the change of a geometric mean in % from the mean difference of logarithms."""
-    return f"{100 * math.expm1(log_ratio):+.1f}"
 
 
 def _count(pair: Tensor) -> str:

@@ -52,6 +52,7 @@ def record_robust(
     solvers: Sequence[str] = (),
     options: Mapping[str, int] | None = None,
     redo: Sequence[str] = (),
+    command: str = "",
 ) -> None:
     """Compute the missing results of a run, with a progress bar.
 
@@ -64,6 +65,7 @@ def record_robust(
         solvers: names for :func:`~kornia_learnnorm.evaluation.robust.estimators.find_solver`.
         options: options that differ from :data:`DEFAULT_OPTIONS`.
         redo: estimators or solvers whose results are computed again.
+        command: the command line that asks for it, for the report.
 
     Raises:
         ValueError: if the folder holds a run of other options, an option, a store or an estimator is wrong, an existing
@@ -88,7 +90,7 @@ def record_robust(
         "threads": torch.get_num_threads(),
     }
     redone = [(names | solver_names)[name] for name in redo]
-    begin_section(folder, "robust", read, about, redone)
+    begin_section(folder, "robust", read, about, redone, command)
     for path in result_files(folder, redone):
         path.unlink()
     installed = {names[name]: estimator for name, estimator in found.items() if estimator is not None}

@@ -80,6 +80,7 @@ def record_run(
     options: SampleOptions | None = None,
     protocols: Sequence[str] = tuple(PROTOCOLS),
     complete: bool = True,
+    command: str = "",
 ) -> str:
     """Compute what a run does not have yet, with a progress bar.
 
@@ -91,6 +92,7 @@ def record_run(
         protocols: ``filtered``, ``unfiltered`` or both.
         complete: compute everything that a report shows: also the shares of inliers, F1 and, for one pair, the errors
             by the number of correspondences.
+        command: the command line that asks for it, for the report.
 
     Returns:
         why there is no example of a pair; empty where there is one or none was wanted.
@@ -111,7 +113,7 @@ def record_run(
         "trained_on": {name: list(method.trained_on) for name, method in found.items()},
     }
     before = (read_section(folder, "evaluate") or {}).get("methods", {})
-    begin_section(folder, "evaluate", recorder.stores, about)
+    begin_section(folder, "evaluate", recorder.stores, about, command=command)
     recorder.record_stores(protocols)
     no_example = recorder.record_sizes() if complete else ""
     if failed := recorder.failed:

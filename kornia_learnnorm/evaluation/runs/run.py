@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -98,7 +99,8 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
                 absent = ["all methods"]
             missing += [f"{name} on {store}, {protocol}" for name in absent]
     if not (folder / "example.npz").is_file():
-        return Run(about, cells, pairs, {}, {}, [*missing, "the example of a pair"])
+        known = any(np.isfinite(motions["inliers"]).any() for motions in pairs.values())
+        return Run(about, cells, pairs, {}, {}, [*missing, *["the example of a pair"] * known])
     example = read_arrays(folder / "example.npz", EXAMPLE)
     swept = {name: sweep_path(folder, name) for name in about["methods"] if is_swept(name)}
     missing += [f"{name} by the number of correspondences" for name, path in swept.items() if not path.is_file()]

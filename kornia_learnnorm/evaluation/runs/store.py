@@ -11,6 +11,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Collection, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,8 @@ def read_section(folder: Path, section: str) -> About | None:
         return None
     if not isinstance(about, dict):
         raise ValueError(f"{folder / 'run.json'} is damaged: {section} must be an object, got {about!r}")
-    wrong = [key for key in JOINED[section] if not isinstance(about.get(key), dict)]
+    about.setdefault("commands", {})  # runs of older versions have none
+    wrong = [key for key in (*JOINED[section], "commands") if not isinstance(about.get(key), dict)]
     wrong += [key for key in OPTIONS[section] if key not in about]
     if wrong:
         raise ValueError(f"{folder / 'run.json'} is damaged: {', '.join(wrong)} missing or not an object")
@@ -62,12 +64,18 @@ def read_section(folder: Path, section: str) -> About | None:
 
 
 def begin_section(
-    folder: Path, section: str, stores: Mapping[str, CorrespondenceStore], about: About, redo: Collection[str] = ()
+    folder: Path,
+    section: str,
+    stores: Mapping[str, CorrespondenceStore],
+    about: About,
+    redo: Collection[str] = (),
+    command: str = "",
 ) -> None:
     """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
 
     ``about`` has the options and, by the names in ``JOINED``, what each method, estimator and so on is, None for one
     whose package is not installed. The descriptions of ``redo`` may change.
+    ``command`` is noted with the date of today.
     """
     about = about | {
         "stores": {
@@ -84,6 +92,8 @@ def begin_section(
     if differ:
         raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
     folder.mkdir(parents=True, exist_ok=True)
+    dates = {command: datetime.now().astimezone().date().isoformat()} if command else {}
+    about["commands"] = {**had.get("commands", {}), **dates}
     _write(folder, section, about | {key: _join(had[key], about[key]) for key in joined})
 
 

@@ -23,7 +23,9 @@ matplotlib = pytest.importorskip("matplotlib", reason="Matplotlib is not install
 
 def test_files(copied, capsys):
     assert main(["report", str(copied)]) == 0
-    assert "Better than Hartley" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert printed.startswith("scenes, filtered (")
+    assert "Better than Hartley" in printed
     text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
     for name in re.findall(r"\]\(([\w-]+\.svg)\)", text):
         ElementTree.parse(copied / name)
@@ -33,6 +35,21 @@ def test_files(copied, capsys):
     assert len(identifiers) == len(set(identifiers))
     for reference in re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', page):
         assert "".join(reference) in identifiers
+
+
+def test_the_answer_comes_first_then_contents_date_and_command(copied, methods):
+    write_report(copied)
+    text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
+    titles = re.findall(r"^## (.+)$", text, flags=re.MULTILINE)
+    assert titles[:3] == ["Summary", "Contents", "Data and methods"]
+    contents = re.findall(r"^- \[(.+)\]\(#(.+)\)$", text, flags=re.MULTILINE)
+    assert [title for title, _ in contents] == titles[2:]
+    for _, anchor in contents:
+        assert f'<h2 id="{anchor}">' in page
+    ((command, date),) = json.loads((copied / "run.json").read_text())["evaluate"]["commands"].items()
+    assert command.startswith("learnnorm evaluate ")
+    assert f"{date}: `{command}`" in text
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", date)
 
 
 def test_not_a_run_or_without_the_baseline(tmp_path, copied, refused):

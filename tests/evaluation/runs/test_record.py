@@ -55,7 +55,7 @@ def test_a_temporary_run_of_methods_in_another_order_has_the_same_numbers(run, s
     assert [*found.about["methods"]] == methods[::-1]
     assert_same(read_run(run), found)
     assert {*found.cells[1].predictions["Hartley+LM"]} == {*ERRORS}
-    assert found.about == read_run(run).about
+    assert found.about | {"commands": read_run(run).about["commands"]} == read_run(run).about
 
 
 def test_another_run_computes_nothing_and_adds_what_is_new(copied, command, methods, monkeypatch, few_trials):

@@ -1,0 +1,126 @@
+"""Summary of a run: which method or estimator won in each store and protocol, by how much, and on what."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.evaluation.report.formatting import BASELINE, RESAMPLES, median_text, percent_change
+from kornia_learnnorm.evaluation.report.robust import pairs_with_truth
+from kornia_learnnorm.evaluation.robust.estimators import TRUTH
+from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR
+from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
+from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.metrics.bootstrap import PairedDifference, paired_bootstrap
+from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, THRESHOLDS
+
+__all__ = ["robust_summary", "run_summary"]
+
+MIN_DISTANCE = 1e-6  # pixels; smaller distances are clamped before the logarithm
+# The errors of methods, the most telling first: what is known of the first that is known decides.
+ERRORS = {
+    "truth": "error on the ground-truth inliers",
+    "heldout": "error on held-out matches",
+    "own": "error of the fit (there are neither held-out matches nor a ground truth)",
+}
+
+
+class _Ranking(NamedTuple):
+    """Methods by a score of each sample, of which less is better."""
+
+    winner: str
+    second: str  # empty for a single method
+    level: list[str]  # whose difference from the winner has a 95 % interval that includes zero
+    against: dict[str, PairedDifference]  # the winner's difference from each other method
+
+
+def run_summary(run: Run) -> list[str]:
+    """Return a sentence or two for each store and protocol of a run of predictions, Markdown."""
+    return [_about_methods(cell) for cell in run.cells]
+
+
+def robust_summary(run: RobustRun) -> list[str]:
+    """Return a sentence or two for each store and protocol of a run of robust estimators, Markdown."""
+    return [text for cell in run.cells if (text := _about_estimators(cell))]
+
+
+def _rank(scores: dict[str, Tensor], pair: Tensor) -> _Ranking:
+    """Rank methods by the mean of their scores, (S,) each, over the samples that all have; ``pair`` has their pairs."""
+    valid = torch.stack([*scores.values()]).isfinite().all(0)
+    order = sorted(scores, key=lambda name: scores[name][valid].mean().item())
+    winner, *others = order
+    differences = {}
+    if len(torch.unique(pair[valid])) > 1:
+        mine = scores[winner][valid]
+        differences = {
+            name: paired_bootstrap(mine, scores[name][valid], pair[valid], draws=RESAMPLES) for name in others
+        }
+    level = [name for name, found in differences.items() if found.low <= 0 <= found.high]
+    return _Ranking(winner, others[0] if others else "", level, differences)
+
+
+def _about_methods(cell: Cell) -> str:
+    """Return which method has the smallest error, beside the baseline's."""
+    key = next((key for key in ERRORS if not cell.predictions[BASELINE][key].isnan().all()), "own")
+    logs = {name: p[key].clamp(min=MIN_DISTANCE).log() for name, p in cell.predictions.items()}
+    ranking = _rank(logs, cell.pair)
+    winner, best = ranking.winner, cell.predictions[ranking.winner]
+    used = cell.pair[torch.stack([*logs.values()]).isfinite().all(0)]
+    size = f"{len(used):,} samples of {len(torch.unique(used))} image pairs"
+    text = f"**{cell.title}** ({size}): "
+    text += f"`{winner}` has the smallest {ERRORS[key]}, median {median_text(best[key])} px"
+    if winner != BASELINE:
+        text += f"; {BASELINE} has {median_text(cell.predictions[BASELINE][key])} px"
+        if found := ranking.against.get(BASELINE):
+            low, mean, high = (percent_change(value) for value in (found.low, found.mean, found.high))
+            text += f" (change of the geometric mean {mean} % [{low}, {high}])"
+    text += f".{_level(ranking)}"
+    if key != "truth" and "inliers" in best:
+        shares = [_inlier_share(cell, name) for name in dict.fromkeys((winner, BASELINE))]
+        text += f" Share of the matches within {INLIER_THRESHOLD:g} px: {', '.join(shares)}. No ground truth is known."
+    return text
+
+
+def _inlier_share(cell: Cell, name: str) -> str:
+    share = cell.predictions[name]["inliers"][:, THRESHOLDS.index(INLIER_THRESHOLD)]
+    return f"`{name}` {100 * share.nanmean().item():.1f} %"
+
+
+def _level(ranking: _Ranking) -> str:
+    """Return which methods cannot be distinguished from the winner."""
+    if not ranking.against:
+        return " There is nothing to test it against." if not ranking.second else " One image pair has no interval."
+    return f" Level with it: {_names(ranking.level)}." if ranking.level else ""
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def _about_estimators(cell: RobustCell) -> str:
+    """Return which robust estimator has the smallest error, or without ground truth the most inliers."""
+    found = {name: by[INLIER_THRESHOLD] for name, by in cell.estimates.items() if name != TRUTH}
+    if not found:
+        return ""
+    known = pairs_with_truth(cell, INLIER_THRESHOLD)
+    truth = bool(known.any())
+    kept = known if truth else torch.ones_like(known)
+    key, sign = ("error", 1) if truth else ("inliers", -1)
+    scores = {name: sign * r[key][kept].clamp(max=MAX_ERROR).mean(1) for name, r in found.items()}
+    ranking = _rank(scores, torch.arange(int(kept.sum())))
+
+    def describe(name: str) -> str:
+        mean = abs(scores[name].mean().item())
+        value = f"{mean:.3f} px" if truth else f"{100 * mean:.1f} %"
+        return f"{value} in {median(1000 * found[name]['seconds'].flatten()).item():.1f} ms"
+
+    what = f"smallest error on the ground-truth inliers at {INLIER_THRESHOLD:g} px"
+    what = what if truth else f"largest share of inliers at {INLIER_THRESHOLD:g} px (there is no ground truth)"
+    text = f"**{cell.title}, robust estimation** ({int(kept.sum())} image pairs): `{ranking.winner}` has the {what}, "
+    text += f"mean {describe(ranking.winner)}"
+    text += f"; next is `{ranking.second}` with {describe(ranking.second)}" if ranking.second else ""
+    return f"{text}.{_level(ranking)}"
