@@ -6,11 +6,11 @@ import argparse
 
 import torch
 
-from kornia_learnnorm.cli.evaluate import add_run_arguments, run_arguments
+from kornia_learnnorm.cli.evaluate import add_run_arguments, json_tables, print_table, run_arguments
 from kornia_learnnorm.evaluation.report.formatting import rate_text
 from kornia_learnnorm.evaluation.runs.record import temporary_run
 from kornia_learnnorm.evaluation.runs.run import Cell
-from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.evaluation.tables import Table
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
 
@@ -33,11 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a table per comparison, with a row per method and a column per store."""
-    cells = temporary_run(*run_arguments(args, size=8), protocols=["filtered"]).cells
-    header = ["method", *map(_column, cells)]
-    for title, (quantity, baseline) in COMPARISONS.items():
-        rows = [[name, *(_rate(cell, name, baseline, quantity) for cell in cells)] for name in cells[0].predictions]
-        print(f"\n{title}\n\n{format_table(header, rows)}", flush=True)
+    with json_tables(args, [*args.stores, *(args.weights or ())]) as tables:
+        cells = temporary_run(*run_arguments(args, size=8), protocols=["filtered"]).cells
+        header = ["method", *map(_column, cells)]
+        for title, (quantity, baseline) in COMPARISONS.items():
+            rows = [[name, *(_rate(cell, name, baseline, quantity) for cell in cells)] for name in cells[0].predictions]
+            tables.append(Table(title, "", header, rows))
+            print_table(args, title, tables[-1])
     return 0
 
 

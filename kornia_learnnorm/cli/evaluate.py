@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import torch
 
@@ -11,10 +14,20 @@ from kornia_learnnorm.evaluation.methods import DEFAULT_METHODS, SHIPPED, defaul
 from kornia_learnnorm.evaluation.runs.predict import SampleOptions
 from kornia_learnnorm.evaluation.runs.record import record_run, temporary_run
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
-from kornia_learnnorm.evaluation.tables import HEADER, format_table, method_rows, names_of
+from kornia_learnnorm.evaluation.tables import HEADER, Table, format_table, method_rows, names_of, tables_as_json
+from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["EXAMPLES", "add_arguments", "add_run_arguments", "run", "run_arguments"]
+__all__ = [
+    "EXAMPLES",
+    "add_arguments",
+    "add_json_argument",
+    "add_run_arguments",
+    "json_tables",
+    "print_table",
+    "run",
+    "run_arguments",
+]
 
 EXAMPLES = """\
 learnnorm evaluate store.h5 --methods Hartley crossview Hartley+LM --size 16
@@ -55,6 +68,48 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         default=SampleOptions.max_samples,
         help="at most so many samples of each store and protocol, at random (default: %(default)s; 0: all)",
     )
+    add_json_argument(parser)
+
+
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json`` to the parser of a command that prints tables."""
+    parser.add_argument("--json", metavar="FILE", help="write the tables to this file as JSON; - for standard output")
+
+
+@contextmanager
+def json_tables(args: argparse.Namespace, inputs: Sequence[str] = ()) -> Iterator[list[Table]]:
+    """Give a list for the tables of a command, which are written when the block succeeds, if ``--json`` is given.
+
+    Args:
+        args: arguments with ``json`` and ``command_line``.
+        inputs: files that must not be overwritten; FILE.h5@3:10 for some pairs of a store.
+
+    Raises:
+        ValueError: if the file cannot be written.
+        OSError: if its folder does not exist or is not writable.
+
+    """
+    tables: list[Table] = []
+    with ExitStack() as stack:
+        if args.json not in (None, "-"):
+            taken = {Path(part).resolve() for name in inputs for part in (name, name.rpartition("@")[0])}
+            if not args.json or Path(args.json).resolve() in taken:
+                raise ValueError(f"--json {args.json}: expected a new file or -")
+            beside = stack.enter_context(atomic_write(args.json))
+        yield tables
+        text = tables_as_json(args.command_line, tables) + "\n"
+        if args.json == "-":
+            print(text, end="")
+        elif args.json is not None:
+            beside.write_text(text, encoding="utf-8")
+    if args.json not in (None, "-"):
+        print(f"\nwrote {args.json}")
+
+
+def print_table(args: argparse.Namespace, heading: str, table: Table) -> None:
+    """Print a table under a heading, unless standard output is for JSON."""
+    if args.json != "-":
+        print(f"\n{heading}\n\n{format_table(table.header, table.rows)}", flush=True)
 
 
 def run_arguments(args: argparse.Namespace, size: int) -> tuple[dict[str, str], tuple[str, ...], SampleOptions]:
@@ -83,26 +138,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make a run of predictions and print two tables per store, filtered and unfiltered."""
     stores, methods, options = run_arguments(args, args.size)
-    if args.out is None:
-        _print_tables(temporary_run(stores, methods, options))
-        return 0
-    if not args.out:
-        raise ValueError("--out is empty: expected a folder")
-    if not args.methods and not args.weights:
-        methods = DEFAULT_METHODS
-    no_example = record_run(args.out, stores, methods, options, command=args.command_line)
-    _print_tables(read_run(args.out))
+    with json_tables(args, [*args.stores, *(args.weights or ())]) as tables:
+        if args.out is None:
+            _print_tables(args, temporary_run(stores, methods, options), tables)
+            return 0
+        if not args.out:
+            raise ValueError("--out is empty: expected a folder")
+        if not args.methods and not args.weights:
+            methods = DEFAULT_METHODS
+        no_example = record_run(args.out, stores, methods, options, command=args.command_line)
+        _print_tables(args, read_run(args.out), tables)
     if no_example:
         print(f"without Figures 10 and 11: {no_example}", file=sys.stderr)
-    print(f"\nwrote {args.out}; learnnorm report {args.out} makes tables and figures of it")
+    done = f"\nwrote {args.out}; learnnorm report {args.out} makes tables and figures of it"
+    print(done, file=sys.stderr if args.json == "-" else sys.stdout)
     return 0
 
 
-def _print_tables(run: Run) -> None:
-    """Print the tables of a run."""
+def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> None:
+    """Print the tables of a run and append them to a list."""
     limit = run.about["max_residual"]
     for store, about in run.about["stores"].items():
-        print(f"\n{store}: {about}")
+        if args.json != "-":
+            print(f"\n{store}: {about}")
         for cell in run.cells:
             if cell.store != store or not cell.predictions:
                 continue
@@ -111,4 +169,5 @@ def _print_tables(run: Run) -> None:
             own = torch.stack([errors["own"] for errors in cell.predictions.values()])
             if infinite := int(own.isinf().any(0).sum()):
                 text += f"; {infinite} with a point on an epipole, not in the means"
-            print(f"\n{text}\n\n{format_table(HEADER, method_rows(cell.predictions))}", flush=True)
+            tables.append(Table(cell.title, text, [*HEADER], method_rows(cell.predictions)))
+            print_table(args, text, tables[-1])

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from kornia_learnnorm.cli.evaluate import add_json_argument, json_tables
 from kornia_learnnorm.evaluation.report.pages import print_summary, print_tables, write_report
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
@@ -18,14 +19,19 @@ learnnorm robust store.h5 --out run && learnnorm report run"""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm report`` to a parser."""
     parser.add_argument("folder", metavar="RUN", type=Path, help="folder that learnnorm evaluate or robust --out wrote")
+    add_json_argument(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write ``report.md``, ``report.html`` and the pictures; print the summary and the tables that fit."""
-    report = write_report(args.folder)
-    print_summary(report.summary)
-    print_tables(report.tables, args.folder / "report.html")
+    with json_tables(args) as tables:
+        report = write_report(args.folder)
+        tables += report.tables
+        if args.json != "-":
+            print_summary(report.summary)
+            print_tables(report.tables, args.folder / "report.html")
     if report.missing:
         print(f"not there yet, so left out: {'; '.join(report.missing)}", file=sys.stderr)
-    print(f"wrote {args.folder / 'report.md'} and {args.folder / 'report.html'}")
+    wrote = f"wrote {args.folder / 'report.md'} and {args.folder / 'report.html'}"
+    print(wrote, file=sys.stderr if args.json == "-" else sys.stdout)
     return 0

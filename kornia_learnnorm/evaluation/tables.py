@@ -1,8 +1,12 @@
-"""Tables of methods from the errors of their samples."""
+"""Tables: their form as Markdown and as JSON, and those of methods from the errors of their samples."""
 
 from __future__ import annotations
 
+import importlib.metadata
+import json
+import re
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,7 +15,16 @@ from kornia_learnnorm.files import short_name
 from kornia_learnnorm.metrics.better_rate import better_rate, comparable
 from kornia_learnnorm.metrics.summary import median
 
-__all__ = ["DIAGNOSTICS", "HEADER", "diagnostic_rows", "format_table", "method_rows", "names_of"]
+__all__ = [
+    "DIAGNOSTICS",
+    "HEADER",
+    "Table",
+    "diagnostic_rows",
+    "format_table",
+    "method_rows",
+    "names_of",
+    "tables_as_json",
+]
 
 HEADER = (
     "method",
@@ -24,7 +37,58 @@ HEADER = (
 )
 DIAGNOSTICS = ("method", "condition number", "rho", "distance 1", "distance 2", "error due to rank 2 %")
 
+_NUMBER = r"([+-]?\d+(?:\.\d*)?(?:e[+-]?\d+)?)"
+# A number; its interval and p-value, or the standard deviation of a run's mean; * for a store that was trained on.
+CELL = re.compile(rf"{_NUMBER}(?: \[{_NUMBER}, {_NUMBER}\](?:, (?:< )?{_NUMBER})?)?(?: ± {_NUMBER})?( \*)?")
+PARTS = ("value", "low", "high", "p", "std", "trained_on")
+
 Predictions = Mapping[str, Mapping[str, Tensor]]
+
+
+class Table(NamedTuple):
+    """A table; an empty cell is an unknown number, ``-`` one that is not defined, as of a method against itself."""
+
+    title: str
+    text: str  # what the table shows and how to read it, Markdown
+    header: list[str]
+    rows: list[list[str]]  # cells as text
+
+
+def tables_as_json(command: str, tables: Sequence[Table]) -> str:
+    """Return the tables of a command as a JSON object with ``command``, ``version`` and ``tables``.
+
+    Each table has ``title``, ``text`` and ``rows``, objects by the names of the columns. A cell is a number; an object
+    with ``value`` and, where the table has them, ``low`` and ``high`` (interval), ``p``, ``std`` and ``trained_on``;
+    null where the table is empty or has ``-``; otherwise its text. Numbers are rounded as in the printed table.
+
+    Example:
+        >>> print(tables_as_json("learnnorm ...", [Table("A", "", ["method", "px"], [["mine", "1.5 [1.2, 2]"]])]))
+        {"command": "learnnorm ...",... "rows": [{"method": "mine", "px": {"value": 1.5, "low": 1.2, "high": 2}}]}]}
+
+    """
+    content = {
+        "command": command,
+        "version": importlib.metadata.version("kornia_learnnorm"),
+        "tables": [{"title": t.title, "text": t.text, "rows": [_row(t.header, row) for row in t.rows]} for t in tables],
+    }
+    return json.dumps(content, allow_nan=False)
+
+
+def _row(header: Sequence[str], row: Sequence[str]) -> dict[str, Any]:
+    name, *cells = row
+    return {header[0]: name, **{column: _value(cell) for column, cell in zip(header[1:], cells, strict=True)}}
+
+
+def _value(cell: str) -> Any:
+    """Return what a cell says, for JSON."""
+    if cell in ("", "-"):
+        return None
+    if not (found := CELL.fullmatch(cell)):
+        return cell
+    *numbers, star = found.groups()
+    parts = [*(None if number is None else json.loads(number.lstrip("+")) for number in numbers), bool(star) or None]
+    known = {name: part for name, part in zip(PARTS, parts, strict=True) if part is not None}
+    return known if len(known) > 1 else known["value"]
 
 
 def method_rows(predictions: Predictions) -> list[list[str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.evaluation.tables import Table, tables_as_json
 from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
 
 METHODS = ["none", "Hartley", "whitening", "reweighted", "tilted", "crossview", "searched"]
@@ -143,6 +145,67 @@ def test_diagnose(folder, capsys, size):
     for name, normalizer in {"Hartley": kln.Hartley(), "whitening": kln.Whitening()}.items():
         *expected, share = (np.median(v) for v in kln.diagnose(samples.points1, samples.points2, normalizer))
         assert rows[name] == [*(f"{value:.4g}" for value in expected), f"{100 * share:z.0f}"]
+
+
+@pytest.mark.parametrize("command", ["evaluate", "compare", "diagnose"])
+def test_json_has_the_numbers_of_the_tables(folder, tmp_path, capsys, command):
+    words = [command, str(folder / "known.h5"), "--methods", "Hartley", "crossview"]
+    path = tmp_path / "tables.json"
+    assert main([*words, "--json", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.endswith(f"\nwrote {path}\n")
+    assert main([*words, "--json", "-"]) == 0
+    found, again = json.loads(path.read_text()), json.loads(capsys.readouterr().out)
+    assert found["tables"] == again["tables"]
+    assert found["command"] == f"learnnorm {' '.join(words)} --json {path}"
+    assert found["version"] == kln.__version__
+    tables = read_tables(printed)
+    assert len(tables) == len(found["tables"])
+    for table, (header, rows) in zip(found["tables"], tables.values(), strict=True):
+        for row in table["rows"]:
+            assert [*row] == header
+            for value, cell in zip([*row.values()][1:], rows[row["method"]], strict=True):
+                if isinstance(value, dict):
+                    low, high = (float(end) for end in cell.partition("[")[2].rstrip("]").split(", "))
+                    assert [value["value"], value["low"], value["high"]] == [float(cell.split()[0]), low, high]
+                else:
+                    assert value == (None if cell == "-" else float(cell))
+
+
+def test_json_of_a_run_and_of_its_report(folder, tmp_path, capsys):
+    out = str(tmp_path / "run")
+    command = ["evaluate", str(folder / "known.h5"), "--methods", "Hartley", "crossview", "--out", out, "--json", "-"]
+    assert main(command) == 0
+    printed = capsys.readouterr()
+    assert len(json.loads(printed.out)["tables"]) == 2
+    assert f"wrote {out}" in printed.err
+    assert main(["report", out, "--json", "-"]) == 0
+    tables = json.loads(capsys.readouterr().out)["tables"]
+    rows = {row["method"]: row for row in tables[0]["rows"]}
+    assert rows["Hartley"]["trained on"] is None
+    assert {*next(value for key, value in rows["crossview"].items() if "known" in key)} == {"value", "low", "high"}
+
+
+def test_json_is_not_written_where_a_command_fails_or_over_its_input(folder, tmp_path, refused):
+    store = tmp_path / "known.h5"
+    store.write_bytes((folder / "known.h5").read_bytes())
+    for command in ("evaluate", "compare", "diagnose"):
+        refused([command, f"{store}@0:2", "--json", store], "known.h5: expected a new file or -")
+        refused([command, store, "--json", tmp_path / "none/a.json"], "none does not exist")
+        refused([command, store, "--json", tmp_path / "a.json", "--weights", "nothing"], "no weights")
+    assert [*tmp_path.iterdir()] == [store]
+
+
+def test_cells_as_json():
+    cells = ["", "-", "12", "+1.50", "2.5e+06", "1.5 [1.2, +2.0]", "-3.0 [-4.0, -2.0], < 0.001", "7.00 ± 0.10"]
+    cells += ["99.9 *", "99.9 [99.0, 100.0] *", "kitti_00, kitti_01", "inf"]
+    (row,) = json.loads(tables_as_json("", [Table("", "", ["name", *map(str, range(12))], [["12", *cells]])]))[
+        "tables"
+    ][0]["rows"]
+    expected = [None, None, 12, 1.5, 2.5e6, {"value": 1.5, "low": 1.2, "high": 2.0}]
+    expected += [{"value": -3.0, "low": -4.0, "high": -2.0, "p": 0.001}, {"value": 7.0, "std": 0.1}]
+    expected += [{"value": 99.9, "trained_on": True}, {"value": 99.9, "low": 99.0, "high": 100.0, "trained_on": True}]
+    assert [*row.values()] == ["12", *expected, "kitti_00, kitti_01", "inf"]
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,15 @@
-"""Tables of a report and the text of their cells: an empty cell is an unknown number, ``-`` one that is not defined."""
+"""Text of the cells of a report's tables."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.runs.run import Cell
+from kornia_learnnorm.evaluation.tables import Table
 from kornia_learnnorm.metrics.better_rate import comparable
 from kornia_learnnorm.metrics.bootstrap import bootstrap_interval, paired_bootstrap
 from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
@@ -20,7 +20,6 @@ __all__ = [
     "MIN_P_VALUE",
     "POSE_HEADER",
     "RESAMPLES",
-    "Table",
     "known_parts",
     "mean_text",
     "median_text",
@@ -35,15 +34,6 @@ BASELINE = "Hartley"  # the method that all others are compared with
 RESAMPLES = 2000  # bootstrap resamples of a paired test
 MIN_P_VALUE = 1e-3  # the smallest p-value that these resamples can resolve
 POSE_HEADER = ("AUC@5", "AUC@10", "AUC@20", "mAA(10)")
-
-
-class Table(NamedTuple):
-    """A table of a report."""
-
-    title: str
-    text: str  # what the table shows and how to read it, Markdown
-    header: list[str]
-    rows: list[list[str]]  # cells as text
 
 
 def known_parts(table: Table) -> Table | None:

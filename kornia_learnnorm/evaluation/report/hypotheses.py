@@ -7,7 +7,7 @@ from math import nan
 
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.formatting import BASELINE, Table, number_text, paired_text
+from kornia_learnnorm.evaluation.report.formatting import BASELINE, number_text, paired_text
 from kornia_learnnorm.evaluation.report.style import (
     Picture,
     line_style,
@@ -18,6 +18,7 @@ from kornia_learnnorm.evaluation.report.style import (
 )
 from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR, NUMBERS, expected_best, picked
 from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
+from kornia_learnnorm.evaluation.tables import Table
 
 __all__ = ["hypothesis_figures", "hypothesis_tables"]
 

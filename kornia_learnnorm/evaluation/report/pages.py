@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kornia_learnnorm.evaluation.report.figures import report_figures
-from kornia_learnnorm.evaluation.report.formatting import Table, known_parts
+from kornia_learnnorm.evaluation.report.formatting import known_parts
 from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_figures, hypothesis_tables
 from kornia_learnnorm.evaluation.report.rates import with_baseline
 from kornia_learnnorm.evaluation.report.robust import robust_tables
@@ -22,7 +22,7 @@ from kornia_learnnorm.evaluation.report.tables import report_tables
 from kornia_learnnorm.evaluation.robust.run import RobustRun, read_robust
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
 from kornia_learnnorm.evaluation.runs.store import read_section
-from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.evaluation.tables import Table, format_table
 from kornia_learnnorm.files import write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO

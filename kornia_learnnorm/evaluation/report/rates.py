@@ -6,8 +6,9 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 
-from kornia_learnnorm.evaluation.report.formatting import BASELINE, Table, rate_text
+from kornia_learnnorm.evaluation.report.formatting import BASELINE, rate_text
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.evaluation.tables import Table
 from kornia_learnnorm.metrics.better_rate import better_rate
 from kornia_learnnorm.protocol import PROTOCOLS, RATIO
 

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.report.formatting import (
     POSE_HEADER,
-    Table,
     median_text,
     number_text,
     paired_text,
@@ -19,6 +18,7 @@ from kornia_learnnorm.evaluation.report.rates import papers_data
 from kornia_learnnorm.evaluation.robust.estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR
 from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
+from kornia_learnnorm.evaluation.tables import Table
 from kornia_learnnorm.protocol import THRESHOLDS
 
 __all__ = ["pairs_with_truth", "robust_tables"]

@@ -12,7 +12,6 @@ from kornia_learnnorm.evaluation.report.formatting import (
     MIN_P_VALUE,
     POSE_HEADER,
     RESAMPLES,
-    Table,
     mean_text,
     median_text,
     number_text,
@@ -23,6 +22,7 @@ from kornia_learnnorm.evaluation.report.formatting import (
 )
 from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.evaluation.tables import Table
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import THRESHOLDS
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.evaluation.report.formatting import Table
 from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 from kornia_learnnorm.evaluation.report.pair import draw_example
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs import example
 from kornia_learnnorm.evaluation.runs.run import read_run
+from kornia_learnnorm.evaluation.tables import Table
 
 matplotlib = pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 
