@@ -1,14 +1,15 @@
-"""Files that are written whole or not at all, and their short names."""
+"""Files that are written whole or not at all, by one process at a time, and their short names."""
 
 from __future__ import annotations
 
 import os
+import platform
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["atomic_write", "short_name", "write_text"]
+__all__ = ["atomic_write", "exclusive", "short_name", "write_text"]
 
 
 @contextmanager
@@ -61,6 +62,60 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text file in UTF-8 as :func:`atomic_write` does."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def exclusive(path: str | Path) -> Iterator[None]:
+    """Hold the lock of a folder or a file that a run writes, so that no other run writes it too.
+
+    The system releases the lock when the process ends, however it ends. The lock is a file, ``.lock`` in the folder or
+    ``.NAME.lock`` beside the file, which is there while the lock is held; a killed process leaves it, without effect.
+
+    Args:
+        path: a folder, or the file to write, which need not exist.
+
+    Raises:
+        BlockingIOError: if another run holds the lock; the message names its process.
+        OSError: if the lock cannot be written, or the folder of the file does not exist.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, exclusive(folder):
+        ...     with exclusive(folder):
+        ...         pass
+        Traceback (most recent call last):
+        BlockingIOError: ... is in use by process ...: wait for it to end, or write elsewhere
+
+    """
+    from filelock import FileLock, Timeout  # a requirement of torch
+
+    path = Path(path)
+    file = path / ".lock" if path.is_dir() else path.with_name(f".{path.name}.lock")
+    if not file.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {file.parent} does not exist")
+    lock = FileLock(file)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise BlockingIOError(f"{path} is in use by {_holder(file)}: wait for it to end, or write elsewhere") from error
+    except OSError as error:
+        raise type(error)(f"cannot write {path}: {error.strerror or error}") from error
+    try:
+        with suppress(OSError):  # on Windows nobody can write or read a locked file
+            file.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
+        yield
+    finally:
+        with suppress(OSError):  # nor remove it
+            file.unlink()
+        lock.release()
+
+
+def _holder(file: Path) -> str:
+    """Return which process wrote a lock."""
+    try:
+        return file.read_text(encoding="utf-8") or "another run"
+    except (OSError, ValueError):
+        return "another run"
 
 
 def short_name(path: str | Path) -> str:

@@ -8,6 +8,7 @@ import sys
 import warnings
 import zipfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from jsonargparse import ArgumentError
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from torch import Tensor
 
+from kornia_learnnorm.files import exclusive
 from lightning_modules.config_files import with_config_paths
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import NormalizerTask
@@ -37,6 +39,15 @@ class TrainingCLI(LightningCLI):
 
     def _parse_ckpt_path(self) -> None:
         """Take no configuration from a checkpoint: it could name any class to be made."""
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        """Run a subcommand; only one training at a time writes a folder."""
+        with ExitStack() as stack:
+            if subcommand == "fit" and self.trainer.is_global_zero:
+                folder = Path(self.trainer.default_root_dir)
+                folder.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(exclusive(folder))
+            super()._run_subcommand(subcommand)
 
     def before_fit(self) -> None:
         """Check the checkpoint; only ``fit`` needs none, without one it begins a new run."""

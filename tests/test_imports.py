@@ -32,7 +32,7 @@ FLOORS = [
 ]
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 CORE = set().union(*FLOORS[:5])
-CORE_NEEDS = {"kornia", "kornia_learnnorm", "numpy", "safetensors", "torch", *sys.stdlib_module_names}
+CORE_NEEDS = {"filelock", "kornia", "kornia_learnnorm", "numpy", "safetensors", "torch", *sys.stdlib_module_names}
 HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "rich", "bokeh"]
 
 FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))

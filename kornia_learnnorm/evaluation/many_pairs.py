@@ -18,7 +18,7 @@ from kornia_learnnorm.evaluation.inputs import check_settings
 from kornia_learnnorm.evaluation.pair import MAX_SIZE, check_matching, estimate_pair
 from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, package_versions
 from kornia_learnnorm.evaluation.reliability import PairWarning
-from kornia_learnnorm.files import write_text
+from kornia_learnnorm.files import exclusive, write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
@@ -124,7 +124,7 @@ def estimate_pairs(
 
     Raises:
         ValueError: if the folder holds results with other options.
-        OSError: if a file cannot be written.
+        OSError: if a file cannot be written, or another process writes the folder.
 
     """
     folder = Path(folder)
@@ -132,6 +132,16 @@ def estimate_pairs(
     _layer(options.weights)  # wrong weights are an error of the options, not of each pair
     given = json.loads(json.dumps({**asdict(options), "K": cameras}))
     folder.mkdir(parents=True, exist_ok=True)
+    with exclusive(folder):
+        done = _estimate_missing(pairs, folder, options, given, jobs, dask)
+    warned = sum(bool(done[str(first), str(second)]["warnings"]) for first, second in pairs)
+    return len(pairs) - warned, warned
+
+
+def _estimate_missing(
+    pairs: list[tuple[Path, Path]], folder: Path, options: PairOptions, given: Any, jobs: int, dask: str | None
+) -> dict[tuple[str, str], dict[str, Any]]:
+    """Return the JSON objects of all pairs by their files; those that are not there yet are estimated and written."""
     if (folder / OPTIONS).exists():
         had = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
         if had != given:
@@ -152,8 +162,7 @@ def estimate_pairs(
             file.flush()
             done[str(pair[0]), str(pair[1])] = line
             bar.update()
-    warned = sum(bool(done[str(first), str(second)]["warnings"]) for first, second in pairs)
-    return len(pairs) - warned, warned
+    return done
 
 
 def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> dict[str, Any]:

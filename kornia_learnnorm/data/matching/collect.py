@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from importlib.metadata import version
@@ -24,7 +24,8 @@ from kornia_learnnorm.data.matching.features import DETECTORS, Features
 from kornia_learnnorm.data.matching.matchers import MATCHERS, one_to_one
 from kornia_learnnorm.data.matching.workers import Workers, open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.data.writer import StoreWriter
+from kornia_learnnorm.data.writer import StoreWriter, check_target
+from kornia_learnnorm.files import exclusive
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import MAX_FILTERED, RATIO
 
@@ -133,24 +134,27 @@ def collect_matches(
 
     Raises:
         ValueError: if there are no pairs, none of them could be matched, or ``path`` holds another store.
-        OSError: if a file cannot be written, or workers crash repeatedly without progress.
+        OSError: if a file cannot be written, another process writes the store, or workers crash repeatedly without
+            progress.
         ImportError: if OpenCV, h5py, joblib or, for ``dask``, Dask is not installed.
 
     """
     options, about = options or MatchOptions(), about or {}
     if not pairs:
         raise ValueError("no pairs of frames to match: one pair or more expected, got none")
-    writer = StoreWriter(path, {**about, **asdict(options), **METHOD, "frames": _digest(pairs)})
-    if writer.complete:
-        print(f"{path} exists already, made with these options; remove it to match again", file=sys.stderr)
-        return writer.skipped
-    with closing(writer):
-        with open_workers(jobs, dask) as workers:
-            skipped = _match_all(pairs, writer, options, about, workers)
-        if not writer.done():
-            first = next(iter(skipped.values()))
-            raise ValueError(f"none of the {len(pairs)} pairs could be matched; reason for the first: {first}")
-        writer.finish({"versions": _versions(), "skipped": skipped})
+    check_target(path)
+    with nullcontext() if Path(path).exists() else exclusive(path):
+        writer = StoreWriter(path, {**about, **asdict(options), **METHOD, "frames": _digest(pairs)})
+        if writer.complete:
+            print(f"{path} exists already, made with these options; remove it to match again", file=sys.stderr)
+            return writer.skipped
+        with closing(writer):
+            with open_workers(jobs, dask) as workers:
+                skipped = _match_all(pairs, writer, options, about, workers)
+            if not writer.done():
+                first = next(iter(skipped.values()))
+                raise ValueError(f"none of the {len(pairs)} pairs could be matched; reason for the first: {first}")
+            writer.finish({"versions": _versions(), "skipped": skipped})
     return skipped
 
 

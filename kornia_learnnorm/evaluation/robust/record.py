@@ -29,7 +29,14 @@ from kornia_learnnorm.evaluation.robust.hypotheses import hypothesis_quality, sa
 from kornia_learnnorm.evaluation.robust.matches import Matches, draw_matches, even_pairs, measure
 from kornia_learnnorm.evaluation.robust.peers import PEERS
 from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path, result_files
-from kornia_learnnorm.evaluation.runs.store import Arrays, begin_section, leave_out, read_arrays, write_arrays
+from kornia_learnnorm.evaluation.runs.store import (
+    Arrays,
+    begin_section,
+    leave_out,
+    read_arrays,
+    run_folder,
+    write_arrays,
+)
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
@@ -70,7 +77,7 @@ def record_robust(
     Raises:
         ValueError: if the folder holds a run of other options, an option, a store or an estimator is wrong, an existing
             file is damaged, or, at the end, if an estimator or solver has failed.
-        OSError: if a file is missing or cannot be written.
+        OSError: if a file is missing or cannot be written, or another process writes this run.
 
     """
     folder, options = Path(folder), {**DEFAULT_OPTIONS, **(options or {})}
@@ -90,12 +97,14 @@ def record_robust(
         "threads": torch.get_num_threads(),
     }
     redone = [(names | solver_names)[name] for name in redo]
-    begin_section(folder, "robust", read, about, redone, command)
-    for path in result_files(folder, redone):
-        path.unlink()
     installed = {names[name]: estimator for name, estimator in found.items() if estimator is not None}
-    if failed := _record_missing(folder, read, installed, solve, options):
+    with run_folder(folder):
+        begin_section(folder, "robust", read, about, redone, command)
+        for path in result_files(folder, redone):
+            path.unlink()
+        failed = _record_missing(folder, read, installed, solve, options)
         leave_out(folder, "robust", [name for name in failed if not result_files(folder, [name])])
+    if failed:
         raise ValueError(f"{'; '.join(dict.fromkeys(failed.values()))}. All others are in {folder}")
 
 

@@ -41,6 +41,7 @@ from kornia_learnnorm.evaluation.runs.store import (
     leave_out,
     read_arrays,
     read_section,
+    run_folder,
     write_arrays,
 )
 from kornia_learnnorm.optional import import_extra
@@ -100,7 +101,7 @@ def record_run(
     Raises:
         ValueError: if the folder holds a run of other options, a store or a method is wrong, a file is damaged, or, at
             the end, if a method has failed.
-        OSError: if a file is missing or cannot be written.
+        OSError: if a file is missing or cannot be written, or another process writes this run.
 
     """
     options = SampleOptions() if options is None else options
@@ -112,12 +113,13 @@ def record_run(
         "methods": {names[name]: identify_method(name) for name in methods},
         "trained_on": {name: list(method.trained_on) for name, method in found.items()},
     }
-    before = (read_section(folder, "evaluate") or {}).get("methods", {})
-    begin_section(folder, "evaluate", recorder.stores, about, command=command)
-    recorder.record_stores(protocols)
-    no_example = recorder.record_sizes() if complete else ""
+    with run_folder(folder):
+        before = (read_section(folder, "evaluate") or {}).get("methods", {})
+        begin_section(folder, "evaluate", recorder.stores, about, command=command)
+        recorder.record_stores(protocols)
+        no_example = recorder.record_sizes() if complete else ""
+        recorder.forget(recorder.failed.keys() - before.keys())
     if failed := recorder.failed:
-        recorder.forget(failed.keys() - before.keys())
         # A normaliser of the user's own is named in its message already.
         texts = [text if text.startswith(base_name(name)) else f"{name}: {text}" for name, text in failed.items()]
         raise ValueError("; ".join(texts) + (f". All others are in {folder}" if complete else ""))

@@ -10,7 +10,8 @@ import importlib.metadata
 import json
 import zipfile
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.files import atomic_write, write_text
+from kornia_learnnorm.files import atomic_write, exclusive, write_text
 
 __all__ = [
     "About",
@@ -29,6 +30,7 @@ __all__ = [
     "leave_out",
     "read_arrays",
     "read_section",
+    "run_folder",
     "write_arrays",
 ]
 
@@ -46,6 +48,16 @@ OPTIONS = {
 
 About = dict[str, Any]
 Arrays = dict[str, NDArray[Any]]
+
+
+@contextmanager
+def run_folder(folder: Path) -> Iterator[None]:
+    """Make the folder of a run if missing and keep other processes from writing it; raise ValueError for a file."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file: expected a folder for the run, or a new name")
+    folder.mkdir(parents=True, exist_ok=True)
+    with exclusive(folder):
+        yield
 
 
 def read_section(folder: Path, section: str) -> About | None:
@@ -84,14 +96,11 @@ def begin_section(
         },
         "versions": {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")},
     }
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file: expected a folder for the run, or a new name")
     joined, had = JOINED[section], read_section(folder, section) or about
     differ = [f"{key} {had[key]!r}, now {about[key]!r}" for key in OPTIONS[section] if had[key] != about[key]]
     differ += [text for key in joined for text in _changes(had[key], about[key], redo)]
     if differ:
         raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
-    folder.mkdir(parents=True, exist_ok=True)
     dates = {command: datetime.now().astimezone().date().isoformat()} if command else {}
     about["commands"] = {**had.get("commands", {}), **dates}
     _write(folder, section, about | {key: _join(had[key], about[key]) for key in joined})

@@ -1,0 +1,83 @@
+"""Locks of folders and files, in this process and against others."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.files import exclusive
+
+HOLD = """
+import sys
+from kornia_learnnorm.files import exclusive
+with exclusive(sys.argv[1]):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("name", ["", "store.h5"])
+def test_a_lock_is_refused_then_released_and_leaves_no_file(tmp_path, name):
+    with exclusive(tmp_path / name):
+        with pytest.raises(BlockingIOError, match=r"is in use by process \d+ on .*: wait for it to end, or"):
+            exclusive(tmp_path / name).__enter__()
+        with exclusive(tmp_path / "other.h5"):
+            pass
+    with exclusive(tmp_path / name):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_is_released_after_an_error(tmp_path):
+    with pytest.raises(KeyboardInterrupt), exclusive(tmp_path):
+        raise KeyboardInterrupt
+    with exclusive(tmp_path):
+        pass
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(OSError, match=r"cannot write .*store\.h5"), exclusive(tmp_path / "none" / "store.h5"):
+        pass
+
+
+def test_a_killed_process_does_not_block(tmp_path):
+    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(BlockingIOError, match=f"{tmp_path} is in use by process {process.pid} on "):
+            exclusive(tmp_path).__enter__()
+        process.kill()
+    assert (tmp_path / ".lock").is_file()
+    with exclusive(tmp_path):
+        pass
+    assert not (tmp_path / ".lock").exists()
+
+
+@pytest.mark.usefixtures("program")
+def test_commands_refuse_a_folder_that_another_run_writes(tmp_path, refused):
+    store, out = tmp_path / "store.h5", tmp_path / "run"
+    write_store(store, synthetic_store(pairs=1, points=40))
+    main(["synthesize", str(tmp_path / "images"), "--pairs", "1", "--points", "40"])
+    (tmp_path / "pairs.txt").write_text("images/image1.png images/image2.png")
+    out.mkdir()
+    with exclusive(out):
+        refused(["evaluate", store, "--methods", "Hartley", "--out", out], "run is in use by process ")
+        refused(["robust", store, "--estimators", "--solvers", "Hartley", "--out", out], "run is in use by process ")
+        refused(["estimate", "--pairs", tmp_path / "pairs.txt", "--out", out], "run is in use by process ")
+        options = ["--trainer.max_steps=1", f"--trainer.default_root_dir={out}"]
+        refused(["fit", "--config", "crossview-synthetic", *options], "run is in use by process ")
+        assert [path.name for path in out.iterdir()] == [".lock"]
+    with exclusive(tmp_path / "matched.h5"):
+        assert (
+            main(["match", "folder", str(tmp_path / "images"), "--out", str(tmp_path / "matched.h5"), "--jobs", "1"])
+            == 2
+        )
+    assert not (tmp_path / "matched.h5.parts").exists()
+    assert (
+        main(["match", "folder", str(tmp_path / "images"), "--out", str(tmp_path / "matched.h5"), "--jobs", "1"]) == 0
+    )
