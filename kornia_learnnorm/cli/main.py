@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import shlex
 import shutil
 import sys
@@ -40,8 +41,21 @@ TOOLS = {
 def main(args: Sequence[str] | None = None) -> int:
     """Run a command, from ``sys.argv`` if None, and return its exit code.
 
-    It is 0; 2 after an error, whose message is printed as one line; 130 when interrupted.
+    It is 0; 2 after an error, whose message is printed as one line; 130 when interrupted; 141, as of a program that the
+    signal SIGPIPE ends, when the reader of the output, such as ``head``, has ended.
     """
+    try:
+        try:
+            return _run(args)
+        finally:
+            sys.stdout.flush()  # what is not written yet fails here instead of when Python ends
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still in the buffer
+        return 141
+
+
+def _run(args: Sequence[str] | None) -> int:
+    """Run a command and return its exit code."""
     words = list(sys.argv[1:] if args is None else args)
     try:
         if words and words[0] in TRAINING:
@@ -52,6 +66,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        raise
     except (ValueError, OSError, ImportError) as error:
         print(f"learnnorm {words[0]}: error: {_one_line(error)}", file=sys.stderr)
         return 2

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import io
+import os
 import re
 import shlex
 import sys
@@ -235,6 +236,16 @@ def test_interrupted(monkeypatch, capsys):
     monkeypatch.setattr("kornia_learnnorm.cli.evaluate.run", interrupt)
     assert main(["evaluate", "store.h5"]) == 130
     assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("words", [["config", "crossview"], ["evaluate", "--help"]])
+def test_output_whose_reader_has_ended_is_no_error(words, monkeypatch, capsys):
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as stream:  # closing it writes what is left in the buffer
+        monkeypatch.setattr("sys.stdout", stream)
+        assert main(words) == 141
+    assert capsys.readouterr().err == ""
 
 
 def test_synthesize_evaluate_estimate(tmp_path, capsys, refused):
