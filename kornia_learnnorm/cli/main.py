@@ -36,6 +36,13 @@ TOOLS = {
     "synthesize": ("kornia_learnnorm.cli.synthesize", "a synthetic store and a rendered image pair"),
     "config": ("kornia_learnnorm.cli.config", "print a configuration for training"),
 }
+COMPLETION = "print the completion of commands and options for a shell"
+COMPLETION_EXAMPLES = """\
+learnnorm completion bash > ~/.local/share/bash-completion/completions/learnnorm
+learnnorm completion fish > ~/.config/fish/completions/learnnorm.fish"""
+# Arguments that are completed with names of files and of folders, by what the help calls them.
+FILES = ("CAMERA", "FILE", "IMG", "LIST", "NAME_OR_PATH", "PATH", "STORE", "STORE.h5")
+FOLDERS = ("FOLDER", "ROOT", "RUN")
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -88,6 +95,10 @@ def make_parser(names: Collection[str] = tuple(TOOLS)) -> argparse.ArgumentParse
             if examples := getattr(tool, "EXAMPLES", ""):
                 command.epilog = "examples:\n" + textwrap.indent(examples, "  ")
             command.set_defaults(run=tool.run)
+    command = commands.add_parser("completion", help=COMPLETION, description=COMPLETION, formatter_class=HelpFormatter)
+    command.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
+    command.epilog = "examples:\n" + textwrap.indent(COMPLETION_EXAMPLES, "  ")
+    command.set_defaults(run=_print_completion)
     return parser
 
 
@@ -106,6 +117,26 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         shown = [a for a in actions if a.required or id(a) in members or (not a.option_strings and a.nargs == "?")]
         rest = argparse.Action([], "options", metavar="[options]")
         super().add_usage(usage, [*shown, rest], required, prefix)
+
+
+def _print_completion(args: argparse.Namespace) -> int:
+    """Print a script that completes commands, options and files; those of a training by the options given most."""
+    shtab = import_extra("shtab", "completion", "completion in the shell")
+    from lightning_modules.config_files import config_names
+
+    parser = make_parser()
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
+    for name, command in commands.choices.items():
+        if name in TRAINING:
+            command.add_argument("--config", choices=config_names())
+            command.add_argument("--ckpt_path", metavar="FILE")
+            command.add_argument("--trainer.default_root_dir", metavar="FOLDER")
+            command.add_argument("--trainer.max_steps")
+        for action in command._actions:  # noqa: SLF001
+            if not action.choices and action.metavar in (*FILES, *FOLDERS):
+                action.complete = shtab.FILE if action.metavar in FILES else shtab.DIRECTORY
+    print(shtab.complete(parser, args.shell))
+    return 0
 
 
 def _run_tool(words: list[str]) -> int:

@@ -31,7 +31,9 @@ READER_OPTIONS = ("sequences", "split", "camera", "max_difference", "model")  # 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm match`` to a parser."""
     options = MatchOptions()
-    parser.add_argument("reader", metavar="DATASET", choices=DATASETS, help=f"kind of dataset: {', '.join(DATASETS)}")
+    parser.add_argument(
+        "reader", metavar="DATASET", choices=[*DATASETS], help=f"kind of dataset: {', '.join(DATASETS)}"
+    )
     parser.add_argument("root", metavar="ROOT", type=Path, help="its folder")
     parser.add_argument("--out", metavar="STORE.h5", type=Path, required=True, help="the store to write")
     frames = parser.add_argument_group("frames")

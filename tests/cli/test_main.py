@@ -6,6 +6,8 @@ import io
 import os
 import re
 import shlex
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -238,6 +240,54 @@ def test_interrupted(monkeypatch, capsys):
     assert capsys.readouterr().err == "interrupted\n"
 
 
+@pytest.fixture(scope="module")
+def completion():
+    """A function that returns what bash offers for a line, by the script that the package prints."""
+    pytest.importorskip("shtab", reason="shtab is not installed")
+    if shutil.which("bash") is None:
+        pytest.skip("bash is not installed")
+    with contextlib.redirect_stdout(io.StringIO()) as script:
+        assert main(["completion", "bash"]) == 0
+    ask = """
+    eval "$(cat)"
+    read -ra COMP_WORDS <<< "$1"; [[ $1 == *" " ]] && COMP_WORDS+=("")
+    COMP_CWORD=$(( ${#COMP_WORDS[@]} - 1 )) COMP_LINE=$1 COMP_POINT=${#1}
+    function=$(complete -p learnnorm | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+    $function learnnorm "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
+    printf '%s\\n' "${COMPREPLY[@]}"
+    """
+
+    def offered(line, folder):
+        command = ["bash", "--norc", "-c", ask, "bash", line]
+        text = script.getvalue()
+        found = subprocess.run(command, input=text, cwd=folder, capture_output=True, text=True, check=True, timeout=60)
+        return found.stdout.split()
+
+    return offered
+
+
+def test_completion_in_bash(completion, tmp_path):
+    (tmp_path / "own.h5").touch()
+    assert completion("learnnorm ev", tmp_path) == ["evaluate"]
+    assert {*TOOLS, "fit", "completion"} <= {*completion("learnnorm ", tmp_path)}
+    assert completion("learnnorm evaluate --max-s", tmp_path) == ["--max-samples"]
+    assert completion("learnnorm evaluate o", tmp_path) == ["own.h5"]
+    assert completion("learnnorm match ki", tmp_path) == ["kitti"]
+    assert completion("learnnorm fit --config crossv", tmp_path) == ["crossview", "crossview-synthetic"]
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_completion_of_other_shells(shell, capsys):
+    pytest.importorskip("shtab", reason="shtab is not installed")
+    assert main(["completion", shell]) == 0
+    assert "max-residual" in capsys.readouterr().out
+
+
+def test_completion_names_what_to_install(monkeypatch, refused):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    refused(["completion", "bash"], "completion in the shell needs shtab: run pip install '.[completion]'")
+
+
 @pytest.mark.parametrize("words", [["config", "crossview"], ["evaluate", "--help"]])
 def test_output_whose_reader_has_ended_is_no_error(words, monkeypatch, capsys):
     read, write = os.pipe()
@@ -343,7 +393,7 @@ def test_configurations_take_the_accelerator_that_is_there(path):
     assert "accelerator" in trainer or path.parent != FOLDER
 
 
-@pytest.mark.parametrize("command", sorted(TOOLS))
+@pytest.mark.parametrize("command", [*sorted(TOOLS), "completion"])
 def test_help_fits_a_screen_and_ends_with_examples_that_parse(command, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit) as caught:
