@@ -48,12 +48,12 @@ class RobustRun:
 
 def estimate_path(folder: Path, store: str, protocol: str, threshold: float, name: str) -> Path:
     """Return the file of an estimator's results."""
-    return folder / "robust" / store / protocol / f"{threshold:g}px" / f"{file_name(name)}.npz"
+    return folder / "robust" / file_name(store) / protocol / f"{threshold:g}px" / f"{file_name(name)}.npz"
 
 
 def hypotheses_path(folder: Path, store: str, protocol: str, name: str) -> Path:
     """Return the file of a minimal solver's results."""
-    return folder / "hypotheses" / store / protocol / f"{file_name(name)}.npz"
+    return folder / "hypotheses" / file_name(store) / protocol / f"{file_name(name)}.npz"
 
 
 def result_files(folder: Path, names: Iterable[str]) -> list[Path]:

@@ -31,8 +31,10 @@ from kornia_learnnorm.evaluation.runs.run import (
     Run,
     is_swept,
     method_path,
+    pairs_path,
     prediction_keys,
     read_run,
+    samples_path,
     sweep_path,
 )
 from kornia_learnnorm.evaluation.runs.store import (
@@ -144,7 +146,7 @@ class _Recorder:
         with tqdm(total=steps, unit="step", disable=None) as bar:
             for name, store in self.stores.items():
                 bar.set_postfix_str(name)
-                _once(self.folder / name / "pairs.npz", partial(pair_motions, store), PAIRS, len(store))
+                _once(pairs_path(self.folder, name), partial(pair_motions, store), PAIRS, len(store))
                 for protocol in protocols:
                     samples = self._samples(name, protocol)
                     for label, method in self.methods.items():
@@ -164,7 +166,7 @@ class _Recorder:
                 raise ValueError(f"{store}, {protocol}: {few}")
             return {"pair": drawn.pair.numpy(), "plain_residual": residual}
 
-        path = self.folder / store / protocol / "samples.npz"
+        path = samples_path(self.folder, store, protocol)
         found = _once(path, describe, SAMPLES, len(drawn.pair))
         if not np.array_equal(found["pair"], drawn.pair.numpy()):
             raise ValueError(f"{path.parent} is of other samples than the run's seed draws of the store, remove it")

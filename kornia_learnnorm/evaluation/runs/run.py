@@ -15,7 +15,21 @@ from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS
 from kornia_learnnorm.evaluation.runs.store import Arrays, file_name, read_arrays, read_section
 from kornia_learnnorm.protocol import PROTOCOLS
 
-__all__ = ["EXAMPLE", "PAIRS", "SAMPLES", "SWEEP", "Cell", "Run", "is_swept", "method_path", "read_run", "sweep_path"]
+__all__ = [
+    "EXAMPLE",
+    "PAIRS",
+    "SAMPLES",
+    "SWEEP",
+    "Cell",
+    "Run",
+    "is_swept",
+    "method_path",
+    "pairs_path",
+    "prediction_keys",
+    "read_run",
+    "samples_path",
+    "sweep_path",
+]
 
 # Arrays in the files of a run; read by name, so that a damaged file is recognised before it is used.
 PAIRS = (*MOTIONS, "names")
@@ -52,9 +66,19 @@ class Run:
     missing: list[str] = field(default_factory=list)  # what has not been computed yet
 
 
+def pairs_path(folder: Path, store: str) -> Path:
+    """Return the file of the motions of a store's pairs."""
+    return folder / file_name(store) / "pairs.npz"
+
+
+def samples_path(folder: Path, store: str, protocol: str) -> Path:
+    """Return the file of the samples of a store."""
+    return folder / file_name(store) / protocol / "samples.npz"
+
+
 def method_path(folder: Path, store: str, protocol: str, method: str) -> Path:
     """Return the file of a method's predictions."""
-    return folder / store / protocol / f"{file_name(method)}.npz"
+    return folder / file_name(store) / protocol / f"{file_name(method)}.npz"
 
 
 def sweep_path(folder: Path, method: str) -> Path:
@@ -91,9 +115,9 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
     cells, pairs = [], {}
     for store in about["stores"]:
         for protocol in PROTOCOLS:
-            if (folder / store / protocol / "samples.npz").is_file():
+            if samples_path(folder, store, protocol).is_file():
                 cells.append(_read_cell(folder, about, store, protocol, complete))
-                pairs[store] = _read_pairs(folder / store / "pairs.npz", cells[-1].pair)
+                pairs[store] = _read_pairs(pairs_path(folder, store), cells[-1].pair)
                 absent = [name for name in about["methods"] if name not in cells[-1].predictions]
             else:
                 absent = ["all methods"]
@@ -109,7 +133,7 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
 
 
 def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, complete: bool) -> Cell:
-    samples = read_arrays(folder / store / protocol / "samples.npz", SAMPLES)
+    samples = read_arrays(samples_path(folder, store, protocol), SAMPLES)
     kept = torch.from_numpy(samples["plain_residual"] < about["max_residual"])
     pair = torch.from_numpy(samples["pair"])[kept]
     paths = {name: method_path(folder, store, protocol, name) for name in about["methods"]}

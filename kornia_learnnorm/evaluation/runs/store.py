@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import re
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +36,7 @@ __all__ = [
     "write_arrays",
 ]
 
-FORMAT = 3  # of the folder; runs of another format are refused
+FORMAT = 4  # of the folder; runs of another format are refused
 # Parts of a section that may grow: what each is, by its name.
 JOINED = {
     "evaluate": ("stores", "methods", "trained_on", "versions"),
@@ -45,6 +47,9 @@ OPTIONS = {
     "evaluate": ("size", "seed", "max_samples", "max_residual"),
     "robust": ("pairs", "hypotheses", "seeds", "slow_seeds", "seed", "threads"),
 }
+
+MAX_NAME = 80  # letters of a name in that of a file
+RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{device}{i}" for device in ("COM", "LPT") for i in range(10))}  # Windows
 
 About = dict[str, Any]
 Arrays = dict[str, NDArray[Any]]
@@ -153,8 +158,21 @@ def _write(folder: Path, section: str, about: About) -> None:
 
 
 def file_name(name: str) -> str:
-    """Return the name of the file of a method, an estimator or a solver, without suffix."""
-    return "".join(letter if letter.isalnum() or letter in "+-._" else "_" for letter in name)
+    """Return the name of the file or folder of a store, a method, an estimator or a solver, without suffix.
+
+    It is the name itself, unless that is not a file's name on Linux, macOS and Windows alike, or longer than
+    ``MAX_NAME``: then it has a part of a hash of the name, so that no two names have one file.
+
+    Example:
+        >>> file_name("Hartley+LM"), file_name("tum@0:9"), file_name("con")
+        ('Hartley+LM', 'tum_0_9-62e87db9', '_con-1143da2b')
+
+    """
+    safe = re.sub(r"[^A-Za-z0-9+_.-]", "_", name)[:MAX_NAME]
+    if name.partition(".")[0].upper() in RESERVED or name.startswith("."):
+        safe = f"_{safe}"
+    safe = safe.rstrip(".")
+    return safe if safe and safe == name else f"{safe}-{sha256(name.encode()).hexdigest()[:8]}"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:

@@ -15,7 +15,7 @@ from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import peers, record
 from kornia_learnnorm.evaluation.robust.estimators import find_estimator
 from kornia_learnnorm.evaluation.robust.matches import draw_matches, measure
-from kornia_learnnorm.evaluation.robust.run import read_robust
+from kornia_learnnorm.evaluation.robust.run import estimate_path, hypotheses_path, read_robust
 
 
 @pytest.fixture(autouse=True)
@@ -56,7 +56,11 @@ def test_again_computes_nothing(robust_copied, robust_again, monkeypatch):
 
 
 def test_resumes_with_what_is_missing(robust_copied, robust_again, robust_run):
-    names = ["robust/kitti_06/filtered/1px/count_Hartley.npz", "hypotheses/kitti_06/unfiltered/Hartley.npz"]
+    paths = [
+        estimate_path(robust_copied, "kitti_06", "filtered", 1.0, "count:Hartley"),
+        hypotheses_path(robust_copied, "kitti_06", "unfiltered", "Hartley"),
+    ]
+    names = [path.relative_to(robust_copied) for path in paths]
     for name in names:
         (robust_copied / name).unlink()
     assert main(robust_again) == 0
@@ -110,7 +114,7 @@ def test_damaged(robust_copied, robust_again, refused):
         path.write_bytes(content)
         for again in (["report", robust_copied], robust_again):
             refused(again, f"{path} is damaged, remove it")
-    (robust_copied / "run.json").write_text('{"format": 3, "robust": {"stores": {}}}')
+    (robust_copied / "run.json").write_text('{"format": 4, "robust": {"stores": {}}}')
     for again in (["report", robust_copied], robust_again):
         refused(again, "run.json is damaged: estimators, solvers, versions, pairs")
 

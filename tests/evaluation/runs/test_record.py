@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -19,9 +20,11 @@ from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method
+from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs import record
 from kornia_learnnorm.evaluation.runs.predict import ERRORS, SampleOptions
 from kornia_learnnorm.evaluation.runs.run import read_run
+from kornia_learnnorm.evaluation.runs.store import file_name
 from kornia_learnnorm.pretrained import WEIGHTS
 
 
@@ -93,11 +96,11 @@ def test_a_run_of_other_options_is_refused(copied, command, refused, options, di
     [
         ("run.json", "{", "run.json is damaged, it is not JSON"),
         ("run.json", "[1]", "run.json is damaged: expected an object of JSON, got list"),
-        ("run.json", "{}", "a run of format None, expected 3: another version of the package made it, remove it"),
-        ("run.json", '{"format": 2, "stores": {}}', "a run of format 2, expected 3"),
-        ("robust.json", "{}", "a run of format 1 with a robust.json, expected 3"),
-        ("run.json", '{"format": 3, "evaluate": 1}', "evaluate must be an object, got 1"),
-        ("run.json", '{"format": 3, "evaluate": {"stores": {}}}', "damaged: methods, trained_on, versions, size, seed"),
+        ("run.json", "{}", "a run of format None, expected 4: another version of the package made it, remove it"),
+        ("run.json", '{"format": 2, "stores": {}}', "a run of format 2, expected 4"),
+        ("robust.json", "{}", "a run of format 1 with a robust.json, expected 4"),
+        ("run.json", '{"format": 4, "evaluate": 1}', "evaluate must be an object, got 1"),
+        ("run.json", '{"format": 4, "evaluate": {"stores": {}}}', "damaged: methods, trained_on, versions, size, seed"),
     ],
 )
 def test_damaged_or_of_another_version(copied, reading, refused, name, text, message):
@@ -199,7 +202,7 @@ class TestOwnCode:
 
     def test_edited_code_is_refused(self, store, capsys):
         assert self.evaluate(store, self.GOOD) == 0
-        assert len([*Path("run").rglob("own_normaliser_Mine.npz")]) == 3
+        assert len([*Path("run").rglob("own_normaliser_Mine-*.npz")]) == 3
         assert self.evaluate(store, self.GOOD) == 0
         assert self.evaluate(store, self.GOOD + "# edited") == 2
         assert "is a run of other options, remove it or write elsewhere: own_normaliser:Mine" in capsys.readouterr().err
@@ -258,3 +261,33 @@ def test_a_few_samples(store, most):
         few, samples = (part.draw(read_store(store), max_ratio) for part in (options, everything))
         assert len(few.pair) == (most or len(samples.pair))
         assert {*map(tuple, few.points1[:, 0].tolist())} <= {*map(tuple, samples.points1[:, 0].tolist())}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["tum@0:9", "guided:robust", "CON", "nul.h5", "com1", "a/b", "..", "name.", " ", "", "ä", 300 * "n", "a*?<>|\"'"],
+)
+def test_names_become_files_of_every_system(name):
+    """By the rules of Windows, of which Linux and macOS have fewer."""
+    found = file_name(name)
+    assert re.fullmatch(r"[A-Za-z0-9+_-][A-Za-z0-9+_.-]{0,99}", found)
+    assert not found.endswith(".")
+    assert found.partition(".")[0].lower() not in {"con", "prn", "aux", "nul", "com1", "lpt1"}
+
+
+def test_names_that_differ_have_files_that_differ():
+    names = ["a:b", "a/b", "a_b", "con", "_con", 99 * "n", 98 * "n", "Hartley", "Hartley+LM", "RANSAC.", "RANSAC"]
+    assert len({file_name(name) for name in names}) == len(names)
+    plain = ["a_b", "Hartley+LM", "tum_fr3_office"]
+    assert [file_name(name) for name in plain] == plain
+
+
+def test_a_run_of_some_pairs_of_a_store(store, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(["evaluate", f"{store}@0:2", "--methods", "Hartley", "--max-samples", "20", "--out", str(out)]) == 0
+    solver = ["--estimators", "--solvers", "Hartley", "--hypotheses", "1"]
+    assert main(["robust", f"{store}@0:2", *solver, "--out", str(out)]) == 0
+    assert [path for path in out.rglob("*") if re.search(r"[^A-Za-z0-9+_.-]", path.name)] == []
+    assert [*read_run(out).about["stores"]] == ["scenes@0:2"]
+    assert read_run(out).cells[0].store == "scenes@0:2"
+    assert read_robust(out).cells[0].hypotheses
