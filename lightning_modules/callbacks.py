@@ -1,9 +1,11 @@
-"""Callbacks: checkpoints, export of the trained weights, and predictions to a file."""
+"""Callbacks: checkpoints, the expected time, export of the trained weights, and predictions to a file."""
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
+import time
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,7 +23,7 @@ from kornia_learnnorm.files import atomic_write, short_name
 from lightning_modules.estimator_task import EstimatorTask
 from lightning_modules.task import NormalizerTask
 
-__all__ = ["Checkpoints", "ExportWeights", "WritePredictions"]
+__all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "WritePredictions"]
 
 
 class Checkpoints(ModelCheckpoint):
@@ -85,6 +87,50 @@ class Checkpoints(ModelCheckpoint):
         if self._previous_handler is not None:
             signal.signal(signal.SIGINT, self._previous_handler)
             self._previous_handler = None
+
+
+class ExpectedTime(Callback):
+    """Print the device, the number of steps and the folder of a training at its start, and soon how long it will take.
+
+    The command line adds it to every training.
+
+    Args:
+        measured_steps: steps whose mean time is multiplied, after one that is left out.
+    """
+
+    def __init__(self, measured_steps: int = 10) -> None:
+        self.measured_steps = measured_steps
+        self._first = 0
+        self._start = 0.0
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Print where and how far the training will go."""
+        self._first = trainer.global_step + 1
+        steps = _remaining_steps(trainer)
+        count = "steps until it is stopped" if steps is None else f"{steps} steps"
+        rank_zero_info(f"device {pl_module.device}, {count}; results in {trainer.default_root_dir}")
+
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
+        """Print the expected time after the first steps."""
+        done = trainer.global_step - self._first
+        if done == 0:
+            self._start = time.monotonic()
+        elif done == self.measured_steps and (steps := _remaining_steps(trainer)):
+            seconds = (time.monotonic() - self._start) / done * steps
+            rank_zero_info(f"about {_duration(seconds)} for the remaining {steps} steps, without validation")
+
+
+def _remaining_steps(trainer: pl.Trainer) -> int | None:
+    """Return the number of steps that a training has before it; None where it has no end."""
+    total = trainer.max_steps if trainer.max_steps > 0 else trainer.estimated_stepping_batches
+    return int(total) - trainer.global_step if math.isfinite(total) else None
+
+
+def _duration(seconds: float) -> str:
+    """Return a time to one or two digits."""
+    if seconds < 90:
+        return f"{max(seconds, 1):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"
 
 
 class ExportWeights(Callback):

@@ -20,6 +20,7 @@ from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCL
 from torch import Tensor
 
 from kornia_learnnorm.files import exclusive
+from lightning_modules.callbacks import ExpectedTime
 from lightning_modules.config_files import with_config_paths
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import NormalizerTask
@@ -131,6 +132,7 @@ def run(args: list[str] | None) -> None:
             subclass_mode_data=named,
             args=args,
             auto_configure_optimizers=False,
+            trainer_defaults={"callbacks": [ExpectedTime()]},
             parser_kwargs={"prog": "learnnorm", **raises, **dict.fromkeys(LightningCLI.subcommands(), raises)},
             save_config_kwargs={"overwrite": True},
         )

@@ -21,6 +21,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import TOOLS, main, make_parser
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
+from lightning_modules.callbacks import _duration
 from lightning_modules.config_files import find_config
 
 pytestmark = pytest.mark.usefixtures("program")
@@ -355,6 +356,23 @@ def test_wrong_options_of_a_training_are_one_line(options, message, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     Path("bad.yaml").write_text("model: {nomalizer: 3}")
     refused(["fit", "--config", "crossview-synthetic", *options], message)
+
+
+def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog):
+    options = ["--data.batch_size=16", "--trainer.max_steps=13", "--trainer.enable_progress_bar=false"]
+    options += [f"--data.{stage}.init_args.number=64" for stage in ("train", "val")]
+    options += [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=1", "--trainer.accelerator=cpu"]
+    with caplog.at_level("INFO"):
+        assert main(["fit", "--config=crossview-synthetic", *options, f"--trainer.default_root_dir={tmp_path}"]) == 0
+    assert f"device cpu, 13 steps; results in {tmp_path}" in caplog.messages
+    assert [text for text in caplog.messages if re.fullmatch(r"about \d+ s for the remaining 2 steps, .*", text)]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.1, "1 s"), (89, "89 s"), (120, "2 min"), (5399, "90 min"), (9000, "2.5 h")]
+)
+def test_durations(seconds, text):
+    assert _duration(seconds) == text
 
 
 def test_an_interrupted_training_exits_as_interrupted(tmp_path, monkeypatch, capsys):
