@@ -1,6 +1,8 @@
 # make demo   set up, train a minute, evaluate, estimate; with DATA=<folder> on real images and stores
 # make test   set up, run all tests
 # make test-cpus   set up, run the numerical tests with the kernels of other processors
+# make test-oldest   in .venv-oldest, run the tests of the core with the oldest NumPy, Kornia, safetensors and filelock that
+#             pyproject.toml allows, and the torch of the lock; TORCH=torch==2.5.0 where pip finds a CPU build of it
 # make lint   set up, run the linters and the type checker
 # make docs   set up, build the documentation in docs/_build/html, check its links and notebooks
 # make audit  report known vulnerabilities of the locked packages; never fails
@@ -20,8 +22,10 @@ STORES = "$(DATA)"/correspondences
 
 AUDIT := .venv-audit
 TWINE := .venv-twine
+OLDEST := .venv-oldest
+TORCH ?= $$(grep '^torch==' requirements.lock)
 
-.PHONY: bench demo test test-cpus lint docs audit wheel check-wheel clean ablations layer-ablations table1
+.PHONY: bench demo test test-cpus test-oldest lint docs audit wheel check-wheel clean ablations layer-ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -62,6 +66,17 @@ test-cpus: $(VENV)/.ready
 		env $$(echo $$cpu | tr , ' ') OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -q \
 			-m "numerical and not slow and not long" || exit 1; \
 	done
+
+CORE_TESTS = tests/geometry tests/normalizers tests/estimators tests/ransac tests/metrics tests/test_losses.py
+
+# The lower bounds of the core as pins, without the extras: so the warnings of these have no filters.
+test-oldest: export OMP_NUM_THREADS = 1
+test-oldest:
+	$(PYTHON) -m venv $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --quiet $(TORCH)
+	$(OLDEST)/bin/python tests/oldest_versions.py > $(OLDEST)/pins.txt
+	$(OLDEST)/bin/python -m pip install --quiet --requirement $(OLDEST)/pins.txt pytest pytest-timeout pytest-xdist hypothesis
+	$(OLDEST)/bin/python -m pytest -n auto -q -o filterwarnings=error -o pythonpath=". tests" $(CORE_TESTS)
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
@@ -143,4 +158,4 @@ check-wheel: wheel
 	$(TWINE)/bin/twine check --strict dist/*
 
 clean:
-	rm -rf $(VENV) $(AUDIT) $(TWINE) dist build docs/_build runs
+	rm -rf $(VENV) $(AUDIT) $(TWINE) $(OLDEST) dist build docs/_build runs
