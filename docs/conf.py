@@ -107,6 +107,8 @@ def _plain_notebook(app, doctree):
 
 def setup(app):
     """Connect what the settings above cannot say."""
+    # It adds a file to the site and reads no page, but does not declare that it is safe for parallel reading.
+    app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True
     app.connect("doctree-read", _plain_notebook)
     # The kernels that run the pages inherit the style of figures, and a path that has the command learnnorm.
     os.environ["MATPLOTLIBRC"] = str(app.confdir)
