@@ -224,7 +224,7 @@ def prepare_problem(
         points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
         weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
     check_correspondences(points1, points2, weights)
-    check_cameras(K1, K2, len(points1))
+    check_cameras(K1, K2, points1.shape[0])
     return LinearProblem.from_points(
         points1, points2, None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
     )
@@ -314,5 +314,5 @@ def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:
     """Return correspondences (B, N, 2) that determine a matrix: multiples of irrational numbers, modulo one."""
     index = torch.arange(1, like.shape[1] + 1, dtype=like.dtype, device=like.device)[:, None]
     roots = torch.tensor([2.0, 3.0, 5.0, 7.0], dtype=like.dtype, device=like.device).sqrt()
-    points = (index * roots).frac().expand(len(like), -1, -1)
+    points = (index * roots).frac().expand(like.shape[0], -1, -1)
     return points[..., :2], points[..., 2:]

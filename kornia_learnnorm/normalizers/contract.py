@@ -128,7 +128,7 @@ def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tu
 
     """
     result = transforms_of(normalizer, problem)
-    expected = (len(problem.points1), 3, 3)
+    expected = (problem.points1.shape[0], 3, 3)
     shapes = [tuple(getattr(T, "shape", ())) for T in result] if isinstance(result, tuple | list) else [type(result)]
     if shapes != [expected, expected]:
         raise ValueError(f"a normalizer must return two transforms of shape {expected}, got {shapes}")

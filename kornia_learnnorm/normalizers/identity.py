@@ -25,5 +25,5 @@ class Identity(ProblemNormalizer):
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return identities with shape :math:`(B, 3, 3)`."""
-        eye = torch.eye(3, dtype=problem.x1.dtype, device=problem.x1.device).expand(len(problem.x1), 3, 3)
+        eye = torch.eye(3, dtype=problem.x1.dtype, device=problem.x1.device).expand(problem.x1.shape[0], 3, 3)
         return eye, eye

@@ -122,7 +122,7 @@ class ReweightedWhitening(ProblemNormalizer):
 def _whitening(points: Tensor, w: Tensor) -> Tensor:
     """Return the whitening transforms ``(2, B, 3, 3)`` of points ``(2, N, 2, B)`` with weights ``(N, 2, B)``."""
     total = w.sum(0)
-    w = (w + (total == 0)) / (total + len(w) * (total == 0))
+    w = (w + (total == 0)) / (total + w.shape[0] * (total == 0))
     weighted = w * points
     mean = weighted.sum(1)
     x, y = (weighted - w * mean[:, None]).unbind(0)

@@ -86,7 +86,8 @@ class CrossViewNetwork(nn.Module):
         point_features, set_features = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
         doubled = None if weights is None else torch.cat([weights, weights]).to(self.dtype)
         params = self.set_network(point_features, set_features, doubled).to(points1.dtype)
-        params1, params2 = (self.bound * torch.tanh(params / self.bound)).chunk(2)
+        # Not `chunk`, which torch.export cannot trace with a dynamic batch.
+        params1, params2 = torch.unflatten(self.bound * torch.tanh(params / self.bound), 0, (2, -1)).unbind(0)
         return params1, params2
 
     def _views(

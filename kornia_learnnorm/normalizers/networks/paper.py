@@ -77,7 +77,8 @@ class PaperNetwork(nn.Module):
         doubled = None if weights is None else torch.cat([weights, weights]).to(dtype)
         maxima = self.global_features(points, doubled)
         params = self.head(self.convolution(maxima[:, None]).flatten(1)).to(points1.dtype)
-        params1, params2 = params.chunk(2)
+        # Not `chunk`, which torch.export cannot trace with a dynamic batch.
+        params1, params2 = torch.unflatten(params, 0, (2, -1)).unbind(0)
         return params1, params2
 
     def global_features(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
