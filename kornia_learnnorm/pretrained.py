@@ -15,7 +15,7 @@ from torch import nn
 
 from kornia_learnnorm.files import atomic_write
 
-__all__ = ["check_architecture", "load_module", "save_module", "shipped_weights", "weights_digest"]
+__all__ = ["check_architecture", "load_module", "save_module", "shipped_weights", "weights_digest", "weights_format"]
 
 WEIGHTS = Path(__file__).parent / "weights"
 MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that a file may name
@@ -102,14 +102,29 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
     return module.eval()
 
 
-def shipped_weights(form: str) -> list[str]:
-    """Return the names of the weights of a format that ship with the package."""
+def shipped_weights(form: str | None = None) -> list[str]:
+    """Return the names of the weights that ship with the package, of one format or of all."""
     names = []
     for path in WEIGHTS.glob("*.safetensors"):
         with safe_open(path, "pt") as file:
-            if file.metadata()["format"] == form:
+            if form is None or file.metadata()["format"] == form:
                 names.append(path.stem)
     return sorted(names)
+
+
+def weights_format(name: str | Path) -> str | None:
+    """Return the format of shipped weights by name or of a file; None where there is no such file.
+
+    A file that is none of this package has the format "".
+    """
+    path = weights_path(name)
+    if not path.is_file():
+        return "" if Path(name).is_file() else None
+    try:
+        with safe_open(path, "pt") as file:
+            return str((file.metadata() or {}).get("format", ""))
+    except SafetensorError:
+        return ""
 
 
 def weights_digest(name: str | Path) -> str:

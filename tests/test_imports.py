@@ -24,7 +24,7 @@ FLOORS = [
     {"normalizers", "metrics", "losses"},
     {"estimators"},
     {"ransac"},
-    {"data"},
+    {"data", "export"},
     {"evaluation", "lightning_modules"},
     {"demo"},
     {"kornia_learnnorm"},  # the package's __init__, with the public names

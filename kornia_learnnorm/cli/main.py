@@ -34,6 +34,7 @@ TOOLS = {
     "match": ("kornia_learnnorm.cli.match", "a store of correspondences from folders of images"),
     "convert": ("kornia_learnnorm.cli.convert", "a store from or to the files of hloc"),
     "synthesize": ("kornia_learnnorm.cli.synthesize", "a synthetic store and a rendered image pair"),
+    "export": ("kornia_learnnorm.cli.export", "a layer as a program that runs without this package"),
     "config": ("kornia_learnnorm.cli.config", "print a configuration for training"),
 }
 COMPLETION = "print the completion of commands and options for a shell"

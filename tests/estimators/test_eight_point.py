@@ -362,6 +362,17 @@ class TestBackEnds:
         compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
         assert up_to_sign(compiled(points1, points2).detach(), layer(points1, points2).detach()) < 1e-9
 
+    @pytest.mark.long
+    @pytest.mark.parametrize("name", ["hartley", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
+    def test_compiled_gradients(self, name):
+        torch.compiler.reset()
+        layer = LAYERS[name]()
+        found = []
+        for call in (layer, torch.compile(layer, fullgraph=True, backend="aot_eager")):
+            points = [p.requires_grad_() for p in correspondences("handheld", 4, 12)]
+            found.append(torch.autograd.grad(signless(call(*points)).sum(), points))
+        torch.testing.assert_close(*found, rtol=1e-5, atol=1e-9)
+
     @pytest.mark.slow
     @pytest.mark.filterwarnings("ignore")  # Inductor's own
     def test_inductor(self):

@@ -1,0 +1,62 @@
+"""Write a layer as a program that runs without this package: ``learnnorm export``."""
+
+from __future__ import annotations
+
+import argparse
+from io import BytesIO
+from pathlib import Path
+
+import torch
+
+from kornia_learnnorm.export import export_layer, export_networks, load_layer
+from kornia_learnnorm.files import atomic_write
+
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm export robust --format pt2 --out robust.pt2 --inputs mask scores
+learnnorm export crossview --format pt2 --out eight.pt2 --points 8
+learnnorm export robust --format onnx --out robust.onnx"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``learnnorm export`` to a parser."""
+    parser.add_argument("weights", metavar="NAME_OR_PATH", help="weights that ship with the package, or a file of them")
+    text = "pt2: the whole layer, for torch.export.load; onnx: its networks alone"
+    parser.add_argument("--format", choices=["pt2", "onnx"], required=True, help=text)
+    text = "file to write, .pt2 or .onnx; of several networks, FILE-stage1.onnx and so on"
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help=text)
+    text = "further inputs of the program besides the points: weights, mask, scores"
+    parser.add_argument("--inputs", metavar="INPUT", nargs="+", default=[], help=text)
+    text = "fixed number of correspondences, as 8 for minimal samples; without it, any number from 9 on"
+    parser.add_argument("--points", metavar="N", type=int, help=text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the program, or one file for each network."""
+    if args.out.suffix != f".{args.format}":
+        raise ValueError(f"--format {args.format} is written to a .{args.format} file, got {str(args.out)!r}")
+    if args.format == "onnx":
+        if args.inputs or args.points is not None:
+            raise ValueError("--inputs and --points belong to --format pt2: the networks are written by themselves")
+        return _write_networks(args.weights, args.out)
+    with atomic_write(args.out) as temporary:  # a path that cannot be written is refused before the work
+        buffer = BytesIO()  # a file would give its temporary name to the archive
+        torch.export.save(export_layer(load_layer(args.weights), args.inputs, args.points), buffer)
+        temporary.write_bytes(buffer.getvalue())
+    _report(args.out)
+    return 0
+
+
+def _write_networks(weights: str, path: Path) -> int:
+    programs = export_networks(load_layer(weights))
+    for name, program in programs.items():
+        file = path if len(programs) == 1 else path.with_stem(f"{path.stem}-{name}")
+        with atomic_write(file) as temporary:
+            temporary.write_bytes(program.model_proto.SerializeToString())
+        _report(file)
+    return 0
+
+
+def _report(path: Path) -> None:
+    print(f"wrote {path}: {path.stat().st_size / 1e6:.1f} MB")

@@ -1,0 +1,225 @@
+r"""Export of the layers as programs that run without this package, and of their networks as ONNX.
+
+A layer becomes one graph of PyTorch's operators by ``torch.export``: input checks that read no values, transforms,
+networks, solver and refinement. ONNX has no operators for eigenvectors, singular values and LU factorisations, so only
+the networks can be written in it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import warnings
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
+
+from kornia_learnnorm.estimators.eight_point import EightPoint
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedEstimate
+from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES
+from kornia_learnnorm.normalizers.learned import FORMAT as NORMALIZER_FORMAT
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.optional import import_extra
+from kornia_learnnorm.pretrained import shipped_weights, weights_format
+
+__all__ = ["export_layer", "export_networks", "load_layer"]
+
+MIN_DYNAMIC_POINTS = 9  # eight correspondences have a solver of their own
+EXAMPLE_BATCH = 2  # sets of the example that is traced; a dynamic size must not be one there
+
+
+def load_layer(name: str | Path) -> EightPoint | LearnedEightPoint:
+    """Load trained weights as a layer: an estimator's as they are, a normaliser's inside :class:`EightPoint`.
+
+    Args:
+        name: name of weights that ship with the package, or the path of a ``.safetensors`` file.
+
+    Returns:
+        the layer, in evaluation mode.
+
+    Raises:
+        FileNotFoundError: if there are no such weights; the message lists those that ship.
+        ValueError: if the file is not one of this package.
+
+    Example:
+        >>> load_layer("crossview").normalizer.max_points
+        12
+
+    """
+    form = weights_format(name)
+    if form is None:
+        raise FileNotFoundError(
+            f"no weights {str(name)!r}: expected a .safetensors file or one of {', '.join(shipped_weights())}"
+        )
+    if form == NORMALIZER_FORMAT:
+        return EightPoint(LearnedNormalizer.from_pretrained(name)).eval()
+    return LearnedEightPoint.from_pretrained(name)
+
+
+def export_layer(
+    layer: EightPoint | LearnedEightPoint,
+    inputs: Collection[str] = (),
+    num_points: int | None = None,
+    gradients: bool = False,
+) -> ExportedProgram:
+    r"""Return the program of a layer, which ``torch.export.save`` writes and any PyTorch process runs.
+
+    The program takes ``points1`` and ``points2`` with shape :math:`(B, N, 2)`, float32, and by name the tensors of
+    ``inputs``. It returns a tuple of the matrices ``F_mat`` (B, 3, 3), ``determined`` (B,) and, of a
+    :class:`~kornia_learnnorm.LearnedEightPoint`, ``weights`` (B, N), as the layer's ``estimate``. The batch size
+    :math:`B` is any from one on. Values are not checked: NaN in the points gives NaN in the matrices.
+
+    Args:
+        layer: the layer; the program runs on its device.
+        inputs: further inputs: ``"weights"``, ``"mask"`` and, for a :class:`~kornia_learnnorm.LearnedEightPoint`,
+            ``"scores"``. They are then no longer optional.
+        num_points: number of correspondences :math:`N`, at least eight; without it, any number from nine on, up to the
+            normaliser's ``max_points`` where there is one. With a mask, sets of eight and less fit in nine rows.
+        gradients: keep what derivatives need, as for training the network before the layer. Without, the outputs
+            carry no gradient.
+
+    Returns:
+        the program.
+
+    Raises:
+        TypeError: if ``layer`` is neither layer.
+        ValueError: if the layer has no such input, or ``num_points`` is less than eight.
+
+    Example:
+        >>> program = export_layer(EightPoint(), num_points=8)
+        >>> F_mat, determined = program.module()(torch.rand(3, 8, 2), torch.rand(3, 8, 2))
+        >>> F_mat.shape
+        torch.Size([3, 3, 3])
+
+    """
+    if not isinstance(layer, EightPoint | LearnedEightPoint):
+        raise TypeError(f"layer must be an EightPoint or a LearnedEightPoint, got {type(layer)}")
+    offered = list(inspect.signature(layer.forward).parameters)[2:]
+    if wrong := [name for name in inputs if name not in offered]:
+        raise ValueError(f"further inputs of {type(layer).__name__} are {', '.join(offered)}, got {', '.join(wrong)}")
+    if num_points is not None and num_points < 8:
+        raise ValueError(f"num_points must be at least 8, got {num_points}")
+    most = getattr(getattr(layer, "normalizer", None), "max_points", None)
+    shape: dict[int, Any] = {0: Dim("B", min=1)}
+    if num_points is None:
+        shape[1] = Dim("N", min=MIN_DYNAMIC_POINTS, max=most)
+    first = next(layer.parameters(), torch.empty(0))
+    points1, points2, given = _example(num_points or MIN_DYNAMIC_POINTS + 1, inputs, first.device)
+    shapes = dict.fromkeys(["points1", "points2", *given], shape)
+    module = _Exported(layer, gradients).eval()
+    with torch.set_grad_enabled(gradients):
+        return torch.export.export(module, (points1, points2), given, dynamic_shapes=shapes, strict=False)
+
+
+def export_networks(layer: EightPoint | LearnedEightPoint) -> dict[str, Any]:
+    """Return the networks of a layer as ONNX programs, without the steps around them.
+
+    The networks of a :class:`~kornia_learnnorm.LearnedEightPoint` map ``features`` (B, N, C) and ``absent`` (B, N) to
+    ``logits`` (B, N) and ``params`` (B, 10); the features are those of
+    :mod:`kornia_learnnorm.estimators.match_features`. The network of a learned normaliser maps ``points1`` and
+    ``points2`` (B, N, 2) in the base's coordinates, and ``null_matrix`` (B, 3, 3) where it needs one, to ``params1``
+    and ``params2`` (B, P).
+
+    Args:
+        layer: a layer with learned parts.
+
+    Returns:
+        one ``torch.onnx.ONNXProgram`` for each network, by name: ``stage1`` and so on, or ``network``.
+
+    Raises:
+        ImportError: if onnx or onnxscript is not installed.
+        ValueError: if the layer has no network.
+
+    """
+    import_extra("onnx", "onnx", "ONNX export")
+    import_extra("onnxscript", "onnx", "ONNX export")
+    if isinstance(layer, LearnedEightPoint):
+        outputs = ["logits", "params"]
+        return {
+            f"stage{stage + 1}": _to_onnx(network, _stage_example(stage), outputs)
+            for stage, network in enumerate(layer.networks)
+        }
+    network = getattr(layer.normalizer, "network", None)
+    if network is None:
+        raise ValueError(f"the layer has no network: its normaliser is {type(layer.normalizer).__name__}")
+    example = {name: torch.zeros(EXAMPLE_BATCH, 10, 2) for name in ("points1", "points2")}
+    if getattr(network, "needs_null_matrix", False):
+        example["null_matrix"] = torch.eye(3).repeat(EXAMPLE_BATCH, 1, 1)
+    return {"network": _to_onnx(network, example, ["params1", "params2"])}
+
+
+class _Exported(nn.Module):
+    """A layer with a plain tuple as output: a named tuple needs its class where the program is loaded."""
+
+    def __init__(self, layer: EightPoint | LearnedEightPoint, gradients: bool) -> None:
+        super().__init__()
+        self.layer, self.gradients = layer, gradients
+
+    def forward(
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        scores: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """Return the matrices, which sets determine them, and the weights of the correspondences."""
+        given = {} if scores is None else {"scores": scores}
+        found = self.layer.estimate(points1, points2, weights=weights, mask=mask, **given)
+        outputs = [found.F_mat, found.determined, *([found.weights] if isinstance(found, LearnedEstimate) else [])]
+        # Steps that need a gradient have been left out of the graph: what is left would give a wrong one.
+        return tuple(outputs) if self.gradients else tuple(value.detach() for value in outputs)
+
+
+def _example(
+    num_points: int, inputs: Collection[str], device: torch.device
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Return two views of points and further inputs, of which only shapes and dtypes count."""
+    points = torch.zeros(EXAMPLE_BATCH, num_points, 2, device=device)
+    others = {name: torch.ones(EXAMPLE_BATCH, num_points, device=device) for name in inputs}
+    return points, points.clone(), {name: v.bool() if name == "mask" else v for name, v in others.items()}
+
+
+def _stage_example(stage: int) -> dict[str, Tensor]:
+    """Return an example of the inputs of a stage's network."""
+    features = POINT_FEATURES + (RESIDUAL_FEATURES if stage else 0)
+    return {
+        "features": torch.zeros(EXAMPLE_BATCH, 10, features),
+        "absent": torch.zeros(EXAMPLE_BATCH, 10, dtype=torch.bool),
+    }
+
+
+def _to_onnx(network: nn.Module, example: dict[str, Tensor], outputs: list[str]) -> Any:
+    """Return the ONNX program of a network with dynamic batch and number of points."""
+    sizes = {0: Dim("B", min=1), 1: Dim("N", min=2)}
+    shapes = {name: {0: sizes[0]} if name == "null_matrix" else sizes for name in example}
+    with _quiet_exporter():
+        return torch.onnx.export(
+            network.cpu().eval(),
+            (),
+            kwargs=example,
+            dynamo=True,
+            verbose=False,
+            input_names=[*example],
+            output_names=outputs,
+            dynamic_shapes=shapes,
+        )
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Silence the exporter, which reports every package that it would also support and warns of its own calls."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
