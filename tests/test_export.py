@@ -33,8 +33,8 @@ for program, cases in torch.load(sys.argv[1]):
         run = torch._inductor.aoti_load_package(program)
     else:
         run = torch.export.load(program).module()
-    for inputs, expected in cases:
-        found = run(*inputs)
+    for points, given, expected in cases:
+        found = run(*points, **given)
         torch.testing.assert_close(tuple(found), tuple(expected), rtol=1e-4, atol=1e-5)
 assert not [name for name in sys.modules if name.partition(".")[0] in ("kornia_learnnorm", "kornia")]
 """
@@ -65,25 +65,36 @@ def small_eight_point() -> EightPoint:
 
 @pytest.fixture(scope="module")
 def small_layer():
-    return shaken_estimator(stages=2, depth=1, refine_steps=1)
+    return shaken_estimator(stages=1, depth=1, refine_steps=1)
 
 
 @pytest.fixture(scope="module")
 def small_program(small_layer):
-    return export_layer(small_layer)
+    return export_layer(small_layer, ["mask", "scores"])
+
+
+def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
+    """Points, and a mask and scores by name; the first set has eight correspondences, the last one all rows."""
+    numbers = torch.linspace(8, num_points, batch_size).long()
+    mask = torch.arange(num_points) < numbers[:, None]
+    return sets(batch_size, num_points), {"mask": mask, "scores": torch.rand(batch_size, num_points)}
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_any_batch_and_number_of_points(small_layer, small_program, size):
-    check(small_program.module(), small_layer, *sets(*size))
+    points, given = masked_sets(*size)
+    program = small_program.module()
+    check(program, small_layer, *points, **given)
+    check(program, small_layer, *points, **{**given, "mask": torch.ones_like(given["mask"])})
+    eight = small_layer(*(p[:1, :8] for p in points), scores=given["scores"][:1, :8])
+    assert up_to_sign(program(*points, **given)[0][:1], eight.detach()) < 1e-5
 
 
 def test_a_program_needs_no_package(small_layer, small_program, tmp_path):
     torch.export.save(small_program, tmp_path / "layer.pt2")
     cases = []
-    for size in SIZES:
-        points = sets(*size)
-        cases.append((points, estimates(small_layer, *points)))
+    for points, given in (masked_sets(*size) for size in SIZES):
+        cases.append((points, given, estimates(small_layer, *points, **given)))
     run_without_the_package([(str(tmp_path / "layer.pt2"), cases)], tmp_path)
 
 
@@ -96,20 +107,20 @@ def run_without_the_package(programs, folder) -> None:
 
 def test_a_program_says_what_sizes_it_takes(small_program):
     with pytest.raises(AssertionError, match=r"points1.size\(\)\[1\] >= 9"):
-        small_program.module()(*sets(2, 8))
+        small_program.module()(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
 
 
 def test_a_program_without_gradients_sends_none(small_program):
-    points1, points2 = sets(2, 20)
-    assert not any(value.requires_grad for value in small_program.module()(points1.requires_grad_(), points2))
+    (points1, points2), given = masked_sets(2, 20)
+    assert not any(value.requires_grad for value in small_program.module()(points1.requires_grad_(), points2, **given))
 
 
 def test_a_program_with_gradients_sends_those_of_the_layer():
     layer = small_eight_point()
-    program = export_layer(layer, num_points=8, gradients=True).module()
+    program = export_layer(layer, gradients=True).module()
     found = []
     for call in (program, lambda *points: (layer(*points),)):
-        points = [points.requires_grad_() for points in sets(3, 8)]
+        points = [points.requires_grad_() for points in sets(3, 20)]
         found.append(torch.autograd.grad(signless(call(*points)[0]).sum(), points))
     torch.testing.assert_close(*found, rtol=1e-3, atol=1e-6)
 
@@ -123,16 +134,6 @@ def test_eights_with_weights_and_mask():
     program = export_layer(layer, ["weights", "mask"], num_points=8).module()
     assert program(*points, mask=mask, weights=weights)[1].tolist() == [True, True, False, False]
     check(program, layer, *(p[:2] for p in points), mask=mask[:2], weights=weights[:2])
-
-
-def test_masked_sets_of_any_size_with_scores():
-    layer = shaken_estimator(stages=1, depth=1, refine_steps=1)
-    program = export_layer(layer, ["mask", "scores"]).module()
-    points, scores = sets(4, 40), torch.rand(4, 40)
-    mask = torch.arange(40) < torch.tensor([8, 9, 23, 40])[:, None]
-    check(program, layer, *points, mask=mask, scores=scores)
-    eight = layer.estimate(*(p[:1, :8] for p in points), scores=scores[:1, :8]).F_mat
-    assert up_to_sign(program(*points, mask=mask, scores=scores)[0][:1], eight.detach()) < 1e-5
 
 
 @pytest.mark.slow
@@ -158,7 +159,7 @@ def test_compiled_ahead_of_time(tmp_path):
     cases = []
     for size in SIZES:
         points = sets(*size)
-        cases.append((points, estimates(layer, *points)))
+        cases.append((points, {}, estimates(layer, *points)))
     run_without_the_package([(str(path), cases)], tmp_path)
 
 

@@ -6,16 +6,16 @@ import sys
 
 import pytest
 import torch
-from two_view import correspondences, shaken, small, up_to_sign
+from two_view import correspondences, shaken, up_to_sign
 
-from kornia_learnnorm import EightPoint, LearnedNormalizer, PaperNetwork
+from kornia_learnnorm import EightPoint, Hartley, LearnedNormalizer, PaperNetwork
 from kornia_learnnorm.cli.main import main
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "own.safetensors"
-    shaken(small()).save_pretrained(path)
+    shaken(LearnedNormalizer(Hartley(), PaperNetwork(8, 2, num_parameters=5))).save_pretrained(path)
     return path
 
 
@@ -33,13 +33,12 @@ def test_program_of_a_file_of_weights(weights, tmp_path, capsys):
     assert up_to_sign(F_mat, expected.detach()) < 1e-6
 
 
-def test_network_as_onnx(tmp_path, capsys):
+def test_network_as_onnx(weights, tmp_path, capsys):
     for name in ("onnxscript", "onnxruntime"):
         pytest.importorskip(name, reason=f"{name} is not installed")
     import onnxruntime
 
-    weights, out = tmp_path / "paper.safetensors", tmp_path / "paper.onnx"
-    LearnedNormalizer(network=PaperNetwork(8, 2, num_parameters=5)).save_pretrained(weights)
+    out = tmp_path / "own.onnx"
     assert main(["export", str(weights), "--format", "onnx", "--out", str(out)]) == 0
     assert capsys.readouterr().out.startswith(f"wrote {out}: ")
     session = onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
