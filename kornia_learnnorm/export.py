@@ -7,6 +7,7 @@ the networks can be written in it.
 
 from __future__ import annotations
 
+import copy
 import inspect
 import logging
 import warnings
@@ -72,7 +73,7 @@ def export_layer(
     The program takes ``points1`` and ``points2`` with shape :math:`(B, N, 2)`, float32, and by name the tensors of
     ``inputs``. It returns a tuple of the matrices ``F_mat`` (B, 3, 3), ``determined`` (B,) and, of a
     :class:`~kornia_learnnorm.LearnedEightPoint`, ``weights`` (B, N), as the layer's ``estimate``. The batch size
-    :math:`B` is any from one on. Values are not checked: NaN in the points gives NaN in the matrices.
+    :math:`B` is any from one on. Values are not checked: points must be finite but where masked, weights not negative.
 
     Args:
         layer: the layer; the program runs on its device.
@@ -111,7 +112,7 @@ def export_layer(
     first = next(layer.parameters(), torch.empty(0))
     points1, points2, given = _example(num_points or MIN_DYNAMIC_POINTS + 1, inputs, first.device)
     shapes = dict.fromkeys(["points1", "points2", *given], shape)
-    module = _Exported(layer, gradients).eval()
+    module = _Exported(layer, gradients)
     with torch.set_grad_enabled(gradients):
         return torch.export.export(module, (points1, points2), given, dynamic_shapes=shapes, strict=False)
 
@@ -200,7 +201,7 @@ def _to_onnx(network: nn.Module, example: dict[str, Tensor], outputs: list[str])
     shapes = {name: {0: sizes[0]} if name == "null_matrix" else sizes for name in example}
     with _quiet_exporter():
         return torch.onnx.export(
-            network.cpu().eval(),
+            copy.deepcopy(network).float().cpu().eval(),
             (),
             kwargs=example,
             dynamo=True,

@@ -239,6 +239,12 @@ class TestNetworks:
             for found, value in zip(self.run(program, example), expected, strict=True):
                 torch.testing.assert_close(torch.from_numpy(found), value, rtol=1e-4, atol=1e-4)
 
+    def test_leaves_the_layer_as_it_is(self):
+        layer = EightPoint(shaken(LearnedNormalizer(network=PaperNetwork(8, 2, num_parameters=5)))).double().train()
+        export_networks(layer)
+        assert layer.training
+        assert next(layer.parameters()).dtype == torch.float64
+
     def test_a_layer_without_network(self):
         with pytest.raises(ValueError, match="no network: its normaliser is Hartley"):
             export_networks(EightPoint())
