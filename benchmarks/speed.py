@@ -125,8 +125,10 @@ def correspondences(case: Case, device: str, dtype: torch.dtype) -> tuple[Tensor
     return points1.to(device), points2.to(device)
 
 
-def measure(methods: dict[str, Method], case: Case, args: argparse.Namespace, backward: bool) -> dict[str, float]:
-    """Return the median milliseconds of each method on one batch, taken in turns."""
+def measure(
+    methods: dict[str, Method], case: Case, args: argparse.Namespace, backward: bool
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the median milliseconds of each method on one batch, taken in turns, and those of its first call."""
     points = correspondences(case, args.device, getattr(torch, args.dtype))
 
     def run(method: Method) -> float:
@@ -140,16 +142,17 @@ def measure(methods: dict[str, Method], case: Case, args: argparse.Namespace, ba
             torch.cuda.synchronize()
         return 1e3 * (time.perf_counter() - start)
 
-    times = {name: [run(method)] for name, method in methods.items()}
-    for name, method in methods.items():  # the first run warms up
-        if times[name][0] < MAX_WARM_MILLISECONDS:
-            times[name] = [run(method)]
+    first = {name: run(method) for name, method in methods.items()}  # warms up, and compiles where asked to
+    times = {
+        name: [run(method)] if args.compile or first[name] < MAX_WARM_MILLISECONDS else [first[name]]
+        for name, method in methods.items()
+    }
     budget = 1e3 * SECONDS / (5 if args.quick else 1)
     short = [name for name in methods if times[name][0] < MAX_WARM_MILLISECONDS]
     for _ in range(int(min(MAX_TURNS, max(MIN_TURNS, len(short) * budget / sum(times[name][0] for name in short))))):
         for name in short:
             times[name].append(run(methods[name]))
-    return {name: statistics.median(values) for name, values in times.items()}
+    return {name: statistics.median(values) for name, values in times.items()}, first
 
 
 def machine(args: argparse.Namespace) -> dict[str, object]:
@@ -207,14 +210,17 @@ def main() -> None:
     print(json.dumps(found["machine"]), flush=True)
     for group, (cases, methods, others) in groups.items():
         for backward in (False, True):
-            results = {}
+            results, first = {}, {}
             for case in cases:
                 alone = {name: pairs[name] for name in others if name in pairs and not backward}
                 chosen = methods | (alone if case.batch <= LARGE_FOR_PAIRS else {})
-                results[str(case)] = measure(chosen, case, args, backward)
+                results[str(case)], first[str(case)] = measure(chosen, case, args, backward)
             title = f"{group}, {'forward and backward' if backward else 'forward'}"
             found[title] = results
             print(f"\n{title}: ms a batch (ratio to Kornia)\n\n{table(results)}", flush=True)
+            if args.compile:
+                found[f"{title}, first call"] = first
+                print(f"\n{title}, first call, which compiles: ms\n\n{table(first)}", flush=True)
     if args.out is not None:
         write_text(args.out, json.dumps(found, indent=1) + "\n")
 

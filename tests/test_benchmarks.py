@@ -265,9 +265,10 @@ class TestSpeed:
     def test_every_method_is_timed(self, speed, backward, monkeypatch):
         monkeypatch.setattr(speed, "SECONDS", 1e-3)
         monkeypatch.setattr(speed, "MIN_TURNS", 1)
-        args = argparse.Namespace(device="cpu", dtype="float64", quick=True)
+        args = argparse.Namespace(device="cpu", dtype="float64", quick=True, compile=False)
         methods = speed.solvers("cpu") | ({} if backward else speed.single_pairs())
-        times = speed.measure(methods, speed.Case(2, 12), args, backward)
+        times, first = speed.measure(methods, speed.Case(2, 12), args, backward)
+        assert first.keys() == times.keys()
         assert times.keys() == methods.keys()
         assert min(times.values()) > 0
         results = {"2 x 12": times, "4 x 12": {speed.KORNIA: 2.0, "Hartley": 3.0}}
