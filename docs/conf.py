@@ -110,8 +110,9 @@ def setup(app):
     # It adds a file to the site and reads no page, but does not declare that it is safe for parallel reading.
     app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True
     app.connect("doctree-read", _plain_notebook)
-    # The kernels that run the pages inherit the style of figures, and a path that has the command learnnorm.
+    # The kernels of the pages inherit the style of figures, results_tables.py, and a path that has learnnorm.
     os.environ["MATPLOTLIBRC"] = str(app.confdir)
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(app.confdir), *filter(None, [os.environ.get("PYTHONPATH")])])
     os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     app.connect("autodoc-skip-member", _skip_tuple_fields)
     app.connect("autodoc-process-signature", _no_arguments)

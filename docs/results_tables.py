@@ -1,0 +1,178 @@
+"""Tables and plots of the numbers in docs/results, for the hidden code cells of the pages.
+
+A page shows the file ``results/NAME.csv`` by ``table("NAME")``. ``results/commands.toml`` has the command that printed
+each file, which the page names too (tests/test_docs.py). sizes.json is what benchmarks/sizes.py writes with --json.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from IPython.display import HTML, Markdown
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from kornia_learnnorm.evaluation.tables import format_table
+
+RESULTS = Path(__file__).parent / "results"
+RATE = re.compile(r"(\S+) \[(\S+), (\S+)\]")  # a rate and its interval, as reports print them
+STORES = {"kitti_06": "KITTI 06", "tum_fr3_office": "TUM"}
+NOT_DRAWN = ("none", "Hartley")  # their rates are so low that those of the other rows would not be told apart
+
+INK = "#010203"  # text and axes; the page's own text colour takes its place, light or dark
+BLUE, ORANGE, GREEN, PURPLE, GREY = "#2f7fd6", "#d9622b", "#2a9d62", "#9a63d6", "#7b858f"  # readable on both
+DRAWN_IN_INK = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
+PLAIN = {**dict.fromkeys(DRAWN_IN_INK, INK), "figure.facecolor": "none", "axes.facecolor": "none"}
+MIN_WIDTH = 34  # rem; a plot scrolls within its box on pages that are narrower
+
+SIZES = (8, 16, 32, 64, 128, 512)
+ESTIMATORS = {  # as benchmarks/sizes.py names them, and how they are drawn
+    "Hartley": (GREY, "-"),
+    "Hartley+optimal": (GREY, "--"),
+    "Hartley+LM": (GREY, ":"),
+    "opencv-usac-magsac": (PURPLE, "-"),
+    "poselib": (GREEN, "-"),
+    "kornia": (GREEN, "--"),
+    "RANSAC": (ORANGE, "-"),
+    "learned:robust": (BLUE, "-"),
+    "learned:robust-synthetic": (BLUE, "--"),
+    "learned:robust-tiny": (BLUE, ":"),
+}
+
+
+def read_rows(name: str) -> list[list[str]]:
+    """Return the rows of a file of results, the header first."""
+    with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.reader(file))
+
+
+def table(name: str) -> Markdown:
+    """Return a file of results as a table."""
+    header, *rows = read_rows(name)
+    return Markdown(format_table(header, rows))
+
+
+def read_sizes() -> dict[str, dict[str, dict[str, list[float]]]]:
+    """Return the errors (pixels) and times by store and protocol, method, and number of matches."""
+    return json.loads((RESULTS / "sizes.json").read_text(encoding="utf-8"))
+
+
+def _words(title: str) -> str:
+    store, _, protocol = title.partition(", ")
+    return f"{STORES.get(store, store)}, {protocol} matches"
+
+
+def sizes_rows(title: str, methods: Sequence[str], sizes: Sequence[int] = SIZES) -> list[list[str]]:
+    """Return a row of median errors for each method, from the measurements of one store and protocol."""
+    found = read_sizes()[title]
+    if missing := [name for name in methods if name not in found]:
+        raise ValueError(f"sizes.json has no {', '.join(missing)} for {title}: run benchmarks/sizes.py with --methods")
+    errors = {name: {int(size): f"{values[0]:.3f}" for size, values in found[name].items()} for name in methods}
+    return [[name, *(by_size.get(size, "-") for size in sizes)] for name, by_size in errors.items()]
+
+
+def sizes_table(
+    title: str,
+    methods: Sequence[str] = tuple(ESTIMATORS),
+    sizes: Sequence[int] = SIZES,
+    corner: str = "median error, px",
+) -> Markdown:
+    """Return the median errors of one store and protocol as a table."""
+    return Markdown(format_table([corner, *(f"N = {size}" for size in sizes)], sizes_rows(title, methods, sizes)))
+
+
+def sizes_ratios(method: str, reference: str) -> Markdown:
+    """Return by how much the errors of a method are above those of a reference, percent, for every size of both."""
+    rows, sizes = [], SIZES[1:]
+    for title in read_sizes():
+        pair = zip(*sizes_rows(title, [method, reference], sizes), strict=True)
+        next(pair)  # the names
+        rows.append([_words(title), *(f"{100 * (float(error) / float(other) - 1):+.0f} %" for error, other in pair)])
+    return Markdown(format_table([f"{method} against {reference}", *(f"N = {size}" for size in sizes)], rows))
+
+
+def show(figure: Figure, alt: str) -> HTML:
+    """Return a figure as SVG in the text colour of the page, which scrolls within its box where the page is narrow."""
+    text = StringIO()
+    with plt.rc_context({"svg.hashsalt": alt}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    plt.close(figure)
+    svg = text.getvalue().replace(INK, "currentColor")
+    style = f'style="width: 100%; min-width: {MIN_WIDTH}rem; height: auto"'
+    svg = svg[svg.index("<svg") :].replace("<svg", f"<svg {style}", 1)
+    return HTML(f'<div role="img" aria-label="{alt}" style="overflow-x: auto">{svg}</div>')
+
+
+def sizes_plot() -> HTML:
+    """Draw the median error against the number of matches, a panel for each store and protocol."""
+    with plt.rc_context(PLAIN):
+        figure, axes = plt.subplots(2, 2, figsize=(8, 6.6), layout="constrained", sharex=True, sharey="row")
+        for (title, found), ax in zip(read_sizes().items(), axes.T.flat, strict=True):
+            for name, (colour, style) in ESTIMATORS.items():
+                errors = {int(size): values[0] for size, values in found[name].items()}
+                width = 2.2 if name.startswith("learned") else 1.2
+                ax.plot(errors.keys(), errors.values(), style, marker=".", color=colour, label=name, linewidth=width)
+            ax.set(title=_words(title), xscale="log", yscale="log")
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.set_xticks(SIZES, map(str, SIZES))
+            ax.minorticks_off()
+            ax.grid(visible=True)
+        for ax in axes[1]:
+            ax.set_xlabel("matches in the set")
+        figure.supylabel("median error of true inliers, px", fontsize=9)
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        return show(figure, "Median error against the number of matches, on KITTI and TUM, filtered and unfiltered")
+
+
+def _draw_dots(ax: Axes, rows: Sequence[Sequence[str]], column: int, offset: float, **style: str) -> None:
+    """Draw the numbers of one column as dots, with their intervals where they have any."""
+    for y, row in enumerate(rows):
+        if row[column] == "-":
+            continue
+        rate = RATE.fullmatch(row[column])
+        value, *interval = map(float, rate.groups() if rate else [row[column]])
+        ax.plot(value, y + offset, "o", markersize=3.5, **style)
+        if interval:
+            ax.plot(interval, [y + offset] * 2, "-", linewidth=1.2, **style)
+
+
+def dot_plot(panels: dict[str, tuple[str, dict[str, int]]], alt: str, log: bool = False) -> HTML:
+    """Draw columns of tables as dots with their intervals, a line for each row of the tables.
+
+    Args:
+        panels: by title, the name of a file of results, and its columns by the name in the legend.
+        alt: description for readers who do not see the figure.
+        log: whether the horizontal axis is logarithmic.
+
+    """
+    tables = {
+        title: ([row for row in read_rows(name)[1:] if row[0] not in NOT_DRAWN], columns)
+        for title, (name, columns) in panels.items()
+    }
+    first = next(iter(tables.values()))[0]
+    with plt.rc_context(PLAIN):
+        size = (8, 1.1 + 0.21 * len(first))
+        figure, axes = plt.subplots(1, len(tables), figsize=size, layout="constrained", sharey=True, squeeze=False)
+        for ax, (title, (rows, columns)) in zip(axes[0], tables.items(), strict=True):
+            for index, (label, column) in enumerate(columns.items()):
+                colour, offset = (BLUE, ORANGE, GREEN, PURPLE)[index], 0.18 * (index - (len(columns) - 1) / 2)
+                _draw_dots(ax, rows, column, offset, color=colour)
+                ax.plot([], [], "o", markersize=3.5, color=colour, label=label)
+            ax.set_xlabel(title)
+            ax.grid(visible=True)
+            if log:
+                ax.set_xscale("log", subs=[])
+                ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+                ax.xaxis.set_major_formatter("{x:g}")
+        axes[0, 0].set_yticks(range(len(first)), [row[0].replace("`", "") for row in first])
+        axes[0, 0].set_ylim(len(first) - 0.4, -0.6)
+        if len(axes[0, 0].get_legend_handles_labels()[1]) > 1:
+            figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+        return show(figure, alt)
