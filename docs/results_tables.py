@@ -110,11 +110,14 @@ def show(figure: Figure, alt: str) -> HTML:
     return HTML(f'<div role="img" aria-label="{alt}" style="overflow-x: auto">{svg}</div>')
 
 
-def sizes_plot() -> HTML:
-    """Draw the median error against the number of matches, a panel for each store and protocol."""
+def sizes_plot(protocols: Sequence[str] = ("unfiltered", "filtered")) -> HTML:
+    """Draw the median error against the number of matches, a row for each protocol and a panel for each store."""
     with plt.rc_context(PLAIN):
-        figure, axes = plt.subplots(2, 2, figsize=(8, 6.6), layout="constrained", sharex=True, sharey="row")
-        for (title, found), ax in zip(read_sizes().items(), axes.T.flat, strict=True):
+        options = {"figsize": (8, 1.2 + 2.7 * len(protocols)), "layout": "constrained", "squeeze": False}
+        figure, axes = plt.subplots(len(protocols), len(STORES), sharex=True, sharey="row", **options)
+        titles = [f"{store}, {protocol}" for protocol in protocols for store in STORES]
+        for title, ax in zip(titles, axes.flat, strict=True):
+            found = read_sizes()[title]
             for name, (colour, style) in ESTIMATORS.items():
                 errors = {int(size): values[0] for size, values in found[name].items()}
                 width = 2.2 if name.startswith("learned") else 1.2
@@ -124,11 +127,11 @@ def sizes_plot() -> HTML:
             ax.set_xticks(SIZES, map(str, SIZES))
             ax.minorticks_off()
             ax.grid(visible=True)
-        for ax in axes[1]:
+        for ax in axes[-1]:
             ax.set_xlabel("matches in the set")
         figure.supylabel("median error of true inliers, px", fontsize=9)
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        return show(figure, "Median error against the number of matches, on KITTI and TUM, filtered and unfiltered")
+        return show(figure, f"Median error against the number of matches, on KITTI and TUM, {' and '.join(protocols)}")
 
 
 def _draw_dots(ax: Axes, rows: Sequence[Sequence[str]], column: int, offset: float, **style: str) -> None:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 
 nbformat = pytest.importorskip("nbformat")
 DOCS = Path(__file__).parents[1] / "docs"
+PAGES = {path: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
+RESULTS = sorted(path for path in (DOCS / "results").iterdir() if path.suffix != ".toml")
+COMMANDS = tomllib.loads((DOCS / "results/commands.toml").read_text(encoding="utf-8"))
+PLAIN_TABLE = re.compile(r"<!-- docs/results/(\S+)\.csv -->\n((?:\|.*\n)+)")
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 MAX_COLUMNS = 82  # of code, at the width of the page
 SOURCE = "# Title\n\n```{code-cell}\n:tags: [hide-input]\n\nprint(1)\n```\n\n```{code-cell}\n%%bash\nls\n```\n"
@@ -19,6 +25,14 @@ SOURCE = "# Title\n\n```{code-cell}\n:tags: [hide-input]\n\nprint(1)\n```\n\n```
 def check(monkeypatch):
     monkeypatch.syspath_prepend(DOCS)
     return importlib.import_module("check_site")
+
+
+@pytest.fixture
+def results(monkeypatch):
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("IPython")
+    monkeypatch.syspath_prepend(DOCS)
+    return importlib.import_module("results_tables")
 
 
 @pytest.fixture
@@ -103,3 +117,37 @@ def test_missing_and_damaged_notebooks_are_found(check, site, source):
 def test_a_folder_without_a_site_is_an_error(check, tmp_path, capsys):
     assert check.main(tmp_path, tmp_path) == 2
     assert str(tmp_path) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.name)
+def test_results_are_shown_by_pages_that_name_their_command(path):
+    uses = f'"{path.stem}"', f"results/{path.name}", f"results.{path.stem}_"
+    pages = {page.name: text for page, text in PAGES.items() if any(use in text for use in uses)}
+    assert pages
+    for name, text in pages.items():
+        assert COMMANDS[path.name] in " ".join(text.replace("\\\n", " ").split()), name
+
+
+def test_commands_are_those_of_files():
+    assert sorted(COMMANDS) == [path.name for path in RESULTS]
+
+
+def test_plain_tables_have_the_numbers_of_their_files():
+    tables = [match for text in PAGES.values() for match in PLAIN_TABLE.findall(text)]
+    assert len(tables) == 4
+    for name, table in tables:
+        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+        with (DOCS / f"results/{name}.csv").open(newline="", encoding="utf-8") as file:
+            assert rows[:1] + rows[2:] == list(csv.reader(file)), name
+
+
+def test_plots_take_the_colour_of_the_page(results):
+    plot = results.dot_plot({"rate, %": ("ablations-hartley", {"KITTI": 1, "TUM": 2})}, "rates of all rows")
+    assert "currentColor" in plot.data
+    assert results.INK not in plot.data
+    assert 'aria-label="rates of all rows"' in plot.data
+
+
+def test_a_missing_method_is_an_error(results):
+    with pytest.raises(ValueError, match=r"no learned:none for kitti_06, filtered"):
+        results.sizes_rows("kitti_06, filtered", ["Hartley", "learned:none"])
