@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -15,6 +16,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 PAGES = {path: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
 RESULTS = sorted(path for path in (DOCS / "results").iterdir() if path.suffix != ".toml")
 COMMANDS = tomllib.loads((DOCS / "results/commands.toml").read_text(encoding="utf-8"))
+CARDS = sorted((DOCS.parent / "kornia_learnnorm/weights").glob("*.md"))
+EIGHTS = [f"benchmarks-{store}-{protocol}" for store in ("kitti", "tum") for protocol in ("filtered", "unfiltered")]
 PLAIN_TABLE = re.compile(r"<!-- docs/results/(\S+)\.csv -->\n((?:\|.*\n)+)")
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 MAX_COLUMNS = 82  # of code, at the width of the page
@@ -132,13 +135,46 @@ def test_commands_are_those_of_files():
     assert sorted(COMMANDS) == [path.name for path in RESULTS]
 
 
+def read_table(table):
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    return rows[0], rows[2:]
+
+
+def read_results(name):
+    with (DOCS / f"results/{name}.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.reader(file))
+
+
 def test_plain_tables_have_the_numbers_of_their_files():
     tables = [match for text in PAGES.values() for match in PLAIN_TABLE.findall(text)]
-    assert len(tables) == 4
+    assert [name for name, _ in tables] == EIGHTS
     for name, table in tables:
-        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
-        with (DOCS / f"results/{name}.csv").open(newline="", encoding="utf-8") as file:
-            assert rows[:1] + rows[2:] == list(csv.reader(file)), name
+        header, rows = read_table(table)
+        assert [header, *rows] == read_results(name), name
+
+
+def test_the_proposal_to_kornia_has_the_numbers_of_the_benchmarks():
+    table = re.search(r"^\| normalisation(?:.*\n\|)+.*\n", PAGES[DOCS / "upstream.md"], flags=re.MULTILINE)[0]
+    measured = {row[0]: [row[4], row[5]] for row in read_results("benchmarks-kitti-filtered")}
+    names = "none", "Hartley", "whitening", "reweighted", "crossview"
+    assert [row[1:] for row in read_table(table)[1]] == [measured[name] for name in names]
+
+
+@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
+def test_model_cards_have_the_numbers_of_the_results(path):
+    text = path.read_text(encoding="utf-8")
+    by_size = re.findall(r"^`(\w+)`, (\w+) matches\n\n(\| median(?:.*\n\|)+.*\n)", text, flags=re.MULTILINE)
+    eights = re.findall(r"^\| method(?:.*\n\|)+.*\n", text, flags=re.MULTILINE)
+    assert len(by_size) + len(eights) == 4
+    measured = json.loads((DOCS / "results/sizes.json").read_text(encoding="utf-8"))
+    for store, protocol, table in by_size:
+        header, rows = read_table(table)
+        for name, *cells in rows:
+            errors = {f"N = {size}": f"{pair[0]:.3f}" for size, pair in measured[f"{store}, {protocol}"][name].items()}
+            assert cells == [errors.get(size, "-") for size in header[1:]], f"{store}, {protocol}, {name}"
+    for name, table in zip(EIGHTS, eights, strict=False):
+        for row in read_table(table)[1]:
+            assert row in read_results(name), name
 
 
 def test_plots_take_the_colour_of_the_page(results):
