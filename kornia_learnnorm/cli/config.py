@@ -9,8 +9,8 @@ from lightning_modules.config_files import config_names, find_config
 __all__ = ["EXAMPLES", "add_arguments", "run"]
 
 EXAMPLES = """\
-learnnorm config crossview > own.yaml
-learnnorm fit --config own.yaml --trainer.default_root_dir runs/own"""
+learnnorm config crossview > full.yaml
+learnnorm fit --config full.yaml --trainer.default_root_dir runs/own"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
