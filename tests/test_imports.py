@@ -24,7 +24,7 @@ FLOORS = [
     {"normalizers", "metrics", "losses"},
     {"estimators"},
     {"ransac"},
-    {"data", "export"},
+    {"data", "export", "hub"},
     {"evaluation", "lightning_modules"},
     {"demo"},
     {"kornia_learnnorm"},  # the package's __init__, with the public names
@@ -34,6 +34,7 @@ FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 CORE = set().union(*FLOORS[:5])
 CORE_NEEDS = {"filelock", "kornia", "kornia_learnnorm", "numpy", "safetensors", "torch", *sys.stdlib_module_names}
 HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "rich", "bokeh"]
+HEAVY.append("huggingface_hub")
 
 MOST_MODULES = {"kornia_learnnorm": 6, "cli": 16}  # the command line has one for each command
 

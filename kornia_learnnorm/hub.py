@@ -1,0 +1,108 @@
+"""Trained layers in the form of the Hugging Face Hub: local folders, upload and download; needs the extra ``hub``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.optional import import_extra
+
+import_extra("huggingface_hub", "hub", "kornia_learnnorm.hub")
+
+from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download  # noqa: E402
+
+__all__ = ["HubModel"]
+
+LAYERS = {layer.__name__: layer for layer in (LearnedEightPoint, LearnedNormalizer)}  # what a repository may hold
+WEIGHTS_FILE = "model.safetensors"
+CONFIG_FILE = "config.json"
+
+CARD = """\
+---
+{{ card_data }}
+---
+
+# A layer of kornia_learnnorm
+
+`{{ class_name }}` for the normalised eight-point algorithm, trained on: {{ trained_on }}.
+
+With the name of this repository:
+
+```python
+from kornia_learnnorm.hub import HubModel
+
+layer = HubModel.from_pretrained("OWNER/NAME").layer
+```
+"""
+
+
+class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm", model_card_template=CARD):
+    r"""Save, upload and download a learned layer by the methods of ``PyTorchModelHubMixin``.
+
+    ``save_pretrained(folder)``, ``push_to_hub(repo_id)`` and ``from_pretrained(folder_or_repo_id)`` are the mixin's.
+    A folder or repository holds ``model.safetensors``, the file that the layer's own ``save_pretrained`` writes,
+    ``config.json``, which names the class of the layer, and a model card, ``README.md``, unless there is one already.
+
+    Args:
+        layer: the layer.
+
+    Attributes:
+        layer: the layer, with all methods of its class.
+
+    Raises:
+        TypeError: if the layer is neither a :class:`~kornia_learnnorm.LearnedEightPoint` nor a
+            :class:`~kornia_learnnorm.LearnedNormalizer`.
+
+    Example:
+        >>> import tempfile
+        >>> from kornia_learnnorm import LearnedEightPoint
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = HubModel(LearnedEightPoint.from_pretrained("robust-synthetic")).save_pretrained(folder)
+        ...     layer = HubModel.from_pretrained(folder).layer
+        >>> layer.trained_on
+        ('synthetic scenes',)
+
+    """
+
+    def __init__(self, layer: LearnedEightPoint | LearnedNormalizer) -> None:
+        super().__init__()
+        if type(layer) not in LAYERS.values():
+            raise TypeError(f"the layer must be one of {', '.join(LAYERS)}, got {type(layer).__name__}")
+        self.layer = layer
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """Return what the layer returns."""
+        return self.layer(*args, **kwargs)
+
+    def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
+        """Return the model card; ``model_card_kwargs`` of the mixin's methods replace its words."""
+        names = ", ".join(self.layer.trained_on) or "not known"
+        words = {"class_name": type(self.layer).__name__, "trained_on": names}
+        return super().generate_model_card(*args, **{**words, **kwargs})
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        """Write the weights, with the architecture, and the name of the class."""
+        self.layer.save_pretrained(save_directory / WEIGHTS_FILE)
+        text = json.dumps({"class_name": type(self.layer).__name__}, indent=2)
+        (save_directory / CONFIG_FILE).write_text(text + "\n", encoding="utf-8")
+
+    @classmethod
+    def _from_pretrained(cls, *, model_id: str, config: dict[str, Any] | None = None, **download: Any) -> HubModel:
+        """Load the layer of a local folder or of a repository; ``download`` are options of ``hf_hub_download``.
+
+        Raises:
+            ValueError: if ``config.json`` is missing or names no layer of this package.
+
+        """
+        local = Path(model_id)
+        path = local / WEIGHTS_FILE if local.is_dir() else Path(hf_hub_download(model_id, WEIGHTS_FILE, **download))
+        name = (config or {}).get("class_name")
+        if name not in LAYERS:
+            expected = " or ".join(LAYERS)
+            raise ValueError(f"{CONFIG_FILE} of {model_id} must have class_name {expected}, got {name!r}")
+        return cls(LAYERS[name].from_pretrained(path)).eval()

@@ -1,0 +1,102 @@
+"""Layers in folders and repositories of the Hugging Face Hub, without network."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+import torch
+
+import kornia_learnnorm as kln
+
+hub = pytest.importorskip("kornia_learnnorm.hub")
+LAYERS = [(kln.LearnedEightPoint, "robust-tiny"), (kln.LearnedNormalizer, "crossview-synthetic")]
+COMMIT = "0" * 40
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with the weights ``robust-tiny``."""
+    hub.HubModel(kln.LearnedEightPoint.from_pretrained("robust-tiny")).save_pretrained(tmp_path / "tiny")
+    return tmp_path / "tiny"
+
+
+@pytest.mark.parametrize(("layer_class", "name"), LAYERS)
+def test_a_layer_returns_from_a_folder(layer_class, name, tmp_path):
+    layer = layer_class.from_pretrained(name)
+    hub.HubModel(layer).save_pretrained(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "config.json", "model.safetensors"]
+    loaded = hub.HubModel.from_pretrained(tmp_path)
+    points1, points2 = torch.rand(2, 2, 9, 2) * 600
+    assert type(loaded.layer) is layer_class
+    assert not loaded.training
+    assert loaded.layer.trained_on == layer.trained_on
+    torch.testing.assert_close(loaded(points1, points2), layer(points1, points2))
+    assert layer_class.from_pretrained(tmp_path / "model.safetensors").trained_on == layer.trained_on
+
+
+def test_the_card_names_the_class_and_the_training_data(folder):
+    card = (folder / "README.md").read_text(encoding="utf-8")
+    assert "library_name: kornia_learnnorm" in card
+    assert "`LearnedEightPoint`" in card
+    assert "trained on: kitti_00@0:160, " in card
+    (folder / "README.md").write_text("my own", encoding="utf-8")
+    hub.HubModel.from_pretrained(folder).save_pretrained(folder)
+    assert (folder / "README.md").read_text(encoding="utf-8") == "my own"
+
+
+def test_a_layer_returns_from_a_downloaded_repository(folder, tmp_path):
+    repository = tmp_path / "cache" / "models--someone--tiny"
+    shutil.copytree(folder, repository / "snapshots" / COMMIT)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text(COMMIT)
+    loaded = hub.HubModel.from_pretrained("someone/tiny", cache_dir=tmp_path / "cache", local_files_only=True)
+    assert isinstance(loaded.layer, kln.LearnedEightPoint)
+    with pytest.raises(OSError, match="cache"):
+        hub.HubModel.from_pretrained("someone/other", cache_dir=tmp_path / "cache", local_files_only=True)
+
+
+def test_an_upload_has_the_files_of_the_folder(folder, tmp_path, monkeypatch):
+    class Api:
+        def __init__(self, token=None, **kwargs):
+            self.token = token
+
+        def create_repo(self, repo_id, **kwargs):
+            self.repo_id = repo_id
+            return self
+
+        def upload_folder(self, *, repo_id, folder_path, **kwargs):
+            shutil.copytree(folder_path, tmp_path / repo_id)
+            return f"{repo_id} uploaded"
+
+    monkeypatch.setattr("huggingface_hub.hub_mixin.HfApi", Api)
+    assert hub.HubModel.from_pretrained(folder).push_to_hub("someone/tiny") == "someone/tiny uploaded"
+    loaded = hub.HubModel.from_pretrained(tmp_path / "someone" / "tiny")
+    torch.testing.assert_close(
+        loaded.layer.state_dict(), kln.LearnedEightPoint.from_pretrained("robust-tiny").state_dict()
+    )
+
+
+@pytest.mark.parametrize("config", [None, {}, {"class_name": "Linear"}])
+def test_a_folder_without_a_layer_of_this_package_is_refused(config, folder):
+    (folder / "config.json").unlink()
+    if config is not None:
+        (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"config\.json of .*tiny must have class_name LearnedEightPoint or"):
+        hub.HubModel.from_pretrained(folder)
+
+
+def test_weights_of_another_class_or_none_are_refused(folder):
+    (folder / "config.json").write_text(json.dumps({"class_name": "LearnedNormalizer"}))
+    with pytest.raises(ValueError, match=r"expected format 'kornia_learnnorm\.normalizer"):
+        hub.HubModel.from_pretrained(folder)
+    (folder / "model.safetensors").unlink()
+    with pytest.raises(FileNotFoundError, match=r"model\.safetensors"):
+        hub.HubModel.from_pretrained(folder)
+
+
+@pytest.mark.parametrize("layer", [torch.nn.Linear(2, 2), kln.EightPoint(), None])
+def test_other_modules_are_refused(layer):
+    with pytest.raises(TypeError, match="must be one of LearnedEightPoint, LearnedNormalizer, got "):
+        hub.HubModel(layer)
