@@ -8,6 +8,7 @@
 # make audit  report known vulnerabilities of the locked packages; never fails
 # make bench   set up, time all estimators beside Kornia's; DEVICE=cuda on a GPU
 # make wheel  build wheel and sdist in dist/, the same bytes for the same commit; make check-wheel checks their metadata
+# make check-extras   install the wheel with each extra in an empty environment and use it; EXTRAS="core hub" for some. Takes long
 # make ablations DATA=<folder>, make table1 DATA=<folder>   train what is not trained yet, print the tables; -j 2 for two at once
 # make layer-ablations DATA=<folder>   those of the learned layer alone
 PYTHON ?= python3
@@ -25,7 +26,7 @@ TWINE := .venv-twine
 OLDEST := .venv-oldest
 TORCH ?= $$(grep '^torch==' requirements.lock)
 
-.PHONY: bench demo test test-cpus test-oldest lint docs audit wheel check-wheel clean ablations layer-ablations table1
+.PHONY: bench demo test test-cpus test-oldest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -67,7 +68,7 @@ test-cpus: $(VENV)/.ready
 			-m "numerical and not slow and not long" || exit 1; \
 	done
 
-CORE_TESTS = tests/geometry tests/normalizers tests/estimators tests/ransac tests/metrics tests/test_losses.py
+CORE_TESTS = tests/geometry tests/normalizers tests/estimators tests/ransac tests/metrics tests/test_losses.py tests/test_files.py
 
 # The lower bounds of the core as pins, without the extras: so the warnings of these have no filters.
 test-oldest: export OMP_NUM_THREADS = 1
@@ -156,6 +157,9 @@ wheel: $(VENV)/.ready
 check-wheel: wheel
 	@test -x $(TWINE)/bin/twine || { $(PYTHON) -m venv $(TWINE) && $(TWINE)/bin/python -m pip install --quiet twine==7.0.0; }
 	$(TWINE)/bin/twine check --strict dist/*
+
+check-extras: $(VENV)/.ready
+	$(BIN)/python tests/check_extras.py $(EXTRAS)
 
 clean:
 	rm -rf $(VENV) $(AUDIT) $(TWINE) $(OLDEST) dist build docs/_build runs

@@ -60,6 +60,8 @@ def test_a_killed_process_does_not_block(tmp_path):
 
 @pytest.mark.usefixtures("program")
 def test_commands_refuse_a_folder_that_another_run_writes(tmp_path, refused):
+    for module in ("cv2", "h5py", "pytorch_lightning"):
+        pytest.importorskip(module)
     store, out = tmp_path / "store.h5", tmp_path / "run"
     write_store(store, synthetic_store(pairs=1, points=40))
     main(["synthesize", str(tmp_path / "images"), "--pairs", "1", "--points", "40"])
