@@ -112,7 +112,8 @@ def trapezoids(errors, threshold):
     """The recall curve point by point, level behind the last error."""
     below = [error for error in sorted(errors) if error < threshold]
     recall = [i / len(errors) for i in range(len(below) + 1)]
-    return np.trapezoid([*recall, recall[-1]], [0.0, *below, threshold]) / threshold
+    heights, bounds = np.array([*recall, recall[-1]]), np.array([0.0, *below, threshold])
+    return (np.diff(bounds) * (heights[1:] + heights[:-1]) / 2).sum() / threshold  # np.trapezoid needs NumPy 2
 
 
 class TestPoseAUC:
