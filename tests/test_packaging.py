@@ -6,7 +6,9 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 import zipfile
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,7 @@ import yaml
 import kornia_learnnorm as kln
 
 ROOT = Path(__file__).parents[1]
+SERVICES = ("test", "pages", "release")  # workflows
 BUILD = "from hatchling.build import build_wheel; import sys; build_wheel(sys.argv[1])"
 
 
@@ -55,7 +58,15 @@ def test_the_wheel_finds_its_configurations_in_any_folder(wheels, tmp_path):
     assert found.stdout == (ROOT / "configs/crossview.yaml").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("path", [".github/workflows/test.yml", ".github/workflows/pages.yml", ".readthedocs.yaml"])
+def test_every_extra_is_checked():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    documented = (ROOT / "docs/install.md").read_text(encoding="utf-8")
+    checks = import_module("check_extras").CHECKS
+    assert set(checks) == set(project["optional-dependencies"]) - {"dev", "docs", "all"} | {"core"}
+    assert [extra for extra in checks if extra != "core" and f"\n| `{extra}` |" not in documented] == []
+
+
+@pytest.mark.parametrize("path", [*(f".github/workflows/{name}.yml" for name in SERVICES), ".readthedocs.yaml"])
 def test_services_call_targets_of_the_makefile(path):
     content = yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
     jobs = content.get("jobs", {}).values()
