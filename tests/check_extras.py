@@ -65,6 +65,7 @@ CHECKS = {
     "dask": [f'python -c "{ON_A_CLUSTER}"'],
     "colmap": ["learnnorm match colmap colmap/images --model colmap/model --out colmap.h5 --jobs 1"],
     "demo": [f'python -c "{SERVED_PAGE}"'],
+    "onnx": ["learnnorm export crossview --format onnx --out crossview.onnx", "test -s crossview.onnx"],
     "completion": ["learnnorm completion bash | bash -n"],
     "hub": [f'python -c "{ROUND_TRIP}"'],
     "robust": ["learnnorm robust synthetic.h5 --pairs 1 --out peers --estimators " + " ".join(ROBUST)],

@@ -15,7 +15,6 @@ __all__ = ["EXAMPLES", "add_arguments", "run"]
 
 EXAMPLES = """\
 learnnorm export robust --format pt2 --out robust.pt2 --inputs mask scores
-learnnorm export crossview --format pt2 --out eight.pt2 --points 8
 learnnorm export robust --format onnx --out robust.onnx"""
 
 
