@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -35,6 +36,7 @@ class _Ranking(NamedTuple):
     winner: str
     second: str  # empty for a single method
     level: list[str]  # whose difference from the winner has a 95 % interval that includes zero
+    ahead: list[str]  # whose mean score is below the winner's, with the whole 95 % interval
     against: dict[str, PairedDifference]  # the winner's difference from each other method
 
 
@@ -48,11 +50,16 @@ def robust_summary(run: RobustRun) -> list[str]:
     return [text for cell in run.cells if (text := _about_estimators(cell))]
 
 
-def _rank(scores: dict[str, Tensor], pair: Tensor) -> _Ranking:
-    """Rank methods by the mean of their scores, (S,) each, over the samples that all have; ``pair`` has their pairs."""
+def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> _Ranking:
+    """Rank methods by their values, and compare the mean score of the winner with each other one's.
+
+    Args:
+        values: what the summary quotes of each method, less is better; NaN comes last.
+        scores: a score of each sample by method, (S,) each; those count that all methods have.
+        pair: image pair of each sample, (S,).
+    """
     valid = torch.stack([*scores.values()]).isfinite().all(0)
-    order = sorted(scores, key=lambda name: scores[name][valid].mean().item())
-    winner, *others = order
+    winner, *others = sorted(values, key=lambda name: math.inf if math.isnan(values[name]) else values[name])
     differences = {}
     if len(torch.unique(pair[valid])) > 1:
         mine = scores[winner][valid]
@@ -60,14 +67,15 @@ def _rank(scores: dict[str, Tensor], pair: Tensor) -> _Ranking:
             name: paired_bootstrap(mine, scores[name][valid], pair[valid], draws=RESAMPLES) for name in others
         }
     level = [name for name, found in differences.items() if found.low <= 0 <= found.high]
-    return _Ranking(winner, others[0] if others else "", level, differences)
+    ahead = [name for name, found in differences.items() if found.low > 0]
+    return _Ranking(winner, others[0] if others else "", level, ahead, differences)
 
 
 def _about_methods(cell: Cell) -> str:
-    """Return which method has the smallest error, beside the baseline's."""
+    """Return which method has the smallest median error, as the table shows it, beside the baseline's."""
     key = next((key for key in ERRORS if not cell.predictions[BASELINE][key].isnan().all()), "own")
     logs = {name: p[key].clamp(min=MIN_DISTANCE).log() for name, p in cell.predictions.items()}
-    ranking = _rank(logs, cell.pair)
+    ranking = _rank({name: median(p[key]).item() for name, p in cell.predictions.items()}, logs, cell.pair)
     winner, best = ranking.winner, cell.predictions[ranking.winner]
     used = cell.pair[torch.stack([*logs.values()]).isfinite().all(0)]
     size = f"{len(used):,} samples of {len(torch.unique(used))} image pairs"
@@ -79,6 +87,8 @@ def _about_methods(cell: Cell) -> str:
             low, mean, high = (percent_change(value) for value in (found.low, found.mean, found.high))
             text += f" (change of the geometric mean {mean} % [{low}, {high}])"
     text += f".{_level(ranking)}"
+    if ranking.ahead:
+        text += f" The geometric mean of the errors is smaller for {_names(ranking.ahead)}."
     if key != "truth" and "inliers" in best:
         shares = [_inlier_share(cell, name) for name in dict.fromkeys((winner, BASELINE))]
         text += f" Share of the matches within {INLIER_THRESHOLD:g} px: {', '.join(shares)}. No ground truth is known."
@@ -111,7 +121,7 @@ def _about_estimators(cell: RobustCell) -> str:
     kept = known if truth else torch.ones_like(known)
     key, sign = ("error", 1) if truth else ("inliers", -1)
     scores = {name: sign * r[key][kept].clamp(max=MAX_ERROR).mean(1) for name, r in found.items()}
-    ranking = _rank(scores, torch.arange(int(kept.sum())))
+    ranking = _rank({n: s.mean().item() for n, s in scores.items()}, scores, torch.arange(int(kept.sum())))
 
     def describe(name: str) -> str:
         mean = abs(scores[name].mean().item())
