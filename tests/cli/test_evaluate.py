@@ -198,13 +198,14 @@ def test_json_is_not_written_where_a_command_fails_or_over_its_input(folder, tmp
 
 def test_cells_as_json():
     cells = ["", "-", "12", "+1.50", "2.5e+06", "1.5 [1.2, +2.0]", "-3.0 [-4.0, -2.0], < 0.001", "7.00 ± 0.10"]
-    cells += ["99.9 *", "99.9 [99.0, 100.0] *", "kitti_00, kitti_01", "inf"]
-    (row,) = json.loads(tables_as_json("", [Table("", "", ["name", *map(str, range(12))], [["12", *cells]])]))[
+    cells += ["99.9 *", "99.9 [99.0, 100.0] *", "2 [1, 3], -", "kitti_00, kitti_01", "inf"]
+    (row,) = json.loads(tables_as_json("", [Table("", "", ["name", *map(str, range(13))], [["12", *cells]])]))[
         "tables"
     ][0]["rows"]
     expected = [None, None, 12, 1.5, 2.5e6, {"value": 1.5, "low": 1.2, "high": 2.0}]
     expected += [{"value": -3.0, "low": -4.0, "high": -2.0, "p": 0.001}, {"value": 7.0, "std": 0.1}]
     expected += [{"value": 99.9, "trained_on": True}, {"value": 99.9, "low": 99.0, "high": 100.0, "trained_on": True}]
+    expected += [{"value": 2, "low": 1, "high": 3}]
     assert [*row.values()] == ["12", *expected, "kitti_00, kitti_01", "inf"]
 
 

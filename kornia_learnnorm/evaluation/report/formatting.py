@@ -18,6 +18,7 @@ from kornia_learnnorm.metrics.summary import median
 __all__ = [
     "BASELINE",
     "MIN_P_VALUE",
+    "MIN_TESTED_PAIRS",
     "POSE_HEADER",
     "RESAMPLES",
     "known_parts",
@@ -33,6 +34,7 @@ __all__ = [
 BASELINE = "Hartley"  # the method that all others are compared with
 RESAMPLES = 2000  # bootstrap resamples of a paired test
 MIN_P_VALUE = 1e-3  # the smallest p-value that these resamples can resolve
+MIN_TESTED_PAIRS = 8  # image pairs; a bootstrap over fewer gives intervals that are too narrow, and no p-value
 POSE_HEADER = ("AUC@5", "AUC@10", "AUC@20", "mAA(10)")
 
 
@@ -101,15 +103,18 @@ def paired_text(
     """Return the mean difference of two methods with its 95 % interval and p-value, from a paired bootstrap over pairs.
 
     Without ``pair`` each number is of its own pair. ``show`` formats the mean and the ends of the interval. The text is
-    empty if fewer than two pairs have a finite difference.
+    empty if fewer than two pairs have a finite difference, and the p-value is ``-`` if fewer than
+    :data:`MIN_TESTED_PAIRS` have.
     """
     pair = torch.arange(len(values)) if pair is None else pair
     valid = (values - baseline).isfinite()
-    if len(torch.unique(pair[valid])) < 2:
+    pairs = len(torch.unique(pair[valid]))
+    if pairs < 2:
         return ""
     found = paired_bootstrap(values[valid], baseline[valid], pair[valid], draws=RESAMPLES)
     text = f"{show(found.mean)} [{show(found.low)}, {show(found.high)}]"
     p_value = f"< {MIN_P_VALUE:g}" if found.p_value < MIN_P_VALUE else f"{found.p_value:.3f}"
+    p_value = p_value if pairs >= MIN_TESTED_PAIRS else "-"
     return f"{text}, {p_value}" if with_p_value else text
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.formatting import BASELINE, RESAMPLES, median_text, percent_change
+from kornia_learnnorm.evaluation.report.formatting import BASELINE, MIN_TESTED_PAIRS, RESAMPLES, median_text, percent_change
 from kornia_learnnorm.evaluation.report.robust import pairs_with_truth
 from kornia_learnnorm.evaluation.robust.estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR
@@ -37,7 +37,8 @@ class _Ranking(NamedTuple):
     second: str  # empty for a single method
     level: list[str]  # whose difference from the winner has a 95 % interval that includes zero
     ahead: list[str]  # whose mean score is below the winner's, with the whole 95 % interval
-    against: dict[str, PairedDifference]  # the winner's difference from each other method
+    against: dict[str, PairedDifference]  # the winner's difference from each other method; empty for too few pairs
+    pairs: int  # number of image pairs
 
 
 def run_summary(run: Run) -> list[str]:
@@ -61,14 +62,15 @@ def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> 
     valid = torch.stack([*scores.values()]).isfinite().all(0)
     winner, *others = sorted(values, key=lambda name: math.inf if math.isnan(values[name]) else values[name])
     differences = {}
-    if len(torch.unique(pair[valid])) > 1:
+    pairs = len(torch.unique(pair[valid]))
+    if pairs >= MIN_TESTED_PAIRS:
         mine = scores[winner][valid]
         differences = {
             name: paired_bootstrap(mine, scores[name][valid], pair[valid], draws=RESAMPLES) for name in others
         }
     level = [name for name, found in differences.items() if found.low <= 0 <= found.high]
     ahead = [name for name, found in differences.items() if found.low > 0]
-    return _Ranking(winner, others[0] if others else "", level, ahead, differences)
+    return _Ranking(winner, others[0] if others else "", level, ahead, differences, pairs)
 
 
 def _about_methods(cell: Cell) -> str:
@@ -102,8 +104,11 @@ def _inlier_share(cell: Cell, name: str) -> str:
 
 def _level(ranking: _Ranking) -> str:
     """Return which methods cannot be distinguished from the winner."""
+    if not ranking.second:
+        return " There is nothing to test it against."
     if not ranking.against:
-        return " There is nothing to test it against." if not ranking.second else " One image pair has no interval."
+        count = f"{ranking.pairs} image pair{'s' * (ranking.pairs != 1)}"
+        return f" Not tested: there {'is' if ranking.pairs == 1 else 'are'} {count}, a test needs {MIN_TESTED_PAIRS}."
     return f" Level with it: {_names(ranking.level)}." if ranking.level else ""
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from kornia_learnnorm.evaluation.report.formatting import (
     BASELINE,
     MIN_P_VALUE,
+    MIN_TESTED_PAIRS,
     POSE_HEADER,
     RESAMPLES,
     mean_text,
@@ -162,7 +163,7 @@ def _tests(cell: Cell) -> Table:
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "
         f"p-value of a paired bootstrap over image pairs with {RESAMPLES:,} resamples, which cannot resolve p-values "
-        f"below {MIN_P_VALUE:g}. Negative is better. `own` and `held out` use {_count(cell.pair)}"
+        f"below {MIN_P_VALUE:g}; fewer than {MIN_TESTED_PAIRS} pairs have no p-value. Negative is better. `own` and `held out` use {_count(cell.pair)}"
     )
     truth = cell.pair[_with_truth(cell)]
     text += f", `truth` uses {_count(truth)}." if len(truth) else "."

@@ -59,9 +59,14 @@ def test_without_ground_truth_the_error_is_on_heldout_matches_beside_the_share_o
     assert text.endswith("Share of the matches within 1 px: `mine` 25.0 %, `Hartley` 25.0 %. No ground truth is known.")
 
 
-def test_one_pair_or_one_method_has_nothing_to_compare():
-    one = torch.zeros(SAMPLES, dtype=torch.int64)
-    assert summary_of({"Hartley": errors(1.0), "mine": errors(0.5)}, one).endswith("One image pair has no interval.")
+@pytest.mark.parametrize(("pairs", "text"), [(1, "is 1 image pair"), (7, "are 7 image pairs"), (8, "")])
+def test_few_pairs_are_not_tested(pairs, text):
+    found = summary_of({"Hartley": errors(1.0), "mine": errors(0.5)}, torch.arange(SAMPLES) % pairs)
+    assert found.endswith(f" Not tested: there {text}, a test needs 8.") == bool(text)
+    assert ("change of the geometric mean" in found) == (not text)
+
+
+def test_one_method_has_nothing_to_compare():
     assert summary_of({"Hartley": errors(1.0)}).endswith("There is nothing to test it against.")
 
 

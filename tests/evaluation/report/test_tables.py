@@ -48,7 +48,10 @@ def test_texts_of_cells():
     assert [number_text(0.5), number_text(float("nan"))] == ["0.500", ""]
     assert median_text(torch.tensor([1.0, 4.0, torch.nan])) == "2.500"
     values = torch.tensor([1.5, 2.5])
+    assert paired_text(values, values - 0.5) == "+0.500 [+0.500, +0.500], -"  # too few pairs
+    values = torch.arange(8) + 1.5
     assert paired_text(values, values - 0.5) == "+0.500 [+0.500, +0.500], < 0.001"
+    assert paired_text(values[1:], values[1:] - 0.5).endswith(", -")
     assert method_colors(["none", "Hartley"]) == {"none": "#8b8b8b", "Hartley": "#e69f00"}
 
 
