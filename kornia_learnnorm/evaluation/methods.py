@@ -27,6 +27,7 @@ from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.pretrained import WEIGHTS, shipped_weights
 
 __all__ = [
+    "CLOSED_FORMS",
     "DEFAULT_METHODS",
     "OPTIMAL",
     "REFINED",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from kornia_learnnorm.evaluation.methods import REFINED
 from kornia_learnnorm.evaluation.report.pair import draw_example, example_inliers
 from kornia_learnnorm.evaluation.report.style import (
     INK,
     Picture,
+    is_learned,
     line_style,
     make_figure,
     make_picture,
@@ -24,7 +26,6 @@ MAX_FRAMES = 20  # image pairs on the axis of Figure 4a
 RHO_WINDOW = 100  # successive samples in a mean of Figure 13
 NORMALISATIONS = ("none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched")
 BUILT_IN = {*NORMALISATIONS, "crossview-synthetic"}
-DASHES = "Dashed: learned."
 
 
 @report_style()
@@ -39,7 +40,7 @@ def report_figures(run: Run) -> list[Picture]:
         *draw_example(run, colors),
         *([_by_size(run, colors)] if run.sizes else []),
         _conditions(cell, colors),
-        _rho(cell, colors),
+        *([_rho(cell, colors)] if len(cell.pair) >= RHO_WINDOW else []),
     ]
 
 
@@ -51,25 +52,29 @@ def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
     for name in chosen:
         own = cell.predictions[name]["own"].numpy()
         means = [own[(pair == frame) & np.isfinite(own)].mean() for frame in frames]
-        style = "--" if name.endswith("+LM") else "-"
+        style = "--" if name.endswith(REFINED) else "-"
         axes.plot(frames, means, style, color=colors[name], label=name, marker="o", markersize=3)
     axes.set(xlabel="image pair", ylabel="mean error of a pair's samples, px", yscale="log")
     axes.locator_params(axis="x", integer=True)
     text = (
         f"Mean symmetric epipolar distance of the samples of each of the first {len(frames)} image pairs of "
-        f"{cell.store}, with and without non-linear refinement."
+        f"{cell.store}."
     )
+    if any(name.endswith(REFINED) for name in chosen):
+        text += " Dashed: with non-linear refinement."
     return make_picture(figure, "figure-4a", "Error by frame (Figure 4a)", text)
 
 
 def _distribution(cell: Cell, colors: dict[str, str]) -> Picture:
     figure, (axes,) = make_figure(1, 1)
-    for name in _present(cell, *NORMALISATIONS, "Hartley+optimal"):
+    names = _present(cell, *NORMALISATIONS, "Hartley+optimal")
+    for name in names:
         own = np.sort(cell.predictions[name]["own"].numpy())
         axes.plot(own, np.arange(1, len(own) + 1) / len(own), line_style(name), color=colors[name], label=name)
     axes.set(xlabel="symmetric epipolar distance of a sample, px", ylabel="share of samples below", xscale="log")
     axes.set(xlim=(0.01, 60), ylim=(0, 1))
-    text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}. {DASHES}"
+    text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}."
+    text += _dashes(names)
     return make_picture(figure, "figure-4b", "Distribution of errors (Figure 4b)", text)
 
 
@@ -133,17 +138,24 @@ def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
 
 def _rho(cell: Cell, colors: dict[str, str]) -> Picture:
     figure, (axes,) = make_figure(1, 1)
-    for name in _present(cell, "Hartley", "whitening", "paper", "crossview"):
+    names = _present(cell, "Hartley", "whitening", "paper", "crossview")
+    for name in names:
         rho = cell.predictions[name]["rho"].numpy()
         means = [np.mean(rho[i : i + RHO_WINDOW]) for i in range(0, len(rho) - RHO_WINDOW + 1, RHO_WINDOW)]
-        axes.plot(np.arange(len(means)) * RHO_WINDOW, means, line_style(name), color=colors[name], label=name)
+        places = np.arange(len(means)) * RHO_WINDOW
+        axes.plot(places, means, line_style(name), color=colors[name], label=name, marker="o", markersize=3)
     axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {RHO_WINDOW} samples (no unit)")
     text = (
         "Singularity ratio rho before the projection to rank 2: the second over the third singular value of the "
         f"normalised matrix. The larger it is, the less the projection changes. Means of {RHO_WINDOW} successive "
-        f"samples, {cell.title}. {DASHES}"
+        f"samples, {cell.title}.{_dashes(names)}"
     )
     return make_picture(figure, "figure-13", "Singularity ratio (Figure 13)", text)
+
+
+def _dashes(names: list[str]) -> str:
+    """Return what dashed lines are, for the text of a picture; empty where no method is learned."""
+    return " Dashed: learned." if any(map(is_learned, names)) else ""
 
 
 def _present(cell: Cell, *names: str) -> list[str]:

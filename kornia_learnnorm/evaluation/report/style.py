@@ -12,17 +12,18 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kornia_learnnorm.evaluation.drawing import import_matplotlib
+from kornia_learnnorm.evaluation.methods import CLOSED_FORMS, base_name
+from kornia_learnnorm.evaluation.robust.estimators import SEVEN_POINT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["INK", "Picture", "line_style", "make_figure", "make_picture", "method_colors", "report_style"]
+__all__ = ["INK", "Picture", "is_learned", "line_style", "make_figure", "make_picture", "method_colors", "report_style"]
 
 INK = "#010203"  # placeholder that make_picture replaces by the text colour of the page
 # Legible on white and on black; after P. Tol's and Okabe and Ito's palettes for colour blindness.
 HUES = "8b8b8b e69f00 2b9fd9 18a57a d55e00 cc79a7 a0714f 7a6ff0 b8a400 c2443f 5f8f2f"
-LEARNED = ("paper", "crossview")
 WIDTH = 8.0  # inches
 SETTINGS: dict[str, Any] = {
     "svg.fonttype": "none",
@@ -54,9 +55,14 @@ def method_colors(names: Iterable[str]) -> dict[str, str]:
     return {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(names)}
 
 
+def is_learned(name: str) -> bool:
+    """Return whether a method or a minimal solver has weights: it is no closed form and no ``module:Name``."""
+    return base_name(name) not in (*CLOSED_FORMS, SEVEN_POINT) and ":" not in name
+
+
 def line_style(name: str) -> str:
     """Return the Matplotlib line style of a method: dashed for a learned one, which often lies on a closed form."""
-    return "--" if name in LEARNED else "-"
+    return "--" if is_learned(name) else "-"
 
 
 def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, list[Axes]]:

@@ -9,7 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.formatting import BASELINE, MIN_TESTED_PAIRS, RESAMPLES, median_text, percent_change
+from kornia_learnnorm.evaluation.report.formatting import (
+    BASELINE,
+    MIN_TESTED_PAIRS,
+    RESAMPLES,
+    median_text,
+    percent_change,
+)
 from kornia_learnnorm.evaluation.report.robust import pairs_with_truth
 from kornia_learnnorm.evaluation.robust.estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import xml.etree.ElementTree as ElementTree
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 
 from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.evaluation.report.figures import report_figures
 from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 from kornia_learnnorm.evaluation.report.pair import draw_example
+from kornia_learnnorm.evaluation.report.style import line_style
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs import example
 from kornia_learnnorm.evaluation.runs.run import read_run
@@ -35,6 +38,30 @@ def test_files(copied, capsys):
     assert len(identifiers) == len(set(identifiers))
     for reference in re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', page):
         assert "".join(reference) in identifiers
+
+
+def test_pictures_show_what_the_run_has(run):
+    """Captions name only lines that are there, and there is no picture without a curve."""
+    found = read_run(run)
+    pictures = {picture.name: picture for picture in report_figures(found)}
+    assert pictures["figure-4a"].text.endswith(" Dashed: with non-linear refinement.")
+    assert pictures["figure-4b"].text.endswith(" Dashed: learned.")
+    (cell, *_), kept = found.cells, slice(99)
+    predictions = {name: {k: v[kept] for k, v in cell.predictions[name].items()} for name in ("Hartley", "whitening")}
+    few = dataclasses.replace(cell, pair=cell.pair[kept], predictions=predictions)
+    pictures = {picture.name: picture for picture in report_figures(dataclasses.replace(found, cells=[few]))}
+    assert "figure-12" in pictures
+    assert "figure-13" not in pictures  # its points are means of 100 samples
+    assert not [picture.name for picture in pictures.values() if "Dashed" in picture.text]
+
+
+@pytest.mark.parametrize(
+    ("name", "style"),
+    [("crossview", "--"), ("own", "--"), ("own+LM", "--"), ("Hartley+optimal", "-"), ("seven-point", "-")],
+)
+def test_lines_of_learned_methods_are_dashed(name, style):
+    assert line_style(name) == style
+    assert line_style("module:Name") == "-"
 
 
 def test_the_answer_comes_first_then_contents_date_and_command(copied, methods):
