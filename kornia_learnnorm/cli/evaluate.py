@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from kornia_learnnorm.evaluation.methods import DEFAULT_METHODS, SHIPPED, default_methods
+from kornia_learnnorm.evaluation.report.formatting import known_parts
 from kornia_learnnorm.evaluation.runs.predict import SampleOptions
 from kornia_learnnorm.evaluation.runs.record import record_run, temporary_run
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
@@ -156,11 +157,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> None:
-    """Print the tables of a run and append them to a list."""
+    """Print the tables of a run, without columns that have no number, and append them to a list."""
     limit = run.about["max_residual"]
     for store, about in run.about["stores"].items():
         if args.json != "-":
-            print(f"\n{store}: {about}")
+            print(f"\n{store}: {about}{'' if _has_truth(run, store) else '; without ground truth'}")
         for cell in run.cells:
             if cell.store != store or not cell.predictions:
                 continue
@@ -169,5 +170,13 @@ def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> No
             own = torch.stack([errors["own"] for errors in cell.predictions.values()])
             if infinite := int(own.isinf().any(0).sum()):
                 text += f"; {infinite} with a point on an epipole, not in the means"
-            tables.append(Table(cell.title, text, [*HEADER], method_rows(cell.predictions)))
-            print_table(args, text, tables[-1])
+            table = known_parts(Table(cell.title, text, [*HEADER], method_rows(cell.predictions)))
+            if table is not None:
+                tables.append(table)
+                print_table(args, text, table)
+
+
+def _has_truth(run: Run, store: str) -> bool:
+    """Return whether any error of a store is one against a ground truth."""
+    found = [errors["truth"] for cell in run.cells if cell.store == store for errors in cell.predictions.values()]
+    return any(bool((~truth.isnan()).any()) for truth in found)

@@ -130,9 +130,10 @@ def test_evaluate_prints_the_same_with_and_without_a_folder(folder, tmp_path, ca
     assert main(command) == main([*command, "--out", str(tmp_path / "run")]) == 0
     tables, again = capsys.readouterr().out.split("\nunknown: ")[1:]
     assert again.startswith(tables)
-    rows = [row for _, rows in read_tables(tables).values() for row in rows.values()]
-    assert len(rows) == 4
-    assert all(row[0] == "-" and row[-2:] == ["-", "-"] for row in rows)  # neither Hartley nor ground truth
+    read = [*read_tables(tables).values()]
+    assert [[*rows] for _, rows in read] == [["none", "whitening"]] * 2
+    # There is neither Hartley nor ground truth.
+    assert [header for header, _ in read] == [["method", "than whitening %", "mean px", "median px"]] * 2
 
 
 @pytest.mark.parametrize("size", [8, 20])
@@ -194,6 +195,18 @@ def test_json_is_not_written_where_a_command_fails_or_over_its_input(folder, tmp
         refused([command, store, "--json", tmp_path / "none/a.json"], "none does not exist")
         refused([command, store, "--json", tmp_path / "a.json", "--weights", "nothing"], "no weights")
     assert [*tmp_path.iterdir()] == [store]
+
+
+def test_without_ground_truth_there_are_no_columns_of_it(folder, capsys):
+    assert main(["evaluate", str(folder / "known.h5"), str(folder / "unknown.h5"), "--methods", "none", "Hartley"]) == 0
+    known, unknown = capsys.readouterr().out.split("\nunknown: ")
+    assert "truth: median px" in known
+    assert "without ground truth" not in known
+    assert unknown.splitlines()[0].endswith("; without ground truth")
+    assert unknown.count("truth") == 1
+    for header, rows in read_tables(unknown).values():
+        assert header == ["method", "better than Hartley %", "mean px", "median px"]
+        assert rows["Hartley"][0] == "-"
 
 
 def test_cells_as_json():

@@ -163,7 +163,8 @@ def _tests(cell: Cell) -> Table:
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "
         f"p-value of a paired bootstrap over image pairs with {RESAMPLES:,} resamples, which cannot resolve p-values "
-        f"below {MIN_P_VALUE:g}; fewer than {MIN_TESTED_PAIRS} pairs have no p-value. Negative is better. `own` and `held out` use {_count(cell.pair)}"
+        f"below {MIN_P_VALUE:g}; fewer than {MIN_TESTED_PAIRS} pairs have no p-value. Negative is better. `own` and "
+        f"`held out` use {_count(cell.pair)}"
     )
     truth = cell.pair[_with_truth(cell)]
     text += f", `truth` uses {_count(truth)}." if len(truth) else "."
