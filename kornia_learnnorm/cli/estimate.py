@@ -25,6 +25,7 @@ EXAMPLES = """\
 learnnorm estimate left.png right.png --K 700,700,320,240 --out pair.png --json pair.json
 learnnorm estimate --pairs pairs.txt --out results --estimator learned
 """
+MAX_FAILURES = 5  # failed pairs that are named
 UNRELIABLE = 3  # exit code where there is no matrix, or reasons to doubt it
 
 
@@ -76,6 +77,20 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _print_pairs(found: list[dict[str, Any]], folder: Path) -> None:
+    """Print how many pairs have a matrix; to standard error, the first pairs without one and why."""
+    failed = [line for line in found if line["F"] is None]
+    warned = sum(bool(line["warnings"]) for line in found) - len(failed)
+    text = f"wrote {folder}: {len(found) - len(failed)} of {len(found)} pairs solved"
+    text += f", {len(failed)} failed" if failed else ""
+    print(text + (f"; {warned} solved with warnings" if warned else ""))
+    for line in failed[:MAX_FAILURES]:
+        reasons = "; ".join(f"{warning['text']} ({warning['code']})" for warning in line["warnings"])
+        print(f"failed: {line['image1']['file']} {line['image2']['file']}: {reasons}", file=sys.stderr)
+    if len(failed) > MAX_FAILURES:
+        print(f"and {len(failed) - MAX_FAILURES} more: lines of pairs.jsonl whose F is null", file=sys.stderr)
+
+
 def run(args: argparse.Namespace) -> int:
     """Print the fundamental matrix; write the picture and the JSON file if asked to, both or neither."""
     _check_options(args)
@@ -83,9 +98,9 @@ def run(args: argparse.Namespace) -> int:
     names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher")
     options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
     if args.pairs is not None:
-        good, warned = estimate_pairs(read_pair_list(args.pairs), args.out, options, args.jobs, args.dask)
-        print(f"wrote {args.out}: {good} pairs solved, {warned} with warnings")
-        return UNRELIABLE if warned else 0
+        found = estimate_pairs(read_pair_list(args.pairs), args.out, options, args.jobs, args.dask)
+        _print_pairs(found, args.out)
+        return UNRELIABLE if any(line["warnings"] for line in found) else 0
     image1, image2 = args.images
     try:
         estimate = _estimate(args, options)

@@ -106,7 +106,7 @@ def read_pair_list(path: str | Path) -> list[tuple[Path, Path]]:
 
 def estimate_pairs(
     pairs: list[tuple[Path, Path]], folder: str | Path, options: PairOptions, jobs: int = -1, dask: str | None = None
-) -> tuple[int, int]:
+) -> list[dict[str, Any]]:
     """Estimate the pairs that are not done yet and append one JSON line each to ``pairs.jsonl``.
 
     A line has what :meth:`~kornia_learnnorm.evaluation.pair_estimate.PairEstimate.as_dict` returns, or
@@ -120,7 +120,7 @@ def estimate_pairs(
         dask: address of a Dask scheduler whose workers estimate instead.
 
     Returns:
-        the number of pairs without and with warnings.
+        the JSON objects of the pairs, in their order; ``F`` is None where there is no matrix.
 
     Raises:
         ValueError: if the folder holds results with other options.
@@ -134,8 +134,7 @@ def estimate_pairs(
     folder.mkdir(parents=True, exist_ok=True)
     with exclusive(folder):
         done = _estimate_missing(pairs, folder, options, given, jobs, dask)
-    warned = sum(bool(done[str(first), str(second)]["warnings"]) for first, second in pairs)
-    return len(pairs) - warned, warned
+    return [done[str(first), str(second)] for first, second in pairs]
 
 
 def _estimate_missing(

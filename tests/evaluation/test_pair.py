@@ -414,7 +414,10 @@ class TestManyPairs:
         Path("list.txt").write_text("".join(f"{scene.folder}/{a}.png {scene.folder}/{b}.png\n\n" for a, b in names[:2]))
         many = ("--pairs", "list.txt", "--out", "found", "--jobs", "1")
         assert command(*many, images=()) == 3
-        assert "wrote found: 1 pairs solved, 1 with warnings" in capsys.readouterr().out
+        printed = capsys.readouterr()
+        assert printed.out.endswith("wrote found: 1 of 2 pairs solved, 1 failed\n")
+        assert f"failed: {scene.left} {scene.blank}: " in printed.err
+        assert "(blank)" in printed.err
         path = Path("found/pairs.jsonl")
         first = path.read_text()
         path.write_text(first + '{"F": nu')  # as a killed run leaves it
@@ -434,6 +437,23 @@ class TestManyPairs:
         assert lines[1]["versions"] == lines[0]["versions"]
         with pytest.raises(ValueError, match="results with other options"):
             command(*many, "--ratio", "0.7", images=())
+
+    def test_failures_and_warnings_are_counted_apart(self, capsys):
+        warning = [{"code": "why", "text": "A reason"}]
+        images = {"image1": {"file": "a"}, "image2": {"file": "b"}}
+        solved, doubtful, failed = (
+            {"F": F, "warnings": w, **images} for F, w in ((1, []), (1, warning), (None, warning))
+        )
+        command_module._print_pairs([solved, solved], Path("found"))
+        command_module._print_pairs([solved, doubtful, *7 * [failed]], Path("found"))
+        printed = capsys.readouterr()
+        assert printed.out.splitlines() == [
+            "wrote found: 2 of 2 pairs solved",
+            "wrote found: 2 of 9 pairs solved, 7 failed; 1 solved with warnings",
+        ]
+        *named, more = printed.err.splitlines()
+        assert named == 5 * ["failed: a b: A reason (why)"]
+        assert more.startswith("and 2 more: ")
 
     def test_names_with_spaces_and_comments(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
