@@ -72,7 +72,8 @@ def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
 
     Raises:
         TypeError: if a camera is neither an array nor a tensor of numbers.
-        ValueError: if only one is given, or one is not a finite and invertible matrix of shape (3, 3).
+        ValueError: if only one is given, or one is not a finite and invertible matrix of shape (3, 3) with a
+            last row of (0, 0, w).
 
     """
     camera1, camera2 = (None if K is None else as_float64(name, K) for name, K in (("K1", K1), ("K2", K2)))

@@ -79,7 +79,7 @@ def estimate_pair(
             matches or inliers.
         TypeError: if an argument is not of the kinds above.
         ValueError: if a file is not an image, an argument is out of range, only one camera is given, or one is not a
-            finite and invertible (3, 3) matrix.
+            finite and invertible (3, 3) matrix with a last row of (0, 0, w).
         ImportError: if OpenCV is not installed.
 
     """

@@ -57,7 +57,7 @@ def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, p
 
 
 def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None = None) -> None:
-    """Raise a clear error for anything but two finite and invertible cameras, or none.
+    """Raise a clear error for anything but two finite and invertible cameras with a last row (0, 0, w), or none.
 
     Args:
         K1: camera of view 1 with shape :math:`(3, 3)`, or of a batch with shape :math:`(B, 3, 3)`.
@@ -66,7 +66,8 @@ def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None =
 
     Raises:
         TypeError: if a camera is not a floating-point tensor.
-        ValueError: if only one is given, a shape is wrong, or one is not finite and invertible.
+        ValueError: if only one is given, a shape is wrong, one is not finite and invertible, or its last row is not
+            :math:`(0, 0, w)`, as of a transposed camera.
 
     """
     if (K1 is None) != (K2 is None):
@@ -80,6 +81,10 @@ def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None =
             raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {[*K.shape]}")
         if is_true(~(K.isfinite().all() & (torch.linalg.det(K.detach().to(solve_dtype(K.device))) != 0).all())):
             raise ValueError(f"{name} must be finite and invertible")
+        if is_true((K[..., 2, :2] != 0).any()):
+            rows = K.detach().reshape(-1, 3, 3)[:, 2]
+            got = " ".join(f"{value:g}" for value in rows[(rows[:, :2] != 0).any(-1)][0].tolist())
+            raise ValueError(f"{name} must have a last row of 0 0 1, up to scale, got {got}; is it transposed?")
 
 
 def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | None = None, min_points: int = 8) -> None:

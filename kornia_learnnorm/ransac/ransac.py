@@ -221,7 +221,8 @@ class RANSAC(nn.Module):
                 floating-point.
             ShapeError: if a shape is wrong.
             ValueError: if there are fewer than eight rows, or five with cameras, the views do not pair up, a weight is
-                negative or not finite, only one camera is given, or one is not a finite and invertible (3, 3) matrix.
+                negative or not finite, only one camera is given, or one is not a finite and invertible (3, 3) matrix
+                with a last row of (0, 0, w).
 
         """
         check_cameras(K1, K2)

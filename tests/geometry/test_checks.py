@@ -8,7 +8,31 @@ import torch
 from kornia.core.exceptions import ShapeError
 from two_view import uniform
 
-from kornia_learnnorm.geometry.checks import check_correspondences, solve_dtype, weighted_mean
+from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, solve_dtype, weighted_mean
+
+K = torch.tensor([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
+
+
+class TestCameras:
+    @pytest.mark.parametrize("scale", [1.0, -2.0, 1e-3])
+    def test_any_scale(self, scale):
+        check_cameras(scale * K, K.expand(4, 3, 3), 4)
+
+    def test_transposed(self):
+        """One line says which camera and what its last row is, also of a single one in a batch."""
+        text = "must have a last row of 0 0 1, up to scale, got 320 240 1; is it transposed"
+        with pytest.raises(ValueError, match=f"^K1 {text}.$"):
+            check_cameras(K.T, K)
+        with pytest.raises(ValueError, match=f"^K2 {text}.$"):
+            check_cameras(K, torch.stack([K, K.T]).requires_grad_(), 2)
+
+    def test_values_are_not_read_in_transforms(self):
+        def focal_length(camera):
+            check_cameras(camera, camera)
+            return camera[0, 0]
+
+        assert torch.func.vmap(focal_length)(torch.stack([K, K.T])).tolist() == [700.0, 700.0]
+        assert torch.compile(focal_length, backend="eager", fullgraph=True)(K.T) == 700.0
 
 
 class TestCorrespondences:

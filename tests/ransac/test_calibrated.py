@@ -75,6 +75,9 @@ class TestSmoke:
         assert up_to_sign(found.E_mat[None], E[None]) < 0.02
 
 
+CAMERA = torch.tensor([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
+
+
 class TestExceptions:
     @pytest.mark.parametrize(
         ("K1", "K2", "error", "message"),
@@ -84,6 +87,7 @@ class TestExceptions:
             (torch.eye(3), torch.zeros(3, 3), ValueError, "K2 must be finite and invertible"),
             (torch.full((3, 3), torch.nan), torch.eye(3), ValueError, "K1 must be finite and invertible"),
             (torch.eye(3)[None], torch.eye(3), ValueError, r"K1 must have shape \[3, 3\], got \[1, 3, 3\]"),
+            (torch.eye(3), CAMERA.T, ValueError, "K2 must have a last row of 0 0 1, up to scale, got 320 240 1; "),
             (np.eye(3), torch.eye(3), TypeError, "K1 must be a floating-point tensor"),
         ],
     )
