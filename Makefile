@@ -40,6 +40,7 @@ $(VENV)/.ready: requirements.lock pyproject.toml
 # The matrices are small: more threads wait for each other.
 demo: export OMP_NUM_THREADS = 1
 demo: $(VENV)/.ready
+	rm -rf $(RUN)/checkpoints
 	$(BIN)/learnnorm synthesize $(RUN)
 ifdef DATA
 	LEARNNORM_DATA="$(DATA)" $(BIN)/learnnorm fit --config configs/crossview.yaml $(SHORT)

@@ -42,12 +42,18 @@ class TrainingCLI(LightningCLI):
         """Take no configuration from a checkpoint: it could name any class to be made."""
 
     def _run_subcommand(self, subcommand: str) -> None:
-        """Run a subcommand; only one training at a time writes a folder."""
+        """Run a subcommand; only one training at a time writes a folder, and none replaces another."""
         with ExitStack() as stack:
             if subcommand == "fit" and self.trainer.is_global_zero:
                 folder = Path(self.trainer.default_root_dir)
                 folder.mkdir(parents=True, exist_ok=True)
                 stack.enter_context(exclusive(folder))
+                last = folder / "checkpoints" / "last.ckpt"
+                if last.exists() and self.config[subcommand].get("ckpt_path") is None:
+                    raise FileExistsError(
+                        f"{folder} holds a run already: go on with it by --ckpt_path {last}, or choose another folder"
+                        " by --trainer.default_root_dir"
+                    )
             super()._run_subcommand(subcommand)
 
     def before_fit(self) -> None:

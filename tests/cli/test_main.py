@@ -386,6 +386,14 @@ def test_an_interrupted_training_exits_as_interrupted(tmp_path, monkeypatch, cap
     assert not Path("runs/crossview-synthetic/weights.safetensors").exists()
 
 
+def test_a_training_does_not_replace_another(trained, refused):
+    folder, options = trained
+    last = folder / "checkpoints/last.ckpt"
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    refused(["fit", *options], f"{folder} holds a run already: go on with it by --ckpt_path {last}, or choose another")
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
 def test_configurations_are_found_by_name_from_any_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["config"]) == 0
