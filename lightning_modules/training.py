@@ -11,25 +11,28 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytorch_lightning as pl
 import torch
 import yaml
 from jsonargparse import ArgumentError
+from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from torch import Tensor
 
 from kornia_learnnorm.files import exclusive
-from lightning_modules.callbacks import ExpectedTime
+from lightning_modules.callbacks import Checkpoints, ExpectedTime, ExportWeights
 from lightning_modules.config_files import with_config_paths
 from lightning_modules.datamodule import CorrespondenceDataModule
+from lightning_modules.estimator_task import EstimatorTask
 from lightning_modules.task import NormalizerTask
 
 __all__ = ["TrainingCLI", "run"]
 
 
 class TrainingCLI(LightningCLI):
-    """LightningCLI that refuses a missing or foreign checkpoint before anything runs."""
+    """LightningCLI that refuses a missing or foreign checkpoint before anything runs, and always writes the weights."""
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
         """Parse the arguments; a configuration that ships with the package can be given by its name."""
@@ -37,6 +40,17 @@ class TrainingCLI(LightningCLI):
             self.config = parser.parse_args(with_config_paths(sys.argv[1:] if args is None else args))
         else:
             super().parse_arguments(parser, args)
+
+    def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
+        """Make the trainer, with checkpoints and the export of the weights where the configuration has none."""
+        config = self.config_init[self.subcommand]["trainer"]
+        callbacks = config["callbacks"] or []
+        callbacks = [*callbacks] if isinstance(callbacks, list) else [callbacks]
+        if config["enable_checkpointing"] is not False and not _has(callbacks, ModelCheckpoint):
+            callbacks.append(Checkpoints())
+        if isinstance(self.model, NormalizerTask | EstimatorTask) and not _has(callbacks, ExportWeights):
+            callbacks.append(ExportWeights())
+        return super().instantiate_trainer(callbacks=callbacks, **kwargs)
 
     def _parse_ckpt_path(self) -> None:
         """Take no configuration from a checkpoint: it could name any class to be made."""
@@ -75,6 +89,11 @@ class TrainingCLI(LightningCLI):
             )
 
     before_validate = before_test = before_predict = before_fit
+
+
+def _has(callbacks: list[Callback], kind: type[Callback]) -> bool:
+    """Return whether there is a callback of a class."""
+    return any(isinstance(callback, kind) for callback in callbacks)
 
 
 def _state_dict(path: str) -> dict[str, Tensor]:

@@ -386,6 +386,15 @@ def test_an_interrupted_training_exits_as_interrupted(tmp_path, monkeypatch, cap
     assert not Path("runs/crossview-synthetic/weights.safetensors").exists()
 
 
+@pytest.mark.parametrize("callbacks", ["null", "[{class_path: lightning_modules.callbacks.ExportWeights}]"])
+def test_a_training_writes_its_weights_once_whatever_its_callbacks(callbacks, trained, tmp_path, capsys):
+    options = [*trained[1], f"--trainer.default_root_dir={tmp_path}", f"--trainer.callbacks={callbacks}"]
+    assert main(["fit", *options]) == 0
+    assert capsys.readouterr().out.count(f"wrote {tmp_path / 'weights.safetensors'}") == 1
+    assert (tmp_path / "checkpoints/last.ckpt").is_file()
+    assert_trained(tmp_path / "weights.safetensors")
+
+
 def test_a_training_does_not_replace_another(trained, refused):
     folder, options = trained
     last = folder / "checkpoints/last.ckpt"
