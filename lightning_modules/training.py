@@ -132,9 +132,14 @@ def _short_message(message: str) -> str:
         classes = re.findall(r"Problem with given class_path '([\w.]+)'", message[: unknown.end()])
         of = f" of {classes[-1]}" if classes else ""
         return f"unknown option {unknown[1]}{of}"
-    # Of the types that were tried, the first is the one that was meant.
-    first = re.search(r"Does not validate against.*?Errors:\s*- (.*?)\n", message, flags=re.DOTALL)
-    return " ".join((first[1] if first else message).split())
+    return _first_error(message)
+
+
+def _first_error(message: str) -> str:
+    """Return, on one line, the error of the first type that jsonargparse tried: it is the one that was meant."""
+    while tried := re.search(r"Does not validate against.*?Errors:\n( *)- (.*?)\n(?:\1-|(?!\1))", message, re.DOTALL):
+        message = tried[2]
+    return " ".join(message.split())
 
 
 def run(args: list[str] | None) -> None:
@@ -164,6 +169,8 @@ def run(args: list[str] | None) -> None:
     except ArgumentError as error:
         command = next(iter(words), "fit")
         raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help lists the options") from error
+    except ValueError as error:  # of a class that was configured: its data, for example
+        raise ValueError(_first_error(str(error))) from error
     except SystemExit as error:  # Lightning exits so when it was interrupted
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from error

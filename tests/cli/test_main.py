@@ -403,6 +403,23 @@ def test_a_training_does_not_replace_another(trained, refused):
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.parametrize(
+    ("init_args", "message"),
+    [
+        ("{paths: [none.h5]}", "learnnorm fit: error: no store at none.h5\n"),
+        ("{paths: [s.h5], size: 3}", "error: a sample needs at least 8 correspondences, a block"),
+        ("{paths: [s.h5], max_ratios: 7}", "Parser key \"max_ratios\": Expected a <class 'collections.abc.Sequence'>"),
+    ],
+)
+@pytest.mark.parametrize("stage", ["train", "val"])
+def test_wrong_data_of_a_training_is_one_line(stage, init_args, message, tmp_path, monkeypatch, refused):
+    monkeypatch.chdir(tmp_path)
+    write_store(tmp_path / "s.h5", synthetic_store(pairs=1, points=40))
+    source = {"class_path": "kornia_learnnorm.data.sources.StoreSamples", "init_args": yaml.safe_load(init_args)}
+    Path("own.yaml").write_text(yaml.safe_dump({"data": {stage: source}}))
+    refused(["fit", "--config", "crossview-synthetic", "--config", "own.yaml"], message)
+
+
 def test_configurations_are_found_by_name_from_any_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["config"]) == 0
