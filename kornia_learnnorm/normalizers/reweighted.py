@@ -166,12 +166,14 @@ def _best_line(products: Tensor, w: Tensor, target: Tensor, minors: Tensor, entr
     cofactors = torch.addcmul(p * q, r, s, value=-1).index_select(0, entries)
     line = (torch.unflatten(cofactors, 0, (3, 3)) * target).sum(1)
     # Not `normalize`, whose floor leaves short lines short: from singular moments, shorter with every iteration.
-    return line / safe_divisor(line.square().sum(0).sqrt())
+    return line / safe_divisor(line.square().sum(0)).sqrt()
 
 
 def _distance_scale(normals: Tensor, share: Tensor | None) -> Tensor:
     """Return the scale from the algebraic residual to the symmetric epipolar distance, ``(N, 1, B)``."""
-    norms = normals.square().sum(0).sqrt()
+    square = normals.square().sum(0)
+    zero = square == 0
+    norms = (square + zero).sqrt() * ~zero  # the root of zero has no derivative
     norms = norms + 1e-3 * safe_divisor(_mean(norms, share))
     return norms.reciprocal().sum(1, keepdim=True)
 
