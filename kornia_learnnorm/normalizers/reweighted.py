@@ -27,6 +27,7 @@ __all__ = ["ReweightedWhitening"]
 # entries less products of two others: one factor of all six, then another, twice.
 MINORS = (3, 2, 1, 0, 1, 0, 5, 4, 4, 5, 2, 3, 4, 1, 2, 2, 0, 1, 4, 5, 3, 2, 4, 1)
 ENTRIES = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # of the whole matrix
+NORMAL_FLOOR = 1e-3  # share of the mean norm of the lines' normals, added to each against points on an epipole
 
 
 class ReweightedWhitening(ProblemNormalizer):
@@ -86,6 +87,7 @@ class ReweightedWhitening(ProblemNormalizer):
         """Return the weights of the last whitening of both views, ``(N, 2, B)``, for their points ``(2, N, 2, B)``."""
         F0 = problem.null_matrix
         weights = None if problem.weights is None else problem.weights.mT[:, None]
+        # Weights of mean values: they sum to one.
         share = None if weights is None else weights / safe_divisor(weights.sum(0))
         both = torch.stack([F0, F0.mT]).permute(2, 3, 0, 1).contiguous()
         normals = _evaluate(both[:, :2], points.flip(-2))  # of the epipolar lines in both views, (2, N, 2, B)
@@ -174,7 +176,7 @@ def _distance_scale(normals: Tensor, share: Tensor | None) -> Tensor:
     square = normals.square().sum(0)
     zero = square == 0
     norms = (square + zero).sqrt() * ~zero  # the root of zero has no derivative
-    norms = norms + 1e-3 * safe_divisor(_mean(norms, share))
+    norms = norms + NORMAL_FLOOR * safe_divisor(_mean(norms, share))
     return norms.reciprocal().sum(1, keepdim=True)
 
 
