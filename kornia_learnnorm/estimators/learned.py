@@ -335,11 +335,10 @@ class LearnedEightPoint(nn.Module):
             # The logits have no effect; through the zero, scores and weights still get their gradient of zero.
             return StageEstimate(_solve_eight(problem, frame) + 0.0 * stage.logits.sum(1)[:, None, None], stage.logits)
         weights = stage.logits.sigmoid() if given is None else stage.logits.sigmoid() * given
-        T = torch.linalg.inv_ex(frame.inverse)[0]
         F_frame = transform_fundamental(stage.F_mat, frame.inverse, frame.inverse)
         x1, x2 = convert_points_to_homogeneous(x1), convert_points_to_homogeneous(x2)
         refined = refine_weighted(x1, x2, F_frame, weights, steps)
-        F_mat = unit_fundamental(transform_fundamental(refined, T, T))
+        F_mat = unit_fundamental(transform_fundamental(refined, frame.T, frame.T))
         if given is not None:
             eight = ((given > 0).sum(1) <= 8)[:, None, None]
             F_mat = torch.where(eight, _solve_eight(problem, frame), F_mat)

@@ -30,12 +30,14 @@ class CommonFrame(NamedTuple):
     Attributes:
         x1: points of the first view, (B, N, 2).
         x2: points of the second view, (B, N, 2).
-        inverse: transform from the frame to pixels, the same for both views, (B, 3, 3).
+        T: transform from pixels to the frame, the same for both views, (B, 3, 3).
+        inverse: transform from the frame to pixels, (B, 3, 3).
         swapped: whether the canonical order of the views is the second before the first, (B,) bool.
     """
 
     x1: Tensor
     x2: Tensor
+    T: Tensor
     inverse: Tensor
     swapped: Tensor
 
@@ -54,7 +56,7 @@ class CommonFrame(NamedTuple):
         inverse = affine_transform(eye * radius, -origin / radius[:, 0])
         spreads = (_mean_distance(points1, mean1, present), _mean_distance(points2, mean2, present))
         swapped = spreads[0].detach() > spreads[1].detach()
-        return cls(transform_points(points1, T), transform_points(points2, T), inverse, swapped[:, 0])
+        return cls(transform_points(points1, T), transform_points(points2, T), T, inverse, swapped[:, 0])
 
 
 def _mean_distance(points: Tensor, origin: Tensor, present: Tensor | None) -> Tensor:

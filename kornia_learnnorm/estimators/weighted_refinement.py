@@ -14,7 +14,8 @@ from kornia_learnnorm.geometry.manifold import Rank2, decompose, retract, tangen
 
 __all__ = ["refine_weighted"]
 
-SCALE = 3.0  # of the robust loss over the geometric mean of the distances
+SCALE = 3.0  # of the robust loss over the geometric mean of the distances, corrected for the parameters
+PARAMETERS = 7  # of a fundamental matrix
 FIRST_DAMPING = 1e-3  # of the mean diagonal entry of the normal matrix, added to all in the first step
 NORMAL_FLOOR = 1e-4  # of the mean norm of the lines' normals, added to each
 DISTANCE_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
@@ -23,9 +24,10 @@ DISTANCE_FLOOR = 1e-5  # of the frame's unit, added to distances before their lo
 def refine_weighted(x1: Tensor, x2: Tensor, F_mat: Tensor, weights: Tensor, steps: int) -> Tensor:
     r"""Return matrices after steps of Levenberg-Marquardt on :math:`\sum_i w_i\, \rho(d_i / s)`.
 
-    :math:`d` are Sampson distances and :math:`\rho(u) = u^2 / (1 + u^2)` is Geman and McClure's loss; its scale
-    :math:`s` is three times the weighted geometric mean of the distances under the given matrices. A step is taken
-    where it lowers the cost.
+    :math:`d` are Sampson distances and :math:`\rho(u) = u^2 / (1 + u^2)` is Geman and McClure's loss. Its scale is
+    :math:`s = 3 \bar d \sqrt{n / (n - 7)}`, with the weighted geometric mean :math:`\bar d` of the distances under the
+    given matrices and :math:`n = (\sum_i w_i)^2 / \sum_i w_i^2` effective correspondences: a matrix of seven parameters
+    that was fitted to few of them leaves distances that are too small. A step is taken where it lowers the cost.
 
     Args:
         x1: homogeneous points of the first view with shape :math:`(B, N, 3)`, of about unit size.
@@ -40,7 +42,7 @@ def refine_weighted(x1: Tensor, x2: Tensor, F_mat: Tensor, weights: Tensor, step
     """
     state = _differentiable_state(F_mat / torch.linalg.matrix_norm(F_mat, keepdim=True))
     distance, J = _linearise(x1, x2, state.matrix(), weights)
-    scale = SCALE * _geometric_mean(distance, weights)
+    scale = SCALE * _geometric_mean(distance, weights) * _degrees_of_freedom_factor(weights)
     cost, damping = _cost(distance, weights, scale), torch.full_like(scale, FIRST_DAMPING)
     for _ in range(steps):
         moved = retract(state, _step(distance / scale, J @ tangents(state) / scale[..., None], weights, damping))
@@ -101,6 +103,17 @@ def _geometric_mean(distance: Tensor, weights: Tensor) -> Tensor:
     """Return the weighted geometric mean of distances, (B, 1)."""
     logarithm = (distance.square() + DISTANCE_FLOOR**2).log() / 2
     return weighted_mean(logarithm[..., None], weights).exp()
+
+
+def _degrees_of_freedom_factor(weights: Tensor) -> Tensor:
+    """Return the square root of the effective number of correspondences over its excess of the parameters, (B, 1).
+
+    Sets of eight effective correspondences or fewer have one degree of freedom.
+    """
+    relative = weights / safe_divisor(weights.detach().amax(1, keepdim=True))  # their squares stay within the range
+    number = relative.sum(1, keepdim=True).square() / safe_divisor(relative.square().sum(1, keepdim=True))
+    number = number.clamp(min=PARAMETERS + 1.0)
+    return (number / (number - PARAMETERS)).sqrt()
 
 
 def _cost(distance: Tensor, weights: Tensor, scale: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch.autograd import gradcheck
 from two_view import correspondences, homogeneous, scenes, signless, uniform, up_to_sign
@@ -17,19 +18,28 @@ def framed(num_points: int = 40, **options):
     return x1, x2, kln.find_fundamental(*points), uniform(6, num_points, low=0.2)
 
 
-def test_is_the_optimum_at_its_scale():
+@pytest.mark.parametrize("num_points", [12, 40])
+def test_is_the_optimum_at_its_scale(num_points):
     """Dividing a set's points by its scale gives Geman and McClure's loss at one pixel."""
-    x1, x2, F_mat, weights = framed(noise=0.3)
+    x1, x2, F_mat, weights = framed(num_points, noise=0.3)
     found = refine_weighted(x1, x2, F_mat, weights, 60)
     points1, points2 = x1[..., :2], x2[..., :2]
     distance = kln.sampson_distance(points1, points2, F_mat)
     mean = ((weights * (distance**2 + 1e-10).log() / 2).sum(1) / weights.sum(1)).exp()
-    scale = (SCALE * mean)[:, None, None]
+    effective = (weights.sum(1) ** 2 / (weights**2).sum(1)).clamp(min=8)
+    scale = (SCALE * mean * (effective / (effective - 7)).sqrt())[:, None, None]
     T = torch.diag_embed(torch.cat([scale[:, 0], scale[:, 0], torch.ones_like(scale[:, 0])], -1))
     options = {"loss": kln.GemanMcClure(1.0), "max_iterations": 200}
     expected = kln.refine_fundamental(points1 / scale, points2 / scale, T @ F_mat @ T, weights, **options).F_mat
     T = torch.linalg.inv(T)
     assert up_to_sign(found, T @ expected @ T) < 1e-4
+
+
+def test_scale_of_the_weights_has_no_effect():
+    x1, x2, F_mat, weights = framed(noise=0.3)
+    expected = refine_weighted(x1, x2, F_mat, weights, 10)
+    for factor in (1e-160, 1e150):
+        assert up_to_sign(refine_weighted(x1, x2, F_mat, factor * weights, 10), expected) < 1e-9
 
 
 def test_exact_correspondences_stay_exact():
