@@ -81,8 +81,9 @@ class AttentiveContextBlock(nn.Module):
         """Return the features after the block with shape :math:`(B, N, C)`."""
         z = self.norm(hidden)
         mean, deviation, maximum = set_statistics(z, self.attention(z), absent)
-        update = self.point(torch.cat([z, (z - mean) / deviation], -1)) + self.context(maximum)
-        out: Tensor = hidden + self.out(torch.relu(update))
+        # In place: for large batches, new memory costs more than the sums.
+        update = self.point(torch.cat([z, (z - mean) / deviation], -1)).add_(self.context(maximum)).relu_()
+        out: Tensor = self.out(update).add_(hidden)
         return out
 
 

@@ -176,7 +176,7 @@ class SetNetwork(nn.Module):
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
 
         """
-        h = self.point_stem(points) + self.set_stem(set_features)[:, None]
+        h = self.point_stem(points).add_(self.set_stem(set_features)[:, None])
         absent = None if weights is None else (weights <= 0)[..., None]
         for layer in self.layers:
             h = layer(h, absent)
@@ -197,9 +197,10 @@ class ContextLayer(nn.Module):
     def forward(self, h: Tensor, absent: Tensor | None) -> Tensor:
         """Return the features after the layer, ``(B, N, C)``."""
         z = self.norm(h)
-        hidden = self.point(z) + self.context(_maximum(z, absent))[:, None]
-        update: Tensor = self.out(torch.relu(hidden))
-        return h + update
+        # In place: for large batches, new memory costs more than the sums.
+        hidden = self.point(z).add_(self.context(_maximum(z, absent))[:, None]).relu_()
+        update: Tensor = self.out(hidden).add_(h)
+        return update
 
 
 def _maximum(h: Tensor, absent: Tensor | None) -> Tensor:
