@@ -47,7 +47,7 @@ class TwoViewEstimate(NamedTuple):
             (fewer than eight of positive weight, coincident, collinear, coplanar), it is the base normaliser's and
             carries no gradient. It is a rank test: a plane with 0.01 px of noise passes.
         gap: relative gap of the design matrix, from 0 to 1, that ``determined`` is decided on, (B,); see
-            :func:`~kornia_learnnorm.geometry.dlt.solve_null_vector`. Errors grow as its inverse.
+            :func:`~kornia_learnnorm.geometry.dlt.solve_epipolar`. Errors grow as its inverse.
     """
 
     F_mat: Tensor

@@ -5,6 +5,8 @@ Every function is batched and has derivatives that stay finite on degenerate inp
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
@@ -19,7 +21,7 @@ __all__ = [
     "null_vector",
     "sideways_null_vector",
     "smallest_right_singular_vector",
-    "solve_null_vector",
+    "solve_epipolar",
 ]
 
 MIN_GAP = 1e-6  # relative gap above which a null vector counts as unique; that of float32 pixels
@@ -49,8 +51,8 @@ def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
     """
     KORNIA_CHECK_SHAPE(x1, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(x2, ["*", "N", "3"])
-    # On a CPU, three products with a column are faster than one outer product.
-    return torch.cat([x2[..., i : i + 1] * x1 for i in range(3)], -1)
+    # On a CPU, products along the points are faster than those along the columns.
+    return (x2.mT.unsqueeze(-2) * x1.mT.unsqueeze(-3)).flatten(-3, -2).mT
 
 
 def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -67,18 +69,19 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
         unit vectors with shape :math:`(*, 9)`, sign arbitrary; without gradient where the rows are linearly dependent.
 
     """
-    return solve_null_vector(A, weights)[0]
+    return _null_vector_of_eight(A, weights)[0] if A.shape[-2] == 8 else smallest_right_singular_vector(A, weights)
 
 
-def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    r"""Return the null vector and the relative gap that tells how well the rows determine it.
+def solve_epipolar(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    r"""Return the null vector of correspondences' design matrix, and the relative gap that tells how unique it is.
 
-    Of eight rows, the gap is the smallest pivot over the largest of the LU factorisation of :math:`A^\top` with partial
-    pivoting. Of more, it is the eighth singular value of :math:`\sqrt w A` over the first. Derivatives of the null
-    vector grow as its inverse.
+    Of eight correspondences, the gap is the smallest pivot over the largest of the LU factorisation of :math:`A^\top`
+    with partial pivoting. Of more, it is the eighth singular value of :math:`\sqrt w A` over the first. Derivatives of
+    the null vector grow as its inverse.
 
     Args:
-        A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
+        x1: homogeneous points of the first view with shape :math:`(*, N, 3)`, :math:`N \ge 8`.
+        x2: homogeneous points of the second view with shape :math:`(*, N, 3)`.
         weights: optional non-negative weights with shape :math:`(*, N)`.
 
     Returns:
@@ -86,9 +89,21 @@ def solve_null_vector(A: Tensor, weights: Tensor | None = None) -> tuple[Tensor,
         without gradient.
 
     """
-    if A.shape[-2] > 8:
-        h, s = _smallest(A, weights)
-        return h, s[..., 7] / safe_divisor(s[..., 0])
+    if x1.shape[-2] == 8:
+        return _null_vector_of_eight(design_matrix(x1, x2), weights)
+
+    rows1, rows2 = x1.mT, x2.mT
+
+    def product(h: Tensor) -> Tensor:  # with derivatives by the points, without those by the nine columns
+        residual = ((torch.unflatten(h, -1, (3, 3)).mT @ rows2) * rows1).sum(-2, keepdim=True)
+        return ((rows2 * (residual if weights is None else residual * weights[..., None, :])) @ x1).flatten(-2)
+
+    h, s = _smallest(design_matrix(x1, x2), weights, product)
+    return h, s[..., 7] / safe_divisor(s[..., 0])
+
+
+def _null_vector_of_eight(A: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return null vectors (*, 9) of eight rows and relative gaps (*)."""
     if weights is not None:
         A = A * (weights > 0).to(A)[..., None]
     with torch.no_grad():
@@ -158,7 +173,7 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
 
     The eigenvectors of the Gram matrix :math:`A^\top W A` are a start, and where it has lost the digits of small
     singular values, those of the singular value decomposition of :math:`\sqrt w A`. A Newton step with the residuals
-    :math:`A v` brings the digits back, and two more, on the Gram matrix, give the derivatives. Other singular values
+    :math:`A v` brings the digits back, and two more give the derivatives. Other singular values
     may coincide, the weights may be zero, and a last singular value that is not simple sends a zero gradient instead of
     an infinite one.
 
@@ -174,26 +189,32 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
         tensor([0., 1., 0.])
 
     """
-    return _smallest(A, weights)[0]
+
+    def product(v: Tensor) -> Tensor:
+        residual = A @ v[..., None]
+        return (A.mT @ (residual if weights is None else residual * weights[..., None]))[..., 0]
+
+    return _smallest(A, weights, product)[0]
 
 
-def _smallest(A: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the vector of :func:`smallest_right_singular_vector` and all singular values of ``sqrt(weights) A``."""
-    gram = A.mT @ (A if weights is None else A * weights[..., None])
+def _smallest(A: Tensor, weights: Tensor | None, product: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Return the vector of :func:`smallest_right_singular_vector` and all singular values of ``sqrt(weights) A``.
+
+    ``product`` multiplies vectors by the Gram matrix and has the derivatives.
+    """
     with torch.no_grad():
+        gram = A.mT @ (A if weights is None else A * weights[..., None])
         s, Vh = _decompose(gram, A, weights)
         others, v = Vh[..., :-1, :], Vh[..., -1, :]
         gap = s[..., :-1].square() - s[..., -1:].square()
         simple = gap > 64 * torch.finfo(A.dtype).eps * s[..., :-1] * s[..., :1]
         inverse_gap = torch.where(simple, gap, torch.inf).reciprocal()
-        residual = A @ v[..., None]
-        gradient = (A.mT @ (residual if weights is None else residual * weights[..., None]))[..., 0]
-        v = normalize(_newton_step(v, gradient, others, inverse_gap), dim=-1)
-    if not needs_gradient(gram):
+        v = normalize(_newton_step(v, product(v), others, inverse_gap), dim=-1)
+    if not (needs_gradient(A) or (weights is not None and needs_gradient(weights))):
         return v, s
     x = v
     for _ in range(2):  # each makes the derivatives of one more order right
-        x = _newton_step(x, (gram @ x[..., None])[..., 0], others, inverse_gap)
+        x = _newton_step(x, product(x), others, inverse_gap)
     x = normalize(x, dim=-1)
     return v + (x - x.detach()), s  # the values do not depend on whether derivatives are wanted
 

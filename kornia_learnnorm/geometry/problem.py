@@ -15,7 +15,7 @@ from kornia_learnnorm.geometry.dlt import (
     design_matrix,
     independence_gap,
     sideways_null_vector,
-    solve_null_vector,
+    solve_epipolar,
 )
 from kornia_learnnorm.geometry.matrices import inverse
 from kornia_learnnorm.geometry.transforms import hartley_coordinates, transform_fundamental
@@ -64,8 +64,9 @@ class LinearProblem:
     def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> LinearProblem:
         r"""Return the problem of correspondences, in float64 where the device has it."""
         dtype = solve_dtype(points1.device)
-        points1, points2, weights = points1.to(dtype), points2.to(dtype), None if weights is None else weights.to(dtype)
-        (x1, x2), (T1, T2) = hartley_coordinates(torch.stack([points1, points2]), weights)
+        points, weights = torch.stack([points1, points2]).to(dtype), None if weights is None else weights.to(dtype)
+        (x1, x2), (T1, T2) = hartley_coordinates(points, weights)
+        points1, points2 = points
         return cls(points1, points2, weights, T1, T2, x1, x2)
 
     @property
@@ -75,7 +76,7 @@ class LinearProblem:
 
     @property
     def gap(self) -> Tensor:
-        """Relative gap that tells how well the points determine the null matrix, (B,); see ``solve_null_vector``."""
+        """Relative gap that tells how well the points determine the null matrix, (B,); see ``solve_epipolar``."""
         return self._solve()[1]
 
     @property
@@ -92,12 +93,12 @@ class LinearProblem:
 
     def _solve_between(self, x1: Tensor, x2: Tensor) -> tuple[tuple[Tensor, Tensor], bool | None]:
         """Return null matrix and gap in some coordinates, and whether all null matrices are unique."""
-        A = design_matrix(x1, x2)
-        h, gap = solve_null_vector(A, self.weights)
+        h, gap = solve_epipolar(x1, x2, self.weights)
         all_determined = read_condition((gap > MIN_GAP).all())
         if all_determined is False:
             rows = (gap <= independence_gap(gap.dtype)).nonzero()[:, 0]
-            A = A[rows] if self.weights is None else A[rows] * self.weights[rows].sqrt()[..., None]
+            A = design_matrix(x1[rows], x2[rows])
+            A = A if self.weights is None else A * self.weights[rows].sqrt()[..., None]
             h = h.index_copy(0, rows, sideways_null_vector(A))
         return (torch.unflatten(h, -1, (3, 3)), gap), all_determined
 

@@ -99,15 +99,22 @@ def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:
 
 
 def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return homogeneous points :math:`(*, N, 3)` in Hartley's coordinates, and :func:`hartley_transform`."""
-    origin = weighted_mean(points, weights)
-    centred = points - origin[..., None, :]
-    radius = weighted_mean(torch.linalg.vector_norm(centred, dim=-1, keepdim=True), weights)[..., 0]
-    scale = math.sqrt(2) / torch.where(radius > _rounding(origin), radius, math.sqrt(2))
-    shift_x, shift_y = (-scale[..., None] * origin).unbind(-1)
+    """Return homogeneous points :math:`(*, N, 3)` in Hartley's coordinates, and :func:`hartley_transform`.
+
+    The points come transposed in memory: on a CPU, one coordinate of all points is a longer run than all of one point.
+    """
+    rows = points.mT.contiguous()
+    origin = weighted_mean(rows.mT, weights)
+    centred = rows - origin[..., None]
+    least = torch.finfo(points.dtype).tiny  # so that the distance of a point at the centroid has a derivative
+    distance = (centred.square().sum(-2) + least).sqrt()
+    radius = weighted_mean(distance[..., None], weights)[..., 0]
+    scale = math.sqrt(2) / torch.where(radius > _rounding(origin) + 2 * math.sqrt(least), radius, math.sqrt(2))
+    shift_x, shift_y = (origin * -scale[..., None]).unbind(-1)
     zero, one = torch.zeros_like(scale), torch.ones_like(scale)
     entries = torch.stack([scale, zero, shift_x, zero, scale, shift_y, zero, zero, one], -1)
-    return pad(centred * scale[..., None, None], (0, 1), value=1.0), torch.unflatten(entries, -1, (3, 3))
+    homogeneous = pad(centred * scale[..., None, None], (0, 0, 0, 1), value=1.0)
+    return homogeneous.mT, torch.unflatten(entries, -1, (3, 3))
 
 
 def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: float = 1e-6) -> Tensor:
@@ -125,11 +132,11 @@ def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: fl
 
     """
     dtype = solve_dtype(points.device)
-    x, w = points.to(dtype), None if weights is None else weights.to(dtype)
-    origin = weighted_mean(x, w)
-    centred = x - origin[..., None, :]
-    products = torch.cat([centred[..., :1] * centred, centred[..., 1:] * centred], -1)
-    covariance = torch.unflatten(weighted_mean(products, w), -1, (2, 2))
+    rows, w = points.to(dtype).mT.contiguous(), None if weights is None else weights.to(dtype)
+    origin = weighted_mean(rows.mT, w)
+    x, y = (rows - origin[..., None]).unbind(-2)
+    a, b, c = weighted_mean(torch.stack([x * x, x * y, y * y], -2).mT, w).unbind(-1)
+    covariance = torch.unflatten(torch.stack([a, b, b, c], -1), -1, (2, 2))
     return whitening_from_moments(origin, covariance, floor).to(points.dtype)
 
 
