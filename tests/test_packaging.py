@@ -45,7 +45,13 @@ def test_the_wheel_has_configurations_and_weights(wheels):
     for path in (ROOT / "kornia_learnnorm/weights").iterdir():
         assert path.relative_to(ROOT).as_posix() in names
     tops = {name.partition("/")[0] for name in names}
-    assert tops == {"kornia_learnnorm", "lightning_modules", f"kornia_learnnorm-{kln.__version__}.dist-info"}
+    information = f"kornia_learnnorm-{kln.__version__}.dist-info"
+    assert tops == {"kornia_learnnorm", "lightning_modules", "kornia_learnnorm_command.py", information}
+
+
+def test_the_command_starts_where_an_interrupted_import_is_caught(wheels):
+    name = next(name for name in zipfile.ZipFile(wheels[0]).namelist() if name.endswith("entry_points.txt"))
+    assert "learnnorm = kornia_learnnorm_command:main" in zipfile.ZipFile(wheels[0]).read(name).decode()
 
 
 def test_the_wheel_finds_its_configurations_in_any_folder(wheels, tmp_path):

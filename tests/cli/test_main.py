@@ -241,6 +241,29 @@ def test_interrupted(monkeypatch, capsys):
     assert capsys.readouterr().err == "interrupted\n"
 
 
+# The console script in a process where importing one module is interrupted.
+INTERRUPTED_IMPORT = """
+import sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == sys.argv[1]:
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupting())
+import kornia_learnnorm_command
+sys.exit(kornia_learnnorm_command.main())
+"""
+
+
+@pytest.mark.parametrize("module", ["torch", "kornia", "kornia_learnnorm", "kornia_learnnorm.cli.main"])
+def test_interrupted_while_importing(module, tmp_path):
+    command = [sys.executable, "-c", INTERRUPTED_IMPORT, module]
+    environment = {**os.environ, "PYTHONPATH": str(FOLDER.parent)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
 @pytest.fixture(scope="module")
 def completion():
     """A function that returns what bash offers for a line, by the script that the package prints."""

@@ -1,0 +1,18 @@
+"""The console script ``learnnorm``: outside the package, whose import loads torch and can be interrupted as well."""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+
+def main() -> int:
+    """Run the command line and return its exit code, 130 also where Ctrl-C comes while modules are imported."""
+    try:
+        from kornia_learnnorm.cli.main import main as run
+
+        return run()
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
