@@ -16,7 +16,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := runs/demo
 SHORT := --trainer.max_steps 500 --trainer.default_root_dir $(RUN)
-WEIGHTS := --weights $(RUN)/weights.safetensors paper crossview crossview-synthetic
+WEIGHTS := --weights $(RUN)/weights.safetensors
 KITTI = "$(DATA)"/kitti/sequences/06/image_0
 
 STORES = "$(DATA)"/correspondences
@@ -107,6 +107,7 @@ INTO = --trainer.default_root_dir $(@D) $(addprefix --ckpt_path ,$(wildcard $(@D
 ABLATIONS := $(filter-out reduction-log,$(patsubst configs/ablations/%.yaml,%,$(wildcard configs/ablations/*.yaml)))
 ABLATIONS += paper-loss-sampson paper-loss-algebraic paper-reduction-log
 TABLE1 := $(patsubst configs/table1/%.yaml,%,$(wildcard configs/table1/*.yaml))
+CLOSED_FORMS := none Hartley whitening reweighted
 ABLATION_RUNS := $(ABLATIONS:%=runs/ablations/%/weights.safetensors)
 TABLE1_RUNS := $(TABLE1:%=runs/table1/%/weights.safetensors)
 LAYER_RUNS := $(patsubst configs/%.yaml,runs/%/weights.safetensors,$(wildcard configs/ablations/layer/*.yaml))
@@ -114,13 +115,13 @@ LAYER_RUNS := $(patsubst configs/%.yaml,runs/%/weights.safetensors,$(wildcard co
 
 ablations: layer-ablations $(VENV)/.ready $(ABLATION_RUNS)
 	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
-		--weights $(ABLATION_RUNS) paper crossview
+		--methods $(CLOSED_FORMS) $(ABLATION_RUNS) paper crossview searched
 
 table1: $(VENV)/.ready $(TABLE1_RUNS)
 	$(BIN)/learnnorm synthesize runs/table1 --scenes hand-held --pairs 60
 	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5@10:19 \
 		$(STORES)/tum_fr3_office_kitti_size.h5@10:19 runs/table1/synthetic.h5 \
-		--weights paper crossview $(TABLE1_RUNS)
+		--methods $(CLOSED_FORMS) paper crossview $(TABLE1_RUNS) searched
 
 layer-ablations: $(VENV)/.ready $(LAYER_RUNS)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/sizes.py $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \

@@ -16,7 +16,7 @@ __all__ = ["EXAMPLES", "add_arguments", "run"]
 
 EXAMPLES = """\
 learnnorm compare one.h5 two.h5@0:9
-learnnorm compare store.h5 --weights runs/own/weights.safetensors paper"""
+learnnorm compare store.h5 --weights runs/own/weights.safetensors"""
 
 # Error and baseline of each table.
 COMPARISONS = {

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from kornia_learnnorm.evaluation.methods import DEFAULT_METHODS, SHIPPED, default_methods
+from kornia_learnnorm.evaluation.methods import KEPT_METHODS, SHIPPED, default_methods
 from kornia_learnnorm.evaluation.report.formatting import known_parts
 from kornia_learnnorm.evaluation.runs.predict import SampleOptions
 from kornia_learnnorm.evaluation.runs.record import record_run, temporary_run
@@ -45,13 +45,13 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         nargs="+",
         help="normalisers or weights, with +LM or +optimal or without; module:Name for your own (default: none,"
-        " Hartley, whitening, reweighted, the weights, searched)",
+        f" Hartley, whitening, reweighted, {', '.join(SHIPPED)}, searched)",
     )
     parser.add_argument(
         "--weights",
         metavar="NAME_OR_PATH",
         nargs="+",
-        help=f"weights beside the methods (default without --methods: {' '.join(SHIPPED)})",
+        help="further weights; the methods or their default stay",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
     parser.add_argument(
@@ -113,12 +113,18 @@ def print_table(args: argparse.Namespace, heading: str, table: Table) -> None:
         print(f"\n{heading}\n\n{format_table(table.header, table.rows)}", flush=True)
 
 
-def run_arguments(args: argparse.Namespace, size: int) -> tuple[dict[str, str], tuple[str, ...], SampleOptions]:
-    """Return the stores by name, the names of the methods and how samples of ``size`` correspondences are drawn."""
+def run_arguments(
+    args: argparse.Namespace, size: int, *, kept: bool = False
+) -> tuple[dict[str, str], tuple[str, ...], SampleOptions]:
+    """Return the stores by name, the names of the methods and how samples of ``size`` correspondences are drawn.
+
+    A run that is ``kept`` has more default methods.
+    """
     if args.max_samples < 0:
         raise ValueError(f"--max-samples must be 0, for all, or more, got {args.max_samples}")
     stores = {name: path for path, name in names_of(args.stores).items()}
-    methods = (*args.methods, *(args.weights or ())) if args.methods else default_methods(args.weights or SHIPPED)
+    weights = args.weights or ()
+    methods = (*args.methods, *weights) if args.methods else default_methods(weights, kept=kept)
     return stores, methods, SampleOptions(size, args.seed, args.max_samples or None, args.max_residual)
 
 
@@ -132,21 +138,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="RUN",
         help="folder to keep the predictions in, with everything that learnnorm report shows; the default methods are"
-        f" then also {', '.join(DEFAULT_METHODS[len(default_methods()) :])}",
+        f" then also {', '.join(KEPT_METHODS)}",
     )
 
 
 def run(args: argparse.Namespace) -> int:
     """Make a run of predictions and print two tables per store, filtered and unfiltered."""
-    stores, methods, options = run_arguments(args, args.size)
+    stores, methods, options = run_arguments(args, args.size, kept=args.out is not None)
     with json_tables(args, [*args.stores, *(args.weights or ())]) as tables:
         if args.out is None:
             _print_tables(args, temporary_run(stores, methods, options), tables)
             return 0
         if not args.out:
             raise ValueError("--out is empty: expected a folder")
-        if not args.methods and not args.weights:
-            methods = DEFAULT_METHODS
         no_example = record_run(args.out, stores, methods, options, command=args.command_line)
         _print_tables(args, read_run(args.out), tables)
     if no_example:

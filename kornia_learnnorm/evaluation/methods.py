@@ -28,7 +28,7 @@ from kornia_learnnorm.pretrained import WEIGHTS, shipped_weights
 
 __all__ = [
     "CLOSED_FORMS",
-    "DEFAULT_METHODS",
+    "KEPT_METHODS",
     "OPTIMAL",
     "REFINED",
     "SHIPPED",
@@ -51,15 +51,21 @@ CLOSED_FORMS: dict[str, Callable[[], Normalizer]] = {
 REFINED, OPTIMAL = "+LM", "+optimal"  # suffixes of a method's name
 SHIPPED = ("paper", "crossview", "crossview-synthetic")  # weights
 UNKNOWN = "not known"  # training data
+KEPT_METHODS = ("Hartley+optimal", "Hartley+LM", "crossview+LM")  # further default methods of a run that is kept
 
 
-def default_methods(weights: Sequence[str] = SHIPPED) -> tuple[str, ...]:
-    """Return the closed forms, weights, and the search as the limit of them all."""
+def default_methods(weights: Sequence[str] = (), *, kept: bool = False) -> tuple[str, ...]:
+    """Return the names of the default methods: closed forms, weights, and the search as the limit of them all.
+
+    Args:
+        weights: names or paths of further weights; of two that have one name in tables, these replace the shipped ones.
+        kept: whether the methods are those of a run that is kept, which has :data:`KEPT_METHODS` too.
+    """
     *closed_forms, search = CLOSED_FORMS
-    return (*closed_forms, *weights, search)
-
-
-DEFAULT_METHODS = (*default_methods(), "Hartley+optimal", "Hartley+LM", "crossview+LM")  # of a run that is kept
+    given = {short_name_of(name) for name in weights}
+    shipped = [name for name in SHIPPED if name not in given]
+    further = [name for name in KEPT_METHODS if kept and base_name(name) not in given]
+    return (*closed_forms, *shipped, *weights, search, *further)
 
 
 class Method(NamedTuple):

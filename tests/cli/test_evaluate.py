@@ -20,7 +20,8 @@ from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.tables import Table, tables_as_json
 from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
 
-METHODS = ["none", "Hartley", "whitening", "reweighted", "tilted", "crossview", "searched"]
+METHODS = ["none", "Hartley", "whitening", "reweighted", "paper", "crossview-synthetic"]
+METHODS += ["tilted", "crossview", "searched"]
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +135,21 @@ def test_evaluate_prints_the_same_with_and_without_a_folder(folder, tmp_path, ca
     assert [[*rows] for _, rows in read] == [["none", "whitening"]] * 2
     # There is neither Hartley nor ground truth.
     assert [header for header, _ in read] == [["method", "than whitening %", "mean px", "median px"]] * 2
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_weights_are_added_to_the_default_methods(folder, tmp_path, capsys, kept):
+    def methods(out, *options):
+        options = [*options, "--out", str(tmp_path / out)] if kept else options
+        assert main(["evaluate", str(folder / "known.h5"), "--max-samples", "8", *options]) == 0
+        return [[*rows] for _, rows in read_tables(capsys.readouterr().out).values()]
+
+    default = methods("default")
+    added = methods("added", "--weights", str(folder / "tilted/weights.safetensors"))
+    for before, after in zip(default, added, strict=True):
+        assert [name for name in after if name != "tilted"] == before
+        assert {"Hartley", "paper", "crossview", "searched"} < {*before}
+        assert "tilted" in after
 
 
 @pytest.mark.parametrize("size", [8, 20])

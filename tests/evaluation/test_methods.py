@@ -68,7 +68,14 @@ def test_names(tmp_path):
     assert short_names([path, path + "+LM", "paper"]) == {path: "mine", path + "+LM": "mine+LM", "paper": "paper"}
     assert identify_method("paper").startswith("paper ")
     assert identify_method("Hartley+LM") == "Hartley+LM"
-    assert default_methods(["my"]) == ("none", "Hartley", "whitening", "reweighted", "my", "searched")
+    closed_forms = ("none", "Hartley", "whitening", "reweighted")
+    assert default_methods() == (*closed_forms, *SHIPPED, "searched")
+    assert default_methods([path]) == (*closed_forms, *SHIPPED, path, "searched")
+    further = ("Hartley+optimal", "Hartley+LM")
+    assert default_methods(kept=True) == (*default_methods(), *further, "crossview+LM")
+    own = "runs/crossview/weights.safetensors"  # tables have room for one of a name
+    replaced = (*closed_forms, "paper", "crossview-synthetic", own, "searched", *further)
+    assert default_methods([own], kept=True) == replaced
     with pytest.raises(ValueError, match="same name"):
         short_names([path, path])
 
