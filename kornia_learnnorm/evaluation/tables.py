@@ -38,9 +38,9 @@ HEADER = (
 DIAGNOSTICS = ("method", "condition number", "rho", "distance 1", "distance 2", "error due to rank 2 %")
 
 _NUMBER = r"([+-]?\d+(?:\.\d*)?(?:e[+-]?\d+)?)"
-# A number; its interval and p-value, - for too few image pairs, or the standard deviation of a run's mean; * for a
+# A number; its interval and p-value, or the standard deviation of a run's mean; * for a
 # store that was trained on.
-CELL = re.compile(rf"{_NUMBER}(?: \[{_NUMBER}, {_NUMBER}\](?:, (?:-|(?:< )?{_NUMBER}))?)?(?: ± {_NUMBER})?( \*)?")
+CELL = re.compile(rf"{_NUMBER}(?: \[{_NUMBER}, {_NUMBER}\](?:, (?:< )?{_NUMBER})?)?(?: ± {_NUMBER})?( \*)?")
 PARTS = ("value", "low", "high", "p", "std", "trained_on")
 
 Predictions = Mapping[str, Mapping[str, Tensor]]

@@ -16,7 +16,7 @@ def bootstrap_interval(
     """Return the percentile bootstrap interval of a mean whose samples come in groups.
 
     Samples of one image pair share its motion and scene, so the groups are drawn with replacement, each with all its
-    samples (the cluster bootstrap).
+    samples (the cluster bootstrap). The interval of few groups is too narrow; reports have none for fewer than eight.
 
     Args:
         values: one value per sample with shape (S,).

@@ -26,9 +26,9 @@ METHODS += ["tilted", "crossview", "searched"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Stores of three pairs, with and without ground truth, and weights whose rates are neither 0 nor 100."""
+    """Stores of nine pairs, with and without ground truth, and weights whose rates are neither 0 nor 100."""
     folder = tmp_path_factory.mktemp("compared")
-    store = synthetic_store(pairs=1, points=90)
+    store = synthetic_store(pairs=3, points=90)
     write_store(folder / "known.h5", store)
     write_store(folder / "unknown.h5", replace(store, F=np.full_like(store.F, np.nan)))
     for name in ("other", "tilted"):
@@ -75,27 +75,39 @@ def errors_by_hand(folder, samples):
 
 
 def test_compare(folder, capsys):
-    stores = [str(folder / store) for store in ("known.h5", "known.h5@1:2", "unknown.h5")]
+    stores = [str(folder / store) for store in ("known.h5", "known.h5@1:8", "unknown.h5")]
     weights = [str(folder / "tilted/weights.safetensors"), "crossview"]
     assert main(["compare", *stores, "--weights", *weights]) == 0
-    tables = read_tables(capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    assert printed.endswith("fewer than 8 pairs have none\n")
+    tables = read_tables(printed)
     assert list(tables) == ["better than Hartley %", "better than whitening %", "ground truth: better than Hartley %"]
-    drawn = [samples_of(folder, "known.h5"), samples_of(folder, "known.h5@1:2")]
+    drawn = [samples_of(folder, "known.h5"), samples_of(folder, "known.h5@1:8")]
     counts = [f"{len(kept.pair)} of {number} samples" for kept, number in drawn]
-    columns = [f"known: {counts[0]}, 3 pairs", f"known@1:2: {counts[1]}, 1 pair", f"unknown: {counts[0]}, 3 pairs"]
+    columns = [f"known: {counts[0]}, 9 pairs", f"known@1:8: {counts[1]}, 7 pairs", f"unknown: {counts[0]}, 9 pairs"]
     for title, (header, rows) in tables.items():
-        assert header == ["method", *columns]
-        assert list(rows) == METHODS
-        for method, (three, one, unknown) in rows.items():
-            if title.endswith(f"{method} %"):
-                assert three == one == unknown == "-"
-                continue
-            rate, low, high = map(float, three.replace("[", "").replace("]", "").replace(",", "").split())
+        truth = title.startswith("ground truth")
+        assert header == ["method", *columns[: 2 if truth else 3]]
+        assert list(rows) == [name for name in METHODS if not title.endswith(f"{name} %")]
+        for nine, seven, *unknown in rows.values():
+            rate, low, high = map(float, nine.replace("[", "").replace("]", "").replace(",", "").split())
             assert 0 <= low <= rate <= high <= 100
-            assert 0 <= float(one) <= 100  # of one pair there is no interval
-            assert unknown == ("-" if title.startswith("ground truth") else three)
+            assert 0 <= float(seven) <= 100  # too few pairs for an interval
+            assert unknown == ([] if truth else [nine])
     for baseline in ("Hartley", "whitening"):
         assert tables[f"better than {baseline} %"][1]["searched"][:2] == ["100.0 [100.0, 100.0]", "100.0"]
+
+
+def test_compare_leaves_out_what_has_no_number(folder, tmp_path, capsys, refused):
+    command = ["compare", str(folder / "unknown.h5"), "--methods"]
+    assert main([*command, "none", "whitening"]) == 0
+    ((title, (_, rows)),) = read_tables(capsys.readouterr().out).items()
+    assert title == "better than whitening %"
+    assert list(rows) == ["none"]
+    for methods in (["none", "crossview"], ["Hartley"]):
+        expected = f"expected Hartley or whitening and methods to compare with it, got {' '.join(methods)}"
+        refused([*command, *methods, "--json", tmp_path / "tables.json"], expected)
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_the_commands_agree_with_a_computation_by_hand(folder, capsys):
@@ -227,7 +239,7 @@ def test_without_ground_truth_there_are_no_columns_of_it(folder, capsys):
 
 def test_cells_as_json():
     cells = ["", "-", "12", "+1.50", "2.5e+06", "1.5 [1.2, +2.0]", "-3.0 [-4.0, -2.0], < 0.001", "7.00 ± 0.10"]
-    cells += ["99.9 *", "99.9 [99.0, 100.0] *", "2 [1, 3], -", "kitti_00, kitti_01", "inf"]
+    cells += ["99.9 *", "99.9 [99.0, 100.0] *", "2 [1, 3]", "kitti_00, kitti_01", "inf"]
     (row,) = json.loads(tables_as_json("", [Table("", "", ["name", *map(str, range(13))], [["12", *cells]])]))[
         "tables"
     ][0]["rows"]
@@ -246,7 +258,7 @@ def test_cells_as_json():
         (["known.h5"], ["Hartley.safetensors"], "two methods have the same name, Hartley: "),
         (["known.h5", "other/known.h5"], ["tilted"], "two files have the same name, known: "),
         (["known.h5", "none.h5"], ["tilted"], "no store at"),
-        (["known.h5", "known.h5@2:9"], ["tilted"], "pairs 2:9 were asked for, the store has 0:3"),
+        (["known.h5", "known.h5@2:19"], ["tilted"], "pairs 2:19 were asked for, the store has 0:9"),
         (["known.h5", "known.h5@2"], ["tilted"], "FILE.h5@FIRST:STOP"),
         (["known.h5"], ["tilted", "nothing"], "no weights"),
         (["known.h5"], ["known.h5"], "no weights"),

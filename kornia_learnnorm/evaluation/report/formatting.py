@@ -17,8 +17,8 @@ from kornia_learnnorm.metrics.summary import median
 
 __all__ = [
     "BASELINE",
+    "MIN_BOOTSTRAP_PAIRS",
     "MIN_P_VALUE",
-    "MIN_TESTED_PAIRS",
     "POSE_HEADER",
     "RESAMPLES",
     "known_parts",
@@ -34,7 +34,7 @@ __all__ = [
 BASELINE = "Hartley"  # the method that all others are compared with
 RESAMPLES = 2000  # bootstrap resamples of a paired test
 MIN_P_VALUE = 1e-3  # the smallest p-value that these resamples can resolve
-MIN_TESTED_PAIRS = 8  # image pairs; a bootstrap over fewer gives intervals that are too narrow, and no p-value
+MIN_BOOTSTRAP_PAIRS = 8  # image pairs; a bootstrap over fewer is too narrow: no interval, no p-value
 POSE_HEADER = ("AUC@5", "AUC@10", "AUC@20", "mAA(10)")
 
 
@@ -72,13 +72,20 @@ def median_text(values: Tensor, spec: str = ".3f") -> str:
 def mean_text(values: Tensor, pair: Tensor) -> str:
     """Return the mean of shares (S,) with its 95 % bootstrap interval over image pairs, %.
 
-    NaN is left out. There is no interval if all shares are of one pair, and no text if there are no shares.
+    NaN is left out. There is no interval of fewer than :data:`MIN_BOOTSTRAP_PAIRS` pairs, and no text without shares.
+
+    Example:
+        >>> mean_text(torch.tensor([1.0, 0.0]), torch.tensor([0, 1]))
+        '50.0'
+        >>> mean_text(torch.ones(8), torch.arange(8))
+        '100.0 [100.0, 100.0]'
+
     """
     values, pair = values[~values.isnan()], pair[~values.isnan()]
     if len(values) == 0:
         return ""
     mean = f"{100 * values.mean().item():.1f}"
-    if len(torch.unique(pair)) < 2:
+    if len(torch.unique(pair)) < MIN_BOOTSTRAP_PAIRS:
         return mean
     low, high = bootstrap_interval(values, pair)
     return f"{mean} [{100 * low:.1f}, {100 * high:.1f}]"
@@ -103,18 +110,17 @@ def paired_text(
     """Return the mean difference of two methods with its 95 % interval and p-value, from a paired bootstrap over pairs.
 
     Without ``pair`` each number is of its own pair. ``show`` formats the mean and the ends of the interval. The text is
-    empty if fewer than two pairs have a finite difference, and the p-value is ``-`` if fewer than
-    :data:`MIN_TESTED_PAIRS` have.
+    empty if no pair has a finite difference, and the mean alone if fewer than :data:`MIN_BOOTSTRAP_PAIRS` have.
     """
     pair = torch.arange(len(values)) if pair is None else pair
     valid = (values - baseline).isfinite()
-    pairs = len(torch.unique(pair[valid]))
-    if pairs < 2:
+    if not valid.any():
         return ""
+    if len(torch.unique(pair[valid])) < MIN_BOOTSTRAP_PAIRS:
+        return show((values - baseline)[valid].mean().item())
     found = paired_bootstrap(values[valid], baseline[valid], pair[valid], draws=RESAMPLES)
     text = f"{show(found.mean)} [{show(found.low)}, {show(found.high)}]"
     p_value = f"< {MIN_P_VALUE:g}" if found.p_value < MIN_P_VALUE else f"{found.p_value:.3f}"
-    p_value = p_value if pairs >= MIN_TESTED_PAIRS else "-"
     return f"{text}, {p_value}" if with_p_value else text
 
 

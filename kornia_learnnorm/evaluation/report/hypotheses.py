@@ -7,7 +7,7 @@ from math import nan
 
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.formatting import BASELINE, number_text, paired_text
+from kornia_learnnorm.evaluation.report.formatting import BASELINE, MIN_BOOTSTRAP_PAIRS, number_text, paired_text
 from kornia_learnnorm.evaluation.report.style import (
     Picture,
     line_style,
@@ -89,7 +89,8 @@ def _tests(cell: RobustCell) -> list[Table]:
     ]
     text = (
         f"Difference of both errors from those of {BASELINE}'s normalisation, on the samples that both have solved, "
-        "px, with the 95 % interval of a paired bootstrap over image pairs. Negative is better."
+        "px, with the 95 % interval of a paired bootstrap over image pairs; fewer than "
+        f"{MIN_BOOTSTRAP_PAIRS} pairs have none. Negative is better."
     )
     header = ["solver", "error", *(f"k = {number}" for number in TESTED)]
     return [Table(f"Hypotheses against {BASELINE}'s: {cell.title}", text, header, rows)]

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 
-from kornia_learnnorm.evaluation.report.formatting import BASELINE, rate_text
+from kornia_learnnorm.evaluation.report.formatting import BASELINE, MIN_BOOTSTRAP_PAIRS, rate_text
 from kornia_learnnorm.evaluation.runs.run import Cell, Run
 from kornia_learnnorm.evaluation.tables import Table
 from kornia_learnnorm.metrics.better_rate import better_rate
@@ -82,10 +82,11 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     ties, degenerate = sum(rate.ties for rate in found), sum(rate.degenerate for rate in found)
     text = (
         f"Share of samples of {run.about['size']} correspondences with a smaller mean symmetric epipolar distance than "
-        f"under {baseline}, %, with the 95 % bootstrap interval over image pairs. An asterisk marks a method that was "
-        f"trained on pairs of the store. The whole table has {ties} ties, which count as not better, and leaves out "
-        f"{degenerate} degenerate comparisons. The header gives the number of samples used and drawn; samples with a "
-        "mean symmetric epipolar distance under the eight-point algorithm without normalisation of "
+        f"under {baseline}, %, with the 95 % bootstrap interval over image pairs; fewer than {MIN_BOOTSTRAP_PAIRS} "
+        "pairs have no interval. An asterisk marks a method that was trained on pairs of the store. The whole table "
+        f"has {ties} ties, which count as not better, and leaves out {degenerate} degenerate comparisons. The header "
+        "gives the number of samples used and drawn; samples with a mean symmetric epipolar distance under the "
+        "eight-point algorithm without normalisation of "
         f"{run.about['max_residual']:g} px or more are not used."
     )
     if protocol == "filtered":

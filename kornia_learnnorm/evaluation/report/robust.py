@@ -8,7 +8,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.report.formatting import (
-    MIN_TESTED_PAIRS,
+    MIN_BOOTSTRAP_PAIRS,
     POSE_HEADER,
     median_text,
     number_text,
@@ -163,7 +163,7 @@ def _tests(cell: RobustCell) -> list[Table]:
     text = (
         "Change of the mean against another estimator, in percentage points and in px, with the 95 % interval and "
         "two-sided p-value of a paired bootstrap over image pairs; fewer than "
-        f"{MIN_TESTED_PAIRS} pairs have no p-value. The mean of a pair is over the runs that both "
+        f"{MIN_BOOTSTRAP_PAIRS} pairs have neither. The mean of a pair is over the runs that both "
         "estimators have. More inliers, a higher F1 and a smaller error are better."
     )
     return [Table(f"Paired tests of robust estimation: {cell.title}", text, header, rows)] if rows else []

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.report.formatting import (
     BASELINE,
-    MIN_TESTED_PAIRS,
+    MIN_BOOTSTRAP_PAIRS,
     RESAMPLES,
     median_text,
     percent_change,
@@ -69,7 +69,7 @@ def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> 
     winner, *others = sorted(values, key=lambda name: math.inf if math.isnan(values[name]) else values[name])
     differences = {}
     pairs = len(torch.unique(pair[valid]))
-    if pairs >= MIN_TESTED_PAIRS:
+    if pairs >= MIN_BOOTSTRAP_PAIRS:
         mine = scores[winner][valid]
         differences = {
             name: paired_bootstrap(mine, scores[name][valid], pair[valid], draws=RESAMPLES) for name in others
@@ -114,7 +114,8 @@ def _level(ranking: _Ranking) -> str:
         return " There is nothing to test it against."
     if not ranking.against:
         count = f"{ranking.pairs} image pair{'s' * (ranking.pairs != 1)}"
-        return f" Not tested: there {'is' if ranking.pairs == 1 else 'are'} {count}, a test needs {MIN_TESTED_PAIRS}."
+        verb = "is" if ranking.pairs == 1 else "are"
+        return f" Not tested: there {verb} {count}, a test needs {MIN_BOOTSTRAP_PAIRS}."
     return f" Level with it: {_names(ranking.level)}." if ranking.level else ""
 
 

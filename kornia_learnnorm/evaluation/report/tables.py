@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.report.formatting import (
     BASELINE,
+    MIN_BOOTSTRAP_PAIRS,
     MIN_P_VALUE,
-    MIN_TESTED_PAIRS,
     POSE_HEADER,
     RESAMPLES,
     mean_text,
@@ -123,8 +123,8 @@ def _consensus(cell: Cell, run: Run) -> Table:
     dropped = " and ".join(f"{int((~keep).sum())} at {t:g} px" for t, keep in zip(THRESHOLDS, known.T, strict=True))
     text = (
         f"Each sample's matrix on all matches of its pair {kind}: mean over samples with the 95 % bootstrap interval "
-        "over image pairs. `inliers` is the share of the matches with a symmetric epipolar distance below the "
-        "threshold."
+        f"over image pairs; fewer than {MIN_BOOTSTRAP_PAIRS} pairs have no interval. `inliers` is the share of the "
+        "matches with a symmetric epipolar distance below the threshold."
     )
     if truth:
         text += (
@@ -163,7 +163,7 @@ def _tests(cell: Cell) -> Table:
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "
         f"p-value of a paired bootstrap over image pairs with {RESAMPLES:,} resamples, which cannot resolve p-values "
-        f"below {MIN_P_VALUE:g}; fewer than {MIN_TESTED_PAIRS} pairs have no p-value. Negative is better. `own` and "
+        f"below {MIN_P_VALUE:g}; fewer than {MIN_BOOTSTRAP_PAIRS} pairs have neither. Negative is better. `own` and "
         f"`held out` use {_count(cell.pair)}"
     )
     truth = cell.pair[_with_truth(cell)]
@@ -195,7 +195,8 @@ def by_motion(cell: Cell, run: Run, learned: str) -> Table:
     text = (
         f"Better rate of `{learned}` against {BASELINE} in the halves of the image pairs below and above the median of "
         "each motion. `with truth` is the number of samples whose pair has ground-truth inliers; the last column is "
-        "the rate on them. A rate of one pair has no interval."
+        "the rate on them. In brackets is the 95 % bootstrap interval over image pairs; fewer than "
+        f"{MIN_BOOTSTRAP_PAIRS} pairs have none."
     )
     if left_out:
         text += f" Not shown: {'; '.join(left_out)}."
