@@ -13,6 +13,7 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks import Callback, ModelCheckpoint
+from pytorch_lightning.trainer.states import TrainerFn
 from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import save_file
 from torch import Tensor, distributed
@@ -67,6 +68,8 @@ class Checkpoints(ModelCheckpoint):
         """Say how an interrupted run can be resumed."""
         super().on_exception(trainer, pl_module, exception)
         self._restore_handler()
+        if trainer.state.fn != TrainerFn.FITTING:
+            return
         last = self.last_model_path
         how = f"to go on, repeat the command with --ckpt_path {last}" if last else "no checkpoint was written"
         rank_zero_info(f"stopped at step {trainer.global_step}; {how}")

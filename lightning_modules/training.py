@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import sys
@@ -17,6 +18,7 @@ import pytorch_lightning as pl
 import torch
 import yaml
 from jsonargparse import ArgumentError
+from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from torch import Tensor
@@ -29,6 +31,14 @@ from lightning_modules.estimator_task import EstimatorTask
 from lightning_modules.task import NormalizerTask
 
 __all__ = ["TrainingCLI", "run"]
+
+# What Lightning prints of devices, of which a line of ours names the one that is used, and its advertisements.
+UNWANTED_MESSAGE = re.compile(r"(GPU|TPU|HPU) available: |LOCAL_RANK: |\W*Tip: For seamless")
+UNWANTED_WARNINGS = (
+    ".*treespec, LeafSpec.*",  # Lightning's own call of torch
+    ".*smaller than the logging interval.*",  # the interval counts the steps of all epochs
+    "Checkpoint directory .* exists and is not empty.*",  # it is that of the run that goes on
+)
 
 
 class TrainingCLI(LightningCLI):
@@ -111,6 +121,11 @@ def _state_dict(path: str) -> dict[str, Tensor]:
     return dict(state)
 
 
+def _is_wanted(record: logging.LogRecord) -> bool:
+    """Return whether a message of Lightning concerns who trains."""
+    return not UNWANTED_MESSAGE.match(record.getMessage())
+
+
 def _names_its_classes(args: Sequence[str]) -> bool:
     """Return whether a configuration among the arguments names the classes of its task and datamodule."""
     files = [value for key, value in pairwise(args) if key in ("-c", "--config")]
@@ -151,7 +166,9 @@ def run(args: list[str] | None) -> None:
 
     """
     words = with_config_paths(sys.argv[1:] if args is None else args)
-    warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")  # Lightning's own call of torch
+    for message in UNWANTED_WARNINGS:
+        warnings.filterwarnings("ignore", message=message)
+    logging.getLogger("pytorch_lightning.utilities.rank_zero").addFilter(_is_wanted)
     named = _names_its_classes(words)
     raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines
     try:
@@ -171,6 +188,8 @@ def run(args: list[str] | None) -> None:
         raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help lists the options") from error
     except ValueError as error:  # of a class that was configured: its data, for example
         raise ValueError(_first_error(str(error))) from error
+    except MisconfigurationException as error:  # such as a test of an estimator, whose task has none
+        raise ValueError(str(error)) from error
     except SystemExit as error:  # Lightning exits so when it was interrupted
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from error

@@ -15,6 +15,7 @@ import pytest
 import torch
 import train_processes
 import yaml
+from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
@@ -98,7 +99,7 @@ def test_every_config_runs(config, data, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("name", ["robust-synthetic", "robust"])
-def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch, capsys):
+def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch, capsys, refused):
     if name == "robust":  # it names pairs of the real stores
         monkeypatch.setenv("LEARNNORM_DATA", str(request.getfixturevalue("real_data")))
     config = ["--config", str(FOLDER / f"{name}.yaml")]
@@ -108,8 +109,10 @@ def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch,
     layer = kln.LearnedEightPoint.from_pretrained(tmp_path / "weights.safetensors")
     assert "synthetic scenes" in layer.trained_on
     assert all(bool(value.any()) for key, value in layer.state_dict().items() if "logit.weight" in key)
-    assert main(["validate", *config, f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"]) == 0
+    checkpoint = f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"
+    assert main(["validate", *config, checkpoint]) == 0
     assert "val/median" in capsys.readouterr().out
+    refused(["test", *config, checkpoint], "No `test_step()` method defined")
 
 
 def together(configs):
@@ -389,6 +392,12 @@ def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog):
         assert main(["fit", "--config=crossview-synthetic", *options, f"--trainer.default_root_dir={tmp_path}"]) == 0
     assert f"device cpu, 13 steps; results in {tmp_path}" in caplog.messages
     assert [text for text in caplog.messages if re.fullmatch(r"about \d+ s for the remaining 2 steps, .*", text)]
+    # Lightning's lines of other devices and of products are left out.
+    assert [text for text in caplog.messages if re.search("available|Tip", text)] == []
+    rank_zero_info("GPU available: False, used: False")
+    rank_zero_info("GPU memory is full")
+    assert caplog.messages[-1] == "GPU memory is full"
+    assert "GPU available: False, used: False" not in caplog.messages
 
 
 @pytest.mark.parametrize(
