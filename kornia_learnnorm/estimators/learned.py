@@ -103,7 +103,8 @@ class LearnedEightPoint(nn.Module):
 
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
     their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
-    eight more than 1 % of their mean distance from the centroid away: some of them are outliers then.
+    eight more than 1 % of their mean distance from the centroid away: some of them are outliers then. The networks
+    get a gradient of zero.
 
     The order of the correspondences has no effect. Swapping the views gives :math:`F^\top` up to sign. Moving both
     images by one translation and scaling them by one factor moves :math:`F` along; rotations and different factors are
@@ -113,7 +114,8 @@ class LearnedEightPoint(nn.Module):
         width: channels of the networks.
         depth: blocks of each stage's network.
         stages: number of stages.
-        learn_transforms: predict transforms; without, they are Hartley's of the weighted points.
+        learn_transforms: predict transforms; without, they are Hartley's of the weighted points, and the heads of the
+            networks get no gradient (``find_unused_parameters=True`` of DistributedDataParallel).
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
         refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
 
@@ -332,8 +334,8 @@ class LearnedEightPoint(nn.Module):
         """Return a stage's matrices after robust refinement; for eight matches, those of :func:`_solve_eight`."""
         given, x1, x2 = problem.weights, frame.x1, frame.x2
         if x1.shape[1] == 8:
-            # The logits have no effect; through the zero, scores and weights still get their gradient of zero.
-            return StageEstimate(_solve_eight(problem, frame) + 0.0 * stage.logits.sum(1)[:, None, None], stage.logits)
+            # The stage has no effect; through the zero, its network, scores and weights still get a gradient of zero.
+            return StageEstimate(_solve_eight(problem, frame) + 0.0 * stage.F_mat, stage.logits)
         weights = stage.logits.sigmoid() if given is None else stage.logits.sigmoid() * given
         F_frame = transform_fundamental(stage.F_mat, frame.inverse, frame.inverse)
         x1, x2 = convert_points_to_homogeneous(x1), convert_points_to_homogeneous(x2)

@@ -69,6 +69,16 @@ class TestSmallSets:
         assert up_to_sign(found[fits], optimal[fits]) < 1e-9
         assert up_to_sign(found[~fits], hartley[~fits]) < 1e-9
 
+    @pytest.mark.parametrize("options", [{}, {"rank2": "optimal"}, {"refine_steps": 0}])
+    @pytest.mark.parametrize("number", [8, 9])
+    def test_every_parameter_gets_a_gradient(self, number, options):
+        """Otherwise DistributedDataParallel waits for the gradients that are missing."""
+        layer = shaken_double(**options)
+        signless(layer(*correspondences("handheld", 3, number))).sum().backward()
+        gradients = torch.cat([parameter.grad.flatten() for parameter in layer.parameters()])
+        assert gradients.isfinite().all()
+        assert bool(gradients.any()) == (number > 8)
+
     def test_an_untrained_layer_is_hartleys(self):
         points = correspondences("handheld", 5, 20)
         layer = kln.LearnedEightPoint(width=16, depth=1, stages=1, refine_steps=0)
