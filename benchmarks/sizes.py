@@ -177,24 +177,29 @@ def table(results: dict[str, dict[str, list[float]]], sizes: list[int], column: 
 
 
 def draw(everything: dict[str, dict], path: str) -> None:
-    """Draw the error against the number of matches, a panel for each store and protocol."""
+    """Draw the error against the number of matches, a panel for each store and protocol, to be read at 400 pixels."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.2 * len(everything), 4.2), layout="constrained")
-    axes = figure.subplots(1, len(everything), sharey=True, squeeze=False)[0]
-    for axis, (title, results) in zip(axes, everything.items(), strict=True):
+    columns = min(2, len(everything))
+    rows = -(-len(everything) // columns)
+    figure = Figure(figsize=(6.4, 1.6 + 2.5 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axis, (title, results) in zip(axes.flat, everything.items(), strict=False):
         for index, name in enumerate(name for name in DRAWN if name in results):
             sizes = sorted(map(int, results[name]))
             style = {"color": f"C{index % 10}", "linewidth": 2.4 if name.startswith("learned") else 1.2}
             axis.plot(sizes, [results[name][str(size)][0] for size in sizes], ".-", label=name, **style)
-        axis.set(title=title, xscale="log", yscale="log", xlabel="matches in the set", ylim=(0.1, 200))
+        axis.set(title=title, xscale="log", yscale="log", ylim=(0.1, 200))
         axis.set_xticks(sizes, [str(size) for size in sizes])
         axis.minorticks_off()
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("median error of true inliers, px")
-    axes[-1].legend(fontsize=7)
+    for axis in axes[-1]:
+        axis.set_xlabel("matches in the set", fontsize=11)
+    figure.supylabel("median error of true inliers, px", fontsize=11)
+    handles = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, fontsize=11)
     with atomic_write(path) as beside:
-        figure.savefig(beside, dpi=150, format=Path(path).suffix[1:])
+        figure.savefig(beside, dpi=200, format=Path(path).suffix[1:])
 
 
 def main() -> None:

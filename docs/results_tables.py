@@ -47,6 +47,16 @@ ESTIMATORS = {  # as benchmarks/sizes.py names them, and how they are drawn
 }
 
 
+LAYERS = {  # as benchmarks/speed.py names them
+    "Kornia": "kornia",
+    "Hartley": "Hartley",
+    '`rank2="optimal"`': "optimal",
+    "`crossview`": "crossview",
+    "`LearnedEightPoint`": "learned",
+}
+CASES = ("1 x 8", "64 x 8", "1 x 128", "32 x 128", "1 x 512", "32 x 512")  # batch x correspondences
+
+
 def read_rows(name: str) -> list[list[str]]:
     """Return the rows of a file of results, the header first."""
     with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as file:
@@ -57,6 +67,18 @@ def table(name: str) -> Markdown:
     """Return a file of results as a table."""
     header, *rows = read_rows(name)
     return Markdown(format_table(header, rows))
+
+
+def layer_times() -> Markdown:
+    """Return the milliseconds of one forward and backward pass of the layers, and their ratios to Kornia's solver."""
+    found = json.loads((RESULTS / "speed.json").read_text(encoding="utf-8"))
+    cells: dict[tuple[str, str], str] = {}
+    for part in ("sets of eight", "larger sets", "larger sets with outliers"):
+        for case, times in found[f"{part}, forward and backward"].items():
+            for method, time in times.items():
+                cells.setdefault((method, case), f"{time:.3g} ({time / times['kornia']:.1f})")
+    rows = [[name, *(cells.get((method, case), "-") for case in CASES)] for name, method in LAYERS.items()]
+    return Markdown(format_table(["ms (ratio to Kornia's)", *CASES], rows))
 
 
 def read_sizes() -> dict[str, dict[str, dict[str, list[float]]]]:
