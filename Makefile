@@ -125,7 +125,8 @@ table1: $(VENV)/.ready $(TABLE1_RUNS)
 
 layer-ablations: $(VENV)/.ready $(LAYER_RUNS)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/sizes.py $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
-		--sets 512 --methods RANSAC $(addprefix learned:,$(LAYER_RUNS)) learned:runs/ablations/layer/base/weights.safetensors+scores
+		--methods RANSAC $(addprefix learned:,$(LAYER_RUNS)) \
+		$(patsubst %,learned:runs/ablations/layer/%/weights.safetensors+scores,base scoreless)
 
 LAYER_BASE = --config configs/robust.yaml --config configs/ablations/layer/base.yaml
 runs/ablations/layer/%/weights.safetensors: | $(VENV)/.ready

@@ -58,6 +58,12 @@ def test_links_lead_to_files_that_read_well_without_the_site():
             assert not re.search(SITE_ONLY, path.read_text(encoding="utf-8")), link
 
 
+def test_named_pages_of_the_documentation_exist():
+    pages = re.findall(r"`([\w/-]+)\.html`", README)
+    assert len(pages) > 6
+    assert [page for page in pages if not (ROOT / f"docs/{page}.md").is_file()] == []
+
+
 def test_results_are_those_of_the_documentation():
     table = re.search(r"## Results\n(.*?)\n## ", README, flags=re.DOTALL)[1]
     rows = dict(re.findall(r"^\| (.+?) \| (\d.*) \|$", table, flags=re.MULTILINE))
