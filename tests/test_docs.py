@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from kornia_learnnorm.evaluation.report.rates import PRINTED
+
 nbformat = pytest.importorskip("nbformat")
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = {path: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
@@ -18,6 +20,11 @@ RESULTS = sorted(path for path in (DOCS / "results").iterdir() if path.suffix !=
 COMMANDS = tomllib.loads((DOCS / "results/commands.toml").read_text(encoding="utf-8"))
 CARDS = sorted((DOCS.parent / "kornia_learnnorm/weights").glob("*.md"))
 EIGHTS = [f"benchmarks-{store}-{protocol}" for store in ("kitti", "tum") for protocol in ("filtered", "unfiltered")]
+NOT_PROSE = re.compile(r"^```.*?^```|^(?:\||    ).*?$|`[^`]*`|\$[^$]*\$", flags=re.DOTALL | re.MULTILINE)
+# Three decimals are errors in pixels; two digits and a decimal are percentages on the pages that discuss rates.
+MEASURED = dict.fromkeys(("ablations.md", "paper.md"), r"\d+\.\d{3}|\d\d\.\d\d?") | {"": r"\d+\.\d{3}"}
+# Printed by a command that the page names, and in no table; settings.
+IN_NO_TABLE = {"evaluation.md": {"1.952", "0.999"}, "upstream.md": {"1.952"}, "paper.md": {"87.6", "0.136"}}
 PLAIN_TABLE = re.compile(r"<!-- docs/results/(\S+)\.csv -->\n((?:\|.*\n)+)")
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 MAX_COLUMNS = 82  # of code, at the width of the page
@@ -151,6 +158,22 @@ def test_plain_tables_have_the_numbers_of_their_files():
     for name, table in tables:
         header, rows = read_table(table)
         assert [header, *rows] == read_results(name), name
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """All numbers of the results as tables show them, and those that Fan et al. print."""
+    cells = str([read_results(path.stem) for path in RESULTS if path.suffix == ".csv"] + [PRINTED])
+    sizes = json.loads((DOCS / "results/sizes.json").read_text(encoding="utf-8"))
+    errors = {f"{found[0]:.3f}" for store in sizes.values() for row in store.values() for found in row.values()}
+    return errors | set(re.findall(r"\d+\.\d+", cells))
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_numbers_in_sentences_are_those_of_the_results(path, measured):
+    pattern = MEASURED.get(path.name, MEASURED[""])
+    found = re.findall(rf"(?<![\w./])(?:{pattern})(?![\w.]*\w)", NOT_PROSE.sub("", PAGES[path]))
+    assert [number for number in found if number not in measured | IN_NO_TABLE.get(path.name, set())] == []
 
 
 def test_the_proposal_to_kornia_has_the_numbers_of_the_benchmarks():
