@@ -22,6 +22,7 @@ from bokeh.models.widgets import (
     Select,
     TableColumn,
 )
+from jinja2 import Template
 from tornado.ioloop import IOLoop
 
 from kornia_learnnorm.demo.compute import (
@@ -58,6 +59,11 @@ EXPLANATION = (
     "algorithm takes all matches, the false ones too."
 )
 ROW_HEIGHT = 25  # pixels, of the table
+# Extends Bokeh's page: without the tag, phones lay the page out 980 pixels wide and shrink it.
+TEMPLATE = Template(
+    '{% extends base %}{% block preamble %}<meta name="viewport" content="width=device-width, initial-scale=1">'
+    "{% endblock %}"
+)
 WRAP: Any = {"flex-wrap": "wrap"}
 log = logging.getLogger(__name__)
 
@@ -85,6 +91,7 @@ class Page:
             view.on_pointer(partial(self._point, index))
         self._make_widgets()
         document.title = "Fundamental matrix of two images"
+        document.template = TEMPLATE
         document.add_root(self._layout())
         self._choose_example(next(iter(EXAMPLES)))
 

@@ -6,6 +6,7 @@ import json
 import signal
 from http.client import HTTPConnection
 from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -31,6 +32,8 @@ def test_only_this_computer_gets_the_page_and_ctrl_c_ends_it():
     with served() as (address, process):
         assert address.startswith("http://127.0.0.1:")
         assert status_of(address, "/") == 200
+        with urlopen(address, timeout=60) as page:  # for phones
+            assert b'<meta name="viewport" content="width=device-width, initial-scale=1">' in page.read()
         assert status_of(address, "/download/guessed/RANSAC") == 404
         websocket = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
         websocket |= {"Sec_WebSocket_Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
