@@ -20,6 +20,7 @@ from kornia_learnnorm import (
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
 
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
+WALL_SHIFT = np.array([4.0, 3.0])  # of the wall of `repeated_wall`, pixels
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -202,3 +203,24 @@ WRONG_MATRICES = [  # with two sets of points
     (torch.full((2, 3, 3), torch.inf), ValueError, "F_mat must be finite, got 18 NaN or infinite"),
     (torch.stack([torch.eye(3), torch.zeros(3, 3)]), ValueError, "F_mat must not be zero, got 1 zero"),
 ]
+
+
+def repeated_wall(copies: int = 90, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """A wall, a board of 120 points before it, and windows of the wall that match the next one.
+
+    The images have 640 x 480 pixels. Returns the points of both and what each match is: 0 wall, 1 board, 2 false.
+    """
+    cell, epipole = np.array([60.0, 0.0]), np.array([0.8, 0.6])  # from a window to the next, pixels; a direction
+    rng = np.random.default_rng(seed)
+    wall, board, false = (
+        rng.uniform(0, (640, 480), (600, 2)),
+        rng.uniform(200, 300, (120, 2)),
+        rng.uniform(0, (640, 480), (copies, 2)),
+    )
+    wall = wall[((wall < 195) | (wall > 305)).any(-1)]
+    points1 = np.concatenate([wall, board, false])
+    label = np.repeat([0, 1, 2], [len(wall), len(board), len(false)])
+    points2 = points1 + WALL_SHIFT + rng.normal(0, 0.1, points1.shape)
+    points2[label == 1] += rng.uniform(8, 14, (len(board), 1)) * epipole
+    points2[label == 2] += rng.integers(1, 4, (len(false), 1)) * cell
+    return torch.from_numpy(points1), torch.from_numpy(points2), torch.from_numpy(label)

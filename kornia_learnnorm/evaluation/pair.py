@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +18,8 @@ from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation.inputs import Points, check_number, check_settings, check_whole, read_cameras
 from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.evaluation.reliability import check_ambiguity, mutual_share
-from kornia_learnnorm.evaluation.two_view import estimate_matches
+from kornia_learnnorm.evaluation.reliability import MIN_MUTUAL_SHARE, mutual_share
+from kornia_learnnorm.evaluation.two_view import estimate_matches, settle_repeats
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points, unit_fundamental
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
@@ -51,7 +53,8 @@ def estimate_pair(
     Matches are nearest neighbours in both directions that pass the ratio test in both, one-to-one: of those that share
     a point, the one of smallest ratio counts. :class:`~kornia_learnnorm.RANSAC`, or a learned layer, reads them with
     their scores, 1 minus the larger ratio.
-    Features on a constant black frame around an image are dropped.
+    Features on a constant black frame around an image are dropped. Where texture repeats, matches that do not move like
+    those around them are left out.
 
     Args:
         image1: file of image 1, or its values: grey with shape (H, W) or RGB with shape (H, W, 3), uint8.
@@ -124,25 +127,43 @@ class MatchedPair:
         cameras = read_cameras(K1, K2)
         S1, S2 = self._scalings()
         scaled = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
-        matches = self.points1[self.mutual], self.points2[self.mutual], 1 - self.ratios[self.mutual]
+        solve = partial(
+            estimate_matches,
+            size1=self.size1,
+            size2=self.size2,
+            layer=layer,
+            threshold=threshold,
+            seed=seed,
+            K1=scaled[0],
+            K2=scaled[1],
+        )
         try:
-            estimate = estimate_matches(*matches, self.size1, self.size2, layer, threshold, seed, *scaled)
+            estimate = solve(self.points1[self.mutual], self.points2[self.mutual], 1 - self.ratios[self.mutual])
         except NoReliableMatrixError as error:
             raise _named(error, (self.path1, self.path2)) from error
-        share = mutual_share(self.points1, self.points2, self.mutual, estimate.F_mat, threshold)
+        estimate = self._settled(estimate, solve)
         return replace(
             estimate,
             F_mat=unit_fundamental(transform_fundamental(estimate.F_mat, S1, S2)),
             points1=transform_points(estimate.points1[None], torch.linalg.inv(S1)[None])[0],
             points2=transform_points(estimate.points2[None], torch.linalg.inv(S2)[None])[0],
             predicted_error=estimate.predicted_error / self.scale,
-            warnings=estimate.warnings + check_ambiguity(share),
             size1=self.full_size1,
             size2=self.full_size2,
             ratio=self.ratio,
             path1=self.path1,
             path2=self.path2,
         )
+
+    def _settled(self, first: PairEstimate, solve: Callable[..., PairEstimate]) -> PairEstimate:
+        """Return an estimate, or where many false matches fit it that of the coherent matches."""
+        if mutual_share(self.points1, self.points2, self.mutual, first.F_mat, first.threshold) >= MIN_MUTUAL_SHARE:
+            return first
+
+        def again(kept: Tensor) -> PairEstimate:
+            return solve(first.points1[kept], first.points2[kept], first.scores[kept])
+
+        return settle_repeats(first, self.points1[~self.mutual], self.points2[~self.mutual], again)
 
     def _scalings(self) -> tuple[Tensor, Tensor]:
         """Return the transforms of pixels from the full images to those that were matched, (3, 3) each."""

@@ -20,10 +20,10 @@ from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.ransac.parallax import parallax, parallax_evidence
 
 __all__ = [
+    "MIN_MUTUAL_SHARE",
     "PairWarning",
     "Stability",
     "assess",
-    "check_ambiguity",
     "choose_found",
     "find_homography",
     "log_false_alarms",
@@ -45,7 +45,7 @@ MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of random models wit
 MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
 PARALLAX_SCALES = (1.0, 0.5)  # of the threshold at which parallax is sought; SIFT's errors are below half a pixel
 MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
-MIN_MUTUAL_SHARE = 0.85  # of the matches off the plane that fit; below, false ones agree with each other
+MIN_MUTUAL_SHARE = 0.85  # of the matches off the plane that fit; below, false ones may agree with each other
 COMMON_ERRORS = 400  # matches beyond which more do not help: the errors of neighbours are alike
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
 
@@ -239,14 +239,6 @@ def mutual_share(points1: Tensor, points2: Tensor, mutual: Tensor, F_mat: Tensor
     if H is not None:
         fits &= parallax(points1, points2, H) > 3 * threshold
     return float(mutual[fits].double().mean()) if int(fits.sum()) >= MIN_INLIERS else 1.0
-
-
-def check_ambiguity(share: float) -> tuple[PairWarning, ...]:
-    """Return a warning where the share of :func:`mutual_share` tells of repeated texture."""
-    if share >= MIN_MUTUAL_SHARE:
-        return ()
-    text = f"only {share:.0%} of the matches off the main plane are nearest neighbours both ways: texture that repeats"
-    return (PairWarning("ambiguous", text),)
 
 
 def _spread(points: Tensor) -> float:

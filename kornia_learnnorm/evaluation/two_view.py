@@ -2,6 +2,9 @@ r"""The fundamental matrix of the matches of two images, with its predicted erro
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -29,13 +32,18 @@ from kornia_learnnorm.geometry.pose import in_front, relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
+from kornia_learnnorm.ransac.coherence import coherent_matches, fitting_share
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 
-__all__ = ["estimate_matches"]
+__all__ = ["estimate_matches", "settle_repeats"]
 
 MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
 FEW_MATCHES = 400  # so few determine a matrix only with more inliers than RANSAC misses again and again
 MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as all matches, before the search ends
+MIN_FALSE_SHARE = 0.15  # of the false matches off the plane; as many fit the true matrix by chance
+MAX_FALSE_SHARE = 0.3  # of the false matches off the plane; more fit only a matrix that they decided
+MAX_SHARE_LEFT = 0.8  # of the false matches that fit the first matrix, for another one to replace it
+MIN_COHERENT_SHARE = 2 / 3  # of the coherent matches off the plane; with fewer, they belong to two matrices
 
 Size = tuple[int, int]  # width and height, pixels
 
@@ -206,3 +214,48 @@ def _find_warnings(
         *warnings,
         PairWarning("no_pose", "the matches do not decide between the four poses of the essential matrix"),
     )
+
+
+def settle_repeats(
+    first: PairEstimate, false1: Tensor, false2: Tensor, again: Callable[[Tensor], PairEstimate]
+) -> PairEstimate:
+    """Return the estimate of the coherent matches where false ones decided the first, with a warning where in doubt.
+
+    Args:
+        first: estimate of all matches.
+        false1: pixels in image 1 of matches that are not nearest neighbours in both directions, (M, 2), float64.
+        false2: pixels in image 2, (M, 2).
+        again: returns the estimate of some matches of the first one, from a mask of them, or raises
+            NoReliableMatrixError.
+    """
+    coherent = _coherent_rows(first)
+    plane = find_homography(first.points1[coherent], first.points2[coherent], first.threshold)
+    if plane is None:
+        return _doubted(first, "few matches move like their neighbours")
+
+    best, share = first, fitting_share(false1, false2, plane, first.F_mat, first.threshold)
+    if share > MIN_FALSE_SHARE:
+        with suppress(NoReliableMatrixError):
+            second = again(coherent)
+            left = fitting_share(false1, false2, plane, second.F_mat, first.threshold)
+            best, share = (second, left) if left < MAX_SHARE_LEFT * share else (first, share)
+    if share > MAX_FALSE_SHARE:
+        return _doubted(
+            best, f"{share:.0%} of the matches off the main plane that are nearest in one direction only fit"
+        )
+    share = fitting_share(first.points1[coherent], first.points2[coherent], plane, best.F_mat, first.threshold)
+    if share < MIN_COHERENT_SHARE:
+        return _doubted(best, f"only {share:.0%} of the matches off the main plane that move like their neighbours fit")
+    return best
+
+
+def _coherent_rows(estimate: PairEstimate) -> Tensor:
+    """Return which matches of an estimate are coherent, (N,) bool; none where no homography explains its inliers."""
+    points1, points2, inliers = estimate.points1, estimate.points2, estimate.inliers
+    H = find_homography(points1[inliers], points2[inliers], estimate.threshold)
+    return torch.zeros_like(inliers) if H is None else coherent_matches(points1, points2, H, estimate.threshold)
+
+
+def _doubted(estimate: PairEstimate, reason: str) -> PairEstimate:
+    warning = PairWarning("ambiguous", f"{reason}: texture that repeats")
+    return replace(estimate, warnings=(*estimate.warnings, warning))

@@ -12,7 +12,6 @@ from two_view import epipolar_distances
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.evaluation import two_view as two_view_module
-from kornia_learnnorm.evaluation.reliability import check_ambiguity, mutual_share
 from kornia_learnnorm.evaluation.solver import TwoViewSolver
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
@@ -189,19 +188,3 @@ class TestEstimateMatches:
         points = dict(zip(("points1", "points2"), torch.rand(2, 9, 2) * 100, strict=True))
         with pytest.raises(error, match=message):
             kln.estimate_matches(**{**points, **changes})
-
-
-class TestAmbiguity:
-    def test_share_of_mutual_matches(self):
-        """Of the matches that fit and lie off the plane, every second one is mutual."""
-        scene = handheld(1, 100, torch.Generator().manual_seed(0), noise=0.0)
-        mutual = torch.arange(100) % 2 == 0
-        share = mutual_share(scene.points1[0], scene.points2[0], mutual, scene.F_mat[0], 1.0)
-        assert 0.3 < share < 0.7
-        assert mutual_share(scene.points1[0], scene.points2[0], mutual, torch.eye(3).double(), 1e-9) == 1.0
-
-    def test_warning(self):
-        assert check_ambiguity(0.95) == ()
-        (warning,) = check_ambiguity(0.6)
-        assert warning.code == "ambiguous"
-        assert "60%" in warning.text

@@ -1,0 +1,73 @@
+r"""Matches that move like the matches around them, unlike the false ones of repeated texture.
+
+Equal windows of a wall match each other along its rows, so that the false matches agree on an epipole where these rows
+meet, and on a matrix that more matches fit than the true one. Which matches fit cannot tell these matrices apart; that
+the false matches jump away from their neighbours does.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.transforms import transform_points
+from kornia_learnnorm.ransac.parallax import parallax
+
+__all__ = ["coherent_matches", "fitting_share"]
+
+NUM_NEIGHBOURS = 24  # matches nearest to a match in an image
+MIN_COHERENT = 0.5  # of the neighbours, in both images, have the parallax of a coherent match
+MAX_PARALLAX_CHANGE = 0.3  # of the distance between neighbours; 3 thresholds where this is less
+PARALLAX = 3.0  # thresholds; a match that the homography misses by more lies off the plane
+MIN_MATCHES = 16  # off the plane; fewer tell nothing of a matrix
+
+
+def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: float) -> Tensor:
+    """Return which matches have the parallax of most matches around them, in both images.
+
+    A false match of repeated texture jumps to a copy, away from its neighbours in one image or in both.
+
+    Args:
+        points1: pixels in image 1 with shape (N, 2), float64.
+        points2: pixels in image 2 with shape (N, 2).
+        H: homography that explains most matches, (3, 3); parallax is measured from where it moves points1.
+        threshold: largest distance of an inlier, pixels.
+
+    Returns:
+        a mask (N,).
+
+    References:
+        J. Bian et al., GMS: grid-based motion statistics for fast, ultra-robust feature correspondence, CVPR 2017;
+        J. Ma et al., Locality preserving matching, IJCV 2019.
+
+    """
+    vectors = points2 - transform_points(points1[None], H[None])[0]
+    shares = [_agreeing_share(points, vectors, PARALLAX * threshold) for points in (points1, points2)]
+    return torch.minimum(*shares) >= MIN_COHERENT
+
+
+def _agreeing_share(points: Tensor, vectors: Tensor, least: float) -> Tensor:
+    """Return which share of the neighbours of each point (N, 2) has a vector (N, 2) like its own, (N,)."""
+    number = min(NUM_NEIGHBOURS, len(points) - 1)
+    apart = torch.cdist(points, points)
+    apart.fill_diagonal_(torch.inf)
+    nearest = apart.topk(number, largest=False)
+    change = (vectors[nearest.indices] - vectors[:, None]).norm(dim=-1)
+    share: Tensor = (change < (MAX_PARALLAX_CHANGE * nearest.values).clamp(min=least)).double().mean(-1)
+    return share
+
+
+def fitting_share(points1: Tensor, points2: Tensor, H: Tensor, F_mat: Tensor, threshold: float) -> float:
+    """Return which share of the matches off a plane fits a matrix; 1 where fewer than 16 lie off it.
+
+    Args:
+        points1: pixels in image 1, (N, 2), float64.
+        points2: pixels in image 2, (N, 2).
+        H: homography of the plane, (3, 3).
+        F_mat: matrix, (3, 3).
+        threshold: largest distance of an inlier, pixels.
+    """
+    off = parallax(points1, points2, H) > PARALLAX * threshold
+    fits = symmetric_epipolar_distance(points1[off], points2[off], F_mat) < threshold
+    return float(fits.double().mean()) if len(fits) >= MIN_MATCHES else 1.0
