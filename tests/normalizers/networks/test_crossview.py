@@ -62,6 +62,15 @@ class TestSetNetwork:
         for gradient in torch.autograd.grad(found.sum(), [points, weights]):
             assert torch.isfinite(gradient).all()
 
+    @pytest.mark.parametrize("weighted", [False, True])
+    def test_parts_of_a_large_batch_change_nothing(self, weighted, monkeypatch):
+        net, points, whole = set_network(), uniform(10, 8, 4), uniform(10, 6, seed=1)
+        weights = uniform(10, 8, seed=2) if weighted else None
+        expected = net(points, whole, weights).detach()
+        monkeypatch.setattr("kornia_learnnorm.normalizers.networks.crossview.MAX_POINTS", 24)
+        with torch.no_grad():
+            torch.testing.assert_close(net(points, whole, weights), expected)
+
     def test_sees_points_set_and_their_number(self):
         net, points, whole = set_network(), uniform(1, 10, 4), uniform(1, 6, seed=1)
         expected = net(points, whole)
