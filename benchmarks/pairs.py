@@ -224,7 +224,7 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--kinds", nargs="+", choices=[*KINDS, OUTLIERS], default=[*KINDS, OUTLIERS])
     parser.add_argument("--seed", type=int, default=0, help="first seed of each kind")
     parser.add_argument("--estimator", choices=["ransac", "learned"], default="ransac")
-    parser.add_argument("--weights", default="robust", help="name or file of the learned estimator's weights")
+    parser.add_argument("--weights", default="robust-synthetic", help="name or file of the learned estimator's weights")
     parser.add_argument("--cameras", action="store_true", help="give the true cameras to the estimator")
     parser.add_argument("--size", type=int, nargs=2, default=[640, 480], help="width and height of the images, pixels")
     parser.add_argument("--cache", type=Path, help="folder that keeps the rendered pairs; empty it for a new renderer")

@@ -23,7 +23,7 @@ RESULTS = {
     "PoseLib": "poselib",
     "Kornia RANSAC": "kornia",
     "`RANSAC`": "RANSAC",
-    "`LearnedEightPoint`": "learned:robust",
+    "`LearnedEightPoint`": "learned:robust-synthetic",
 }
 LINKS = [link for link in re.findall(r"\]\(([^)#\s]+)\)", README) if "://" not in link]
 

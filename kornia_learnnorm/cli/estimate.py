@@ -45,7 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     estimation.add_argument(
         "--estimator", choices=("ransac", "learned"), default="ransac", help="(default: %(default)s)"
     )
-    estimation.add_argument("--weights", metavar="NAME_OR_PATH", help="weights of the learned one (default: robust)")
+    estimation.add_argument(
+        "--weights", metavar="NAME_OR_PATH", help="weights of the learned one (default: robust-synthetic)"
+    )
     estimation.add_argument(
         "--threshold",
         metavar="PX",
@@ -94,7 +96,7 @@ def _print_pairs(found: list[dict[str, Any]], folder: Path) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the fundamental matrix; write the picture and the JSON file if asked to, both or neither."""
     _check_options(args)
-    weights = (args.weights or "robust") if args.estimator == "learned" else None
+    weights = (args.weights or "robust-synthetic") if args.estimator == "learned" else None
     names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher")
     options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
     if args.pairs is not None:

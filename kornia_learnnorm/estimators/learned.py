@@ -279,11 +279,11 @@ class LearnedEightPoint(nn.Module):
         save_module(path, self, FORMAT, {key: getattr(self, key) for key in ARCHITECTURE})
 
     @classmethod
-    def from_pretrained(cls, name: str | Path = "robust") -> LearnedEightPoint:
+    def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:
         """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
 
         Args:
-            name: ``"robust"``, ``"robust-synthetic"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
+            name: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
 
         Returns:
             the estimator, in evaluation mode.

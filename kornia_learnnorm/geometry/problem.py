@@ -117,8 +117,8 @@ class LinearProblem:
             if needs_gradient(F):
                 F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
             return F / torch.linalg.matrix_norm(F, keepdim=True), self.gap
-        x1, x2 = convert_points_to_homogeneous(self.points1), convert_points_to_homogeneous(self.points2)
-        return self._solve_between(x1 @ T1.mT, x2 @ T2.mT)[0]
+        x1, x2 = (T @ convert_points_to_homogeneous(p).mT for T, p in ((T1, self.points1), (T2, self.points2)))
+        return self._solve_between(x1.mT, x2.mT)[0]
 
     def select(self, rows: Tensor) -> LinearProblem:
         """Return the problem of some of the sets, by their indices or a mask (B,); solved if this one is."""
