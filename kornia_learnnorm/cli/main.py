@@ -126,8 +126,7 @@ def _print_completion(args: argparse.Namespace) -> int:
     from lightning_modules.config_files import config_names
 
     parser = make_parser()
-    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
-    for name, command in commands.choices.items():
+    for name, command in _parsers_of_commands(parser).items():
         if name in TRAINING:
             command.add_argument("--config", choices=config_names())
             command.add_argument("--ckpt_path", metavar="FILE")
@@ -140,8 +139,18 @@ def _print_completion(args: argparse.Namespace) -> int:
     return 0
 
 
+def _parsers_of_commands(parser: argparse.ArgumentParser) -> dict[str, Any]:
+    """Return the parser of each command by its name."""
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
+    return dict(commands.choices)
+
+
 def _run_tool(words: list[str]) -> int:
-    parsed = make_parser(words[:1]).parse_args(words)
+    parser = make_parser(words[:1])
+    parsed, unknown = parser.parse_known_args(words)
+    if unknown:  # parse_args would print the usage of learnnorm instead of the command's
+        command = _parsers_of_commands(parser)[parsed.command]
+        command.error(f"unrecognized arguments: {shlex.join(unknown)}; {command.prog} --help lists the options")
     parsed.command_line = shlex.join(["learnnorm", *words])
     return int(parsed.run(parsed))
 

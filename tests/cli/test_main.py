@@ -501,3 +501,14 @@ def test_bad_usage_exits_with_2(arguments, capsys):
         main(arguments)
     assert caught.value.code == 2
     assert "usage" in capsys.readouterr().err.lower()
+
+
+@pytest.mark.parametrize("arguments", [["config", "crossview"], ["compare", "s.h5"], ["estimate", "a.png", "b.png"]])
+def test_unknown_option_shows_the_usage_of_its_command(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([*arguments, "--unheard", "of"])
+    assert caught.value.code == 2
+    usage, *_, last = capsys.readouterr().err.splitlines()
+    assert usage.startswith(f"usage: learnnorm {arguments[0]} ")
+    assert last.startswith(f"learnnorm {arguments[0]}: error: unrecognized arguments: --unheard")
+    assert last.endswith(f"learnnorm {arguments[0]} --help lists the options")
