@@ -171,6 +171,8 @@ class StoreReader:
         if not self.path.is_file():
             named = part or "@" not in self.path.name
             hint = "" if named else "; write some pairs of a store as FILE.h5@FIRST:STOP, for example s.h5@3:10"
+            if self.path.is_dir():
+                hint = "; it is a folder, and learnnorm match folder makes a store of a folder of images"
             raise FileNotFoundError(f"no store at {self.path}{hint}")
         with open_hdf5(self.path) as file:
             offsets = _check(self.path, file)

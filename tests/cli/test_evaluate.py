@@ -258,6 +258,7 @@ def test_cells_as_json():
         (["known.h5"], ["Hartley.safetensors"], "two methods have the same name, Hartley: "),
         (["known.h5", "other/known.h5"], ["tilted"], "two files have the same name, known: "),
         (["known.h5", "none.h5"], ["tilted"], "no store at"),
+        (["tilted"], ["tilted"], "tilted; it is a folder, and learnnorm match folder makes"),
         (["known.h5", "known.h5@2:19"], ["tilted"], "pairs 2:19 were asked for, the store has 0:9"),
         (["known.h5", "known.h5@2"], ["tilted"], "FILE.h5@FIRST:STOP"),
         (["known.h5"], ["tilted", "nothing"], "no weights"),
