@@ -99,7 +99,7 @@ def find_method(name: str) -> Method:
             rank 2.
 
     Raises:
-        ValueError: if there is no such class or function, or the class needs arguments.
+        ValueError: if there is no such class or function, the class needs arguments, or the weights are of a layer.
         FileNotFoundError: if there is no such normalisation and there are no such weights.
 
     """
@@ -122,6 +122,11 @@ def _find_normalizer(name: str) -> Normalizer:
         return _own_normalizer(name)
     shipped = shipped_weights(FORMAT)
     if name not in shipped and Path(name).suffix != ".safetensors":
+        if name in shipped_weights():
+            raise ValueError(
+                f"the weights {name!r} are not those of a normalisation, which an evaluation of samples compares;"
+                f" learnnorm robust STORE --out RUN --estimators learned:{name} evaluates them"
+            )
         raise FileNotFoundError(
             f"no weights {name!r} and no such normalisation: expected {', '.join([*CLOSED_FORMS, *shipped])}, a"
             f" .safetensors file or module:Name, each without suffix or with {REFINED} or {OPTIMAL}"

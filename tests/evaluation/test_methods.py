@@ -47,6 +47,7 @@ def test_refined_is_the_better_fit(scene):
     ("name", "error", "message"),
     [
         ("nothing", FileNotFoundError, "no weights 'nothing'"),
+        ("robust", ValueError, "robust STORE --out RUN --estimators learned:robust evaluates them"),
         ("hartley+LM", FileNotFoundError, r"expected none, Hartley, .*paper, .*module:Name, .*\+LM or \+optimal"),
         ("Hartley+foo", FileNotFoundError, r"no weights 'Hartley\+foo'"),
         ("Hartley+optimal+LM", FileNotFoundError, "expected none, Hartley"),
