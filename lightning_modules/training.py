@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import signal
 import sys
 import warnings
 import zipfile
@@ -21,6 +22,7 @@ from jsonargparse import ArgumentError
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
+from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 from kornia_learnnorm.files import exclusive
@@ -163,6 +165,7 @@ def run(args: list[str] | None) -> None:
     Raises:
         ValueError: if the arguments or a configuration are wrong.
         KeyboardInterrupt: if the run was interrupted.
+        SystemExit: with the code 143, as of a program that the signal SIGTERM ends, if that signal ended the run.
 
     """
     words = with_config_paths(sys.argv[1:] if args is None else args)
@@ -190,6 +193,8 @@ def run(args: list[str] | None) -> None:
         raise ValueError(_first_error(str(error))) from error
     except MisconfigurationException as error:  # such as a test of an estimator, whose task has none
         raise ValueError(str(error)) from error
+    except SIGTERMException as error:  # a SystemExit without a code, which would end the program with 0
+        raise SystemExit(128 + signal.SIGTERM) from error
     except SystemExit as error:  # Lightning exits so when it was interrupted
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from error

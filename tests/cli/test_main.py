@@ -16,6 +16,7 @@ import torch
 import train_processes
 import yaml
 from pytorch_lightning.utilities import rank_zero_info
+from pytorch_lightning.utilities.exceptions import SIGTERMException
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
@@ -512,3 +513,13 @@ def test_unknown_option_shows_the_usage_of_its_command(arguments, capsys):
     assert usage.startswith(f"usage: learnnorm {arguments[0]} ")
     assert last.startswith(f"learnnorm {arguments[0]}: error: unrecognized arguments: --unheard")
     assert last.endswith(f"learnnorm {arguments[0]} --help lists the options")
+
+
+def test_terminated_training_exits_with_143(monkeypatch):
+    def terminated(*args, **kwargs):
+        raise SIGTERMException
+
+    monkeypatch.setattr("lightning_modules.training.TrainingCLI", terminated)
+    with pytest.raises(SystemExit) as caught:
+        main(["fit", "--config", "crossview"])
+    assert caught.value.code == 143
