@@ -18,6 +18,7 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.ransac.parallax import parallax, parallax_evidence
+from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 
 __all__ = [
     "MIN_MUTUAL_SHARE",
@@ -27,6 +28,7 @@ __all__ = [
     "choose_found",
     "find_homography",
     "log_false_alarms",
+    "log_false_samples",
     "measure_stability",
     "mutual_share",
     "nominal_camera",
@@ -41,6 +43,7 @@ MAX_ANGLE = 6.0  # degrees; a pose that moves by more in half of the parts is un
 NOMINAL_FOCAL = 1.2  # of the longer image side: focal length where no camera is given
 MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
 MIN_SPREAD = 0.02  # of the image diagonal; standard deviation of the inliers across their longest direction
+SEARCH_SAMPLES = 50_000  # minimal samples of a search that finds nothing
 MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of random models with as much support
 MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
 PARALLAX_SCALES = (1.0, 0.5)  # of the threshold at which parallax is sought; SIFT's errors are below half a pixel
@@ -259,6 +262,23 @@ def log_false_alarms(matches: int, inliers: int, threshold: float, size: tuple[i
         threshold: largest distance of an inlier, pixels.
         size: width and height of image 2, pixels.
     """
-    strip = min(1.0, 2 * threshold * math.hypot(*size) / math.prod(size))
+    strip = _strip(threshold, size)
     tests = max(1, matches - 7) * math.comb(matches, inliers) * math.comb(inliers, 7)
     return math.log10(max(1, tests)) + (inliers - 7) * math.log10(strip)
+
+
+def log_false_samples(matches: int, inliers: int, threshold: float, size: tuple[int, int]) -> float:
+    """Return log10 of the expected number of a search's samples with as many inliers among random matches.
+
+    A search tries 50,000 samples of eight, far fewer than all that :func:`log_false_alarms` counts. A true matrix with
+    too few inliers to be told from all those can have more than a search among random matches finds. Arguments are
+    those of :func:`log_false_alarms`.
+    """
+    others = max(0, inliers - SAMPLE_SIZE)
+    samples = SEARCH_SAMPLES * math.comb(max(0, matches - SAMPLE_SIZE), others)
+    return math.log10(max(1, samples)) + others * math.log10(_strip(threshold, size))
+
+
+def _strip(threshold: float, size: tuple[int, int]) -> float:
+    """Return a bound on the share of an image within a threshold (pixels) of a line."""
+    return min(1.0, 2 * threshold * math.hypot(*size) / math.prod(size))

@@ -23,6 +23,7 @@ from kornia_learnnorm.evaluation.reliability import (
     choose_found,
     find_homography,
     log_false_alarms,
+    log_false_samples,
     measure_stability,
     nominal_camera,
     random_parts,
@@ -40,6 +41,7 @@ __all__ = ["estimate_matches", "settle_repeats"]
 MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
 FEW_MATCHES = 400  # so few determine a matrix only with more inliers than RANSAC misses again and again
 MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as all matches, before the search ends
+MAX_EMPTY_PARTS = 2  # parts with no more inliers than a search among random matches finds, before the search ends
 MIN_FALSE_SHARE = 0.15  # of the false matches off the plane; as many fit the true matrix by chance
 MAX_FALSE_SHARE = 0.3  # of the false matches off the plane; more fit only a matrix that they decided
 MAX_SHARE_LEFT = 0.8  # of the false matches that fit the first matrix, for another one to replace it
@@ -165,20 +167,17 @@ def _search(solver: TwoViewSolver, size2: Size) -> _Found:
 
 
 def _solve_parts(solver: TwoViewSolver, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
-    """Return the matrices of the parts; of few matches, only those before too many are no better than chance."""
-    found: list[Tensor] = []
-
-    def fails(F_mat: Tensor) -> bool:
-        support = int(solver.support(F_mat[None]))
-        return log_false_alarms(len(solver.scores), support, solver.threshold, size2) > MAX_LOG_FALSE_ALARMS
-
-    hopeless = len(solver.scores) <= FEW_MATCHES and fails(F_mat)
+    """Return the matrices of the parts, only the first of them where the search finds no more than chance."""
+    matches, found = len(solver.scores), F_mat[None]
     for rows in parts:
-        found.append(solver.solve(rows)[0])
-        hopeless = hopeless and fails(found[-1])
-        if hopeless and len(found) == MAX_FAILED_PARTS:
+        found = torch.cat([found, solver.solve(rows)[0][None]])
+        most, failed = int(solver.support(found).max()), len(found) - 1
+        if failed == MAX_EMPTY_PARTS and log_false_samples(matches, most, solver.threshold, size2) > 0:
             break
-    return torch.stack(found)
+        by_chance = log_false_alarms(matches, most, solver.threshold, size2) > MAX_LOG_FALSE_ALARMS
+        if failed == MAX_FAILED_PARTS and matches <= FEW_MATCHES and by_chance:
+            break
+    return found[1:]
 
 
 class _Pose(NamedTuple):

@@ -17,6 +17,7 @@ from kornia_learnnorm.evaluation.reliability import (
     choose_found,
     find_homography,
     log_false_alarms,
+    log_false_samples,
     measure_stability,
     nominal_camera,
     random_parts,
@@ -141,3 +142,13 @@ def test_homography():
 
 def test_nominal_camera():
     assert nominal_camera((640, 480)).tolist() == [[768, 0, 320], [0, 768, 240], [0, 0, 1]]
+
+
+def test_false_samples():
+    """No less than the binomial tail, summed term by term, and small where the tail is."""
+    strip, others = 2 * 800 / (640 * 480), 300 - 8
+    for inliers in (12, 18, 24):
+        terms = [math.comb(others, k) * strip**k * (1 - strip) ** (others - k) for k in range(inliers - 8, others)]
+        value, exact = log_false_samples(300, inliers, 1.0, (640, 480)), math.log10(50_000 * sum(terms))
+        assert exact < value < exact + 1
+    assert log_false_samples(5, 0, 1.0, (640, 480)) > 0
