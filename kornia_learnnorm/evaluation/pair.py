@@ -54,7 +54,7 @@ def estimate_pair(
     a point, the one of smallest ratio counts. :class:`~kornia_learnnorm.RANSAC`, or a learned layer, reads them with
     their scores, 1 minus the larger ratio.
     Features on a constant black frame around an image are dropped. Where texture repeats, matches that do not move like
-    those around them are left out.
+    those around them are left out. The predicted error is too small there.
 
     Args:
         image1: file of image 1, or its values: grey with shape (H, W) or RGB with shape (H, W, 3), uint8.

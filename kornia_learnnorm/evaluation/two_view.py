@@ -220,6 +220,9 @@ def settle_repeats(
 ) -> PairEstimate:
     """Return the estimate of the coherent matches where false ones decided the first, with a warning where in doubt.
 
+    On rendered walls of repeated windows the predicted error of the answers without a warning is too small: 0.2 to 0.6
+    times the true one (10 % and 90 % quantiles).
+
     Args:
         first: estimate of all matches.
         false1: pixels in image 1 of matches that are not nearest neighbours in both directions, (M, 2), float64.
