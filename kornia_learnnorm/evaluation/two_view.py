@@ -167,15 +167,16 @@ def _search(solver: TwoViewSolver, size2: Size) -> _Found:
 
 
 def _solve_parts(solver: TwoViewSolver, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
-    """Return the matrices of the parts, only the first of them where the search finds no more than chance."""
+    """Return the matrices of the parts; of few matches, only the first of them where these find no more than chance."""
     matches, found = len(solver.scores), F_mat[None]
     for rows in parts:
         found = torch.cat([found, solver.solve(rows)[0][None]])
+        if matches > FEW_MATCHES:  # a late part can find what all others missed
+            continue
         most, failed = int(solver.support(found).max()), len(found) - 1
-        if failed == MAX_EMPTY_PARTS and log_false_samples(matches, most, solver.threshold, size2) > 0:
-            break
+        empty = log_false_samples(matches, most, solver.threshold, size2) > 0
         by_chance = log_false_alarms(matches, most, solver.threshold, size2) > MAX_LOG_FALSE_ALARMS
-        if failed == MAX_FAILED_PARTS and matches <= FEW_MATCHES and by_chance:
+        if (failed == MAX_EMPTY_PARTS and empty) or (failed == MAX_FAILED_PARTS and by_chance):
             break
     return found[1:]
 

@@ -70,10 +70,10 @@ class TestEstimateMatches:
         json.dumps(found.as_dict(), allow_nan=False)
 
     @pytest.mark.parametrize(
-        ("number", "agree", "solved"), [(60, 0, 1 + 2), (450, 0, 1 + 2), (60, 14, 1 + 6), (450, 30, 1 + 12)]
+        ("number", "agree", "solved"), [(60, 0, 1 + 2), (450, 0, 1 + 12), (60, 14, 1 + 6), (450, 30, 1 + 12)]
     )
     def test_random_matches_are_given_up_early(self, number, agree, solved, monkeypatch):
-        """After two parts with no more inliers than a search finds by chance, of few matches after six with more."""
+        """Of few matches after two parts with no more inliers than a search finds by chance, after six with more."""
         solve, calls = TwoViewSolver.solve, []
 
         def counted(self, rows=None):
