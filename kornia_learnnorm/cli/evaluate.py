@@ -122,6 +122,8 @@ def run_arguments(
     """
     if args.max_samples < 0:
         raise ValueError(f"--max-samples must be 0, for all, or more, got {args.max_samples}")
+    if not args.max_residual >= 0:
+        raise ValueError(f"--max-residual must be 0 or more, inf for all, got {args.max_residual:g}")
     stores = {name: path for path, name in names_of(args.stores).items()}
     weights = args.weights or ()
     methods = (*args.methods, *weights) if args.methods else default_methods(weights, kept=kept)

@@ -243,6 +243,7 @@ def test_pairs_with_few_matches_have_no_example_and_nothing_held_out(tmp_path, c
         (["--out", ""], "--out is empty: expected a folder"),
         (["--out", "FILE"], "FILE is a file: expected a folder"),
         (["--out", "RUN", "--max-samples", "-1"], "--max-samples must be 0, for all, or more, got -1"),
+        (["--out", "RUN", "--max-residual", "-1"], "--max-residual must be 0 or more, inf for all, got -1"),
         (["--out", "RUN", "--size", "7"], "a sample needs at least 8 correspondences, got size=7"),
         (["--max-residual", "0"], "scenes, filtered: none of "),
     ],
