@@ -81,9 +81,10 @@ class AttentiveContextBlock(nn.Module):
         """Return the features after the block with shape :math:`(B, N, C)`."""
         z = self.norm(hidden)
         mean, deviation, maximum = set_statistics(z, self.attention(z), absent)
-        # In place: for large batches, new memory costs more than the sums.
+        # In place: for large batches, new memory costs more than the sums. Not the last one: under autocast, `out` has
+        # half the precision of `hidden`.
         update = self.point(torch.cat([z, (z - mean) / deviation], -1)).add_(self.context(maximum)).relu_()
-        out: Tensor = self.out(update).add_(hidden)
+        out: Tensor = hidden + self.out(update)
         return out
 
 

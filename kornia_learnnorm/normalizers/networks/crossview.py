@@ -208,10 +208,11 @@ class ContextLayer(nn.Module):
     def forward(self, h: Tensor, absent: Tensor | None) -> Tensor:
         """Return the features after the layer, ``(B, N, C)``."""
         z = self.norm(h)
-        # In place: for large batches, new memory costs more than the sums.
+        # In place: for large batches, new memory costs more than the sums. Not the last one: under autocast, `out` has
+        # half the precision of `h`.
         hidden = self.point(z).add_(self.context(_maximum(z, absent))[:, None]).relu_()
-        update: Tensor = self.out(hidden).add_(h)
-        return update
+        update: Tensor = self.out(hidden)
+        return h + update
 
 
 def _maximum(h: Tensor, absent: Tensor | None) -> Tensor:

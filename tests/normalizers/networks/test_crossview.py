@@ -15,8 +15,9 @@ from torch.autograd import gradcheck
 from two_view import numpy_whitening, prepared, shaken, uniform
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer
+from kornia_learnnorm.estimators.set_network import AttentiveContextBlock
 from kornia_learnnorm.normalizers.networks import crossview as networks
-from kornia_learnnorm.normalizers.networks.crossview import SetNetwork
+from kornia_learnnorm.normalizers.networks.crossview import ContextLayer, SetNetwork
 
 FEATURES = ["epipolar", "both", "own"]
 
@@ -70,6 +71,11 @@ class TestSetNetwork:
         monkeypatch.setattr("kornia_learnnorm.normalizers.networks.crossview.MAX_POINTS", 24)
         with torch.no_grad():
             torch.testing.assert_close(net(points, whole, weights), expected)
+
+    @pytest.mark.parametrize("block", [ContextLayer(16), AttentiveContextBlock(16)])
+    def test_sums_of_residual_layers_keep_their_precision_under_autocast(self, block):
+        with torch.autocast("cpu", torch.bfloat16):
+            assert block(uniform(2, 8, 16).float(), None).dtype == torch.float32
 
     def test_sees_points_set_and_their_number(self):
         net, points, whole = set_network(), uniform(1, 10, 4), uniform(1, 6, seed=1)
