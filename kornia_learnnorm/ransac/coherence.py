@@ -8,10 +8,10 @@ the false matches jump away from their neighbours does.
 from __future__ import annotations
 
 import torch
+from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.transforms import transform_points
 from kornia_learnnorm.ransac.parallax import parallax
 
 __all__ = ["coherent_matches", "fitting_share"]
@@ -42,7 +42,7 @@ def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: flo
         J. Ma et al., Locality preserving matching, IJCV 2019.
 
     """
-    vectors = points2 - transform_points(points1[None], H[None])[0]
+    vectors = points2 - transform_points(H[None], points1[None])[0]
     shares = [_agreeing_share(points, vectors, PARALLAX * threshold) for points in (points1, points2)]
     return torch.minimum(*shares) >= MIN_COHERENT
 

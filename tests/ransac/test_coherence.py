@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from two_view import WALL_SHIFT, repeated_wall
+from two_view import WALL_SHIFT, homogeneous, repeated_wall
 
 from kornia_learnnorm.ransac.coherence import coherent_matches, fitting_share
 
@@ -14,6 +14,13 @@ def wall_homography() -> torch.Tensor:
     H = torch.eye(3, dtype=torch.float64)
     H[:2, 2] = torch.from_numpy(WALL_SHIFT)
     return H
+
+
+def coherent_share(points: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """The share of the 24 nearest points with a vector like a point's own."""
+    apart = torch.cdist(points, points).fill_diagonal_(torch.inf).topk(24, largest=False)
+    change = (vectors[apart.indices] - vectors[:, None]).norm(dim=-1)
+    return (change < (0.3 * apart.values).clamp(min=3)).double().mean(-1)
 
 
 class TestCoherentMatches:
@@ -45,6 +52,17 @@ class TestCoherentMatches:
         turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
         turned = (points2 @ turn[:2, :2].mT)[order]
         assert (coherent_matches(points1[order], turned, turn @ wall_homography(), 1.0) == expected[order]).all()
+
+    def test_homography_of_a_slanted_wall(self):
+        """Images 1 that are warped by a homography leave the parallax as it was."""
+        points1, points2, _ = repeated_wall()
+        slant = torch.tensor([[1.0, 0.1, 5], [0, 1.1, 0], [8e-4, 2e-4, 1]], dtype=torch.float64)
+        warped = homogeneous(points1.numpy()) @ slant.numpy().T
+        warped1 = torch.from_numpy(warped[:, :2] / warped[:, 2:])
+        vectors = points2 - points1
+        expected = torch.minimum(coherent_share(warped1, vectors), coherent_share(points2, vectors)) >= 0.5
+        H = wall_homography() @ torch.linalg.inv(slant)
+        assert (coherent_matches(warped1, points2, H, 1.0) == expected).all()
 
     @pytest.mark.parametrize("number", [1, 2, 9])
     def test_few_matches(self, number):

@@ -178,7 +178,7 @@ class SetNetwork(nn.Module):
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
 
         """
-        # Without gradients, in parts that stay in the processor's cache: at 32,768 sets of eight in half the time.
+        # Without gradients, in parts that stay in the processor's cache.
         part = max(1, MAX_POINTS // points.shape[1])
         if torch.is_grad_enabled() or torch.compiler.is_compiling() or points.shape[0] <= part:
             return self._evaluate(points, set_features, weights)
