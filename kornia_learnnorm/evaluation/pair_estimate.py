@@ -29,7 +29,7 @@ class PairEstimate:
     r"""The fundamental matrix of two images and the correspondences behind it; pixels are those of the full images."""
 
     F_mat: Tensor  # (3, 3), float64, unit Frobenius norm, x2^T F x1 = 0 in pixels
-    E_mat: Tensor | None  # (3, 3), unit Frobenius norm, any sign; None without cameras
+    E_mat: Tensor | None  # essential matrix (3, 3) nearest to K2^T F K1, unit Frobenius norm; None without cameras
     R: Tensor | None  # rotation (3, 3) of X2 = R X1 + t; None without cameras, and where two poses tie
     t: Tensor | None  # direction of translation (3,); None without cameras
     estimator: str  # what made F_mat: "RANSAC" or "LearnedEightPoint"

@@ -8,15 +8,15 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.essential import refine_essential
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.evaluation.inputs import Cameras
 from kornia_learnnorm.evaluation.reliability import MIN_PLANAR_SHARE, find_homography
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
+from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
+from kornia_learnnorm.ransac.models import EssentialModel
 from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.scoring import PairScorer
@@ -98,13 +98,15 @@ class TwoViewSolver:
 
     def _refine(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
-        loss = GemanMcClure(FINAL_LOSS_SCALE * self.threshold)
-        x1, x2 = points1[None], points2[None]
         if self.cameras is None:
-            return refine_fundamental(x1, x2, F_mat[None], loss=loss).F_mat[0]
-        K1, K2 = self.cameras[0][None], self.cameras[1][None]
-        E_mat = unit_fundamental(transform_fundamental(F_mat[None], K1, K2))
-        return refine_essential(x1, x2, E_mat, K1, K2, loss=loss).F_mat[0]
+            loss = GemanMcClure(FINAL_LOSS_SCALE * self.threshold)
+            return refine_fundamental(points1[None], points2[None], F_mat[None], loss=loss).F_mat[0]
+        scorer = PairScorer(points1, points2, self.threshold)
+        start = scorer.best(scorer.from_pixels(F_mat[None]), 1)
+        if len(start.F_mat) == 0:
+            return F_mat
+        fitted = EssentialModel(scorer, *self.cameras).fit(start, refine=True)
+        return unit_fundamental(scorer.to_pixels(fitted.matrix()))[0]
 
     def _try_plane_and_parallax(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher."""

@@ -29,8 +29,9 @@ from kornia_learnnorm.evaluation.reliability import (
     random_parts,
 )
 from kornia_learnnorm.evaluation.solver import TwoViewSolver
+from kornia_learnnorm.geometry.manifold import nearest_essential
 from kornia_learnnorm.geometry.pose import in_front, relative_pose
-from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.coherence import coherent_matches, fitting_share
@@ -194,7 +195,7 @@ def _find_pose(solver: TwoViewSolver, F_mat: Tensor, inliers: Tensor) -> _Pose:
     if solver.cameras is None:
         return _Pose()
     K1, K2 = solver.cameras
-    E_mat = unit_fundamental(transform_fundamental(F_mat, K1, K2))
+    E_mat = nearest_essential(transform_fundamental(F_mat, K1, K2)[None])[0]
     pair = (K1[None], K2[None], solver.points1[None], solver.points2[None])
     R, t = relative_pose(F_mat[None], *pair, inliers[None])
     return _Pose(E_mat, R[0], t[0], in_front(R, t, *pair)[0]) if bool(R.isfinite().all()) else _Pose(E_mat)

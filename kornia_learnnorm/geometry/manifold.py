@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-__all__ = ["Calibrated", "Rank2", "decompose", "decompose_essential", "retract", "tangents"]
+__all__ = ["Calibrated", "Rank2", "decompose", "decompose_essential", "nearest_essential", "retract", "tangents"]
 
 
 class Rank2(NamedTuple):
@@ -104,6 +104,18 @@ def decompose_essential(E_mat: Tensor, C1: Tensor, C2: Tensor) -> Calibrated:
     """
     axes, A = decompose(E_mat)
     return Calibrated(axes, torch.eye(2).to(A).expand_as(A) * 0.5**0.5, C1, C2)
+
+
+def nearest_essential(E_mat: Tensor) -> Tensor:
+    """Return the nearest essential matrices, scaled to unit norm, to matrices (B, 3, 3).
+
+    Example:
+        >>> nearest_essential(torch.diag(torch.tensor([4.0, 3.0, 1.0]))[None]).diagonal(dim1=1, dim2=2)
+        tensor([[0.7071, 0.7071, 0.0000]])
+
+    """
+    axes, A = decompose(E_mat)
+    return Rank2(axes, torch.eye(2).to(A).expand_as(A) * 0.5**0.5).matrix()
 
 
 def retract(state: State, step: Tensor) -> State:

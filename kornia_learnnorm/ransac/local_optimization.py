@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -25,6 +27,8 @@ MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
 CALIBRATED_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages, with cameras
 CALIBRATED_STEPS = 2  # steps of Levenberg-Marquardt in a stage
+SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
+MIN_NOISE = 0.01  # thresholds; smaller distances don't speak against cameras
 
 
 def optimize_locally(scorer: PairScorer, F_mat: Tensor, number: int) -> Hypotheses:
@@ -60,10 +64,11 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Rank2:
     return state if cost <= _largest_cost(scorer, pool) else decompose(pool.F_mat[:1])
 
 
-def fit_final_calibrated(scorer: PairScorer, pool: Hypotheses, start: Calibrated) -> Calibrated:
+def fit_final_calibrated(scorer: PairScorer, pool: Hypotheses, start: Calibrated) -> Calibrated | Rank2:
     """Return the optimum (1, 3, 3) among essential matrices that is next to the best of the pool.
 
-    Correspondences behind a camera are mismatches: they neither vote nor count in the fit.
+    Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
+    contradict the cameras, the optimum is that of fundamental matrices.
 
     Args:
         scorer: all correspondences.
@@ -77,9 +82,34 @@ def fit_final_calibrated(scorer: PairScorer, pool: Hypotheses, start: Calibrated
     front = in_front_of_best_pose(start.essential(), rays1, rays2, gains)
     best = int((gains * front).sum(-1).argmax())
     state, weights = Calibrated(*(value[best : best + 1] for value in start)), front[best : best + 1].to(gains)
-    near, loss = Truncated(scorer.threshold), GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold)
-    state = minimize(_objective(scorer, near, weights=weights), state, CALIBRATED_STEPS, LM_TOLERANCE)[1].state
-    return minimize(_objective(scorer, loss, weights=weights), state, MAX_LM_STEPS, LM_TOLERANCE)[1].state
+    near = _objective(scorer, Truncated(scorer.threshold), weights=weights)
+    last = _objective(scorer, GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold), weights=weights)
+    state = minimize(near, state, CALIBRATED_STEPS, LM_TOLERANCE)[1].state
+    state = minimize(last, state, MAX_LM_STEPS, LM_TOLERANCE)[1].state
+    before, free = minimize(last, decompose(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)
+    return free.state if _contradicts(last, free.state, float(before - free.cost), scorer.threshold) else state
+
+
+def _contradicts(objective: EpipolarCost, free: Rank2, gain: float, threshold: float) -> bool:
+    r"""Return whether two more parameters lower the cost of Geman and McClure's loss by more than noise would.
+
+    The :math:`\tau` test: the gain over the mean of :math:`\psi^2` and times that of :math:`\psi'`, where
+    :math:`\psi(d)` is half of the loss's derivative, is twice an F-distributed number of 2 and :math:`m` degrees of
+    freedom, which is above :math:`x` with probability :math:`(1 + 2x / m)^{-m / 2}`.
+
+    Reference:
+        F. Hampel, E. Ronchetti, P. Rousseeuw, W. Stahel, Robust Statistics, 1986, section 7.2.
+
+    """
+    squares = objective.distances(free.matrix()).square()
+    weights = objective.weights * objective.loss(squares)[1]
+    freedom = float(weights.sum()) - 7
+    if freedom < 1:
+        return False
+    noise = (squares + (MIN_NOISE * threshold) ** 2) * weights.square()
+    slope = weights * (4 * weights.sqrt() - 3)  # of Geman and McClure's psi
+    statistic = gain * float(slope.sum() / noise.sum())
+    return statistic > freedom * (math.pow(SIGNIFICANCE, -2 / freedom) - 1)
 
 
 def _objective(

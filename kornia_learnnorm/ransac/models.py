@@ -10,7 +10,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.essential import calibrated_state
 from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.minimal import are_determined, solve_calibrated_samples, solve_samples
-from kornia_learnnorm.geometry.manifold import Calibrated, Rank2, decompose, decompose_essential
+from kornia_learnnorm.geometry.manifold import Calibrated, Rank2, decompose, decompose_essential, nearest_essential
 from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.ransac.local_optimization import (
     FINAL_POOL_SIZE,
@@ -106,16 +106,24 @@ class EssentialModel:
         """Return the best of the matrices fitted to their inliers."""
         return optimize_calibrated(self.scorer, self._decompose(F_mat), number)
 
-    def fit(self, pool: Hypotheses, refine: bool) -> Calibrated:
-        """Return the final matrix (1, 3, 3), fitted to all inliers if ``refine``."""
+    def fit(self, pool: Hypotheses, refine: bool) -> Calibrated | Rank2:
+        """Return the final matrix (1, 3, 3), fitted to all inliers if ``refine``; not calibrated if they contradict."""
         if not refine:
             return self._decompose(pool.F_mat[:1])
         return fit_final_calibrated(self.scorer, pool, self._decompose(pool.F_mat[:FINAL_POOL_SIZE]))
 
+    def essential(self, F_mat: Tensor) -> Tensor:
+        """Return the essential matrices of unit norm that are nearest to fundamental matrices (K, 3, 3)."""
+        return nearest_essential(self._calibrate(F_mat))
+
     def _decompose(self, F_mat: Tensor) -> Calibrated:
-        inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (self.C1, self.C2))
-        E_mat = inverse2.mT @ F_mat @ inverse1
+        E_mat = self._calibrate(F_mat)
         return decompose_essential(E_mat, self.C1.expand_as(E_mat), self.C2.expand_as(E_mat))
+
+    def _calibrate(self, F_mat: Tensor) -> Tensor:
+        inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (self.C1, self.C2))
+        E_mat: Tensor = inverse2.mT @ F_mat @ inverse1
+        return E_mat
 
 
 def _on_a_line(points: Tensor, shift: float) -> bool:

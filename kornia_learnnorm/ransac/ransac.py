@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from kornia_learnnorm.geometry.checks import check_cameras, check_rank2, check_tensor, solve_dtype
 from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
-from kornia_learnnorm.geometry.manifold import Calibrated
 from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
 from kornia_learnnorm.normalizers.hartley import Hartley
@@ -50,8 +49,9 @@ class RansacResult(NamedTuple):
         inliers: which correspondences are inliers, (N,) bool.
         num_samples: minimal samples drawn.
         score: MSAC score of ``F_mat``, the sum of :math:`\max(0, 1 - d_i^2 / \tau^2)` over the correspondences.
-        E_mat: essential matrix of unit Frobenius norm, singular values (s, s, 0), with
-            :math:`F = K_2^{-\top} E K_1^{-1}` up to scale, (3, 3); zeros where none was found, None without cameras.
+        E_mat: essential matrix of unit Frobenius norm, singular values (s, s, 0), nearest to :math:`K_2^\top F K_1`,
+            (3, 3); that is :math:`F = K_2^{-\top} E K_1^{-1}` up to scale, but where the correspondences contradict the
+            cameras. Zeros where none was found, None without cameras.
     """
 
     F_mat: Tensor
@@ -71,8 +71,9 @@ class RANSAC(nn.Module):
     to Levenberg-Marquardt where least squares have not converged.
 
     With both cameras, minimal samples of five run through Kornia's five-point solver, and local optimisation and the
-    final fit are Levenberg-Marquardt on essential matrices; distances stay in pixels. ``normalizer`` and ``rank2`` then
-    have no effect.
+    final fit are Levenberg-Marquardt on essential matrices; distances stay in pixels. Where a fundamental matrix then
+    fits so much better that chance explains it with a probability below 0.001, the cameras are inexact, or a lens or a
+    shutter is not that of a pinhole, and the result is this matrix. ``normalizer`` and ``rank2`` have no effect.
 
     Matches that share a point exactly, in either view, with a match of higher weight, or of the same weight and before
     them, are treated as absent: many matches on one point agree with every epipolar line through it.
@@ -280,7 +281,7 @@ class RANSAC(nn.Module):
             return _failure(points1, drawn, cameras)
         score = float((1 - (distances / self.inl_th).square()).clamp(min=0).nansum())
         F_mat = unit_fundamental(scorer.to_pixels(F)[0]).to(points1.dtype)
-        E_mat = unit_fundamental(state.essential()[0]).to(points1.dtype) if isinstance(state, Calibrated) else None
+        E_mat = model.essential(F)[0].to(points1.dtype) if isinstance(model, EssentialModel) else None
         return RansacResult(F_mat, inliers, drawn, score, E_mat)
 
     def _model(self, scorer: PairScorer, cameras: Cameras | None) -> Model:

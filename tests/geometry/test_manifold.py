@@ -7,7 +7,7 @@ import pytest
 import torch
 from two_view import uniform
 
-from kornia_learnnorm.geometry.manifold import decompose, decompose_essential, retract, tangents
+from kornia_learnnorm.geometry.manifold import decompose, decompose_essential, nearest_essential, retract, tangents
 
 
 def states(kind: str, batch_size: int = 4):
@@ -44,6 +44,7 @@ def test_calibrated():
     U, _, Vh = np.linalg.svd(E.numpy())
     nearest = U[..., :2] @ Vh[..., :2, :] / 2**0.5
     np.testing.assert_allclose(state.essential(), nearest, atol=1e-14)
+    np.testing.assert_allclose(nearest_essential(E), nearest, atol=1e-14)
     np.testing.assert_allclose(state.matrix(), C2.numpy().swapaxes(1, 2) @ nearest @ C1.numpy(), atol=1e-14)
 
 

@@ -159,6 +159,65 @@ class TestAccuracy:
         assert optimum.cost_before <= 1.001 * optimum.cost
 
 
+def distorted(seed: int, scale: float = 1.0):
+    """Correspondences of a lens that moves the corners inwards by 3 %, and the cameras, E, R and t of a pinhole."""
+    scene = scenes("handheld", 1, 300, seed, noise=0.3, outliers=0.3)
+    T = torch.diag(torch.tensor([scale, scale, 1.0])).double()
+    points = []
+    for pixels, K in ((scene.points1[0], scene.K1[0]), (scene.points2[0], scene.K2[0])):
+        offset = pixels - K[:2, 2]
+        square = offset.square().sum(-1, keepdim=True)
+        points.append(scale * (K[:2, 2] + offset * (1 - 0.03 * square / square.max())))
+    return points, (T @ scene.K1[0], T @ scene.K2[0]), scene.R, scene.t
+
+
+def pose_error(F_mat, points, cameras, R, t):
+    near = kln.sampson_distance(*points, F_mat) <= 1
+    pose = relative_pose(*(v[None] for v in (F_mat, *cameras, *points, near)))
+    return kln.pose_error(*pose, R, t).item()
+
+
+class TestInexactCameras:
+    """Where the correspondences contradict the cameras, the fit has seven parameters."""
+
+    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
+    def test_exact_cameras_are_kept(self, name):
+        for seed in range(5):
+            points, cameras, _, _ = pair(name, noise=0.5, seed=seed)
+            found = estimate(points, cameras)
+            K1, K2 = (torch.linalg.inv(K) for K in cameras)
+            assert up_to_sign(found.F_mat[None], (K2.mT @ found.E_mat @ K1)[None]) < 1e-9
+
+    def test_distortion(self):
+        """The pose is better than that of the best essential matrix, and the essential matrix is the nearest one."""
+        free, known = [], []
+        for seed in range(10):
+            points, cameras, R, t = distorted(seed)
+            found = estimate(points, cameras)
+            one = [v[None] for v in (*points, found.E_mat, *cameras)]
+            fitted = refine_essential(*one, loss=kln.GemanMcClure(0.7))
+            free.append(pose_error(found.F_mat, points, cameras, R, t))
+            known.append(pose_error(fitted.F_mat[0], points, cameras, R, t))
+            values = torch.linalg.svdvals(found.E_mat)
+            assert torch.allclose(values, torch.tensor([0.5**0.5, 0.5**0.5, 0.0]).double(), atol=1e-12)
+            U, _, Vh = torch.linalg.svd(cameras[1].mT @ found.F_mat @ cameras[0])
+            assert up_to_sign(found.E_mat[None], (U[:, :2] @ Vh[:2] * 0.5**0.5)[None]) < 1e-9
+        assert np.mean(free) < 0.8 * np.mean(known)
+
+    @pytest.mark.parametrize("scale", [0.1, 30.0])
+    def test_scale_of_the_pixels(self, scale):
+        found, (scaled_points, scaled_cameras, _, _) = estimate(*distorted(0)[:2]), distorted(0, scale)
+        scaled = estimate(scaled_points, scaled_cameras, inl_th=scale)
+        assert up_to_sign(found.E_mat[None], scaled.E_mat[None]) < 1e-2
+
+    def test_points_without_noise(self):
+        """Rounding does not speak against cameras."""
+        points, cameras, _, _ = pair(noise=0.0, outliers=0.3)
+        found = estimate(points, cameras)
+        K1, K2 = (torch.linalg.inv(K) for K in cameras)
+        assert up_to_sign(found.F_mat[None], (K2.mT @ found.E_mat @ K1)[None]) < 1e-9
+
+
 class TestInFront:
     """Matches that agree with the epipolar geometry but lie behind a camera."""
 
