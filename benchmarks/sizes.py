@@ -4,6 +4,7 @@ A set is N random matches of one image pair, filtered by the ratio test or not. 
 epipolar distance of 64 ground-truth inliers of the pair, most of which are not in the set. The tables have the medians
 over the sets, in pixels, and the time per set of batches of 32 sets, in milliseconds; estimators of other packages and
 RANSAC take one set at a time. Prints progress to stderr; writes the numbers and the picture where asked to.
+The inliers of a pair without ground truth are those of OpenCV's MAGSAC on all its matches that pass the ratio test.
 
     python benchmarks/sizes.py STORE.h5 [STORE.h5 ...] [--sizes 8 16 32 64 128 512] [--sets 128] [--seed 0]
         [--methods NAME ...] [--json FILE] [--picture FILE]
@@ -63,18 +64,19 @@ def hartley_lm(points1: Tensor, points2: Tensor, _: Tensor) -> Tensor:
     return kln.refine_fundamental(points1, points2, F_mat, loss=kln.GemanMcClure(2.0)).F_mat
 
 
+def peer_matrix(name: str, points1: Tensor, points2: Tensor) -> Tensor | None:
+    """Return the matrix of another package; the images count as large as their points need."""
+    sizes = np.array([p.amax(0).ceil().int().tolist() for p in (points1, points2)], np.int32)
+    try:
+        F_mat = find_peer(name)(points1.numpy(), points2.numpy(), sizes, 0, INLIER_THRESHOLD)
+    except cv2.error:  # too few matches are left to sample from
+        F_mat = None
+    return None if F_mat is None or np.shape(F_mat) != (3, 3) else torch.tensor(np.array(F_mat, float))
+
+
 def peer(name: str) -> Solver:
-    """Return an estimator of another package; the images count as large as their points need."""
-
-    def solve(points1: Tensor, points2: Tensor, _: Tensor) -> Tensor | None:
-        sizes = np.array([p.amax(0).ceil().int().tolist() for p in (points1, points2)], np.int32)
-        try:
-            F_mat = find_peer(name)(points1.numpy(), points2.numpy(), sizes, 0, INLIER_THRESHOLD)
-        except cv2.error:  # too few matches are left to sample from
-            F_mat = None
-        return None if F_mat is None or np.shape(F_mat) != (3, 3) else torch.tensor(np.array(F_mat, float))
-
-    return partial(one_by_one, solve)
+    """Return an estimator of another package."""
+    return partial(one_by_one, lambda x1, x2, _: peer_matrix(name, x1, x2))
 
 
 def ransac(with_scores: bool) -> Solver:
@@ -128,6 +130,14 @@ def shown(name: str) -> str:
     return name.replace(weights, short_name(weights)) if name.startswith(LEARNED) else name
 
 
+def true_matrix(store: CorrespondenceStore, pair: int) -> Tensor | None:
+    """Return the matrix whose inliers measure a pair: the ground truth, or MAGSAC's where there is none."""
+    if np.isfinite(store.F[pair]).all():
+        return torch.from_numpy(store.F[pair])
+    points1, points2, _ = store.matches(pair, RATIO)
+    return peer_matrix("opencv-usac-magsac", torch.from_numpy(points1).double(), torch.from_numpy(points2).double())
+
+
 def draw_sets(store: CorrespondenceStore, protocol: str, size: int, number: int, seed: int) -> Tensor | None:
     """Return sets and the true inliers that measure them, (S, N + 64, 5); None where too few pairs have enough.
 
@@ -136,7 +146,9 @@ def draw_sets(store: CorrespondenceStore, protocol: str, size: int, number: int,
     generator, pairs = np.random.default_rng(seed), []
     for i in range(len(store)):
         points = np.hstack([store.points1[store.rows(i, None)], store.points2[store.rows(i, None)]]).astype(float)
-        F_mat = torch.from_numpy(store.F[i])
+        F_mat = true_matrix(store, i)
+        if F_mat is None:
+            continue
         distance = kln.symmetric_epipolar_distance(*torch.from_numpy(points).split(2, -1), F_mat).numpy()
         points = np.hstack([points, 1 - store.ratio[store.rows(i, None), None].astype(float)])
         true = np.flatnonzero((distance < INLIER_THRESHOLD) & (store.ratio[store.rows(i, None)] < RATIO))

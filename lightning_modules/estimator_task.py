@@ -81,7 +81,7 @@ class EstimatorTask(pl.LightningModule):
         optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = _adamw,
     ) -> None:
         super().__init__()
-        self.estimator = estimator
+        self.estimator = estimator.train()  # shipped weights come in evaluation mode
         self.label_free = label_free or BoundedEpipolarLoss()
         self.labelled = labelled or LogEpipolarLoss()
         self.inlier = InlierLoss()

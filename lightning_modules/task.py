@@ -63,7 +63,7 @@ class NormalizerTask(pl.LightningModule):
         sample_gradient: float | None = 1.0,
     ) -> None:
         super().__init__()
-        self.normalizer = normalizer
+        self.normalizer = normalizer.train()  # shipped weights come in evaluation mode
         self.loss = loss or EpipolarLoss()
         self.optimizer = optimizer
         self.lr_scheduler = lr_scheduler
