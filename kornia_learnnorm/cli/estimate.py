@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         type=float,
         default=options.threshold,
-        help="largest symmetric epipolar distance of an inlier (default: %(default)s)",
+        help="largest symmetric epipolar distance of an inlier in the images as matched (default: %(default)s)",
     )
     estimation.add_argument("--seed", type=_seed, default=options.seed, help="(default: %(default)s)")
     camera = "one or two of fx,fy,cx,cy, a file of 4 or 9 numbers, KITTI's calib.txt, exif; adds E, R, t"

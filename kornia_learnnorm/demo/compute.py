@@ -175,7 +175,7 @@ def compare(picture1: Picture, picture2: Picture) -> Comparison:
     found = [result.estimate for result in robust.values() if result.estimate is not None]
     if not found:
         raise NoReliableMatrixError("no_matrix", robust["RANSAC"].failure)
-    results = {"Hartley": Result(_hartley(found[0], matched), has_prediction=False), **robust}
+    results = {"Hartley": Result(_hartley(found[0]), has_prediction=False), **robust}
     calls = _calls(found[0])
     timed = {name: replace(results[name], seconds=_seconds(calls[name])) for name in METHODS}
     return Comparison(found[0].points1, found[0].points2, timed)
@@ -240,11 +240,11 @@ def _layer() -> LearnedEightPoint:
     return LearnedEightPoint.from_pretrained()
 
 
-def _hartley(estimate: PairEstimate, matched: MatchedPair) -> PairEstimate:
+def _hartley(estimate: PairEstimate) -> PairEstimate:
     """Return the estimate with the matrix of all its matches by Hartley's eight-point algorithm."""
     F_mat = find_fundamental(estimate.points1[None], estimate.points2[None])[0]
     distance = symmetric_epipolar_distance(estimate.points1, estimate.points2, F_mat)
-    inliers = matched.scale * distance < estimate.threshold
+    inliers = distance < estimate.threshold
     ones = torch.ones_like(estimate.weights)
     return replace(estimate, F_mat=F_mat, estimator="EightPoint", weights=ones, inliers=inliers, warnings=())
 

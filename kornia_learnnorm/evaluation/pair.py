@@ -148,6 +148,7 @@ class MatchedPair:
             points1=transform_points(estimate.points1[None], torch.linalg.inv(S1)[None])[0],
             points2=transform_points(estimate.points2[None], torch.linalg.inv(S2)[None])[0],
             predicted_error=estimate.predicted_error / self.scale,
+            threshold=estimate.threshold / self.scale,
             size1=self.full_size1,
             size2=self.full_size2,
             ratio=self.ratio,

@@ -44,7 +44,7 @@ class PairEstimate:
     size1: tuple[int, int]  # width and height of image 1
     size2: tuple[int, int]  # width and height of image 2
     ratio: float | None  # largest ratio of nearest to second-nearest descriptor distance; None where matches were given
-    threshold: float  # largest symmetric epipolar distance of an inlier, pixels of the images as they were matched
+    threshold: float  # largest symmetric epipolar distance of an inlier, pixels; of the full images as the points are
     seed: int
     path1: Path | None = None
     path2: Path | None = None
@@ -110,7 +110,7 @@ class PairEstimate:
             lines += ["R (X2 = R X1 + t)", *rows(self.R), "t (direction)", *rows(self.t[None])]
         share = self.num_inliers / self.num_matches
         ratio = "" if self.ratio is None else f" (ratio test {self.ratio:g})"
-        within = f"symmetric epipolar distance < {self.threshold:g} px, median {self.median_distance:.2f} px"
+        within = f"symmetric epipolar distance < {self.threshold:.3g} px, median {self.median_distance:.2f} px"
         error = f"{self.predicted_error:.2f} px (typical error of epipolar lines where true matches lie)"
         return "\n".join(
             [

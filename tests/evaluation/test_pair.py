@@ -129,6 +129,7 @@ class TestEstimatePair:
         found = estimate_pair(scene.left, scene.right, max_size=240)
         assert (found.size1, found.size2) == ((WIDTH, HEIGHT), (WIDTH, HEIGHT))
         assert found.points1[:, 0].max() > 240
+        assert found.threshold == pytest.approx(WIDTH / 240, rel=0.01)
         inlying = result.points1[result.inliers], result.points2[result.inliers]
         assert np.median(epipolar_distances(*inlying, found.F_mat)) < 0.5
 
