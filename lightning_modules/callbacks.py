@@ -1,9 +1,10 @@
-"""Callbacks: checkpoints, the expected time, export of the trained weights, and predictions to a file."""
+"""Callbacks: checkpoints, progress and expected time, export of the trained weights, and predictions to a file."""
 
 from __future__ import annotations
 
 import math
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -12,11 +13,13 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from pytorch_lightning.callbacks import Callback, ModelCheckpoint
+from pytorch_lightning.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
+from pytorch_lightning.callbacks.progress.tqdm_progress import Tqdm
 from pytorch_lightning.trainer.states import TrainerFn
 from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import save_file
 from torch import Tensor, distributed
+from tqdm import tqdm
 
 from kornia_learnnorm.data.sets import StoreSets, SyntheticSets
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
@@ -24,7 +27,7 @@ from kornia_learnnorm.files import atomic_write, short_name
 from lightning_modules.estimator_task import EstimatorTask
 from lightning_modules.task import NormalizerTask
 
-__all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "WritePredictions"]
+__all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "StepProgress", "WritePredictions"]
 
 
 class Checkpoints(ModelCheckpoint):
@@ -72,7 +75,7 @@ class Checkpoints(ModelCheckpoint):
             return
         last = self.last_model_path
         how = f"to go on, repeat the command with --ckpt_path {last}" if last else "no checkpoint was written"
-        rank_zero_info(f"stopped at step {trainer.global_step}; {how}")
+        _print_above_bar(f"stopped at step {trainer.global_step}; {how}")
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Give interrupts back."""
@@ -111,7 +114,7 @@ class ExpectedTime(Callback):
         self._first = trainer.global_step + 1
         steps = _remaining_steps(trainer)
         count = "steps until it is stopped" if steps is None else f"{steps} steps"
-        rank_zero_info(f"device {pl_module.device}, {count}; results in {trainer.default_root_dir}")
+        _print_above_bar(f"device {pl_module.device}, {count}; results in {trainer.default_root_dir}")
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
         """Print the expected time after the first steps."""
@@ -120,13 +123,60 @@ class ExpectedTime(Callback):
             self._start = time.monotonic()
         elif done == self.measured_steps and (steps := _remaining_steps(trainer)):
             seconds = (time.monotonic() - self._start) / done * steps
-            rank_zero_info(f"about {_duration(seconds)} for the remaining {steps} steps, without validation")
+            _print_above_bar(f"about {_duration(seconds)} for the remaining {steps} steps, without validation")
+
+
+def _print_above_bar(text: str) -> None:
+    """Print a line of a training, above its progress bar where there is one."""
+    with tqdm.external_write_mode():
+        rank_zero_info(text)
+
+
+class StepProgress(TQDMProgressBar):
+    """Show the steps that a training has done out of all, in one bar over all epochs.
+
+    Lightning's own bars count the batches of one epoch. The command line adds this bar where no other is configured.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(refresh_rate=1 if sys.stdout.isatty() else 100)
+
+    def on_train_start(self, *args: Any) -> None:
+        """Open the bar at the step that the training begins with."""
+        super().on_train_start(*args)
+        bar, done = self.train_progress_bar, self.trainer.global_step
+        bar.total, bar.initial, bar.n = _total_steps(self.trainer), done, done
+        bar.set_description("Step")
+
+    def init_sanity_tqdm(self) -> Tqdm:
+        """Return no bar for the two batches of validation before the training."""
+        return Tqdm(disable=True)
+
+    def get_metrics(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> dict[str, Any]:
+        """Return the logged values, without the number of the logger's version."""
+        return {name: value for name, value in super().get_metrics(trainer, pl_module).items() if name != "v_num"}
+
+    def on_train_epoch_start(self, *args: Any) -> None:
+        """Leave the bar as it is."""
+
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
+        """Show the steps and the logged values."""
+        bar, done = self.train_progress_bar, trainer.global_step
+        bar.n = done
+        if self.is_enabled and (done % self.refresh_rate == 0 or done == bar.total):
+            bar.set_postfix(self.get_metrics(trainer, pl_module))
+
+
+def _total_steps(trainer: pl.Trainer) -> int | None:
+    """Return the number of steps of a training; None where it has no end."""
+    total = trainer.max_steps if trainer.max_steps > 0 else trainer.estimated_stepping_batches
+    return int(total) if math.isfinite(total) else None
 
 
 def _remaining_steps(trainer: pl.Trainer) -> int | None:
     """Return the number of steps that a training has before it; None where it has no end."""
-    total = trainer.max_steps if trainer.max_steps > 0 else trainer.estimated_stepping_batches
-    return int(total) - trainer.global_step if math.isfinite(total) else None
+    total = _total_steps(trainer)
+    return None if total is None else total - trainer.global_step
 
 
 def _duration(seconds: float) -> str:

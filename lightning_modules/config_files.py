@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-__all__ = ["config_names", "find_config", "with_config_paths"]
+import yaml
+
+__all__ = ["config_names", "find_config", "read_config", "with_config_paths"]
 
 OPTIONS = ("-c", "--config")
 PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
@@ -34,6 +37,23 @@ def find_config(name: str) -> Path:
         known = ", ".join(known for known in names if "/" not in known)
         raise FileNotFoundError(f"no configuration {name}: expected a file, or one of {known}, ablations/*, table1/*")
     return _folder() / f"{stem}.yaml"
+
+
+def read_config(path: str | Path) -> dict[str, Any]:
+    """Return the content of a configuration.
+
+    Raises:
+        ValueError: if the file is not YAML, or holds something else than options by name.
+
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"configuration {path} is not YAML: {error}") from error
+    if not isinstance(content, dict):
+        got = "an empty file" if content is None else f"{type(content).__name__} {str(content)[:40]!r}"
+        raise ValueError(f"configuration {path}: options by name expected, such as 'seed_everything: 0', got {got}")
+    return content
 
 
 def with_config_paths(args: Sequence[str]) -> list[str]:

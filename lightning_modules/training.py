@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import signal
 import sys
@@ -17,17 +16,16 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
-import yaml
 from jsonargparse import ArgumentError
 from lightning_fabric.utilities.exceptions import MisconfigurationException
-from pytorch_lightning.callbacks import Callback, ModelCheckpoint
+from pytorch_lightning.callbacks import Callback, ModelCheckpoint, ProgressBar
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 from kornia_learnnorm.files import exclusive
-from lightning_modules.callbacks import Checkpoints, ExpectedTime, ExportWeights
-from lightning_modules.config_files import with_config_paths
+from lightning_modules.callbacks import Checkpoints, ExpectedTime, ExportWeights, StepProgress
+from lightning_modules.config_files import config_names, read_config, with_config_paths
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.estimator_task import EstimatorTask
 from lightning_modules.task import NormalizerTask
@@ -54,7 +52,7 @@ class TrainingCLI(LightningCLI):
             super().parse_arguments(parser, args)
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
-        """Make the trainer, with checkpoints and the export of the weights where the configuration has none."""
+        """Make the trainer, with what the configuration lacks: checkpoints, the export of the weights, progress."""
         config = self.config_init[self.subcommand]["trainer"]
         callbacks = config["callbacks"] or []
         callbacks = [*callbacks] if isinstance(callbacks, list) else [callbacks]
@@ -62,6 +60,8 @@ class TrainingCLI(LightningCLI):
             callbacks.append(Checkpoints())
         if isinstance(self.model, NormalizerTask | EstimatorTask) and not _has(callbacks, ExportWeights):
             callbacks.append(ExportWeights())
+        if config["enable_progress_bar"] is not False and not _has(callbacks, ProgressBar):
+            callbacks.append(StepProgress())
         return super().instantiate_trainer(callbacks=callbacks, **kwargs)
 
     def _parse_ckpt_path(self) -> None:
@@ -128,18 +128,26 @@ def _is_wanted(record: logging.LogRecord) -> bool:
     return not UNWANTED_MESSAGE.match(record.getMessage())
 
 
-def _names_its_classes(args: Sequence[str]) -> bool:
-    """Return whether a configuration among the arguments names the classes of its task and datamodule."""
+def _config_files(args: Sequence[str]) -> list[str]:
+    """Return the paths of the configurations among the arguments."""
     files = [value for key, value in pairwise(args) if key in ("-c", "--config")]
-    files += [arg.partition("=")[2] for arg in args if arg.startswith("--config=")]
-    for path in filter(os.path.isfile, files):
-        try:
-            content = yaml.safe_load(Path(path).read_text())
-        except (OSError, ValueError, yaml.YAMLError):
-            continue  # the parser says what is wrong with it
-        if isinstance(content, dict) and "class_path" in (content.get("model") or {}):
-            return True
-    return False
+    return files + [arg.partition("=")[2] for arg in args if arg.startswith("--config=")]
+
+
+def _names_its_classes(config: dict[str, Any]) -> bool:
+    """Return whether a configuration names the classes of its task and datamodule."""
+    model = config.get("model")
+    return isinstance(model, dict) and "class_path" in model
+
+
+def _which_configurations(command: str) -> str:
+    """Return what to give to a training command without a configuration."""
+    names = ", ".join(name for name in config_names() if "/" not in name)
+    checkpoint = "" if command == "fit" else " --ckpt_path runs/crossview-synthetic/checkpoints/last.ckpt"
+    return (
+        f"no configuration: give one by --config, a file or one of {names} (learnnorm config lists all); for example"
+        f" learnnorm {command} --config crossview-synthetic{checkpoint}, which needs no data"
+    )
 
 
 def _short_message(message: str) -> str:
@@ -172,7 +180,8 @@ def run(args: list[str] | None) -> None:
     for message in UNWANTED_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
     logging.getLogger("pytorch_lightning.utilities.rank_zero").addFilter(_is_wanted)
-    named = _names_its_classes(words)
+    configs = [read_config(path) for path in _config_files(words)]
+    named = any(map(_names_its_classes, configs))
     raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines
     try:
         TrainingCLI(
@@ -188,6 +197,8 @@ def run(args: list[str] | None) -> None:
         )
     except ArgumentError as error:
         command = next(iter(words), "fit")
+        if "are required" in str(error) and not _config_files(words):
+            raise ValueError(_which_configurations(command)) from error
         raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help lists the options") from error
     except ValueError as error:  # of a class that was configured: its data, for example
         raise ValueError(_first_error(str(error))) from error

@@ -385,13 +385,39 @@ def test_wrong_options_of_a_training_are_one_line(options, message, tmp_path, mo
     refused(["fit", "--config", "crossview-synthetic", *options], message)
 
 
-def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog):
-    options = ["--data.batch_size=16", "--trainer.max_steps=13", "--trainer.enable_progress_bar=false"]
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "configuration own.yaml: options by name expected, such as 'seed_everything: 0', got an empty file"),
+        (b"- 1", "configuration own.yaml: options by name expected, such as 'seed_everything: 0', got list '[1]'"),
+        (b"text", "got str 'text'"),
+        (b"a: [1", "configuration own.yaml is not YAML: while parsing a flow sequence"),
+        (b"\xff\xfe", "configuration own.yaml is not YAML: 'utf-8' codec"),
+        (b"model: 3", "model"),
+    ],
+)
+@pytest.mark.parametrize("form", [["--config", "own.yaml"], ["--config=own.yaml"]])
+def test_a_wrong_configuration_is_named(content, message, form, tmp_path, monkeypatch, refused):
+    monkeypatch.chdir(tmp_path)
+    Path("own.yaml").write_bytes(content)
+    refused(["fit", "--config", "crossview-synthetic", *form], message)
+
+
+@pytest.mark.parametrize(("command", "options"), [("fit", []), ("fit", ["--trainer.max_steps=9"]), ("validate", [])])
+def test_a_training_without_a_configuration_names_those_that_ship(command, options, refused):
+    refused([command, *options], "give one by --config, a file or one of crossview, crossview-synthetic, paper,")
+    checkpoint = "" if command == "fit" else " --ckpt_path "
+    refused([command, *options], f"for example learnnorm {command} --config crossview-synthetic{checkpoint}")
+
+
+def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog, capsys):
+    options = ["--data.batch_size=16", "--trainer.max_steps=13", "--trainer.accelerator=cpu"]
     options += [f"--data.{stage}.init_args.number=64" for stage in ("train", "val")]
-    options += [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=1", "--trainer.accelerator=cpu"]
+    options += [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=1"]
     with caplog.at_level("INFO"):
         assert main(["fit", "--config=crossview-synthetic", *options, f"--trainer.default_root_dir={tmp_path}"]) == 0
     assert f"device cpu, 13 steps; results in {tmp_path}" in caplog.messages
+    assert " 13/13 " in capsys.readouterr().out
     assert [text for text in caplog.messages if re.fullmatch(r"about \d+ s for the remaining 2 steps, .*", text)]
     # Lightning's lines of other devices and of products are left out.
     assert [text for text in caplog.messages if re.search("available|Tip", text)] == []

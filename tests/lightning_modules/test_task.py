@@ -1,6 +1,8 @@
 """The task, the datamodule, the callbacks: a few steps of training on small data."""
 
+import contextlib
 import functools
+import re
 import signal
 
 import pytest
@@ -11,7 +13,7 @@ from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.sources import Block, SyntheticSamples
-from lightning_modules.callbacks import Checkpoints, ExportWeights, WritePredictions
+from lightning_modules.callbacks import Checkpoints, ExportWeights, StepProgress, WritePredictions
 from lightning_modules.datamodule import EVALUATION_SEED, CorrespondenceDataModule, SampleLoader
 from lightning_modules.task import NormalizerTask
 
@@ -36,7 +38,7 @@ def make_data(source=None, **arguments):
 
 def make_trainer(folder, callbacks=(), **arguments):
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
-    return pl.Trainer(default_root_dir=folder, callbacks=list(callbacks), max_epochs=-1, **quiet, **arguments)
+    return pl.Trainer(default_root_dir=folder, callbacks=list(callbacks), max_epochs=-1, **quiet | arguments)
 
 
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
@@ -115,6 +117,21 @@ def test_a_second_interrupt_ends_the_run_at_once(tmp_path):
     with pytest.raises(SystemExit):
         make_trainer(tmp_path, callbacks, max_steps=20).fit(make_task(), make_data())
     assert not (tmp_path / "checkpoints/last.ckpt").exists()
+
+
+def test_the_progress_bar_counts_the_steps_of_the_training(tmp_path, capsys):
+    """An epoch has about nine batches; the training goes on from step 12."""
+
+    def shown_steps(more, **resumed):
+        callbacks = [Checkpoints(every_n_train_steps=12), StepProgress(), *more]
+        trainer = make_trainer(tmp_path, callbacks, max_steps=20, enable_progress_bar=True)
+        with contextlib.suppress(InterruptedError):
+            trainer.fit(make_task(), make_data(), **resumed)
+        return re.findall(r"Step: .*?\| (\S+) \[", capsys.readouterr().out)
+
+    assert "0/20" in shown_steps([train_processes.Stop(14)])
+    steps = shown_steps([], ckpt_path=tmp_path / "checkpoints/last.ckpt")
+    assert (steps[0], steps[-1]) == ("12/20", "20/20")
 
 
 @pytest.mark.parametrize("log", [True, False])
