@@ -17,6 +17,7 @@ from pytorch_lightning.callbacks import Callback, ModelCheckpoint, TQDMProgressB
 from pytorch_lightning.callbacks.progress.tqdm_progress import Tqdm
 from pytorch_lightning.trainer.states import TrainerFn
 from pytorch_lightning.utilities import rank_zero_info
+from pytorch_lightning.utilities.exceptions import SIGTERMException
 from safetensors.torch import save_file
 from torch import Tensor, distributed
 from tqdm import tqdm
@@ -33,8 +34,9 @@ __all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "StepProgress", "Writ
 class Checkpoints(ModelCheckpoint):
     """Keep the last checkpoint as ``checkpoints/last.ckpt`` in the trainer's default root directory.
 
-    A training that is interrupted (Ctrl-C) ends after the current step with a checkpoint; a second Ctrl-C ends it at
-    once. Several processes end at once, since they would not agree on the step.
+    A training that is interrupted (Ctrl-C) or terminated (SIGTERM) ends after the current step with a checkpoint; a
+    second Ctrl-C ends it at once, and so does SIGTERM during a validation. Several processes end at once, since they
+    would not agree on the step.
 
     Args:
         every_n_train_steps: steps between checkpoints.
@@ -43,7 +45,7 @@ class Checkpoints(ModelCheckpoint):
     def __init__(self, every_n_train_steps: int = 100) -> None:
         super().__init__(save_last=True, every_n_train_steps=every_n_train_steps, enable_version_counter=False)
         self._previous_handler: Any = None
-        self._interrupted = False
+        self._interrupted = self._started = False
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Choose the folder."""
@@ -53,7 +55,7 @@ class Checkpoints(ModelCheckpoint):
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Handle interrupts, in the main thread of a single process."""
         super().on_train_start(trainer, pl_module)
-        self._interrupted = False
+        self._interrupted, self._started = False, True
         if trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
             self._previous_handler = signal.signal(signal.SIGINT, self._interrupt)
 
@@ -62,16 +64,17 @@ class Checkpoints(ModelCheckpoint):
     ) -> None:
         """Save a checkpoint where one is due, or where the training was interrupted, which ends here."""
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
-        if self._interrupted:
+        terminated = trainer.received_sigterm and trainer.world_size == 1
+        if self._interrupted or terminated:
             self.last_model_path = str(Path(str(self.dirpath)) / "last.ckpt")
             trainer.save_checkpoint(self.last_model_path)
-            raise KeyboardInterrupt
+            raise SIGTERMException if terminated else KeyboardInterrupt
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
         """Say how an interrupted run can be resumed."""
         super().on_exception(trainer, pl_module, exception)
         self._restore_handler()
-        if trainer.state.fn != TrainerFn.FITTING:
+        if trainer.state.fn != TrainerFn.FITTING or not self._started:
             return
         last = self.last_model_path
         how = f"to go on, repeat the command with --ckpt_path {last}" if last else "no checkpoint was written"

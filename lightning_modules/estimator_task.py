@@ -11,12 +11,12 @@ import torch
 from pytorch_lightning.utilities import rank_zero_warn
 from torch import Tensor, nn
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import OneCycleLR
 
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss
+from lightning_modules.schedule import OneCycle
 
 __all__ = ["EstimatorTask"]
 
@@ -94,7 +94,7 @@ class EstimatorTask(pl.LightningModule):
         optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
         steps = max(2, int(self.trainer.estimated_stepping_batches))
         warm_up = max(0.05, 1.5 / steps)  # the schedule divides by the warm-up's steps less one
-        schedule = OneCycleLR(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=warm_up)
+        schedule = OneCycle(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=warm_up)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def training_step(self, batch: MatchSets, batch_idx: int) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from pytorch_lightning.utilities import rank_zero_warn
 from torch import Tensor, nn
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
+from torch.optim.lr_scheduler import LRScheduler
 
 from kornia_learnnorm.data.samples import Samples
 from kornia_learnnorm.estimators.fundamental import find_fundamental, solve_fundamental, solve_in_coordinates
@@ -24,6 +24,7 @@ from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers.whitening import Whitening
+from lightning_modules.schedule import OneCycle
 
 __all__ = ["NormalizerTask"]
 
@@ -80,7 +81,7 @@ class NormalizerTask(pl.LightningModule):
         if self.lr_scheduler is not None:
             return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self.lr_scheduler(optimizer)}}
         steps = int(self.trainer.estimated_stepping_batches)
-        schedule = OneCycleLR(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=max(2, steps))
+        schedule = OneCycle(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=max(2, steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:

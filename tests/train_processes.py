@@ -99,15 +99,15 @@ class Stop(pl.Callback):
 
 
 class Interrupt(pl.Callback):
-    """Interrupt as Ctrl-C does, in the middle of a step."""
+    """Send the signal of Ctrl-C, or another one, in the middle of a step."""
 
-    def __init__(self, step, times=1):
-        self.step, self.times = step, times
+    def __init__(self, step, times=1, number=signal.SIGINT):
+        self.step, self.times, self.number = step, times, number
 
     def on_after_backward(self, trainer, *_):
         if trainer.global_step == self.step:
             for _ in range(self.times):
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), self.number)
 
 
 def task_and_data(case):

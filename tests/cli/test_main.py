@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,6 @@ import torch
 import train_processes
 import yaml
 from pytorch_lightning.utilities import rank_zero_info
-from pytorch_lightning.utilities.exceptions import SIGTERMException
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
@@ -434,14 +434,19 @@ def test_durations(seconds, text):
     assert _duration(seconds) == text
 
 
-def test_an_interrupted_training_exits_as_interrupted(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_training_exits_as_interrupted(number, code, tmp_path, monkeypatch, capsys, caplog):
     monkeypatch.chdir(tmp_path)
-    interrupt = train_processes.Interrupt(1)
+    interrupt = train_processes.Interrupt(1, number=number)
     monkeypatch.setattr("lightning_modules.callbacks.ExportWeights.on_after_backward", interrupt.on_after_backward)
     options = ["--data.batch_size=16", "--trainer.max_steps=3", "--trainer.enable_progress_bar=false"]
-    assert main(["fit", "--config=crossview-synthetic", *options]) == 130
-    assert capsys.readouterr().err.endswith("interrupted\n")
-    assert Path("runs/crossview-synthetic/checkpoints/last.ckpt").is_file()
+    with pytest.raises(SystemExit) as ended, caplog.at_level("INFO"):
+        sys.exit(main(["fit", "--config=crossview-synthetic", *options]))
+    assert ended.value.code == code
+    last = Path("runs/crossview-synthetic/checkpoints/last.ckpt")
+    assert f"stopped at step 2; to go on, repeat the command with --ckpt_path {last}" in caplog.text
+    assert capsys.readouterr().err.endswith("interrupted\n") is (code == 130)
+    assert last.is_file()
     assert not Path("runs/crossview-synthetic/weights.safetensors").exists()
 
 
@@ -539,13 +544,3 @@ def test_unknown_option_shows_the_usage_of_its_command(arguments, capsys):
     assert usage.startswith(f"usage: learnnorm {arguments[0]} ")
     assert last.startswith(f"learnnorm {arguments[0]}: error: unrecognized arguments: --unheard")
     assert last.endswith(f"learnnorm {arguments[0]} --help lists the options")
-
-
-def test_terminated_training_exits_with_143(monkeypatch):
-    def terminated(*args, **kwargs):
-        raise SIGTERMException
-
-    monkeypatch.setattr("lightning_modules.training.TrainingCLI", terminated)
-    with pytest.raises(SystemExit) as caught:
-        main(["fit", "--config", "crossview"])
-    assert caught.value.code == 143

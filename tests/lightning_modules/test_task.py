@@ -92,24 +92,35 @@ def test_resumes_to_the_same_curve(tmp_path, interrupted_at, source, arguments):
     assert got == expected[interrupted_at // 2 * 2 :]
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_an_interrupted_run_saves_its_step_and_goes_on_to_the_same_curve(tmp_path, workers, caplog):
-    """Ctrl-C comes in the middle of step 5; no checkpoint is due before step 100."""
+@pytest.mark.parametrize(("workers", "number"), [(0, signal.SIGINT), (1, signal.SIGINT), (0, signal.SIGTERM)])
+def test_an_interrupted_run_saves_its_step_and_goes_on_to_the_same_curve(tmp_path, workers, number, caplog):
+    """The signal comes in the middle of step 5; no checkpoint is due before step 100."""
     source = Blocks(number=96, num_heldout=4, max_residual=None)
     whole, watches = make_task(), [train_processes.Watch(), train_processes.Watch()]
     data = functools.partial(make_data, source, workers=workers)
     make_trainer(tmp_path / "whole", watches[:1], max_steps=20, enable_checkpointing=False).fit(whole, data())
     first, second, last = make_task(), make_task(), tmp_path / "cut/checkpoints/last.ckpt"
-    handler = signal.getsignal(signal.SIGINT)
+    handler, interrupt = signal.getsignal(number), train_processes.Interrupt(4, number=number)
     with pytest.raises(SystemExit), caplog.at_level("INFO"):
-        make_trainer(tmp_path / "cut", [Checkpoints(), train_processes.Interrupt(4)], max_steps=20).fit(first, data())
-    assert signal.getsignal(signal.SIGINT) is handler
+        make_trainer(tmp_path / "cut", [Checkpoints(), interrupt], max_steps=20).fit(first, data())
+    assert signal.getsignal(number) is handler
     assert f"stopped at step 5; to go on, repeat the command with --ckpt_path {last}" in caplog.text
     make_trainer(tmp_path / "cut", [watches[1], Checkpoints()], max_steps=20).fit(second, data(), ckpt_path=last)
-    assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.getsignal(number) is handler
     torch.testing.assert_close(second.state_dict(), whole.state_dict(), rtol=0, atol=0)
     expected, got = (watch.seen["train/loss"] for watch in watches)
     assert got == expected[5:]
+
+
+@pytest.mark.parametrize("steps", [10, 40])
+def test_a_run_of_another_length_does_not_go_on(tmp_path, steps, caplog):
+    with pytest.raises(InterruptedError):
+        make_trainer(tmp_path, [Checkpoints(2), train_processes.Stop(5)], max_steps=20).fit(make_task(), make_data())
+    trainer, last = make_trainer(tmp_path, [Checkpoints(2)], max_steps=steps), tmp_path / "checkpoints/last.ckpt"
+    caplog.clear()
+    with pytest.raises(ValueError, match=f"a training of 20 steps, .* got {steps} steps"):
+        trainer.fit(make_task(), make_data(), ckpt_path=last)
+    assert "stopped at step" not in caplog.text
 
 
 def test_a_second_interrupt_ends_the_run_at_once(tmp_path):
