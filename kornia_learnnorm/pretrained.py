@@ -18,6 +18,10 @@ from kornia_learnnorm.files import atomic_write
 __all__ = ["check_architecture", "load_module", "save_module", "shipped_weights", "weights_digest", "weights_format"]
 
 WEIGHTS = Path(__file__).parent / "weights"
+CLASSES = {  # of the modules that files hold, by the format
+    "kornia_learnnorm.normalizer.v1": "LearnedNormalizer",
+    "kornia_learnnorm.eight_point.v1": "LearnedEightPoint",
+}
 MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that a file may name
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -84,6 +88,10 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
         raise ValueError(f"{path} is not a safetensors file: {error}") from error
     if metadata.get("format") != form:
         got, fitting = metadata.get("format"), ", ".join(shipped_weights(form))
+        if got in CLASSES:
+            raise ValueError(
+                f"{path} holds the weights of a {CLASSES[got]}, expected those of a {CLASSES[form]}, such as {fitting}"
+            )
         raise ValueError(
             f"{path} has another format: expected format {form!r}, got {got!r}; the package's of that format: {fitting}"
         )

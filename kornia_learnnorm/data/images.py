@@ -110,7 +110,7 @@ def read_mask(path: str | Path, size: Size, max_size: int | None = None) -> npt.
         ImportError: if Pillow is not installed.
 
     """
-    grey = _read(Path(path), "L", max_size)
+    grey = _read(Path(path), "L", max_size, "mask")
     got = image_size(path)
     if got != size:
         raise ValueError(f"mask {path} has {got[0]} x {got[1]} pixels, its image {size[0]} x {size[1]}")
@@ -254,32 +254,32 @@ def image_size(path: str | Path) -> Size:
     return (height, width) if turned else (width, height)
 
 
-def _read(path: Path, mode: str, max_size: int | None) -> npt.NDArray[np.uint8]:
+def _read(path: Path, mode: str, max_size: int | None, kind: str = "image") -> npt.NDArray[np.uint8]:
     """Decode an image file; errors name the file and what is wrong with it."""
     if not path.exists():
-        raise FileNotFoundError(f"image {path} does not exist")
+        raise FileNotFoundError(f"{kind} {path} does not exist")
     reduced_size((1, 1), max_size)  # checks the limit before a file is read
     size = path.stat().st_size
     if path.is_dir() or size == 0:
         got = "a folder" if path.is_dir() else "empty (0 bytes)"
-        raise ValueError(f"image {path} is {got}, expected an image file")
+        raise ValueError(f"{kind} {path} is {got}, expected an image file")
     Image = import_pillow()
     try:
         return decode(path, mode, max_size)
     except PixelError as error:
-        raise ValueError(f"image {path} cannot be used: {error}") from error
+        raise ValueError(f"{kind} {path} cannot be used: {error}") from error
     except Image.DecompressionBombError as error:
         limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels, the limit, 2 * PIL.Image.MAX_IMAGE_PIXELS"
-        raise ValueError(f"image {path} declares more than {limit}") from error
+        raise ValueError(f"{kind} {path} declares more than {limit}") from error
     except Image.UnidentifiedImageError as error:
-        raise ValueError(f"image {path} cannot be decoded: {size} bytes, {_unknown_kind(path)}") from error
+        raise ValueError(f"{kind} {path} cannot be decoded: {size} bytes, {_unknown_kind(path)}") from error
     except Exception as error:  # a broken file can end in nearly any error of Pillow's decoders
         reason = "truncated or corrupt"
         if isinstance(error, MemoryError):
             reason = "too large for the memory"
         elif isinstance(error, OSError) and error.strerror:  # of the system; Pillow's own have no number
             reason = error.strerror
-        raise ValueError(f"image {path} cannot be decoded: {size} bytes, {reason}") from error
+        raise ValueError(f"{kind} {path} cannot be decoded: {size} bytes, {reason}") from error
 
 
 def _unknown_kind(path: Path) -> str:

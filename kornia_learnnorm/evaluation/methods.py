@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor
 
 from kornia_learnnorm.estimators.fundamental import solve_in_coordinates
+from kornia_learnnorm.estimators.learned import FORMAT as LAYER_FORMAT
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.evaluation.tables import names_of
@@ -24,7 +25,7 @@ from kornia_learnnorm.normalizers.identity import Identity
 from kornia_learnnorm.normalizers.learned import FORMAT, LearnedNormalizer
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.normalizers.whitening import Whitening
-from kornia_learnnorm.pretrained import WEIGHTS, shipped_weights
+from kornia_learnnorm.pretrained import WEIGHTS, shipped_weights, weights_format
 
 __all__ = [
     "CLOSED_FORMS",
@@ -121,12 +122,12 @@ def _find_normalizer(name: str) -> Normalizer:
     if ":" in name:
         return _own_normalizer(name)
     shipped = shipped_weights(FORMAT)
+    if weights_format(name) == LAYER_FORMAT:
+        raise ValueError(
+            f"{name} holds the weights of a LearnedEightPoint, expected those of a LearnedNormalizer, such as"
+            f" {', '.join(shipped)}; learnnorm robust STORE --out RUN --estimators learned:{name} evaluates them"
+        )
     if name not in shipped and Path(name).suffix != ".safetensors":
-        if name in shipped_weights():
-            raise ValueError(
-                f"the weights {name!r} are not those of a normalisation, which an evaluation of samples compares;"
-                f" learnnorm robust STORE --out RUN --estimators learned:{name} evaluates them"
-            )
         raise FileNotFoundError(
             f"no weights {name!r} and no such normalisation: expected {', '.join([*CLOSED_FORMS, *shipped])}, a"
             f" .safetensors file or module:Name, each without suffix or with {REFINED} or {OPTIMAL}"

@@ -296,8 +296,10 @@ class TestReadMask:
         cv2.imwrite(str(tmp_path / "m.png"), mask)
         with pytest.raises(ValueError, match=message):
             read_mask(tmp_path / "m.png", size)
-        with pytest.raises(FileNotFoundError):
+        with pytest.raises(FileNotFoundError, match=r"^mask .*none\.png does not exist"):
             read_mask(tmp_path / "none.png", size)
+        with pytest.raises(ValueError, match=r"^mask .* is a folder"):
+            read_mask(tmp_path, size)
 
 
 class TestReadFrame:

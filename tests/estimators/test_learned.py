@@ -203,7 +203,9 @@ class TestFiles:
             kln.LearnedEightPoint.from_pretrained(file)
 
     def test_weights_of_a_normaliser(self):
-        with pytest.raises(ValueError, match=r"expected format 'kornia_learnnorm\.eight_point\.v1'"):
+        with pytest.raises(
+            ValueError, match=r"crossview.* of a LearnedNormalizer, expected .* LearnedEightPoint, such as"
+        ):
             kln.LearnedEightPoint.from_pretrained("crossview")
 
 

@@ -48,6 +48,11 @@ def test_refined_is_the_better_fit(scene):
     [
         ("nothing", FileNotFoundError, "no weights 'nothing'"),
         ("robust", ValueError, "robust STORE --out RUN --estimators learned:robust evaluates them"),
+        (
+            str(WEIGHTS / "robust.safetensors"),
+            ValueError,
+            "of a LearnedEightPoint, expected those of a LearnedNormalizer",
+        ),
         ("hartley+LM", FileNotFoundError, r"expected none, Hartley, .*paper, .*module:Name, .*\+LM or \+optimal"),
         ("Hartley+foo", FileNotFoundError, r"no weights 'Hartley\+foo'"),
         ("Hartley+optimal+LM", FileNotFoundError, "expected none, Hartley"),
