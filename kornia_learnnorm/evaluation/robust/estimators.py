@@ -56,6 +56,7 @@ DEFAULT_ESTIMATORS = (
     "learned:robust",
     "learned:robust-synthetic",
     "guided:robust",
+    "guided:robust-synthetic",
     TRUTH,
 )
 
