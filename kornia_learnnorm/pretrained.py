@@ -78,7 +78,7 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
         raise ValueError(f"{name} is not a .safetensors file by its name")
     if not path.is_file():
         raise FileNotFoundError(
-            f"no weights {str(name)!r}: expected a .safetensors file or one of {shipped_weights(form)}"
+            f"no weights {str(name)!r}: expected a .safetensors file or one of {', '.join(shipped_weights(form))}"
         )
     try:
         with safe_open(path, "pt") as file:
@@ -90,7 +90,7 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
         got, fitting = metadata.get("format"), ", ".join(shipped_weights(form))
         if got in CLASSES:
             raise ValueError(
-                f"{path} holds the weights of a {CLASSES[got]}, expected those of a {CLASSES[form]}, such as {fitting}"
+                f"{name} holds the weights of a {CLASSES[got]}, expected those of a {CLASSES[form]}, such as {fitting}"
             )
         raise ValueError(
             f"{path} has another format: expected format {form!r}, got {got!r}; the package's of that format: {fitting}"

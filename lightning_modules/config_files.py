@@ -11,6 +11,7 @@ import yaml
 __all__ = ["config_names", "find_config", "read_config", "with_config_paths"]
 
 OPTIONS = ("-c", "--config")
+SECTIONS = ("trainer", "model", "data")  # of a configuration, each of which can be the name of a file
 PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
 REPOSITORY = Path(__file__).parents[1] / "configs"  # where a checkout has them
 
@@ -43,16 +44,21 @@ def read_config(path: str | Path) -> dict[str, Any]:
     """Return the content of a configuration.
 
     Raises:
-        ValueError: if the file is not YAML, or holds something else than options by name.
+        ValueError: if the file is not YAML, or it or one of its sections holds something else than options by name.
 
     """
     try:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (ValueError, yaml.YAMLError) as error:
         raise ValueError(f"configuration {path} is not YAML: {error}") from error
-    if not isinstance(content, dict):
-        got = "an empty file" if content is None else f"{type(content).__name__} {str(content)[:40]!r}"
-        raise ValueError(f"configuration {path}: options by name expected, such as 'seed_everything: 0', got {got}")
+    if content is None:
+        raise ValueError(f"configuration {path} is empty: options by name expected, such as 'seed_everything: 0'")
+    sections = {"": content} if not isinstance(content, dict) else {key: content.get(key, {}) for key in SECTIONS}
+    for key, section in sections.items():
+        file = key and isinstance(section, str) and (Path(path).parent / section).is_file()
+        if not isinstance(section, dict) and not file:
+            got = f"{type(section).__name__} {str(section)[:40]!r}"
+            raise ValueError(f"configuration {path}{key and ', '}{key}: options by name expected, got {got}")
     return content
 
 

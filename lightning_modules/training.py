@@ -72,6 +72,8 @@ class TrainingCLI(LightningCLI):
         with ExitStack() as stack:
             if subcommand == "fit" and self.trainer.is_global_zero:
                 folder = Path(self.trainer.default_root_dir)
+                if folder.exists() and not folder.is_dir():
+                    raise FileExistsError(f"{folder} is a file: expected a folder for the run, or a new name")
                 folder.mkdir(parents=True, exist_ok=True)
                 stack.enter_context(exclusive(folder))
                 last = folder / "checkpoints" / "last.ckpt"
@@ -157,7 +159,7 @@ def _short_message(message: str) -> str:
         classes = re.findall(r"Problem with given class_path '([\w.]+)'", message[: unknown.end()])
         of = f" of {classes[-1]}" if classes else ""
         return f"unknown option {unknown[1]}{of}"
-    return _first_error(message)
+    return _with_option(_first_error(message), message)
 
 
 def _first_error(message: str) -> str:
@@ -165,6 +167,14 @@ def _first_error(message: str) -> str:
     while tried := re.search(r"Does not validate against.*?Errors:\n( *)- (.*?)\n(?:\1-|(?!\1))", message, re.DOTALL):
         message = tried[2]
     return " ".join(message.split())
+
+
+def _with_option(text: str, message: str) -> str:
+    """Return an error of a type after the option that has it, and before the value that was given."""
+    given = re.search(r"Given value: (.*?)(?:\. Got value: .*)?$", message, re.MULTILINE)
+    if not given or not text.startswith("Expected a "):
+        return text
+    return ": ".join([*re.findall(r'Parser key "([\w.]+)"', message), f"{text}, got {given[1]}"])
 
 
 def run(args: list[str] | None) -> None:
@@ -180,6 +190,8 @@ def run(args: list[str] | None) -> None:
     for message in UNWANTED_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
     logging.getLogger("pytorch_lightning.utilities.rank_zero").addFilter(_is_wanted)
+    if words[1:] and not words[1].startswith("-"):
+        raise ValueError(f"an option expected, got {words[1]!r}; a configuration is given by --config {words[1]}")
     configs = [read_config(path) for path in _config_files(words)]
     named = any(map(_names_its_classes, configs))
     raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines

@@ -376,6 +376,9 @@ def test_a_missing_package_is_one_line(blocked, extra, tmp_path, monkeypatch, re
         ([f"--{NETWORK}.widht=3"], "unknown option widht of kornia_learnnorm.CrossViewNetwork"),
         (["--config", "bad.yaml"], "unknown option model.nomalizer"),
         (["--trainer.max_steps", "many"], "trainer.max_steps"),
+        (["--trainer.precision", "12"], "trainer.precision: Expected a typing.Literal[64, 32, 16], got 12"),
+        (["--model.optimizer.init_args.lr", "x"], "model.optimizer: lr: Expected a <class 'float'>, got x"),
+        (["--trainer.default_root_dir", "bad.yaml"], "bad.yaml is a file: expected a folder for the run"),
         (["--config", "unknown"], "no configuration unknown: expected a file, or one of crossview, "),
     ],
 )
@@ -388,12 +391,13 @@ def test_wrong_options_of_a_training_are_one_line(options, message, tmp_path, mo
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "configuration own.yaml: options by name expected, such as 'seed_everything: 0', got an empty file"),
-        (b"- 1", "configuration own.yaml: options by name expected, such as 'seed_everything: 0', got list '[1]'"),
+        (b"", "configuration own.yaml is empty: options by name expected, such as 'seed_everything: 0'"),
+        (b"- 1", "configuration own.yaml: options by name expected, got list '[1]'"),
         (b"text", "got str 'text'"),
+        (b"trainer:", "configuration own.yaml, trainer: options by name expected, got NoneType 'None'"),
         (b"a: [1", "configuration own.yaml is not YAML: while parsing a flow sequence"),
         (b"\xff\xfe", "configuration own.yaml is not YAML: 'utf-8' codec"),
-        (b"model: 3", "model"),
+        (b"model: 3", "configuration own.yaml, model: options by name expected, got int '3'"),
     ],
 )
 @pytest.mark.parametrize("form", [["--config", "own.yaml"], ["--config=own.yaml"]])
@@ -401,6 +405,10 @@ def test_a_wrong_configuration_is_named(content, message, form, tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     Path("own.yaml").write_bytes(content)
     refused(["fit", "--config", "crossview-synthetic", *form], message)
+
+
+def test_a_configuration_without_its_option_is_one_line(refused):
+    refused(["fit", "crossview"], "an option expected, got 'crossview'; a configuration is given by --config crossview")
 
 
 @pytest.mark.parametrize(("command", "options"), [("fit", []), ("fit", ["--trainer.max_steps=9"]), ("validate", [])])
