@@ -1,10 +1,15 @@
 """Time estimators of the fundamental matrix side by side: eights and larger sets, forward and backward, one and many.
 
-    python benchmarks/speed.py [--out speed.json] [--device cpu] [--dtype float32] [--compile] [--quick]
+    python benchmarks/speed.py [--out speed.json] [--device cpu] [--dtype float32] [--quick]
+    python benchmarks/speed.py --compile [LAYER ...] [--out compile.json] [--device cpu] [--dtype float32]
 
 All methods take turns in one process on the same synthetic correspondences, with 40 % outliers in sets of more than
 eight. The tables have the median time of a batch in milliseconds and, in brackets, its ratio to Kornia's
 ``find_fundamental``. Estimators of single pairs (OpenCV, PoseLib, RANSAC) are called once for each set of the batch.
+
+With --compile, a line for each compiled layer, forward and backward, has the time of the first call, which compiles it
+without any cache and with one thread, as wall time and as processor time, which other programs change little; and the
+shortest time of later calls with torch.compile and without.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ import os
 import platform
 import statistics
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +39,7 @@ SECONDS = 1.0  # spent on a method in a table's cell, at most
 MIN_TURNS, MAX_TURNS = 5, 101
 MAX_WARM_MILLISECONDS = 3000  # of a batch; what takes longer is run once
 LARGE_FOR_PAIRS = 64  # sets in a batch, above which estimators of single pairs are left out
+LATER_CALLS = 101  # of a compiled layer
 
 Method = Callable[[Tensor, Tensor], Tensor]
 
@@ -49,6 +56,7 @@ class Case(NamedTuple):
 
 
 EIGHTS = [Case(batch, 8) for batch in (1, 64, 2048, 16384)]
+COMPILED = {"Hartley": EIGHTS[1], "whitening": EIGHTS[1], "crossview": EIGHTS[1], "learned": Case(32, 128)}
 SETS = [Case(batch, number) for number in (32, 128, 512, 2000) for batch in (1, 32)] + [Case(64, 128), Case(64, 1000)]
 
 
@@ -125,34 +133,52 @@ def correspondences(case: Case, device: str, dtype: torch.dtype) -> tuple[Tensor
     return points1.to(device), points2.to(device)
 
 
-def measure(
-    methods: dict[str, Method], case: Case, args: argparse.Namespace, backward: bool
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the median milliseconds of each method on one batch, taken in turns, and those of its first call."""
+def run_once(method: Method, points: tuple[Tensor, Tensor], backward: bool) -> float:
+    """Return the milliseconds of one call."""
+    leaves = [p.clone().requires_grad_(backward) for p in points]
+    start = time.perf_counter()
+    with torch.set_grad_enabled(backward):
+        F_mat = method(*leaves)
+    if backward:
+        F_mat[:, 0].sum().backward()
+    if points[0].is_cuda:
+        torch.cuda.synchronize()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def measure(methods: dict[str, Method], case: Case, args: argparse.Namespace, backward: bool) -> dict[str, float]:
+    """Return the median milliseconds of each method on one batch, taken in turns."""
     points = correspondences(case, args.device, getattr(torch, args.dtype))
-
-    def run(method: Method) -> float:
-        leaves = [p.clone().requires_grad_(backward) for p in points]
-        start = time.perf_counter()
-        with torch.set_grad_enabled(backward):
-            F_mat = method(*leaves)
-        if backward:
-            F_mat[:, 0].sum().backward()
-        if args.device != "cpu":
-            torch.cuda.synchronize()
-        return 1e3 * (time.perf_counter() - start)
-
-    first = {name: run(method) for name, method in methods.items()}  # warms up, and compiles where asked to
-    times = {
-        name: [run(method)] if args.compile or first[name] < MAX_WARM_MILLISECONDS else [first[name]]
-        for name, method in methods.items()
-    }
-    budget = 1e3 * SECONDS / (5 if args.quick else 1)
+    times = {name: [run_once(method, points, backward)] for name, method in methods.items()}
     short = [name for name in methods if times[name][0] < MAX_WARM_MILLISECONDS]
+    for name in short:
+        times[name] = [run_once(methods[name], points, backward)]  # without the warm-up
+    budget = 1e3 * SECONDS / (5 if args.quick else 1)
+    short = [name for name in short if times[name][0] < MAX_WARM_MILLISECONDS]
     for _ in range(int(min(MAX_TURNS, max(MIN_TURNS, len(short) * budget / sum(times[name][0] for name in short))))):
         for name in short:
-            times[name].append(run(methods[name]))
-    return {name: statistics.median(values) for name, values in times.items()}, first
+            times[name].append(run_once(methods[name], points, backward))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def measure_compiled(method: Method, case: Case, args: argparse.Namespace) -> dict[str, float]:
+    """Return the seconds of the first call of a compiled layer, and the milliseconds of later and uncompiled calls."""
+    import torch._inductor.config as inductor
+
+    torch.compiler.reset()
+    points = correspondences(case, args.device, getattr(torch, args.dtype))
+    compiled = torch.compile(method, fullgraph=True)
+    start = sum(os.times()[:4])  # of this process and of the compiler, its child
+    with warnings.catch_warnings(), inductor.patch(force_disable_caches=True, compile_threads=1):
+        warnings.simplefilter("ignore")  # of torch.compile, about its own code
+        first = run_once(compiled, points, backward=True) / 1e3
+    processor = sum(os.times()[:4]) - start
+
+    def shortest(method: Method) -> float:
+        return min(run_once(method, points, backward=True) for _ in range(LATER_CALLS))
+
+    found = {"first call, s": first, "first call, processor s": processor}
+    return found | {"later calls, ms": shortest(compiled), "not compiled, ms": shortest(method)}
 
 
 def machine(args: argparse.Namespace) -> dict[str, object]:
@@ -170,7 +196,7 @@ def machine(args: argparse.Namespace) -> dict[str, object]:
         "torch": torch.__version__,
         "device": card or args.device,
         "dtype": args.dtype,
-        "compiled": args.compile,
+        "compiled": args.compile is not None,
     }
 
 
@@ -193,36 +219,51 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dtype", choices=["float32", "float64"], default="float32")
-    parser.add_argument("--compile", action="store_true", help="torch.compile the solvers, Kornia's too")
+    parser.add_argument(
+        "--compile",
+        metavar="LAYER",
+        choices=COMPILED,
+        nargs="*",
+        help="torch.compile all or some of " + ", ".join(COMPILED),
+    )
     parser.add_argument("--quick", action="store_true", help="fewer turns and sizes")
     args = parser.parse_args()
     differentiable, outliers = solvers(args.device), robust(args.device)
+    found: dict[str, object] = {"machine": machine(args)}
+    print(json.dumps(found["machine"]), flush=True)
+    if args.compile is not None:
+        for name in args.compile or COMPILED:
+            layer = outliers[name] if name in outliers else differentiable[name]
+            title = f"{name}, {COMPILED[name]}"
+            found[title] = measure_compiled(layer, COMPILED[name], args)
+            print(f"{title}: " + ", ".join(f"{key} {value:.3g}" for key, value in found[title].items()), flush=True)
+    else:
+        measure_all(differentiable, outliers, args, found)
+    if args.out is not None:
+        write_text(args.out, json.dumps(found, indent=1) + "\n")
+
+
+def measure_all(
+    differentiable: dict[str, Method], outliers: dict[str, Method], args: argparse.Namespace, found: dict[str, object]
+) -> None:
+    """Measure all methods at all sizes, print the tables and add the times to a dictionary."""
     pairs = single_pairs() if args.device == "cpu" else {}
-    if args.compile:
-        differentiable = {name: torch.compile(method) for name, method in differentiable.items()}
     eights, sets = (EIGHTS[:3], [SETS[3], SETS[5]]) if args.quick else (EIGHTS, SETS)
     groups = {
         "sets of eight": (eights, differentiable, ("OpenCV FM_8POINT",)),
         "larger sets": (sets, {name: differentiable[name] for name in (KORNIA, "Hartley", "whitening", "optimal")}, ()),
         "larger sets with outliers": (sets, outliers, ("RANSAC", "PoseLib")),
     }
-    found: dict[str, object] = {"machine": machine(args)}
-    print(json.dumps(found["machine"]), flush=True)
     for group, (cases, methods, others) in groups.items():
         for backward in (False, True):
-            results, first = {}, {}
+            results = {}
             for case in cases:
                 alone = {name: pairs[name] for name in others if name in pairs and not backward}
                 chosen = methods | (alone if case.batch <= LARGE_FOR_PAIRS else {})
-                results[str(case)], first[str(case)] = measure(chosen, case, args, backward)
+                results[str(case)] = measure(chosen, case, args, backward)
             title = f"{group}, {'forward and backward' if backward else 'forward'}"
             found[title] = results
             print(f"\n{title}: ms a batch (ratio to Kornia)\n\n{table(results)}", flush=True)
-            if args.compile:
-                found[f"{title}, first call"] = first
-                print(f"\n{title}, first call, which compiles: ms\n\n{table(first)}", flush=True)
-    if args.out is not None:
-        write_text(args.out, json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

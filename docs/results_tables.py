@@ -81,6 +81,14 @@ def layer_times() -> Markdown:
     return Markdown(format_table(["ms (ratio to Kornia's)", *CASES], rows))
 
 
+def compile_times() -> Markdown:
+    """Return what compiling a layer takes and gains: seconds of the first call, milliseconds of later ones."""
+    found = json.loads((RESULTS / "compile.json").read_text(encoding="utf-8"))
+    columns = ("first call, processor s", "later calls, ms", "not compiled, ms")
+    rows = [[name, *(f"{times[key]:.3g}" for key in columns)] for name, times in found.items() if name != "machine"]
+    return Markdown(format_table(["layer, batch x correspondences", *columns], rows))
+
+
 def read_sizes() -> dict[str, dict[str, dict[str, list[float]]]]:
     """Return the errors (pixels) and times by store and protocol, method, and number of matches."""
     return json.loads((RESULTS / "sizes.json").read_text(encoding="utf-8"))

@@ -265,10 +265,9 @@ class TestSpeed:
     def test_every_method_is_timed(self, speed, backward, monkeypatch):
         monkeypatch.setattr(speed, "SECONDS", 1e-3)
         monkeypatch.setattr(speed, "MIN_TURNS", 1)
-        args = argparse.Namespace(device="cpu", dtype="float64", quick=True, compile=False)
+        args = argparse.Namespace(device="cpu", dtype="float64", quick=True)
         methods = speed.solvers("cpu") | ({} if backward else speed.single_pairs())
-        times, first = speed.measure(methods, speed.Case(2, 12), args, backward)
-        assert first.keys() == times.keys()
+        times = speed.measure(methods, speed.Case(2, 12), args, backward)
         assert times.keys() == methods.keys()
         assert min(times.values()) > 0
         results = {"2 x 12": times, "4 x 12": {speed.KORNIA: 2.0, "Hartley": 3.0}}
@@ -276,6 +275,14 @@ class TestSpeed:
         assert len(lines) == len(methods) + 2
         assert "3 (1.50)" in next(line for line in lines if "Hartley" in line)
         assert lines[-1].rstrip("| ").endswith("-")
+
+    def test_compiled_layers_are_timed(self, speed, monkeypatch):
+        monkeypatch.setattr(torch, "compile", lambda method, fullgraph: method)  # compiling takes a minute
+        args = argparse.Namespace(device="cpu", dtype="float64")
+        times = speed.measure_compiled(speed.solvers("cpu")["Hartley"], speed.Case(2, 8), args)
+        assert list(times) == ["first call, s", "first call, processor s", "later calls, ms", "not compiled, ms"]
+        assert 0 < times["later calls, ms"] < 1e3
+        assert speed.COMPILED.keys() <= speed.solvers("cpu").keys() | speed.robust("cpu").keys()
 
     def test_two_fifths_of_larger_sets_are_outliers(self, speed):
         points1, points2 = speed.correspondences(speed.Case(3, 50), "cpu", torch.float64)
