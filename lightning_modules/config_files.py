@@ -59,7 +59,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
         if not isinstance(section, dict) and not file:
             got = f"{type(section).__name__} {str(section)[:40]!r}"
             raise ValueError(f"configuration {path}{key and ', '}{key}: options by name expected, got {got}")
-    return content
+    return dict(content)
 
 
 def with_config_paths(args: Sequence[str]) -> list[str]:
