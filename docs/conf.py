@@ -52,7 +52,7 @@ myst_heading_anchors = 3
 # A cache would keep outputs of code that has changed since: every build runs every page.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 900  # seconds a cell; on an idle machine the longest takes less than a tenth
+nb_execution_timeout = 900  # seconds a cell; a busy machine takes many times as long as an idle one
 nb_merge_streams = True
 nb_render_markdown_format = "myst"
 

@@ -95,7 +95,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"{len(frames)} frames, {posed} with a pose; {len(pairs)} pairs", file=sys.stderr)
     for missing in missing_ground_truth(args.reader, args.root, frames):
         print(missing, file=sys.stderr)
-    names = sorted({frame.sequence for frame in frames}) if args.reader in ("kitti", "tum") else [args.root.name]
+    sequences = sorted({frame.sequence for frame in frames})
+    names = sequences if args.reader in ("kitti", "tum") else [args.root.resolve().name]  # of "." and ".." too
     resized = f", resized to {args.resize[0]}x{args.resize[1]}" if args.resize else ""
     about = {"dataset": f"{DATASETS[args.reader][0]} {', '.join(names)}{resized}", "pairs": pairing}
     wrote = "" if args.out.exists() else "wrote "

@@ -47,6 +47,12 @@ def test_readers(written, tmp_path, capsys, reader, args, pairs, known):
     assert len(read_store(tmp_path / "s.h5")) == pairs
 
 
+def test_the_current_folder_has_its_name(written, tmp_path, monkeypatch):
+    monkeypatch.chdir(written / "folder")
+    assert run("folder", Path(), tmp_path / "s.h5") == 0
+    assert read_store(tmp_path / "s.h5").dataset == "images of folder"
+
+
 @pytest.mark.parametrize("args", [[], ["--pairs"], ["--min-points", "5"]])
 def test_colmap(written, tmp_path, args):
     root = written / "colmap"
