@@ -162,6 +162,11 @@ class StepProgress(TQDMProgressBar):
     def on_train_epoch_start(self, *args: Any) -> None:
         """Leave the bar as it is."""
 
+    def on_exception(self, *args: Any) -> None:
+        """Close the bar of a training that ends early, so that messages begin on a new line."""
+        if self._train_progress_bar is not None:
+            self.train_progress_bar.close()
+
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
         """Show the steps and the logged values."""
         bar, done = self.train_progress_bar, trainer.global_step
