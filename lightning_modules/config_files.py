@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 __all__ = ["config_names", "find_config", "read_config", "with_config_paths"]
 
 OPTIONS = ("-c", "--config")
@@ -47,6 +45,8 @@ def read_config(path: str | Path) -> dict[str, Any]:
         ValueError: if the file is not YAML, or it or one of its sections holds something else than options by name.
 
     """
+    import yaml  # of the extra train, which listing the names does not need
+
     try:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (ValueError, yaml.YAMLError) as error:
