@@ -33,7 +33,7 @@ class Operations(TorchDispatchMode):
         (EightPoint(Whitening()), 8, 376, 1),
         (EightPoint(Hartley(), rank2="optimal"), 8, 455, 2),
         (EightPoint(ReweightedWhitening()), 8, 1375, 1),
-        (EightPoint(LearnedNormalizer.from_pretrained()), 8, 1870, 1),
+        (EightPoint(LearnedNormalizer.from_pretrained()), 8, 1855, 1),
         (EightPoint(Hartley()), 128, 295, 1),
         (LearnedEightPoint.from_pretrained(), 128, 6735, 7),
     ],

@@ -54,7 +54,7 @@ class CrossViewNetwork(nn.Module):
     """
 
     def __init__(
-        self, width: int = 64, depth: int = 4, num_parameters: int = 5, bound: float = 3.0, features: str = "epipolar"
+        self, width: int = 16, depth: int = 3, num_parameters: int = 5, bound: float = 3.0, features: str = "epipolar"
     ) -> None:
         super().__init__()
         if features not in _POINT_FEATURES:
