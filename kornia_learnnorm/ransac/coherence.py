@@ -16,8 +16,9 @@ from kornia_learnnorm.ransac.parallax import parallax
 
 __all__ = ["coherent_matches", "fitting_share"]
 
-NUM_NEIGHBOURS = 24  # matches nearest to a match in an image
-MIN_COHERENT = 0.5  # of the neighbours, in both images, have the parallax of a coherent match
+NUM_NEIGHBOURS = 48  # matches nearest to a match in an image
+ROUNDS = 2  # in the second, neighbours count by their own share in the first
+MIN_COHERENT = 0.8  # of the neighbours, in both images, have the parallax of a coherent match
 MAX_PARALLAX_CHANGE = 0.3  # of the distance between neighbours; 3 thresholds where this is less
 PARALLAX = 3.0  # thresholds; a match that the homography misses by more lies off the plane
 MIN_MATCHES = 16  # off the plane; fewer tell nothing of a matrix
@@ -43,18 +44,26 @@ def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: flo
 
     """
     vectors = points2 - transform_points(H[None], points1[None])[0]
-    shares = [_agreeing_share(points, vectors, PARALLAX * threshold) for points in (points1, points2)]
-    return torch.minimum(*shares) >= MIN_COHERENT
+    views = [_neighbours(points, vectors, PARALLAX * threshold) for points in (points1, points2)]
+    share = torch.ones_like(points1[:, 0])
+    for _ in range(ROUNDS):
+        share = torch.minimum(*(_agreeing_share(share[indices], agrees) for indices, agrees in views))
+    return share >= MIN_COHERENT
 
 
-def _agreeing_share(points: Tensor, vectors: Tensor, least: float) -> Tensor:
-    """Return which share of the neighbours of each point (N, 2) has a vector (N, 2) like its own, (N,)."""
+def _neighbours(points: Tensor, vectors: Tensor, least: float) -> tuple[Tensor, Tensor]:
+    """Return the rows (N, K) of the neighbours of each point (N, 2), and which have a vector (N, 2) like its own."""
     number = min(NUM_NEIGHBOURS, len(points) - 1)
     apart = torch.cdist(points, points)
     apart.fill_diagonal_(torch.inf)
     nearest = apart.topk(number, largest=False)
     change = (vectors[nearest.indices] - vectors[:, None]).norm(dim=-1)
-    share: Tensor = (change < (MAX_PARALLAX_CHANGE * nearest.values).clamp(min=least)).double().mean(-1)
+    return nearest.indices, change < (MAX_PARALLAX_CHANGE * nearest.values).clamp(min=least)
+
+
+def _agreeing_share(weights: Tensor, agrees: Tensor) -> Tensor:
+    """Return the share of the weights (N, K) of those that agree (N, K), (N,); zero where all weights are zero."""
+    share: Tensor = (weights * agrees).sum(-1) / weights.sum(-1).clamp(min=torch.finfo(weights.dtype).tiny)
     return share
 
 
