@@ -45,7 +45,7 @@ MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as 
 MAX_EMPTY_PARTS = 2  # parts with no more inliers than a search among random matches finds, before the search ends
 MIN_FALSE_SHARE = 0.15  # of the false matches off the plane; as many fit the true matrix by chance
 MAX_FALSE_SHARE = 0.3  # of the false matches off the plane; more fit only a matrix that they decided
-MAX_SHARE_LEFT = 0.8  # of the false matches that fit the first matrix, for another one to replace it
+MAX_SHARE_LEFT = 0.8  # of the false matches per coherent one that fit the first matrix, for another to replace it
 MIN_COHERENT_SHARE = 2 / 3  # of the coherent matches off the plane; with fewer, they belong to two matrices
 
 Size = tuple[int, int]  # width and height, pixels
@@ -237,19 +237,24 @@ def settle_repeats(
     if plane is None:
         return _doubted(first, "few matches move like their neighbours")
 
-    best, share = first, fitting_share(false1, false2, plane, first.F_mat, first.threshold)
-    if share > MIN_FALSE_SHARE:
+    def fitting(F_mat: Tensor) -> tuple[float, float]:
+        """Return which shares of the false and of the coherent matches off the plane fit a matrix."""
+        false = fitting_share(false1, false2, plane, F_mat, first.threshold)
+        return false, fitting_share(first.points1[coherent], first.points2[coherent], plane, F_mat, first.threshold)
+
+    best, (false, true) = first, fitting(first.F_mat)
+    if false > MIN_FALSE_SHARE or true < MIN_COHERENT_SHARE:
         with suppress(NoReliableMatrixError):
             second = again(coherent)
-            left = fitting_share(false1, false2, plane, second.F_mat, first.threshold)
-            best, share = (second, left) if left < MAX_SHARE_LEFT * share else (first, share)
-    if share > MAX_FALSE_SHARE:
+            left, gained = fitting(second.F_mat)
+            if left * true < MAX_SHARE_LEFT * false * gained:
+                best, false, true = second, left, gained
+    if false > MAX_FALSE_SHARE:
         return _doubted(
-            best, f"{share:.0%} of the matches off the main plane that are nearest in one direction only fit"
+            best, f"{false:.0%} of the matches off the main plane that are nearest in one direction only fit"
         )
-    share = fitting_share(first.points1[coherent], first.points2[coherent], plane, best.F_mat, first.threshold)
-    if share < MIN_COHERENT_SHARE:
-        return _doubted(best, f"only {share:.0%} of the matches off the main plane that move like their neighbours fit")
+    if true < MIN_COHERENT_SHARE:
+        return _doubted(best, f"only {true:.0%} of the matches off the main plane that move like their neighbours fit")
     return best
 
 
