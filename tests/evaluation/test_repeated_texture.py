@@ -71,6 +71,14 @@ class TestSettleRepeats:
             (warning,) = settle_repeats(first, *one_way, estimate).warnings
             assert warning.code == "ambiguous"
 
+    def test_coherent_matches_decide(self, first, again):
+        """As many matches one way only fit the first matrix as that of the coherent matches, which fits these too."""
+        one_way = zip(self.one_way(), self.one_way(kind=1), uniform(2, 400, 2, high=480), strict=True)
+        false = [torch.cat([copies[:60], board[:60], anywhere]) for copies, board, anywhere in one_way]
+        settled = settle_repeats(first, *false, again)
+        assert self.board_error(settled) < 0.3
+        assert settled.warnings == ()
+
     def test_coherent_matches_that_do_not_fit(self, first, again):
         """The board moves coherently and does not fit the first matrix, nor do matches one way only."""
         anywhere = uniform(2, 100, 2, high=480)
