@@ -18,7 +18,7 @@ __all__ = ["coherent_matches", "fitting_share"]
 
 NUM_NEIGHBOURS = 48  # matches nearest to a match in an image
 ROUNDS = 2  # in the second, neighbours count by their own share in the first
-MIN_COHERENT = 0.8  # of the neighbours, in both images, have the parallax of a coherent match
+MIN_COHERENT = 0.8  # of the weights of the neighbours, in both images, have the parallax of a coherent match
 MAX_PARALLAX_CHANGE = 0.3  # of the distance between neighbours; 3 thresholds where this is less
 PARALLAX = 3.0  # thresholds; a match that the homography misses by more lies off the plane
 MIN_MATCHES = 16  # off the plane; fewer tell nothing of a matrix
@@ -27,7 +27,9 @@ MIN_MATCHES = 16  # off the plane; fewer tell nothing of a matrix
 def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: float) -> Tensor:
     """Return which matches have the parallax of most matches around them, in both images.
 
-    A false match of repeated texture jumps to a copy, away from its neighbours in one image or in both.
+    A false match of repeated texture jumps to a copy, away from its neighbours in one image or in both. Where most
+    matches around a true one are false, these count little: in a second round the neighbours of a match are weighted by
+    the share of their own neighbours that agree with them.
 
     Args:
         points1: pixels in image 1 with shape (N, 2), float64.
@@ -62,7 +64,7 @@ def _neighbours(points: Tensor, vectors: Tensor, least: float) -> tuple[Tensor, 
 
 
 def _agreeing_share(weights: Tensor, agrees: Tensor) -> Tensor:
-    """Return the share of the weights (N, K) of those that agree (N, K), (N,); zero where all weights are zero."""
+    """Return which share of the neighbours' weights (N, K) those that agree have, (N,); 0 where all weights are."""
     share: Tensor = (weights * agrees).sum(-1) / weights.sum(-1).clamp(min=torch.finfo(weights.dtype).tiny)
     return share
 
