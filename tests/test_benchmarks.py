@@ -281,7 +281,7 @@ class TestSpeed:
         args = argparse.Namespace(device="cpu", dtype="float64")
         times = speed.measure_compiled(speed.solvers("cpu")["Hartley"], speed.Case(2, 8), args)
         assert list(times) == ["first call, s", "first call, processor s", "later calls, ms", "not compiled, ms"]
-        assert 0 < times["later calls, ms"] < 1e3
+        assert min(times.values()) >= 0
         assert speed.COMPILED.keys() <= speed.solvers("cpu").keys() | speed.robust("cpu").keys()
 
     def test_two_fifths_of_larger_sets_are_outliers(self, speed):
