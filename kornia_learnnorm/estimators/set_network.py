@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from kornia_learnnorm.normalizers.networks.pooling import set_maximum
+
 __all__ = ["SetWeightingNetwork"]
 
 MIN_VARIANCE = 1e-3  # added to the variance of a feature over the set
@@ -94,13 +96,10 @@ def set_statistics(features: Tensor, logits: Tensor, absent: Tensor | None) -> t
     Sets without any correspondence have some finite statistics.
     """
     features = features.to(logits.dtype)
-    lowest = torch.finfo(logits.dtype).min
+    absent = None if absent is None else absent[..., None]
+    maximum = set_maximum(features, absent, 1, keepdim=True)
     if absent is not None:
-        logits = logits.masked_fill(absent[..., None], lowest)
-        maximum = features.masked_fill(absent[..., None], lowest).amax(1, keepdim=True)
-        maximum = torch.where(absent.all(1)[:, None, None], 0.0, maximum)
-    else:
-        maximum = features.amax(1, keepdim=True)
+        logits = logits.masked_fill(absent, torch.finfo(logits.dtype).min)
     attention = torch.softmax(logits, 1).mT
     mean = attention @ features
     deviation = (attention @ (features - mean).square() + MIN_VARIANCE).sqrt()

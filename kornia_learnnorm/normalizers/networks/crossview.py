@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 from kornia_learnnorm.geometry.checks import weighted_mean
 from kornia_learnnorm.geometry.dlt import design_matrix, null_vector
 from kornia_learnnorm.geometry.matrices import smallest_singular_vectors
+from kornia_learnnorm.normalizers.networks.pooling import set_maximum
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 
@@ -191,7 +192,7 @@ class SetNetwork(nn.Module):
         absent = None if weights is None else (weights <= 0)[..., None]
         for layer in self.layers:
             h = layer(h, absent)
-        outputs: Tensor = self.head(torch.cat([_maximum(h, absent), _average(h, weights)], -1))
+        outputs: Tensor = self.head(torch.cat([set_maximum(h, absent, 1), _average(h, weights)], -1))
         return outputs
 
 
@@ -210,17 +211,9 @@ class ContextLayer(nn.Module):
         z = self.norm(h)
         # In place: for large batches, new memory costs more than the sums. Not the last one: under autocast, `out` has
         # half the precision of `h`.
-        hidden = self.point(z).add_(self.context(_maximum(z, absent))[:, None]).relu_()
+        hidden = self.point(z).add_(self.context(set_maximum(z, absent, 1))[:, None]).relu_()
         update: Tensor = self.out(hidden)
         return h + update
-
-
-def _maximum(h: Tensor, absent: Tensor | None) -> Tensor:
-    """Return the maximum over the present points, ``(B, C)``; zero where all are absent."""
-    if absent is None:
-        return h.amax(1)
-    empty = absent.all(1)
-    return torch.where(empty, 0.0, torch.where(absent, -torch.inf, h).amax(1))
 
 
 def _average(h: Tensor, weights: Tensor | None) -> Tensor:

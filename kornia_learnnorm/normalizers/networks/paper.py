@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import batch_norm, layer_norm
 
+from kornia_learnnorm.normalizers.networks.pooling import set_maximum
+
 __all__ = ["PaperNetwork"]
 
 _EPSILON = 1e-5
@@ -93,12 +95,13 @@ class PaperNetwork(nn.Module):
 
         """
         w = None if weights is None else weights.T[..., None]
+        absent = None if w is None else w <= 0
         # Points come first: statistics over them are then sums of whole rows, which is what a processor likes.
         h = self.stem(points.transpose(0, 1))
-        maxima = [_maximum(h, w)]
+        maxima = [set_maximum(h, absent, 0)]
         for block in self.blocks:
             h = block(h, w)
-            maxima.append(_maximum(h, w))
+            maxima.append(set_maximum(h, absent, 0))
         return layer_norm(torch.stack(maxima, 1), (self.width,), eps=_EPSILON)
 
 
@@ -123,11 +126,3 @@ def _instance_norm(h: Tensor, weights: Tensor | None) -> Tensor:
     share = weights / torch.where(total > 0, total, 1.0)
     centred = h - (share * h).sum(0)
     return centred * ((share * centred.square()).sum(0) + _EPSILON).rsqrt()
-
-
-def _maximum(h: Tensor, weights: Tensor | None) -> Tensor:
-    """Return the maximum over the present points, ``(B, C)``; zero where all are absent."""
-    if weights is None:
-        return h.amax(0)
-    absent = weights <= 0
-    return torch.where(absent.all(0), 0.0, torch.where(absent, -torch.inf, h).amax(0))
