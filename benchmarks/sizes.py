@@ -9,8 +9,8 @@ The inliers of a pair without ground truth are those of OpenCV's MAGSAC on all i
     python benchmarks/sizes.py STORE.h5 [STORE.h5 ...] [--sizes 8 16 32 64 128 512] [--sets 128] [--seed 0]
         [--methods NAME ...] [--json FILE] [--picture FILE]
 
-A method learned:WEIGHTS is a learned estimator by the name or file of its weights; with +scores after it, it also reads
-1 minus the ratio of each match, as RANSAC+scores does.
+A method learned:WEIGHTS is a learned estimator by the name or file of its weights. With +bfloat16 after it, its
+networks compute in bfloat16. With +scores last, it also reads 1 minus the ratio of each match, as RANSAC+scores does.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD, PROTOCOLS, RATIO
 BATCH = 32  # sets solved at once, as in training
 NUM_TRUE = 64  # ground-truth inliers that measure a set
 MIN_TRUE = 32  # ground-truth inliers of a pair that is used
-LEARNED, SCORES = "learned:", "+scores"
+LEARNED, HALF, SCORES = "learned:", "+bfloat16", "+scores"
 FAILED = 999.0  # pixels; the error of a set without a matrix
 
 Solver = Callable[[Tensor, Tensor, Tensor], Tensor]  # points1, points2 (S, N, 2) and scores (S, N) to F (S, 3, 3)
@@ -86,8 +86,11 @@ def ransac(with_scores: bool) -> Solver:
 
 
 def learned(name: str) -> Solver:
-    """Return a learned estimator by the name or file of its weights, which reads the scores where the name says so."""
-    layer, with_scores = kln.LearnedEightPoint.from_pretrained(name.removesuffix(SCORES)), name.endswith(SCORES)
+    """Return a learned estimator by the name or file of its weights, with what the suffixes of the name say."""
+    without, with_scores = name.removesuffix(SCORES), name.endswith(SCORES)
+    layer = kln.LearnedEightPoint.from_pretrained(without.removesuffix(HALF))
+    if without.endswith(HALF):
+        layer.networks.bfloat16()
     return partial(batched, lambda x1, x2, scores: layer(x1, x2, scores=scores if with_scores else None))
 
 
@@ -126,7 +129,7 @@ DRAWN = ("Hartley", "Hartley+optimal", "Hartley+LM", *ROBUST[:-1], *SHIPPED)
 
 def shown(name: str) -> str:
     """Return how tables call a method; files of weights go by their short names."""
-    weights = name.removeprefix(LEARNED).removesuffix(SCORES)
+    weights = name.removeprefix(LEARNED).removesuffix(SCORES).removesuffix(HALF)
     return name.replace(weights, short_name(weights)) if name.startswith(LEARNED) else name
 
 

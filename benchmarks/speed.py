@@ -56,7 +56,11 @@ class Case(NamedTuple):
 
 
 EIGHTS = [Case(batch, 8) for batch in (1, 64, 2048, 16384)]
-COMPILED = {"Hartley": EIGHTS[1], "whitening": EIGHTS[1], "crossview": EIGHTS[1], "learned": Case(32, 128)}
+COMPILED = {
+    **dict.fromkeys((KORNIA, "Hartley", "whitening", "optimal"), EIGHTS[1:3]),
+    **dict.fromkeys(("reweighted", "crossview"), EIGHTS[1:2]),
+    "learned": [Case(32, 128)],
+}
 SETS = [Case(batch, number) for number in (32, 128, 512, 2000) for batch in (1, 32)] + [Case(64, 128), Case(64, 1000)]
 
 
@@ -234,9 +238,10 @@ def main() -> None:
     if args.compile is not None:
         for name in args.compile or COMPILED:
             layer = outliers[name] if name in outliers else differentiable[name]
-            title = f"{name}, {COMPILED[name]}"
-            found[title] = measure_compiled(layer, COMPILED[name], args)
-            print(f"{title}: " + ", ".join(f"{key} {value:.3g}" for key, value in found[title].items()), flush=True)
+            for case in COMPILED[name]:
+                title = f"{name}, {case}"
+                found[title] = measure_compiled(layer, case, args)
+                print(f"{title}: " + ", ".join(f"{key} {value:.3g}" for key, value in found[title].items()), flush=True)
     else:
         measure_all(differentiable, outliers, args, found)
     if args.out is not None:

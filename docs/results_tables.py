@@ -47,6 +47,23 @@ ESTIMATORS = {  # as benchmarks/sizes.py names them, and how they are drawn
 }
 
 
+TIMED = {  # as benchmarks/sizes.py names them, and how they are drawn
+    "Hartley": (GREY, "o"),
+    "whitening": (GREY, "^"),
+    "reweighted": (GREY, "v"),
+    "Hartley+optimal": (GREY, "s"),
+    "Hartley+LM": (GREY, "P"),
+    "paper": (GREY, "X"),
+    "opencv-usac-magsac": (PURPLE, "o"),
+    "poselib": (GREEN, "o"),
+    "kornia": (GREEN, "^"),
+    "RANSAC": (ORANGE, "o"),
+    "learned:robust": (BLUE, "o"),
+    "learned:robust+bfloat16": (BLUE, "^"),
+    "learned:robust-synthetic": (BLUE, "s"),
+    "learned:robust-tiny": (BLUE, "D"),
+    "learned:robust-tiny+bfloat16": (BLUE, "v"),
+}
 LAYERS = {  # as benchmarks/speed.py names them
     "Kornia": "kornia",
     "Hartley": "Hartley",
@@ -162,6 +179,27 @@ def sizes_plot(protocols: Sequence[str] = ("unfiltered", "filtered")) -> HTML:
         figure.supylabel("median error of true inliers, px", fontsize=9)
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         return show(figure, f"Median error against the number of matches, on KITTI and TUM, {' and '.join(protocols)}")
+
+
+def time_plot() -> HTML:
+    """Draw the median error against the time of a set of unfiltered matches, a row for each size of sets."""
+    with plt.rc_context(PLAIN):
+        found = json.loads((RESULTS / "sizes-time.json").read_text(encoding="utf-8"))
+        figure, axes = plt.subplots(2, 2, figsize=(8, 6.6), layout="constrained", sharex=True)
+        cells = [(size, store) for size in ("128", "512") for store in STORES]
+        for (size, store), ax in zip(cells, axes.flat, strict=True):
+            for name, (colour, mark) in TIMED.items():
+                error, milliseconds = found[f"{store}, unfiltered"][name][size]
+                ax.plot(milliseconds, error, mark, color=colour, label=name, markersize=6)
+            ax.set(title=f"{_words(f'{store}, unfiltered')}, N = {size}", xscale="log", yscale="log")
+            ax.xaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.grid(visible=True)
+        for ax in axes[-1]:
+            ax.set_xlabel("ms per set, in batches of 32 where the method takes batches")
+        figure.supylabel("median error of true inliers, px", fontsize=9)
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        return show(figure, "Median error against time, on KITTI and TUM, unfiltered, sets of 128 and of 512 matches")
 
 
 def _draw_dots(ax: Axes, rows: Sequence[Sequence[str]], column: int, offset: float, **style: str) -> None:

@@ -289,3 +289,36 @@ class TestSpeed:
         scenes = speed.random_scenes(3, 50, torch.Generator().manual_seed(0))
         assert torch.equal(points1, scenes.points1.double())
         assert (points2 == scenes.points2).all(-1).sum(-1).tolist() == [30, 30, 30]
+
+
+@pytest.fixture(scope="module")
+def profile_time():
+    return import_benchmark("profile_time")
+
+
+class TestProfile:
+    @pytest.mark.parametrize(
+        ("operation", "group"),
+        [
+            ("aten::linalg_lu_factor_ex", "factorisations"),
+            ("aten::bmm", "products"),
+            ("aten::addmm", "layers"),
+            ("aten::copy_", "memory"),
+            ("aten::mul", "arithmetic"),
+        ],
+    )
+    def test_groups(self, profile_time, operation, group):
+        assert profile_time.group_of(operation) == group
+
+    @pytest.mark.parametrize("backward", [False, True])
+    def test_shares_of_a_solver(self, profile_time, speed, backward):
+        found = profile_time.solver_shares("paper", speed.Case(2, 8), backward)
+        assert tuple(found) == profile_time.COLUMNS
+        assert sum(found.values()) == pytest.approx(100)
+        assert min(found["layers"], found["factorisations"], found["arithmetic"]) > 0
+
+    def test_shares_of_a_training(self, profile_time):
+        pytest.importorskip("pytorch_lightning")
+        found = profile_time.training_shares("robust-synthetic", 1)
+        assert sum(found.values()) == pytest.approx(100)
+        assert found["layers"] > 0
