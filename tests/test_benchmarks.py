@@ -322,3 +322,17 @@ class TestProfile:
         found = profile_time.training_shares("robust-synthetic", 1)
         assert sum(found.values()) == pytest.approx(100)
         assert found["layers"] > 0
+
+
+@pytest.fixture(scope="module")
+def sizes():
+    return import_benchmark("sizes")
+
+
+class TestSizes:
+    @pytest.mark.parametrize("suffix", ["", "+scores", "+bfloat16", "+bfloat16+scores"])
+    def test_learned_estimators_by_name(self, sizes, case, suffix):
+        points = [p[:64].repeat(2, 1, 1) for p in (case.points1, case.points2)]
+        F_mat = sizes.find_method("learned:robust-tiny" + suffix)(*points, torch.ones(2, 64).double())
+        assert sizes.shown("learned:robust-tiny" + suffix) == "learned:robust-tiny" + suffix
+        assert kln.symmetric_epipolar_distance(*points, F_mat).median() < 0.5
