@@ -18,13 +18,18 @@ from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.models import EssentialModel
 from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax
-from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
 
 __all__ = ["TwoViewSolver"]
 
 MIN_SCORE_GAIN = 1.02  # of another hypothesis over the one found first, which otherwise stays
 MIN_SCORE = 1e-3  # a match of weight zero would never be sampled
+NEAR = 20.0  # thresholds; among the matches this near a matrix, fewer are false than among all
+MIN_NEAR = 16  # matches near a matrix, for a search among them
+MAX_NEAR_SEARCHES = 3
+MIN_INLIER_SHARE = 0.5  # of the matches; with as many inliers, the first search finds the best matrix
+MIN_LOSS_SCALE = 1e-3  # thresholds; of the loss for matches without noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +74,8 @@ class TwoViewSolver:
         rows = torch.arange(len(self.points1)) if rows is None else rows
         x1, x2, score = self.points1[rows], self.points2[rows], self.scores[rows]
         if self.layer is None:
-            found = self._ransac.estimate(x1, x2, score.clamp(min=MIN_SCORE), *(self.cameras or ()))
-            F_mat, weights = found.F_mat, found.inliers.double()
+            found = self._search(x1, x2, score)
+            F_mat, weights = self._search_near(x1, x2, score, found.F_mat), found.inliers.double()
         else:
             with torch.no_grad():
                 estimate = self.layer.estimate(x1[None], x2[None], scores=score[None])
@@ -94,7 +99,31 @@ class TwoViewSolver:
         if float(best.score.sum()) <= least:
             return F_mat
         other = self._refine(self.points1, self.points2, scorer.to_pixels(best.F_mat)[0])
+        if self.layer is None:
+            other = self._search_near(self.points1, self.points2, self.scores, other)
         return other if _score(scorer, other) > least else F_mat
+
+    def _search(self, points1: Tensor, points2: Tensor, scores: Tensor) -> RansacResult:
+        return self._ransac.estimate(points1, points2, scores.clamp(min=MIN_SCORE), *(self.cameras or ()))
+
+    def _search_near(self, points1: Tensor, points2: Tensor, scores: Tensor, F_mat: Tensor) -> Tensor:
+        """Return a matrix (3, 3), or a better one that is found among the matches near it, where most are no inliers.
+
+        Among 80 % of outliers and more, the matrix of a search is often one of a few inliers and some outliers. Near it
+        lie most of the true matches and few of the outliers, so that a search among them finds the best matrix.
+        """
+        scorer = PairScorer(points1, points2, self.threshold)
+        for _ in range(MAX_NEAR_SEARCHES):
+            distance = symmetric_epipolar_distance(points1, points2, F_mat)
+            near = distance < NEAR * self.threshold
+            share = float((distance < self.threshold).double().mean())
+            if share >= MIN_INLIER_SHARE or int(near.sum()) < MIN_NEAR:
+                break
+            other = self._search(points1[near], points2[near], scores[near]).F_mat
+            if _score(scorer, other) <= _score(scorer, F_mat):
+                break
+            F_mat = other
+        return F_mat
 
     def _refine(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
@@ -120,10 +149,24 @@ class TwoViewSolver:
         if float(on_plane.double().mean()) <= MIN_PLANAR_SHARE:
             return F_mat
         other = fit_plane_and_parallax(points1, points2, H, self.threshold, self.seed)
-        if other is None:
-            return F_mat
         scorer = PairScorer(points1, points2, self.threshold)
-        return other if _score(scorer, other) > MIN_SCORE_GAIN * _score(scorer, F_mat) else F_mat
+        if other is not None and _score(scorer, other) > MIN_SCORE_GAIN * _score(scorer, F_mat):
+            F_mat = other
+        return self._refine_finely(points1, points2, F_mat)
+
+    def _refine_finely(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+        """Return the matrix refined on a loss whose scale is the median distance of the inliers.
+
+        Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would the
+        inliers of largest error, if the loss did not leave them out.
+        """
+        distance = symmetric_epipolar_distance(points1, points2, F_mat)
+        inliers = distance < self.threshold
+        if not bool(inliers.any()):
+            return F_mat
+        noise = float(distance[inliers].median())
+        scale = min(max(noise, MIN_LOSS_SCALE * self.threshold), FINAL_LOSS_SCALE * self.threshold)
+        return refine_fundamental(points1[None], points2[None], F_mat[None], loss=GemanMcClure(scale)).F_mat[0]
 
 
 def _score(scorer: PairScorer, F_mat: Tensor) -> float:

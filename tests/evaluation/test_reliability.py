@@ -61,11 +61,14 @@ class TestAssess:
         points2[:40, 0] += torch.linspace(10, 60, 40)  # forty matches with parallax along one direction
         assert codes(points1, points2, inliers, H) == []
 
-    @pytest.mark.parametrize(("distance", "found"), [(0.3, []), (0.7, ["planar"])])
-    def test_little_relief(self, points, distance, found):
-        """Parallax of 1.5 px in one direction is evidence where the matches fit within half the threshold."""
+    @pytest.mark.parametrize(
+        ("relief", "distance", "found"),
+        [(1.5, 0.3, []), (1.5, 0.7, ["planar"]), (0.4, 0.1, []), (0.4, 0.3, ["planar"])],
+    )
+    def test_little_relief(self, points, relief, distance, found):
+        """Parallax in one direction is evidence where the matches fit within less than half of it."""
         points2 = points[0].clone()
-        points2[:60, 0] += 1.5
+        points2[:60, 0] += relief
         distances = torch.full((100,), distance, dtype=torch.float64)
         warnings = assess(points[0], points2, distances, torch.eye(3).double(), 1.0, SIZE, STABLE)
         assert [warning.code for warning in warnings] == found
