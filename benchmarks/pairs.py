@@ -165,7 +165,7 @@ COUNTS: dict[str, Callable[[dict[str, Any]], bool]] = {
     "crashed": lambda record: outcome(record) == "crashed",
     "warned": lambda record: bool(record["warnings"]),
     "silently wrong": lambda record: outcome(record) == "wrong",
-    "determined: right, flagged": lambda record: record["determined"] and outcome(record) == "right, flagged",
+    "right, flagged": lambda record: outcome(record) == "right, flagged",
     "determined: refused": lambda record: record["determined"] and outcome(record) == "refused",
 }
 
