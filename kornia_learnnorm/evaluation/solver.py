@@ -12,12 +12,12 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.evaluation.inputs import Cameras
-from kornia_learnnorm.evaluation.reliability import MIN_PLANAR_SHARE, find_homography
+from kornia_learnnorm.evaluation.reliability import MAX_LOG_CHANCE_PARALLAX, MIN_PLANAR_SHARE, find_homography
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.models import EssentialModel
-from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax
+from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax, parallax_evidence
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
 
@@ -152,17 +152,18 @@ class TwoViewSolver:
         scorer = PairScorer(points1, points2, self.threshold)
         if other is not None and _score(scorer, other) > MIN_SCORE_GAIN * _score(scorer, F_mat):
             F_mat = other
-        return self._refine_finely(points1, points2, F_mat)
+        return self._refine_finely(points1, points2, H, F_mat)
 
-    def _refine_finely(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-        """Return the matrix refined on a loss whose scale is the median distance of the inliers.
+    def _refine_finely(self, points1: Tensor, points2: Tensor, H: Tensor, F_mat: Tensor) -> Tensor:
+        """Return the matrix, refined at the scale of the noise where no parallax exceeds the threshold.
 
         Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would the
-        inliers of largest error, if the loss did not leave them out.
+        inliers of largest error, if the scale of the loss were not the median distance of the inliers.
         """
         distance = symmetric_epipolar_distance(points1, points2, F_mat)
         inliers = distance < self.threshold
-        if not bool(inliers.any()):
+        evidence = parallax_evidence(parallax(points1, points2, H), inliers, self.threshold)
+        if evidence <= MAX_LOG_CHANCE_PARALLAX or not bool(inliers.any()):
             return F_mat
         noise = float(distance[inliers].median())
         scale = min(max(noise, MIN_LOSS_SCALE * self.threshold), FINAL_LOSS_SCALE * self.threshold)

@@ -67,7 +67,7 @@ def estimate_matches(
 
     Where less than half of the matches are inliers, RANSAC searches again among those near its matrix. Where one
     homography explains most inliers, the matrix of this homography and the parallax of the other matches is tried too,
-    and the better one is refined at the scale of the noise.
+    and the better one is refined at the scale of the noise if all parallax is below the threshold.
 
     Args:
         points1: pixels in image 1 with shape (N, 2), an array or a tensor of numbers. Rows that are not finite, or more
