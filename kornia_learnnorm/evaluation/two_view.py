@@ -224,7 +224,7 @@ def settle_repeats(
     """Return the estimate of the coherent matches where false ones decided the first, with a warning where in doubt.
 
     It replaces the first one if fewer false matches fit its matrix for each coherent one that does. On rendered walls
-    of repeated windows the predicted error of the answers without a warning is too small: 0.3 to 0.8 times the true one
+    of repeated windows the predicted error of the answers without a warning is too small: 0.2 to 0.7 times the true one
     (10 % and 90 % quantiles).
 
     Args:
