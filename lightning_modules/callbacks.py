@@ -197,7 +197,8 @@ def _duration(seconds: float) -> str:
 class ExportWeights(Callback):
     """Write the trained module as safetensors when training ends, for its ``from_pretrained``.
 
-    The file names the training data: the stores, or ``synthetic scenes``; nothing for a source of another class.
+    The file names the training data: the stores, or ``synthetic scenes``; nothing for a source of another class. A
+    training that ended before its first step raises a ValueError in the place of writing untrained weights.
 
     Args:
         filename: name of the file in the trainer's default root directory.
@@ -208,6 +209,8 @@ class ExportWeights(Callback):
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the module."""
+        if trainer.global_step == 0:
+            raise ValueError("the training ended before its first step: no weights were written")
         if trainer.is_global_zero:
             path = Path(trainer.default_root_dir) / self.filename
             path.parent.mkdir(parents=True, exist_ok=True)

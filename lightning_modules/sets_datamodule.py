@@ -101,6 +101,8 @@ class MatchSetDataModule(pl.LightningDataModule):
             raise ValueError(f"shares must be one non-negative number for each of {len(train)} sources, got {shares}")
         if not 8 <= sizes[0] <= sizes[1]:
             raise ValueError(f"sizes must be a range of at least 8 matches, got {sizes}")
+        if steps < 1:
+            raise ValueError(f"steps must be at least 1, got {steps}")
         self.train, self.val = list(train), list(val)
         self.shares = [1.0] * len(train) if shares is None else list(shares)
         self.sizes, self.correspondences, self.max_sets = tuple(sizes), correspondences, max_sets

@@ -18,7 +18,7 @@ import pytorch_lightning as pl
 import torch
 from jsonargparse import ArgumentError
 from lightning_fabric.utilities.exceptions import MisconfigurationException
-from pytorch_lightning.callbacks import Callback, ModelCheckpoint, ProgressBar
+from pytorch_lightning.callbacks import Callback, ModelCheckpoint, ProgressBar, Timer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor
@@ -62,7 +62,10 @@ class TrainingCLI(LightningCLI):
             callbacks.append(ExportWeights())
         if config["enable_progress_bar"] is not False and not _has(callbacks, ProgressBar):
             callbacks.append(StepProgress())
-        return super().instantiate_trainer(callbacks=callbacks, **kwargs)
+        trainer = super().instantiate_trainer(callbacks=callbacks, **kwargs)
+        if self.subcommand == "fit":
+            _check_has_steps(trainer)
+        return trainer
 
     def _parse_ckpt_path(self) -> None:
         """Take no configuration from a checkpoint: it could name any class to be made."""
@@ -108,6 +111,16 @@ class TrainingCLI(LightningCLI):
 def _has(callbacks: list[Callback], kind: type[Callback]) -> bool:
     """Return whether there is a callback of a class."""
     return any(isinstance(callback, kind) for callback in callbacks)
+
+
+def _check_has_steps(trainer: pl.Trainer) -> None:
+    """Raise ValueError if a trainer is set to no steps: its weights would be untrained."""
+    names = "max_steps", "max_epochs", "limit_train_batches"
+    zero = [name for name in names if getattr(trainer, name) == 0]
+    if any(isinstance(callback, Timer) and not callback.time_remaining() for callback in trainer.callbacks):  # type: ignore[attr-defined]
+        zero.append("max_time")
+    if zero:
+        raise ValueError(f"trainer.{zero[0]} is 0: at least one step of training expected")
 
 
 def _state_dict(path: str) -> dict[str, Tensor]:

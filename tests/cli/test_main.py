@@ -389,6 +389,17 @@ def test_wrong_options_of_a_training_are_one_line(options, message, tmp_path, mo
 
 
 @pytest.mark.parametrize(
+    "option",
+    ["max_steps=0", "max_epochs=0", "limit_train_batches=0", "limit_train_batches=0.0", "max_time=00:00:00:00"],
+)
+def test_a_training_without_steps_is_refused(option, tmp_path, refused):
+    folder = tmp_path / "run"
+    options = [f"--trainer.{option}", f"--trainer.default_root_dir={folder}"]
+    refused(["fit", "--config", "crossview-synthetic", *options], f"trainer.{option.partition('=')[0]} is 0")
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize(
     ("content", "message"),
     [
         (b"", "configuration own.yaml is empty: options by name expected, such as 'seed_everything: 0'"),

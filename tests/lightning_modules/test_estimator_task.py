@@ -92,6 +92,7 @@ def test_batches_depend_on_seed_and_number_alone():
         ({"shares": [1.0, 2.0]}, "one non-negative number for each of 1 sources"),
         ({"shares": [0.0]}, "one non-negative number for each"),
         ({"sizes": (4, 9)}, "at least 8 matches"),
+        ({"steps": 0}, "at least 1, got 0"),
     ],
 )
 def test_wrong_options(arguments, message):

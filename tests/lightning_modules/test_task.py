@@ -178,6 +178,13 @@ def test_export_and_predictions(tmp_path):
         torch.testing.assert_close(written["residual"][rows], residual)
 
 
+def test_untrained_weights_are_not_written(tmp_path):
+    trainer = make_trainer(tmp_path, [ExportWeights()], max_steps=3, limit_train_batches=0)
+    with pytest.raises(ValueError, match="ended before its first step"):
+        trainer.fit(make_task(), make_data())
+    assert not (tmp_path / "weights.safetensors").exists()
+
+
 def test_metrics_of_an_untrained_network_are_whitening_s(tmp_path):
     task, data = make_task(), make_data()
     trainer = make_trainer(tmp_path, enable_checkpointing=False)
