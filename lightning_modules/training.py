@@ -42,7 +42,20 @@ UNWANTED_WARNINGS = (
 
 
 class TrainingCLI(LightningCLI):
-    """LightningCLI that refuses a missing or foreign checkpoint before anything runs, and always writes the weights."""
+    """LightningCLI that refuses a missing or foreign checkpoint before anything runs, and always writes the weights.
+
+    Args:
+        command: the command that is run; those of the others get no parser, which takes most of the time to start.
+        kwargs: arguments of LightningCLI.
+    """
+
+    def __init__(self, command: str, **kwargs: Any) -> None:
+        self.command = command
+        super().__init__(**kwargs)
+
+    def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]  # it is static
+        """Return the command, and the arguments of the trainer's method that are no options."""
+        return {self.command: LightningCLI.subcommands()[self.command]}
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
         """Parse the arguments; a configuration that ships with the package can be given by its name."""
@@ -200,6 +213,7 @@ def run(args: list[str] | None) -> None:
 
     """
     words = with_config_paths(sys.argv[1:] if args is None else args)
+    command = words[0]
     for message in UNWANTED_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
     logging.getLogger("pytorch_lightning.utilities.rank_zero").addFilter(_is_wanted)
@@ -210,18 +224,18 @@ def run(args: list[str] | None) -> None:
     raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines
     try:
         TrainingCLI(
-            pl.LightningModule if named else NormalizerTask,
-            pl.LightningDataModule if named else CorrespondenceDataModule,
+            command,
+            model_class=pl.LightningModule if named else NormalizerTask,
+            datamodule_class=pl.LightningDataModule if named else CorrespondenceDataModule,
             subclass_mode_model=named,
             subclass_mode_data=named,
             args=args,
             auto_configure_optimizers=False,
             trainer_defaults={"callbacks": [ExpectedTime()]},
-            parser_kwargs={"prog": "learnnorm", **raises, **dict.fromkeys(LightningCLI.subcommands(), raises)},
+            parser_kwargs={"prog": "learnnorm", **raises, command: raises},
             save_config_kwargs={"overwrite": True},
         )
     except ArgumentError as error:
-        command = next(iter(words), "fit")
         if "are required" in str(error) and not _config_files(words):
             raise ValueError(_which_configurations(command)) from error
         raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help lists the options") from error
