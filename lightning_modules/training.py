@@ -45,7 +45,7 @@ class TrainingCLI(LightningCLI):
     """LightningCLI that refuses a missing or foreign checkpoint before anything runs, and always writes the weights.
 
     Args:
-        command: the command that is run; those of the others get no parser, which takes most of the time to start.
+        command: the command that is run; the options of the others are not made.
         kwargs: arguments of LightningCLI.
     """
 
