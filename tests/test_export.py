@@ -73,6 +73,11 @@ def small_program(small_layer):
     return export_layer(small_layer, ["mask", "scores"])
 
 
+@pytest.fixture(scope="module")
+def run_small(small_program):
+    return small_program.module()
+
+
 def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
     """Points, and a mask and scores by name; the first set has eight correspondences, the last one all rows."""
     numbers = torch.linspace(8, num_points, batch_size).long()
@@ -81,13 +86,12 @@ def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], d
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_any_batch_and_number_of_points(small_layer, small_program, size):
+def test_any_batch_and_number_of_points(small_layer, run_small, size):
     points, given = masked_sets(*size)
-    program = small_program.module()
-    check(program, small_layer, *points, **given)
-    check(program, small_layer, *points, **{**given, "mask": torch.ones_like(given["mask"])})
+    check(run_small, small_layer, *points, **given)
+    check(run_small, small_layer, *points, **{**given, "mask": torch.ones_like(given["mask"])})
     eight = small_layer(*(p[:1, :8] for p in points), scores=given["scores"][:1, :8])
-    assert up_to_sign(program(*points, **given)[0][:1], eight.detach()) < 1e-5
+    assert up_to_sign(run_small(*points, **given)[0][:1], eight.detach()) < 1e-5
 
 
 def test_a_program_needs_no_package(small_layer, small_program, tmp_path):
@@ -105,14 +109,14 @@ def run_without_the_package(programs, folder) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_program_says_what_sizes_it_takes(small_program):
+def test_a_program_says_what_sizes_it_takes(run_small):
     with pytest.raises(AssertionError, match=r"points1.size\(\)\[1\] >= 9"):
-        small_program.module()(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
+        run_small(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
 
 
-def test_a_program_without_gradients_sends_none(small_program):
+def test_a_program_without_gradients_sends_none(run_small):
     (points1, points2), given = masked_sets(2, 20)
-    assert not any(value.requires_grad for value in small_program.module()(points1.requires_grad_(), points2, **given))
+    assert not any(value.requires_grad for value in run_small(points1.requires_grad_(), points2, **given))
 
 
 def test_a_program_with_gradients_sends_those_of_the_layer():

@@ -32,7 +32,8 @@ def test_training_lowers_the_loss(tmp_path, labels):
     task, data = make_task(), make_data(train=[SyntheticSets(16, labels=labels)])
     batch = SyntheticSets(32, labels=labels).draw(64, 32, block_generator(9))
     before = task.compute_loss(batch).item()
-    make_trainer(tmp_path, max_steps=60, enable_checkpointing=False, gradient_clip_val=1.0).fit(task, data)
+    options = {"enable_checkpointing": False, "gradient_clip_val": 1.0, "limit_val_batches": 2}
+    make_trainer(tmp_path, max_steps=60, **options).fit(task, data)
     assert task.compute_loss(batch).item() < before - (0.05 if labels else 0.01)
     assert not task.estimator.detach_stages
 
