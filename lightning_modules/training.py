@@ -168,8 +168,14 @@ def _names_its_classes(config: dict[str, Any]) -> bool:
     return isinstance(model, dict) and "class_path" in model
 
 
-def _which_configurations(command: str) -> str:
-    """Return what to give to a training command without a configuration."""
+def _which_configurations(command: str, message: str, files: Sequence[str]) -> str:
+    """Return what to give to a training command without a configuration, or with a part of one."""
+    if files:
+        missing = message.rpartition(": ")[2].replace(f"{command}.", "")
+        return (
+            f"{', '.join(files)} has no {missing}: give a whole configuration before it, for example learnnorm"
+            f" {command} --config crossview --config {files[0]}"
+        )
     names = ", ".join(name for name in config_names() if "/" not in name)
     checkpoint = "" if command == "fit" else " --ckpt_path runs/crossview-synthetic/checkpoints/last.ckpt"
     return (
@@ -236,8 +242,8 @@ def run(args: list[str] | None) -> None:
             save_config_kwargs={"overwrite": True},
         )
     except ArgumentError as error:
-        if "are required" in str(error) and not _config_files(words):
-            raise ValueError(_which_configurations(command)) from error
+        if "are required" in str(error):
+            raise ValueError(_which_configurations(command, str(error), _config_files(words))) from error
         raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help lists the options") from error
     except ValueError as error:  # of a class that was configured: its data, for example
         raise ValueError(_first_error(str(error))) from error

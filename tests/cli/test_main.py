@@ -429,6 +429,15 @@ def test_a_training_without_a_configuration_names_those_that_ship(command, optio
     refused([command, *options], f"for example learnnorm {command} --config crossview-synthetic{checkpoint}")
 
 
+def test_a_part_of_a_configuration_names_what_it_lacks(tmp_path, monkeypatch, refused):
+    monkeypatch.chdir(tmp_path)
+    Path("own.yaml").write_text("trainer: {max_steps: 9}")
+    message = (
+        "own.yaml has no model.normalizer: give a whole configuration before it, for example learnnorm fit --config"
+    )
+    refused(["fit", "--config", "own.yaml"], f"{message} crossview --config own.yaml")
+
+
 def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog, capsys):
     options = ["--data.batch_size=16", "--trainer.max_steps=13", "--trainer.accelerator=cpu"]
     options += [f"--data.{stage}.init_args.number=64" for stage in ("train", "val")]
