@@ -129,7 +129,8 @@ def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tu
     """
     result = transforms_of(normalizer, problem)
     expected = (problem.points1.shape[0], 3, 3)
-    shapes = [tuple(getattr(T, "shape", ())) for T in result] if isinstance(result, tuple | list) else [type(result)]
+    pair = isinstance(result, (tuple, list))  # torch.compile of PyTorch 2.5 cannot trace a union of types
+    shapes = [tuple(getattr(T, "shape", ())) for T in result] if pair else [type(result)]
     if shapes != [expected, expected]:
         raise ValueError(f"a normalizer must return two transforms of shape {expected}, got {shapes}")
     if result[0] is problem.T1 and result[1] is problem.T2:
