@@ -24,6 +24,8 @@ exclude_patterns = ["_build"]
 smartquotes = False  # they turn the two dashes of options into one
 html_theme = "furo"
 html_title = f"kornia-learnnorm {release}"
+html_static_path = ["_static"]
+html_css_files = ["narrow.css"]
 
 # Names of this project must resolve; those of others have no pages here.
 nitpicky = True
