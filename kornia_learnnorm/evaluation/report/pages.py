@@ -42,7 +42,8 @@ th { white-space: normal; vertical-align: bottom; }
 .wide { overflow-x: auto; }
 code { overflow-wrap: anywhere; }
 a { color: light-dark(#0b63b0, #7cb8f2); }
-svg { width: 100%; height: auto; font-family: system-ui, sans-serif; }
+figure { margin: 1rem 0; overflow-x: auto; }
+svg { width: 100%; min-width: 34rem; height: auto; font-family: system-ui, sans-serif; }
 """
 
 
