@@ -116,10 +116,10 @@ def test_ranges_in_sentences(page, sentence, decimals, values):
     assert sentence.format(low if low == high else f"{low} to {high}") in text
 
 
-@pytest.mark.parametrize(("column", "share"), [(5, 5), (6, 8)])
+@pytest.mark.parametrize(("column", "share"), [(5, 5), (6, 8)], ids=["KITTI", "TUM"])
 def test_cameras_save_samples(column, share):
     samples, fewer = (cells("ransac-calibrated", name, column)[0] for name in ("RANSAC", "RANSAC-calibrated"))
-    assert samples / fewer == pytest.approx(share, abs=0.6)
+    assert samples / fewer > share
 
 
 def test_no_wrong_answer_comes_without_a_warning():
