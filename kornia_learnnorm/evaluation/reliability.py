@@ -174,7 +174,7 @@ def assess(
     points1: Tensor,
     points2: Tensor,
     distance: Tensor,
-    H: Tensor | None,
+    off_plane: Tensor | None,
     threshold: float,
     size2: tuple[int, int],
     stability: Stability,
@@ -185,7 +185,8 @@ def assess(
         points1: pixels of all matches in image 1, (N, 2), float64.
         points2: pixels of all matches in image 2, (N, 2).
         distance: symmetric epipolar distances of the matches to the matrix, (N,), pixels.
-        H: the homography that explains most inliers, or None.
+        off_plane: distances of the matches from the plane that explains most inliers, pixels, (N,), or None; see
+            :func:`~kornia_learnnorm.evaluation.plane_distances.distances_from_plane`.
         threshold: largest distance of an inlier, pixels.
         size2: width and height of image 2.
         stability: of the matrix, see :func:`measure_stability`.
@@ -201,8 +202,8 @@ def assess(
     if spread < MIN_SPREAD:
         text = f"the inliers lie close to one line or one point: {spread:.1%} of the image diagonal apart"
         found.append(PairWarning("clustered", text))
-    if H is not None:
-        found += _check_plane(parallax(points1, points2, H), distance, threshold)
+    if off_plane is not None:
+        found += _check_plane(off_plane, distance, threshold)
     if stability.angle > MAX_ANGLE:
         text = f"the pose changes by {stability.angle:.0f} degrees when the matches are drawn anew"
         found.append(PairWarning("unstable", text))
@@ -213,7 +214,7 @@ def _check_plane(off_plane: Tensor, distance: Tensor, threshold: float) -> list[
     """Return a warning where most inliers lie on a plane and the parallax of the others is no more than chance.
 
     Args:
-        off_plane: distances of the matches from where the homography moves them, (N,), pixels.
+        off_plane: distances of the matches from the plane, (N,), pixels.
         distance: symmetric epipolar distances, (N,), pixels.
         threshold: largest distance of an inlier, pixels.
     """

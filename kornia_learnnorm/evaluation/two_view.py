@@ -14,6 +14,7 @@ from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.evaluation.plane_distances import distances_from_plane
 from kornia_learnnorm.evaluation.reliability import (
     MAX_LOG_FALSE_ALARMS,
     MIN_MOTION,
@@ -137,7 +138,7 @@ def _estimate(solver: TwoViewSolver, size1: Size, size2: Size) -> PairEstimate:
         weights=inliers.double() if solver.layer is None else found.weights,
         inliers=inliers,
         predicted_error=min(stability.error, float(max(size2))),
-        warnings=_find_warnings(solver, F_mat, size2, stability, pose),
+        warnings=_find_warnings(solver, F_mat, size1, size2, stability, pose),
         size1=size1,
         size2=size2,
         ratio=None,
@@ -203,13 +204,14 @@ def _find_pose(solver: TwoViewSolver, F_mat: Tensor, inliers: Tensor) -> _Pose:
 
 
 def _find_warnings(
-    solver: TwoViewSolver, F_mat: Tensor, size2: Size, stability: Stability, pose: _Pose
+    solver: TwoViewSolver, F_mat: Tensor, size1: Size, size2: Size, stability: Stability, pose: _Pose
 ) -> tuple[PairWarning, ...]:
     points1, points2, threshold = solver.points1, solver.points2, solver.threshold
     distance = solver.distance(F_mat)
     near = distance < threshold
     H = None if solver.cameras else find_homography(points1[near], points2[near], threshold)
-    warnings = assess(points1, points2, distance, H, threshold, size2, stability)
+    off_plane = None if H is None else distances_from_plane(points1, points2, H, size1, size2, threshold)
+    warnings = assess(points1, points2, distance, off_plane, threshold, size2, stability)
     if solver.cameras is None or pose.R is not None:
         return warnings
     return (

@@ -22,6 +22,7 @@ from kornia_learnnorm.evaluation.reliability import (
     nominal_camera,
     random_parts,
 )
+from kornia_learnnorm.ransac.parallax import parallax
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 
@@ -31,7 +32,8 @@ STABLE = Stability(0.1, 0.1)
 
 def codes(points1, points2, inliers, H=None, stability=STABLE) -> list[str]:
     distance = torch.where(inliers, 0.3, 5.0).double()
-    found = assess(points1, points2, distance, H, 1.0, SIZE, stability)
+    off_plane = None if H is None else parallax(points1, points2, H)
+    found = assess(points1, points2, distance, off_plane, 1.0, SIZE, stability)
     assert all(warning.text and "\n" not in warning.text for warning in found)
     return [warning.code for warning in found]
 
@@ -70,7 +72,7 @@ class TestAssess:
         points2 = points[0].clone()
         points2[:60, 0] += relief
         distances = torch.full((100,), distance, dtype=torch.float64)
-        warnings = assess(points[0], points2, distances, torch.eye(3).double(), 1.0, SIZE, STABLE)
+        warnings = assess(points[0], points2, distances, (points2 - points[0]).norm(dim=-1), 1.0, SIZE, STABLE)
         assert [warning.code for warning in warnings] == found
 
     def test_unstable(self, points):
