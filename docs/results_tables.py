@@ -181,16 +181,16 @@ def sizes_plot(protocols: Sequence[str] = ("unfiltered", "filtered")) -> HTML:
         return show(figure, f"Median error against the number of matches, on KITTI and TUM, {' and '.join(protocols)}")
 
 
-def time_plot() -> HTML:
+def time_plot(name: str) -> HTML:
     """Draw the median error against the time of a set of unfiltered matches, a row for each size of sets."""
     with plt.rc_context(PLAIN):
-        found = json.loads((RESULTS / "sizes-time.json").read_text(encoding="utf-8"))
+        found = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
         figure, axes = plt.subplots(2, 2, figsize=(8, 6.6), layout="constrained", sharex=True)
         cells = [(size, store) for size in ("128", "512") for store in STORES]
         for (size, store), ax in zip(cells, axes.flat, strict=True):
-            for name, (colour, mark) in TIMED.items():
-                error, milliseconds = found[f"{store}, unfiltered"][name][size]
-                ax.plot(milliseconds, error, mark, color=colour, label=name, markersize=6)
+            for method, (colour, mark) in TIMED.items():
+                error, milliseconds = found[f"{store}, unfiltered"][method][size]
+                ax.plot(milliseconds, error, mark, color=colour, label=method, markersize=6)
             ax.set(title=f"{_words(f'{store}, unfiltered')}, N = {size}", xscale="log", yscale="log")
             ax.xaxis.set_major_formatter("{x:g}")
             ax.yaxis.set_major_formatter("{x:g}")
