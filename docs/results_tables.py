@@ -196,7 +196,7 @@ def time_plot(name: str) -> HTML:
             ax.yaxis.set_major_formatter("{x:g}")
             ax.grid(visible=True)
         for ax in axes[-1]:
-            ax.set_xlabel("ms per set, in batches of 32 where the method takes batches")
+            ax.set_xlabel("ms per set")
         figure.supylabel("median error of true inliers, px", fontsize=9)
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         return show(figure, "Median error against time, on KITTI and TUM, unfiltered, sets of 128 and of 512 matches")
