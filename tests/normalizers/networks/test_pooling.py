@@ -40,6 +40,7 @@ class TestSetMaximum:
         absent[0, 3:], absent[1] = True, True
         assert torch.autograd.gradcheck(lambda h: set_maximum(h, absent, 1), features.requires_grad_())
 
+    @pytest.mark.long
     @pytest.mark.filterwarnings("ignore")  # Inductor's own
     def test_gradient_of_compiled_bfloat16(self, features):
         features = features.bfloat16().requires_grad_()
