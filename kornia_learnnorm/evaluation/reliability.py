@@ -186,7 +186,7 @@ def assess(
         points2: pixels of all matches in image 2, (N, 2).
         distance: symmetric epipolar distances of the matches to the matrix, (N,), pixels.
         off_plane: distances of the matches from the plane that explains most inliers, pixels, (N,), or None; see
-            :func:`~kornia_learnnorm.evaluation.plane_distances.distances_from_plane`.
+            :func:`~kornia_learnnorm.ransac.plane_distances.distances_from_plane`.
         threshold: largest distance of an inlier, pixels.
         size2: width and height of image 2.
         stability: of the matrix, see :func:`measure_stability`.

@@ -14,7 +14,6 @@ from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.evaluation.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.evaluation.plane_distances import distances_from_plane
 from kornia_learnnorm.evaluation.reliability import (
     MAX_LOG_FALSE_ALARMS,
     MIN_MOTION,
@@ -36,6 +35,7 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.coherence import coherent_matches, fitting_share
+from kornia_learnnorm.ransac.plane_distances import distances_from_plane
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 
 __all__ = ["estimate_matches", "settle_repeats"]
