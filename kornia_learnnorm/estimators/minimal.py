@@ -52,19 +52,16 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     determined = _independent(R, x1, x2, shift)
     if not bool(determined.all()):
         Q, R, x1, x2 = Q[determined], R[determined], x1[determined], x2[determined]
-    u = Q[..., 8]
-    F = torch.unflatten(u, -1, (3, 3))
-    line1, line2 = (x2 @ F)[..., :2], (x1 @ F.mT)[..., :2]
-    deviation = (line1.square().sum(-1) + line2.square().sum(-1)).sqrt()
-    L = Q[..., :8] @ torch.linalg.solve_triangular(R[..., :8, :].mT, torch.diag_embed(deviation), upper=False)
-    V = L @ L.mT
+    L = Q[..., :8] @ torch.linalg.solve_triangular(
+        R[..., :8, :].mT, torch.diag_embed(_deviation(Q[..., 8], x1, x2)), upper=False
+    )
+    # The samples come last: sums over nine entries are then sums of whole rows, which is what a processor likes.
+    u, L = Q[..., 8].mT.contiguous(), L.movedim(0, -1).contiguous()
     for _ in range(3):
-        gradient = cofactors(F).flatten(1)
-        change = (V @ gradient[..., None])[..., 0]
-        excess = (u * gradient).sum(-1, keepdim=True) / (3 * (change * gradient).sum(-1, keepdim=True))
-        u = u - excess * change
-        F = torch.unflatten(u, -1, (3, 3))
-    F_mat: Tensor = F / torch.linalg.vector_norm(F, dim=(1, 2), keepdim=True)
+        gradient = cofactors(torch.unflatten(u, 0, (3, 3)).movedim(-1, 0)).flatten(1).mT
+        change = (L * (L * gradient[:, None]).sum(0)).sum(1)
+        u = u - (u * gradient).sum(0) / (3 * (change * gradient).sum(0)) * change
+    F_mat: Tensor = torch.unflatten((u / torch.linalg.vector_norm(u, dim=0)).mT, 1, (3, 3))
     return F_mat
 
 
@@ -87,6 +84,13 @@ def solve_calibrated_samples(rays1: Tensor, rays2: Tensor) -> Tensor:
     """
     E_mat: Tensor = find_essential(*(rays[..., :2] / rays[..., 2:] for rays in (rays1, rays2))).flatten(0, 1)
     return E_mat[E_mat.isfinite().flatten(1).all(1)]
+
+
+def _deviation(u: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+    r"""Return the deviations :math:`\sqrt{(u, V_i u)}` of the algebraic residuals of samples, (K, 8)."""
+    F, (x1, x2) = torch.unflatten(u.mT, 0, (3, 3))[..., None], (x.movedim(-1, 0) for x in (x1, x2))
+    line1, line2 = (F[:, :2] * x2[:, None]).sum(0), (F[:2] * x1).sum(1)
+    return (line1.square_().sum(0) + line2.square_().sum(0)).sqrt_()
 
 
 def _independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:

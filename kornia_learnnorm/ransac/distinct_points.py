@@ -30,27 +30,17 @@ def distinct_points(points1: Tensor, points2: Tensor, weights: Tensor | None = N
 
     """
     kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
-    (number1, labels1), (number2, labels2) = _labels(points1), _labels(points2)
-    if number1 == number2 == len(kept):
+    # A complex number for each pixel: equal where both coordinates are, and hashable.
+    pixels1, pixels2 = (torch.view_as_complex(points.contiguous()).tolist() for points in (points1, points2))
+    if len(set(pixels1)) == len(set(pixels2)) == len(kept):
         return kept
-    rows = torch.arange(len(kept)) if weights is None else weights.argsort(descending=True, stable=True).cpu()
-    # A loop over numbers: each match depends on all better ones.
-    seen1, seen2, left_out = bytearray(len(kept)), bytearray(len(kept)), list[int]()
-    for row, a, b in zip(rows.tolist(), labels1.cpu()[rows].tolist(), labels2.cpu()[rows].tolist(), strict=True):
-        if seen1[a] or seen2[b]:
+    order = range(len(kept)) if weights is None else weights.argsort(descending=True, stable=True).tolist()
+    seen1, seen2, left_out = set[complex](), set[complex](), list[int]()
+    for row in order:  # a loop, since each match depends on all better ones
+        if pixels1[row] in seen1 or pixels2[row] in seen2:
             left_out.append(row)
         else:
-            seen1[a] = seen2[b] = 1
+            seen1.add(pixels1[row])
+            seen2.add(pixels2[row])
     kept[left_out] = False
     return kept
-
-
-def _labels(points: Tensor) -> tuple[int, Tensor]:
-    """Return the number of distinct points, and for each point a label below N, equal where points are."""
-    total = len(points)
-    x, y = points.mT.contiguous() + 0.0  # -0.0 is 0.0
-    distinct, labels = torch.unique(x, return_inverse=True)
-    if len(distinct) < total:
-        labels = labels * total + torch.unique(y, return_inverse=True)[1]
-        distinct, labels = torch.unique(labels, return_inverse=True)
-    return len(distinct), labels
