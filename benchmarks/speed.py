@@ -254,10 +254,11 @@ def measure_all(
     """Measure all methods at all sizes, print the tables and add the times to a dictionary."""
     pairs = single_pairs() if args.device == "cpu" else {}
     eights, sets = (EIGHTS[:3], [SETS[3], SETS[5]]) if args.quick else (EIGHTS, SETS)
+    solvers = {name: differentiable[name] for name in (KORNIA, "Hartley", "whitening", "optimal")}
     groups = {
         "sets of eight": (eights, differentiable, ("OpenCV FM_8POINT",)),
-        "larger sets": (sets, {name: differentiable[name] for name in (KORNIA, "Hartley", "whitening", "optimal")}, ()),
-        "larger sets with outliers": (sets, outliers, ("RANSAC", "PoseLib")),
+        "larger sets: solvers": (sets, solvers, ()),
+        "larger sets: robust estimators": (sets, outliers, ("RANSAC", "PoseLib")),
     }
     for group, (cases, methods, others) in groups.items():
         for backward in (False, True):

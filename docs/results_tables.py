@@ -64,12 +64,14 @@ TIMED = {  # as benchmarks/sizes.py names them, and how they are drawn
     "learned:robust-tiny": (BLUE, "D"),
     "learned:robust-tiny+bfloat16": (BLUE, "v"),
 }
-LAYERS = {  # as benchmarks/speed.py names them
-    "Kornia": "kornia",
-    "Hartley": "Hartley",
-    '`rank2="optimal"`': "optimal",
-    "`crossview`": "crossview",
-    "`LearnedEightPoint`": "learned",
+EIGHTS, SOLVERS, ROBUST = "sets of eight", "larger sets: solvers", "larger sets: robust estimators"
+LAYERS = {  # as benchmarks/speed.py names them, and the parts in which they take turns with Kornia's solver
+    "Kornia": ("kornia", (EIGHTS, SOLVERS)),
+    "Hartley": ("Hartley", (EIGHTS, SOLVERS)),
+    '`rank2="optimal"`': ("optimal", (EIGHTS, SOLVERS)),
+    "Kornia, in turn with the rows below": ("kornia", (EIGHTS, ROBUST)),
+    "`crossview`": ("crossview", (EIGHTS, ROBUST)),
+    "`LearnedEightPoint`": ("learned", (EIGHTS, ROBUST)),
 }
 CASES = ("1 x 8", "64 x 8", "1 x 128", "32 x 128", "1 x 512", "32 x 512")  # batch x correspondences
 
@@ -89,12 +91,12 @@ def table(name: str) -> Markdown:
 def layer_times() -> Markdown:
     """Return the milliseconds of one forward and backward pass of the layers, and their ratios to Kornia's solver."""
     found = json.loads((RESULTS / "speed.json").read_text(encoding="utf-8"))
-    cells: dict[tuple[str, str], str] = {}
-    for part in ("sets of eight", "larger sets", "larger sets with outliers"):
-        for case, times in found[f"{part}, forward and backward"].items():
-            for method, time in times.items():
-                cells.setdefault((method, case), f"{time:.3g} ({time / times['kornia']:.1f})")
-    rows = [[name, *(cells.get((method, case), "-") for case in CASES)] for name, method in LAYERS.items()]
+    rows = []
+    for name, (method, parts) in LAYERS.items():
+        both = [found[f"{part}, forward and backward"] for part in parts]
+        times = {case: row for part in both for case, row in part.items() if method in row}
+        cells = {case: f"{row[method]:.3g} ({row[method] / row['kornia']:.1f})" for case, row in times.items()}
+        rows.append([name, *(cells.get(case, "-") for case in CASES)])
     return Markdown(format_table(["ms (ratio to Kornia's)", *CASES], rows))
 
 

@@ -66,8 +66,7 @@ class Checkpoints(ModelCheckpoint):
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
         terminated = trainer.received_sigterm and trainer.world_size == 1
         if self._interrupted or terminated:
-            self.last_model_path = str(Path(str(self.dirpath)) / "last.ckpt")
-            trainer.save_checkpoint(self.last_model_path)
+            self._save_last(trainer)
             raise SIGTERMException if terminated else KeyboardInterrupt
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
@@ -81,9 +80,15 @@ class Checkpoints(ModelCheckpoint):
         _print_above_bar(f"stopped at step {trainer.global_step}; {how}")
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Give interrupts back."""
+        """Save the last step, where no checkpoint was due, and give interrupts back."""
         super().on_train_end(trainer, pl_module)
         self._restore_handler()
+        if self._last_global_step_saved != trainer.global_step:
+            self._save_last(trainer)
+
+    def _save_last(self, trainer: pl.Trainer) -> None:
+        self.last_model_path = str(Path(str(self.dirpath)) / "last.ckpt")
+        trainer.save_checkpoint(self.last_model_path)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         """Ask for the end of the training; the second time, end it."""
@@ -99,7 +104,7 @@ class Checkpoints(ModelCheckpoint):
 
 
 class ExpectedTime(Callback):
-    """Print the device, the number of steps and the folder of a training at its start, and soon how long it will take.
+    """Print the device, steps and folder of a training, soon how long it will take, and in the end how long it took.
 
     The command line adds it to every training.
 
@@ -110,11 +115,11 @@ class ExpectedTime(Callback):
     def __init__(self, measured_steps: int = 10) -> None:
         self.measured_steps = measured_steps
         self._first = 0
-        self._start = 0.0
+        self._start = self._begin = 0.0
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Print where and how far the training will go."""
-        self._first = trainer.global_step + 1
+        self._first, self._begin = trainer.global_step + 1, time.monotonic()
         steps = _remaining_steps(trainer)
         count = "steps until it is stopped" if steps is None else f"{steps} steps"
         _print_above_bar(f"device {pl_module.device}, {count}; results in {trainer.default_root_dir}")
@@ -127,6 +132,11 @@ class ExpectedTime(Callback):
         elif done == self.measured_steps and (steps := _remaining_steps(trainer)):
             seconds = (time.monotonic() - self._start) / done * steps
             _print_above_bar(f"about {_duration(seconds)} for the remaining {steps} steps, without validation")
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Print the time of the steps since the start, validation included."""
+        steps = trainer.global_step + 1 - self._first
+        _print_above_bar(f"{steps} steps in {_duration(time.monotonic() - self._begin)}")
 
 
 def _print_above_bar(text: str) -> None:

@@ -447,6 +447,7 @@ def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog, capsys):
     assert f"device cpu, 13 steps; results in {tmp_path}" in caplog.messages
     assert " 13/13 " in capsys.readouterr().out
     assert [text for text in caplog.messages if re.fullmatch(r"about \d+ s for the remaining 2 steps, .*", text)]
+    assert [text for text in caplog.messages if re.fullmatch(r"13 steps in \d+ s", text)]
     # Lightning's lines of other devices and of products are left out.
     assert [text for text in caplog.messages if re.search("available|Tip", text)] == []
     rank_zero_info("GPU available: False, used: False")

@@ -112,6 +112,12 @@ def test_an_interrupted_run_saves_its_step_and_goes_on_to_the_same_curve(tmp_pat
     assert got == expected[5:]
 
 
+def test_the_last_checkpoint_is_that_of_the_last_step(tmp_path):
+    make_trainer(tmp_path, [Checkpoints(every_n_train_steps=2)], max_steps=3).fit(make_task(), make_data())
+    last = torch.load(tmp_path / "checkpoints/last.ckpt", weights_only=True)
+    assert last["global_step"] == 3
+
+
 @pytest.mark.parametrize("steps", [10, 40])
 def test_a_run_of_another_length_does_not_go_on(tmp_path, steps, caplog):
     with pytest.raises(InterruptedError):
