@@ -124,7 +124,17 @@ METHODS: dict[str, Callable[[], Solver]] = {
 }
 SHIPPED = ["learned:robust", "learned:robust-synthetic"]
 ROBUST = ("opencv-usac-magsac", "poselib", "kornia", "RANSAC", "RANSAC+scores")  # need more than eight matches
-DRAWN = ("Hartley", "Hartley+optimal", "Hartley+LM", *ROBUST[:-1], *SHIPPED)
+DRAWN = {  # in the picture: name, colour and line
+    "Hartley": ("Hartley's eight-point", "#7b858f", "-"),
+    "Hartley+optimal": ("optimal correction", "#7b858f", "--"),
+    "Hartley+LM": ("robust LM", "#7b858f", ":"),
+    "opencv-usac-magsac": ("OpenCV USAC-MAGSAC", "#9a63d6", "-"),
+    "poselib": ("PoseLib", "#2a9d62", "-"),
+    "kornia": ("Kornia RANSAC", "#2a9d62", "--"),
+    "RANSAC": ("RANSAC", "#d9622b", "-"),
+    "learned:robust": ("LearnedEightPoint, robust", "#2f7fd6", "--"),
+    "learned:robust-synthetic": ("LearnedEightPoint, default", "#2f7fd6", "-"),
+}
 
 
 def shown(name: str) -> str:
@@ -191,21 +201,33 @@ def table(results: dict[str, dict[str, list[float]]], sizes: list[int], column: 
     return format_table([title, *(f"N = {size}" for size in sizes)], rows)
 
 
-def draw(everything: dict[str, dict], path: str) -> None:
+def draw_light_and_dark(everything: dict[str, dict], path: Path) -> None:
+    """Draw the errors to a file, and for dark pages to one whose name ends in -dark."""
+    from matplotlib import style
+
+    for name, target in {"default": path, "dark_background": path.with_stem(f"{path.stem}-dark")}.items():
+        with style.context(name):
+            draw(everything, target)
+
+
+def draw(everything: dict[str, dict], path: Path) -> None:
     """Draw the error against the number of matches, a panel for each store and protocol, to be read at 400 pixels."""
     from matplotlib.figure import Figure
 
     columns = min(2, len(everything))
     rows = -(-len(everything) // columns)
-    figure = Figure(figsize=(6.4, 1.6 + 2.5 * rows), layout="constrained")
+    figure = Figure(figsize=(6.4, 1.4 + 2.5 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axis, (title, results) in zip(axes.flat, everything.items(), strict=False):
-        for index, name in enumerate(name for name in DRAWN if name in results):
-            sizes = sorted(map(int, results[name]))
-            style = {"color": f"C{index % 10}", "linewidth": 2.4 if name.startswith("learned") else 1.2}
-            axis.plot(sizes, [results[name][str(size)][0] for size in sizes], ".-", label=name, **style)
+        for name, (label, colour, line) in DRAWN.items():
+            if name in results:
+                errors = {int(size): found[0] for size, found in results[name].items()}
+                width = 2.4 if name.startswith(LEARNED) else 1.2
+                axis.plot(errors.keys(), errors.values(), line, marker=".", color=colour, label=label, linewidth=width)
         axis.set(title=title, xscale="log", yscale="log", ylim=(0.1, 200))
+        sizes = sorted({int(size) for found in results.values() for size in found})
         axis.set_xticks(sizes, [str(size) for size in sizes])
+        axis.yaxis.set_major_formatter("{x:g}")
         axis.minorticks_off()
         axis.grid(alpha=0.3)
     for axis in axes[-1]:
@@ -214,7 +236,7 @@ def draw(everything: dict[str, dict], path: str) -> None:
     handles = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, fontsize=11)
     with atomic_write(path) as beside:
-        figure.savefig(beside, dpi=200, format=Path(path).suffix[1:])
+        figure.savefig(beside, dpi=200, format=path.suffix[1:])
 
 
 def main() -> None:
@@ -232,7 +254,7 @@ def main() -> None:
     )
     parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     parser.add_argument("--json", help="write the numbers to this file")
-    parser.add_argument("--picture", help="draw the errors to this file")
+    parser.add_argument("--picture", help="draw the errors to this file, and for dark pages to NAME-dark")
     args = parser.parse_args()
     if unknown := [name for name in args.methods if name not in METHODS and not name.startswith(LEARNED)]:
         parser.error(f"--methods {' '.join(unknown)}: expected some of {', '.join(METHODS)} or learned:WEIGHTS")
@@ -262,7 +284,7 @@ def main() -> None:
     if args.json:
         write_text(args.json, json.dumps(everything, indent=1))
     if args.picture:
-        draw(everything, args.picture)
+        draw_light_and_dark(everything, Path(args.picture))
 
 
 if __name__ == "__main__":

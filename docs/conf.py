@@ -19,7 +19,7 @@ copyright = author
 release = version = kornia_learnnorm.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
-extensions += ["sphinx_copybutton", "sphinxarg.ext", "sphinx-mathjax-offline"]
+extensions += ["sphinx.ext.autosummary", "sphinx_copybutton", "sphinxarg.ext", "sphinx-mathjax-offline"]
 exclude_patterns = ["_build"]
 smartquotes = False  # they turn the two dashes of options into one
 html_theme = "furo"
@@ -36,6 +36,7 @@ nitpick_ignore_regex = [
 
 copybutton_selector = "div.highlight pre:not(div.cell_output pre)"  # code, not what it prints
 
+autosummary_generate = False  # its tables link to the descriptions of the modules
 viewcode_follow_imported_members = False  # NumPy has types without sources
 add_module_names = False
 autodoc_member_order = "bysource"

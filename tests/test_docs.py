@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import kornia_learnnorm as kln
 from kornia_learnnorm.evaluation.report.rates import PRINTED
 
 nbformat = pytest.importorskip("nbformat")
@@ -28,6 +29,7 @@ MEASURED |= {"evaluation.md": r"\d+\.\d{2,3}|\d\d\.\d|(?:\d+ min )?\d+ s|[\d.,]+
 # Printed by a command that the page names, and in no table; settings.
 IN_NO_TABLE = {"evaluation.md": {"1.952", "0.999"}, "upstream.md": {"1.952"}, "paper.md": {"87.6", "0.136"}}
 PLAIN_TABLE = re.compile(r"<!-- docs/results/(\S+)\.csv -->\n((?:\|.*\n)+)")
+HEADLINE = re.compile(r"<!-- rows of docs/results/(\S+?)\.(?:csv|json)(?:, (.*?))? -->\n((?:\|.*\n)+)")
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 MAX_COLUMNS = 82  # of code, at the width of the page
 SOURCE = "# Title\n\n```{code-cell}\n:tags: [hide-input]\n\nprint(1)\n```\n\n```{code-cell}\n%%bash\nls\n```\n"
@@ -90,6 +92,19 @@ def test_tutorials_have_their_parts(path):
 
 def test_there_are_six_tutorials():
     assert len(TUTORIALS) == 6
+
+
+def test_the_reference_has_every_exported_name():
+    assert sorted(re.findall(r"^   (\w+)$", PAGES[DOCS / "api.md"], flags=re.MULTILINE)) == sorted(kln.__all__)
+
+
+def test_the_reference_has_every_module_once():
+    listed = re.findall(r"automodule:: (\S+)", "".join(page.read_text() for page in (DOCS / "api").glob("*.md")))
+    root = DOCS.parent
+    files = [path for name in ("kornia_learnnorm", "lightning_modules") for path in (root / name).rglob("[!_]*.py")]
+    modules = {".".join(path.relative_to(root).with_suffix("").parts) for path in files}
+    assert sorted(set(listed) - {"kornia_learnnorm.data.synthetic"}) == sorted(modules)
+    assert len(listed) == len(set(listed))
 
 
 def test_a_site_without_faults(check, site, source, capsys):
@@ -160,6 +175,30 @@ def test_plain_tables_have_the_numbers_of_their_files():
     for name, table in tables:
         header, rows = read_table(table)
         assert [header, *rows] == read_results(name), name
+
+
+def rows_of(name, group, columns):
+    """Rows of a file as a page shows them: median errors by size, or times and their ratios to Kornia's."""
+    if group is None:
+        return read_results(name)[1:]
+    found = json.loads((DOCS / f"results/{name}.json").read_text(encoding="utf-8"))[group]
+    if name == "sizes":
+        sizes = [column.removeprefix("N = ") for column in columns]
+        return [[row, *(f"{by[size][0]:.3f}" if size in by else "-" for size in sizes)] for row, by in found.items()]
+    times = [found[case] for case in columns]
+    methods = [row for row in times[0] if all(row in case for case in times)]
+    return [[row, *(f"{case[row]:.3g} ({case[row] / case['kornia']:.2f})" for case in times)] for row in methods]
+
+
+def test_headline_tables_have_rows_of_their_files():
+    tables = HEADLINE.findall(PAGES[DOCS / "benchmarks.md"])
+    assert len(tables) == 8
+    for name, group, table in tables:
+        header, rows = read_table(table)
+        if not group:
+            assert header == read_results(name)[0], name
+        expected = rows_of(name, group or None, header[1:])
+        assert [row for row in rows if row not in expected] == [], (name, group)
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,8 @@ RESULTS = {
     "`RANSAC`": "RANSAC",
     "`LearnedEightPoint`": "learned:robust-synthetic",
 }
-LINKS = [link for link in re.findall(r"\]\(([^)#\s]+)\)", README) if "://" not in link]
+LINKS = [link for link in re.findall(r"\]\(([^)#\s]+)\)|(?:src|srcset)=\"([^\"]+)\"", README) for link in link if link]
+LINKS = [link for link in LINKS if "://" not in link]
 
 
 def test_the_code_prints_what_the_readme_shows():
@@ -79,11 +80,15 @@ def test_the_zoo_lists_every_shipped_file_with_its_size():
     for path in sorted((ROOT / "kornia_learnnorm/weights").glob("*.safetensors")):
         module = kln.LearnedEightPoint if path.stem.startswith("robust") else kln.LearnedNormalizer
         size = sum(p.numel() for p in module.from_pretrained(path.stem).parameters())
-        assert re.search(rf"\[`{path.stem}`\].*\| `{module.__name__}` \| {size:,} \|", README), path.stem
+        row = re.search(rf"\[`{path.stem}`\].*\| `{module.__name__}` \| {size:,} \| (.*) \| (.*) \|", README)
+        assert row, path.stem
+        zoo = (ROOT / "docs/zoo.md").read_text(encoding="utf-8")
+        assert f"| `{path.stem}` | {{py:class}}`~kornia_learnnorm.{module.__name__}` | {row[1]} | {row[2]} |" in zoo
 
 
 def test_the_citation_file_is_that_of_the_package():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == kln.__version__
-    (reference,) = citation["references"]
-    assert f"doi     = {{{reference['doi']}}}" in README
+    article = citation["preferred-citation"]
+    assert f"doi     = {{{article['doi']}}}" in README
+    assert f"url = {{{article['url']}}}" in README
