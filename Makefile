@@ -3,6 +3,7 @@
 # make test-cpus   set up, run the numerical tests with the kernels of other processors
 # make test-oldest   in .venv-oldest, run the tests of the core with the oldest NumPy, Kornia, safetensors and filelock that
 #             pyproject.toml allows, and the torch of the lock; TORCH=torch==2.5.1 for the oldest, a CUDA build of 5 GB on Linux
+# make test-newest   in .venv-newest, run all tests with the newest version of every dependency but torch
 # make lint   set up, run the linters and the type checker
 # make docs   set up, build the documentation in docs/_build/html, check its links and notebooks
 # make audit  report known vulnerabilities of the locked packages; never fails
@@ -24,9 +25,10 @@ STORES = "$(DATA)"/correspondences
 AUDIT := .venv-audit
 TWINE := .venv-twine
 OLDEST := .venv-oldest
+NEWEST := .venv-newest
 TORCH ?= $$(grep '^torch==' requirements.lock)
 
-.PHONY: bench demo test test-cpus test-oldest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations table1
+.PHONY: bench demo test test-cpus test-oldest test-newest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -79,6 +81,13 @@ test-oldest:
 	$(OLDEST)/bin/python tests/oldest_versions.py > $(OLDEST)/pins.txt
 	$(OLDEST)/bin/python -m pip install --quiet $(TORCH) --requirement $(OLDEST)/pins.txt pytest pytest-timeout pytest-xdist hypothesis
 	env -u LEARNNORM_DATA $(OLDEST)/bin/python -m pytest -n auto -q -o filterwarnings=error -o pythonpath=". tests" $(CORE_TESTS)
+
+test-newest: export OMP_NUM_THREADS = 1
+test-newest:
+	$(PYTHON) -m venv $(NEWEST)
+	$(NEWEST)/bin/python -m pip install --quiet $(TORCH)
+	$(NEWEST)/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager $(TORCH) --editable '.[all,dev,docs]'
+	$(NEWEST)/bin/python -m pytest -n auto -q
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
@@ -166,4 +175,4 @@ check-extras: $(VENV)/.ready
 	$(BIN)/python tests/check_extras.py $(EXTRAS)
 
 clean:
-	rm -rf $(VENV) $(AUDIT) $(TWINE) $(OLDEST) dist build docs/_build runs
+	rm -rf $(VENV) $(AUDIT) $(TWINE) $(OLDEST) $(NEWEST) dist build docs/_build runs

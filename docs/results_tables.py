@@ -88,6 +88,12 @@ def table(name: str) -> Markdown:
     return Markdown(format_table(header, rows))
 
 
+def _on(machine: dict[str, object]) -> str:
+    """Return the machine of a measurement as a line below its table."""
+    words = "; ".join(f"{name}: {machine[name]}" for name in ("processor", "threads", "load", "torch"))
+    return f"\n\nMeasured with {words}."
+
+
 def layer_times() -> Markdown:
     """Return the milliseconds of one forward and backward pass of the layers, and their ratios to Kornia's solver."""
     found = json.loads((RESULTS / "speed.json").read_text(encoding="utf-8"))
@@ -97,7 +103,7 @@ def layer_times() -> Markdown:
         times = {case: row for part in both for case, row in part.items() if method in row}
         cells = {case: f"{row[method]:.3g} ({row[method] / row['kornia']:.1f})" for case, row in times.items()}
         rows.append([name, *(cells.get(case, "-") for case in CASES)])
-    return Markdown(format_table(["ms (ratio to Kornia's)", *CASES], rows))
+    return Markdown(format_table(["ms (ratio to Kornia's)", *CASES], rows) + _on(found["machine"]))
 
 
 def compile_times() -> Markdown:
@@ -105,7 +111,7 @@ def compile_times() -> Markdown:
     found = json.loads((RESULTS / "compile.json").read_text(encoding="utf-8"))
     columns = ("first call, processor s", "later calls, ms", "not compiled, ms")
     rows = [[name, *(f"{times[key]:.3g}" for key in columns)] for name, times in found.items() if name != "machine"]
-    return Markdown(format_table(["layer, batch x correspondences", *columns], rows))
+    return Markdown(format_table(["layer, batch x correspondences", *columns], rows) + _on(found["machine"]))
 
 
 def read_sizes() -> dict[str, dict[str, dict[str, list[float]]]]:
