@@ -66,8 +66,8 @@ def command_parser():
     """Return the parser for the page of the command line, its examples as literal blocks."""
     parser = make_parser()
     (commands,) = (action.choices for action in parser._actions if action.dest == "command")  # noqa: SLF001
-    for command in commands.values():
-        command.epilog = command.epilog and command.epilog.replace("examples:\n", "Examples::\n\n")
+    for command in (parser, *commands.values()):
+        command.epilog = command.epilog.replace("examples:\n", "Examples::\n\n")
     return parser
 
 

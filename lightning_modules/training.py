@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 import signal
-import sys
 import warnings
 import zipfile
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from jsonargparse import ArgumentError
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning.callbacks import Callback, ModelCheckpoint, ProgressBar, Timer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
+from pytorch_lightning.utilities import rank_zero_only
 from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
@@ -30,10 +30,18 @@ from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.estimator_task import EstimatorTask
 from lightning_modules.task import NormalizerTask
 
-__all__ = ["TrainingCLI", "run"]
+__all__ = ["TrainingCLI", "is_first_process", "run"]
 
-# What Lightning prints of devices, of which a line of ours names the one that is used, and its advertisements.
-UNWANTED_MESSAGE = re.compile(r"(GPU|TPU|HPU) available: |LOCAL_RANK: |\W*Tip: For seamless")
+# What Lightning prints of devices, of which a line of ours names the one that is used, its advertisements, the seed,
+# which the configuration has, and how it saves a checkpoint.
+UNWANTED_MESSAGE = re.compile(
+    r"(GPU|TPU|HPU) available: |LOCAL_RANK: |\W*Tip: For seamless|(\[rank: \d+\] )?Seed set to |`weights_only` was not"
+)
+LOGGERS = (
+    "lightning_fabric.utilities.seed",
+    "pytorch_lightning.trainer.connectors.checkpoint_connector",
+    "pytorch_lightning.utilities.rank_zero",
+)
 UNWANTED_WARNINGS = (
     ".*treespec, LeafSpec.*",  # Lightning's own call of torch
     ".*smaller than the logging interval.*",  # the interval counts the steps of all epochs
@@ -59,8 +67,8 @@ class TrainingCLI(LightningCLI):
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
         """Parse the arguments; a configuration that ships with the package can be given by its name."""
-        if args is None or isinstance(args, list):
-            self.config = parser.parse_args(with_config_paths(sys.argv[1:] if args is None else args))
+        if isinstance(args, list):
+            self.config = parser.parse_args(with_config_paths(args))
         else:
             super().parse_arguments(parser, args)
 
@@ -151,6 +159,19 @@ def _state_dict(path: str) -> dict[str, Tensor]:
     return dict(state)
 
 
+def is_first_process() -> bool:
+    """Return whether this process is the only one or, of several that train together, the one that prints."""
+    return bool(rank_zero_only.rank == 0)  # type: ignore[attr-defined]
+
+
+def _leave_out_messages() -> None:
+    """Leave out the messages and warnings of Lightning that concern nobody who trains."""
+    for message in UNWANTED_WARNINGS:
+        warnings.filterwarnings("ignore", message=message)
+    for name in LOGGERS:
+        logging.getLogger(name).addFilter(_is_wanted)
+
+
 def _is_wanted(record: logging.LogRecord) -> bool:
     """Return whether a message of Lightning concerns who trains."""
     return not UNWANTED_MESSAGE.match(record.getMessage())
@@ -209,8 +230,8 @@ def _with_option(text: str, message: str) -> str:
     return ": ".join([*re.findall(r'Parser key "([\w.]+)"', message), f"{text}, got {given[1]}"])
 
 
-def run(args: list[str] | None) -> None:
-    """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict``; ``args`` is ``sys.argv`` when None.
+def run(args: list[str]) -> dict[str, float]:
+    """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict`` and return the metrics that it logged last.
 
     Raises:
         ValueError: if the arguments or a configuration are wrong.
@@ -218,18 +239,16 @@ def run(args: list[str] | None) -> None:
         SystemExit: with the code 143, as of a program that the signal SIGTERM ends, if that signal ended the run.
 
     """
-    words = with_config_paths(sys.argv[1:] if args is None else args)
+    words = with_config_paths(args)
     command = words[0]
-    for message in UNWANTED_WARNINGS:
-        warnings.filterwarnings("ignore", message=message)
-    logging.getLogger("pytorch_lightning.utilities.rank_zero").addFilter(_is_wanted)
+    _leave_out_messages()
     if words[1:] and not words[1].startswith("-"):
         raise ValueError(f"an option expected, got {words[1]!r}; a configuration is given by --config {words[1]}")
     configs = [read_config(path) for path in _config_files(words)]
     named = any(map(_names_its_classes, configs))
     raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines
     try:
-        TrainingCLI(
+        cli = TrainingCLI(
             command,
             model_class=pl.LightningModule if named else NormalizerTask,
             datamodule_class=pl.LightningDataModule if named else CorrespondenceDataModule,
@@ -244,7 +263,7 @@ def run(args: list[str] | None) -> None:
     except ArgumentError as error:
         if "are required" in str(error):
             raise ValueError(_which_configurations(command, str(error), _config_files(words))) from error
-        raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help lists the options") from error
+        raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help-all lists the options") from error
     except ValueError as error:  # of a class that was configured: its data, for example
         raise ValueError(_first_error(str(error))) from error
     except MisconfigurationException as error:  # such as a test of an estimator, whose task has none
@@ -255,3 +274,4 @@ def run(args: list[str] | None) -> None:
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from error
         raise
+    return {name: value.item() for name, value in cli.trainer.callback_metrics.items()}

@@ -90,4 +90,4 @@ def test_services_call_targets_of_the_makefile(path):
 def test_the_address_of_the_paper_is_the_cited_one():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert project["urls"]["Paper"] == f"https://doi.org/{citation['references'][0]['doi']}"
+    assert project["urls"]["Paper"] == f"https://doi.org/{citation['preferred-citation']['doi']}"

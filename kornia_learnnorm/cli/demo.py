@@ -17,7 +17,7 @@ learnnorm demo --port 8000 --no-browser"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm demo`` to a parser."""
-    parser.description = f"{parser.description}; it is served to this computer alone, until Ctrl-C"
+    parser.description = f"{parser.description};\nit is served to this computer alone, until Ctrl-C"
     parser.add_argument("--port", type=int, default=PORT, help="port of the page on 127.0.0.1 (default: %(default)s)")
     parser.add_argument("--no-browser", action="store_true", help="print the address, but open no browser")
 

@@ -22,7 +22,7 @@ __all__ = ["EXAMPLES", "add_arguments", "run"]
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf", ".svg")
 EXAMPLES = """\
-learnnorm estimate left.png right.png --K 700,700,320,240 --out pair.png --json pair.json
+learnnorm estimate left.png right.png --K 700,700,320,240 --out pair.png
 learnnorm estimate --pairs pairs.txt --out results --estimator learned
 """
 MAX_FAILURES = 5  # failed pairs that are named
@@ -34,20 +34,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options = PairOptions()
     parser.usage = "%(prog)s IMG1 IMG2 [options]\n       %(prog)s --pairs LIST --out FOLDER [options]"
     parser.description = (
-        f"{parser.description}\nexit codes: 0 solved, 2 wrong use or unreadable input, 3 no matrix or a doubtful one"
+        f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix or a doubtful one"
     )
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
     parser.add_argument(
         "--out", metavar="PATH", type=Path, help="picture of matches and epipolar lines; with --pairs, a folder"
     )
-    parser.add_argument("--json", metavar="FILE", help="write everything to this file; - for standard output")
+    parser.add_argument("--json", metavar="FILE", help="write everything to this file; -: standard output")
     estimation = parser.add_argument_group("estimation")
     estimation.add_argument(
-        "--estimator", choices=("ransac", "learned"), default="ransac", help="(default: %(default)s)"
+        "--estimator",
+        metavar="NAME",
+        choices=("ransac", "learned"),
+        default="ransac",
+        help="ransac, learned (default: %(default)s)",
     )
-    estimation.add_argument(
-        "--weights", metavar="NAME_OR_PATH", help="weights of the learned one (default: robust-synthetic)"
-    )
+    estimation.add_argument("--weights", metavar="NAME_OR_PATH", help="of the learned one (default: robust-synthetic)")
     estimation.add_argument(
         "--threshold",
         metavar="PX",
@@ -55,21 +57,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=options.threshold,
         help="largest symmetric epipolar distance of an inlier in the images as matched (default: %(default)s)",
     )
-    estimation.add_argument("--seed", type=_seed, default=options.seed, help="(default: %(default)s)")
+    estimation.add_argument("--seed", metavar="N", type=_seed, default=options.seed, help="(default: %(default)s)")
     camera = "one or two of fx,fy,cx,cy, a file of 4 or 9 numbers, KITTI's calib.txt, exif; adds E, R, t"
     estimation.add_argument("--K", metavar="CAMERA", nargs="+", default=[], help=camera)
     matching = parser.add_argument_group("matching")
-    matching.add_argument("--detector", choices=DETECTORS, default=options.detector, help="(default: %(default)s)")
-    matching.add_argument("--matcher", choices=MATCHERS, default=options.matcher, help="(default: %(default)s)")
+    for option, names, default in (
+        ("--detector", DETECTORS, options.detector),
+        ("--matcher", MATCHERS, options.matcher),
+    ):
+        text = f"{', '.join(names)} (default: %(default)s)"
+        matching.add_argument(option, metavar="NAME", choices=names, default=default, help=text)
     matching.add_argument("--ratio", type=float, default=options.ratio, help="ratio test (default: %(default)s)")
-    size = "match images reduced to this longer side (default: %(default)s)"
+    size = "reduce images to this longer side (default: %(default)s)"
     matching.add_argument("--max-size", metavar="PX", type=int, default=options.max_size, help=size)
-    mask = "one mask or two: features count where it is white"
+    mask = "one or two: features count where it is white"
     matching.add_argument("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
     many = parser.add_argument_group("many pairs")
-    many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line; one JSON line a pair in --out")
-    many.add_argument("--jobs", type=int, default=-1, help="processes; -1 for all cores (default: %(default)s)")
-    many.add_argument("--dask", metavar="ADDRESS", help="Dask scheduler, as tcp://host:8786; its workers estimate")
+    many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line; a JSON line of each in --out")
+    many.add_argument("--jobs", type=int, default=-1, help="processes; -1: all cores (default: %(default)s)")
+    many.add_argument("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
 
 
 def _seed(text: str) -> int:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import math
 import os
 import shlex
 import shutil
 import sys
 import textwrap
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import redirect_stdout
 from typing import Any
 
 import kornia_learnnorm
@@ -17,12 +19,35 @@ from kornia_learnnorm.optional import import_extra
 
 __all__ = ["main", "make_parser"]
 
+EXAMPLES = """\
+learnnorm estimate left.png right.png --out pair.png
+learnnorm fit --config crossview-synthetic"""
+REPEAT = "Options that were changed for fit have to be repeated."
+# What a command does, in one line and in more.
 TRAINING = {
-    "fit": "train a normaliser",
-    "validate": "validate a checkpoint",
-    "test": "test a checkpoint",
-    "predict": "write the predictions of a checkpoint",
+    "fit": (
+        "train a normaliser or an estimator",
+        "Writes checkpoints/last.ckpt, weights.safetensors and lightning_logs, with the\n"
+        "configuration and the curves, to trainer.default_root_dir.",
+    ),
+    "validate": ("validate a checkpoint", f"Prints the metrics on data.val of the configuration.\n{REPEAT}"),
+    "test": (
+        "test a checkpoint",
+        f"Prints the metrics on data.test of the configuration; estimators have no test.\n{REPEAT}",
+    ),
+    "predict": (
+        "write the predictions of a checkpoint",
+        "Writes predictions.safetensors, with the transforms, matrices and residuals of\n"
+        f"the samples of data.test, to trainer.default_root_dir.\n{REPEAT}",
+    ),
 }
+MEASURED = {"validate": "data.val", "test": "data.test"}  # commands that print metrics, and of which data
+TRAINING_EXAMPLES = """\
+learnnorm fit --config crossview-synthetic --trainer.default_root_dir runs/own
+learnnorm fit --config crossview --config own.yaml --trainer.max_steps 500"""
+CHECKPOINT_EXAMPLES = """\
+learnnorm {0} --config crossview --ckpt_path run/checkpoints/last.ckpt
+learnnorm {0} --config crossview --config own.yaml --ckpt_path last.ckpt"""
 TOOLS = {
     "estimate": ("kornia_learnnorm.cli.estimate", "the fundamental matrix of two images"),
     "demo": ("kornia_learnnorm.cli.demo", "a page in the browser to try two images on"),
@@ -39,7 +64,8 @@ TOOLS = {
 }
 COMPLETION = "print the completion of commands and options for a shell"
 COMPLETION_EXAMPLES = """\
-learnnorm completion bash > ~/.local/share/bash-completion/completions/learnnorm
+learnnorm completion bash \\
+  > ~/.local/share/bash-completion/completions/learnnorm
 learnnorm completion fish > ~/.config/fish/completions/learnnorm.fish"""
 # Arguments that are completed with names of files and of folders, by what the help calls them.
 FILES = ("CAMERA", "FILE", "IMG", "LIST", "NAME_OR_PATH", "PATH", "STORE", "STORE.h5")
@@ -66,11 +92,11 @@ def _run(args: Sequence[str] | None) -> int:
     """Run a command and return its exit code."""
     words = list(sys.argv[1:] if args is None else args)
     try:
-        if words and words[0] in TRAINING:
-            training = import_extra("lightning_modules.training", "train", "training")
-            training.run(None if args is None else words)
-            return 0
-        return _run_tool(words)
+        if not words or words[0] not in TRAINING:
+            return _run_tool(words)
+        if {"-h", "--help"} & {*words}:
+            return _run_tool([words[0], "--help"])
+        return _run_training(words)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -81,26 +107,62 @@ def _run(args: Sequence[str] | None) -> int:
         return 2
 
 
-def make_parser(names: Collection[str] = tuple(TOOLS)) -> argparse.ArgumentParser:
-    """Return the parser of the command line, with the arguments of the named tools only, whose modules are imported."""
-    parser = argparse.ArgumentParser(prog="learnnorm", description="Learned normalisation of the eight-point algorithm")
+def make_parser(names: Collection[str] = (*TRAINING, *TOOLS)) -> argparse.ArgumentParser:
+    """Return the parser of the command line, with the arguments of the named commands only, whose modules are imported.
+
+    It knows the options of a training that are needed most, for its help; LightningCLI parses them, with all others.
+    """
+    parser = argparse.ArgumentParser(prog="learnnorm", formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.description, parser.epilog = "Learned normalisation of the eight-point algorithm", _examples(EXAMPLES)
     parser.add_argument("--version", action="version", version=f"%(prog)s {kornia_learnnorm.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, text in TRAINING.items():
-        commands.add_parser(name, help=text, add_help=False, usage=f"learnnorm {name} --config CONFIG [options]")
+    for name, (text, about) in TRAINING.items():
+        command = commands.add_parser(name, help=text, description=f"{text}\n\n{about}", formatter_class=HelpFormatter)
+        if name in names:
+            _add_training_arguments(command, name)
+            command.epilog = _examples(TRAINING_EXAMPLES if name == "fit" else CHECKPOINT_EXAMPLES.format(name))
     for name, (module, text) in TOOLS.items():
         command = commands.add_parser(name, help=text, description=text, formatter_class=HelpFormatter)
         if name in names:
             tool = importlib.import_module(module)
             tool.add_arguments(command)
-            if examples := getattr(tool, "EXAMPLES", ""):
-                command.epilog = "examples:\n" + textwrap.indent(examples, "  ")
+            command.epilog = _examples(tool.EXAMPLES)
             command.set_defaults(run=tool.run)
     command = commands.add_parser("completion", help=COMPLETION, description=COMPLETION, formatter_class=HelpFormatter)
     command.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
-    command.epilog = "examples:\n" + textwrap.indent(COMPLETION_EXAMPLES, "  ")
+    command.epilog = _examples(COMPLETION_EXAMPLES)
     command.set_defaults(run=_print_completion)
     return parser
+
+
+def _examples(lines: str) -> str:
+    """Return examples as the end of a page of help."""
+    return "examples:\n" + textwrap.indent(lines, "  ")
+
+
+def _add_training_arguments(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add the options of a training command that are needed most to a parser."""
+    parser.add_argument("--help-all", action="store_true", help="list all options: the entries of a configuration")
+    parser.add_argument(
+        "--config",
+        metavar="NAME_OR_FILE",
+        action="append",
+        required=True,
+        help="configuration: a name that learnnorm config lists, or a file; can be repeated, later entries win",
+    )
+    text = "checkpoint of the run to go on with" if name == "fit" else "checkpoint of the run"
+    parser.add_argument("--ckpt_path", metavar="FILE", required=name != "fit", help=text)
+    parser.add_argument("--trainer.default_root_dir", metavar="FOLDER", help="folder to write to")
+    if name == "fit":
+        parser.add_argument("--trainer.max_steps", metavar="N", help="steps of the training")
+    parser.add_argument("--trainer.accelerator", metavar="NAME", help="device: auto, cpu, gpu")
+    parser.add_argument("--data.batch_size", metavar="N", help="samples in a batch (normalisers only)")
+    if name == "fit":
+        parser.add_argument("--print_config", action="store_true", help="print the whole configuration and end")
+    if name in MEASURED:
+        from kornia_learnnorm.cli.evaluate import add_json_argument
+
+        add_json_argument(parser)
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -121,18 +183,15 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 def _print_completion(args: argparse.Namespace) -> int:
-    """Print a script that completes commands, options and files; those of a training by the options given most."""
+    """Print a script that completes commands, options and files."""
     shtab = import_extra("shtab", "completion", "completion in the shell")
     from lightning_modules.config_files import config_names
 
     parser = make_parser()
     for name, command in _parsers_of_commands(parser).items():
-        if name in TRAINING:
-            command.add_argument("--config", choices=config_names())
-            command.add_argument("--ckpt_path", metavar="FILE")
-            command.add_argument("--trainer.default_root_dir", metavar="FOLDER")
-            command.add_argument("--trainer.max_steps")
         for action in command._actions:  # noqa: SLF001
+            if name in TRAINING and action.dest == "config":
+                action.choices = config_names()
             if not action.choices and action.metavar in (*FILES, *FOLDERS):
                 action.complete = shtab.FILE if action.metavar in FILES else shtab.DIRECTORY
     print(shtab.complete(parser, args.shell))
@@ -153,6 +212,31 @@ def _run_tool(words: list[str]) -> int:
         command.error(f"unrecognized arguments: {shlex.join(unknown)}; {command.prog} --help lists the options")
     parsed.command_line = shlex.join(["learnnorm", *words])
     return int(parsed.run(parsed))
+
+
+def _run_training(words: list[str]) -> int:
+    """Run a training command; ``--json`` takes the metrics that it prints."""
+    training = import_extra("lightning_modules.training", "train", "training")
+    words = ["--help" if word == "--help-all" else word for word in words]
+    if words[0] not in MEASURED:
+        training.run(words)
+        return 0
+    from kornia_learnnorm.cli.evaluate import add_json_argument, json_tables
+    from kornia_learnnorm.evaluation.tables import Table
+
+    usage = f"learnnorm {words[0]} --config NAME_OR_FILE --ckpt_path FILE [options]"
+    parser = argparse.ArgumentParser(f"learnnorm {words[0]}", usage, add_help=False, allow_abbrev=False)
+    add_json_argument(parser)
+    args, options = parser.parse_known_args(words)
+    args.command_line = shlex.join(["learnnorm", *words])
+    if not training.is_first_process():
+        args.json = None
+    with json_tables(args, [word.rpartition("=")[2] for word in options]) as tables:
+        with redirect_stdout(sys.stderr if args.json == "-" else sys.stdout):
+            metrics = training.run(options)
+        rows = [[name, "" if math.isnan(value) else str(value)] for name, value in metrics.items()]
+        tables.append(Table(words[0], f"metrics on {MEASURED[words[0]]}", ["metric", "value"], rows))
+    return 0
 
 
 def _one_line(error: Exception) -> str:

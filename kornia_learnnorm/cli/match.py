@@ -31,16 +31,12 @@ READER_OPTIONS = ("sequences", "split", "camera", "max_difference", "model")  # 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm match`` to a parser."""
     options = MatchOptions()
-    parser.add_argument(
-        "reader", metavar="DATASET", choices=[*DATASETS], help=f"kind of dataset: {', '.join(DATASETS)}"
-    )
+    parser.add_argument("reader", metavar="DATASET", choices=[*DATASETS], help=f"one of {', '.join(DATASETS)}")
     parser.add_argument("root", metavar="ROOT", type=Path, help="its folder")
     parser.add_argument("--out", metavar="STORE.h5", type=Path, required=True, help="the store to write")
     frames = parser.add_argument_group("frames")
     frames.add_argument("--sequences", metavar="NAME", nargs="+", help="kitti, tum: these sequences")
-    frames.add_argument(
-        "--split", metavar="NAME", help="kitti, cambridge: train or test; tum: train or val (Fan et al.)"
-    )
+    frames.add_argument("--split", metavar="NAME", help="kitti, cambridge: train, test; tum: train, val")
     frames.add_argument("--camera", help="kitti: image_0 to image_3 (default: image_0)")
     frames.add_argument(
         "--model", metavar="FOLDER", type=Path, help="colmap: cameras, images and points; ROOT has images"
@@ -78,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     where = match.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=int, default=-1, help="processes here; -1 for all cores (default: %(default)s)")
-    where.add_argument("--dask", metavar="ADDRESS", help="Dask scheduler, as tcp://host:8786; its workers match")
+    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
 
 
 def run(args: argparse.Namespace) -> int:

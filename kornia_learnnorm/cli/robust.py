@@ -13,7 +13,7 @@ __all__ = ["EXAMPLES", "add_arguments", "run"]
 
 EXAMPLES = """\
 learnnorm robust store.h5 --out run && learnnorm report run
-learnnorm robust store.h5 --out run --estimators RANSAC poselib learned:robust --solvers"""
+learnnorm robust store.h5 --out run --estimators RANSAC poselib --solvers"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,18 +29,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=list(DEFAULT_ESTIMATORS),
         help="robust estimators; learned:WEIGHTS, guided:WEIGHTS, count:METHOD, time:METHOD and RANSAC:METHOD for your"
         " own; RANSAC-calibrated, poselib-calibrated and opencv-usac-magsac-calibrated use the cameras of the store"
-        " (default: %(default)s)",
+        f" (default: {' '.join(DEFAULT_ESTIMATORS)})",
     )
     parser.add_argument(
         "--solvers",
         metavar="NAME",
         nargs="*",
         default=list(DEFAULT_SOLVERS),
-        help="minimal solvers whose hypotheses are measured (default: %(default)s)",
+        help=f"minimal solvers whose hypotheses are measured (default: {' '.join(DEFAULT_SOLVERS)})",
     )
     counts = {
-        "pairs": "evenly spaced image pairs of each store; 0: all",
-        "hypotheses": "evenly spaced image pairs of each store for the minimal solvers; 0: all",
+        "pairs": "of each store, evenly spaced; 0: all",
+        "hypotheses": "pairs of each store for the minimal solvers, evenly spaced; 0: all",
         "seeds": "runs on each pair",
         "slow_seeds": "runs of the estimators that can take a second: all except opencv-*, count:* and time:*",
         "seed": "the first seed",

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import io
+import json
 import os
 import re
 import shlex
@@ -20,7 +21,7 @@ from pytorch_lightning.utilities import rank_zero_info
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.cli.main import TOOLS, main, make_parser
+from kornia_learnnorm.cli.main import TOOLS, TRAINING, main, make_parser
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from lightning_modules.callbacks import _duration
@@ -388,6 +389,40 @@ def test_wrong_options_of_a_training_are_one_line(options, message, tmp_path, mo
     refused(["fit", "--config", "crossview-synthetic", *options], message)
 
 
+def test_an_unknown_option_of_a_training_names_the_list_of_all(refused):
+    message = "unknown option --nonsense; learnnorm fit --help-all lists the options"
+    refused(["fit", "--config", "crossview-synthetic", "--nonsense"], message)
+
+
+@pytest.mark.parametrize("command", ["validate", "test"])
+def test_json_of_a_checkpoint_has_its_metrics(command, trained, tmp_path, capsys):
+    folder, options = trained
+    words = [command, *options, "--ckpt_path", str(folder / "checkpoints/last.ckpt")]
+    path = tmp_path / "metrics.json"
+    assert main([*words, "--json", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert out.endswith(f"\nwrote {path}\n")
+    assert main([*words, "--json=-"]) == 0
+    found, again = json.loads(path.read_text()), json.loads(capsys.readouterr().out)
+    assert found["command"] == shlex.join(["learnnorm", *words, "--json", str(path)])
+    assert found["tables"] == again["tables"]
+    (table,) = found["tables"]
+    assert table["title"] == command
+    stage = {"validate": "val", "test": "test"}[command]
+    names = {f"{stage}/{name}" for name in ("log_sed", "better_than_hartley", "better_than_whitening", "left_out")}
+    assert {row["metric"] for row in table["rows"]} == names
+    assert all(row["metric"] in out and str(row["value"]) in out for row in table["rows"])
+
+
+def test_json_of_a_checkpoint_is_refused_where_it_cannot_be_written(trained, tmp_path, refused):
+    folder, options = trained
+    last = folder / "checkpoints/last.ckpt"
+    for command in (["test", "--ckpt_path", last], ["validate", f"--ckpt_path={last}"]):
+        refused([*command, *options, "--json", last], f"--json {last}: expected a new file or -")
+        refused([*command, *options, "--json", tmp_path / "none/a.json"], "none does not exist")
+    refused(["fit", *options, "--json", tmp_path / "a.json"], "unknown option --json")
+
+
 @pytest.mark.parametrize(
     "option",
     ["max_steps=0", "max_epochs=0", "limit_train_batches=0", "limit_train_batches=0.0", "max_time=00:00:00:00"],
@@ -448,8 +483,8 @@ def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog, capsys):
     assert " 13/13 " in capsys.readouterr().out
     assert [text for text in caplog.messages if re.fullmatch(r"about \d+ s for the remaining 2 steps, .*", text)]
     assert [text for text in caplog.messages if re.fullmatch(r"13 steps in \d+ s", text)]
-    # Lightning's lines of other devices and of products are left out.
-    assert [text for text in caplog.messages if re.search("available|Tip", text)] == []
+    # Lightning's lines of other devices, of products and of the seed are left out.
+    assert [text for text in caplog.messages if re.search("available|Tip|Seed", text)] == []
     rank_zero_info("GPU available: False, used: False")
     rank_zero_info("GPU memory is full")
     assert caplog.messages[-1] == "GPU memory is full"
@@ -474,6 +509,7 @@ def test_an_interrupted_training_exits_as_interrupted(number, code, tmp_path, mo
     assert ended.value.code == code
     last = Path("runs/crossview-synthetic/checkpoints/last.ckpt")
     assert f"stopped at step 2; to go on, repeat the command with --ckpt_path {last}" in caplog.text
+    assert "weights_only" not in caplog.text
     assert capsys.readouterr().err.endswith("interrupted\n") is (code == 130)
     assert last.is_file()
     assert not Path("runs/crossview-synthetic/weights.safetensors").exists()
@@ -538,22 +574,45 @@ def test_configurations_take_the_accelerator_that_is_there(path):
     assert "accelerator" in trainer or path.parent != FOLDER
 
 
-@pytest.mark.parametrize("command", [*sorted(TOOLS), "completion"])
-def test_help_fits_a_screen_and_ends_with_examples_that_parse(command, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "100")
-    with pytest.raises(SystemExit) as caught:
-        main([command, "--help"])
+def help_of(*words):
+    """What ``--help`` prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit) as caught:
+        main([*words])
     assert caught.value.code == 0
-    lines = capsys.readouterr().out.rstrip().splitlines()
+    return printed.getvalue().rstrip()
+
+
+@pytest.mark.parametrize("command", [(), *((name,) for name in (*TRAINING, *sorted(TOOLS), "completion"))])
+def test_help_fits_a_screen_and_ends_with_examples_that_parse(command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = help_of(*command, "--help").splitlines()
     assert len(lines) <= 40
-    start = lines.index("examples:")
-    assert len(lines) == start + 3
+    assert max(map(len, lines)) <= 80
+    examples = "\n".join(lines[lines.index("examples:") + 1 :]).replace("\\\n", "").splitlines()
+    assert len(examples) == 2
     parser = make_parser()
-    for example in re.split(r" && |\n", "\n".join(lines[start + 1 :])):
+    for example in re.split(r" && |\n", "\n".join(examples)):
         words = shlex.split(example.partition(">")[0])
         assert words[0] == "learnnorm"
-        if words[1] in TOOLS:
-            assert parser.parse_args(words[1:]).command == words[1]
+        assert parser.parse_args(words[1:]).command == words[1]
+
+
+@pytest.mark.parametrize("words", [["-h"], ["--help"], ["--config", "crossview", "--help"]])
+def test_help_of_a_training_needs_no_extra(words, monkeypatch):
+    for module in ("lightning_modules.training", "pytorch_lightning", "jsonargparse", "yaml"):
+        monkeypatch.setitem(sys.modules, module, None)
+    assert "--help-all" in help_of("fit", *words)
+
+
+@pytest.mark.parametrize("command", TRAINING)
+def test_the_options_of_the_help_are_among_all(command):
+    shown = {*re.findall(r"^  (--[\w.]+) ", help_of(command, "--help"), flags=re.MULTILINE)}
+    assert {"--config", "--ckpt_path", "--trainer.default_root_dir", "--data.batch_size"} <= shown
+    every = help_of(command, "--help-all")
+    assert [
+        option for option in shown - {"--json"} if not re.search(rf"^  .*{re.escape(option)}\b", every, re.MULTILINE)
+    ] == []
+    assert "--trainer.limit_val_batches" in every
 
 
 @pytest.mark.parametrize("arguments", [[], ["unknown"], ["evaluate"], ["compare"]])

@@ -6,6 +6,7 @@ import numpy as np
 
 from kornia_learnnorm.evaluation.methods import REFINED
 from kornia_learnnorm.evaluation.report.pair import draw_example, example_inliers
+from kornia_learnnorm.evaluation.report.rates import papers_data
 from kornia_learnnorm.evaluation.report.style import (
     INK,
     Picture,
@@ -33,15 +34,18 @@ def report_figures(run: Run) -> list[Picture]:
     """Draw all pictures of a run; those of samples use the first store with filtered samples."""
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
     colors = method_colors(run.about["methods"])
-    return [
-        _per_frame(cell, colors),
-        _distribution(cell, colors),
-        _distances(cell, colors),
-        *draw_example(run, colors),
-        *([_by_size(run, colors)] if run.sizes else []),
-        _conditions(cell, colors),
-        *([_rho(cell, colors)] if len(cell.pair) >= RHO_WINDOW else []),
-    ]
+    first = [_per_frame(cell, colors), _distribution(cell, colors), _distances(cell, colors)]
+    example = [*draw_example(run, colors), *([_by_size(run, colors)] if run.sizes else [])]
+    last = [_conditions(cell, colors), *([_rho(cell, colors)] if len(cell.pair) >= RHO_WINDOW else [])]
+    store = str(run.example.get("store", cell.store))
+    return [*_numbered(first, run, cell.store), *_numbered(example, run, store), *_numbered(last, run, cell.store)]
+
+
+def _numbered(pictures: list[Picture], run: Run, store: str) -> list[Picture]:
+    """Return pictures of a store with the numbers of Fan et al. in their titles, where it has their test data."""
+    if not papers_data(run.about["stores"][store]):
+        return pictures
+    return [p._replace(title=f"{p.title} (Figure {p.name.removeprefix('figure-')})") for p in pictures]
 
 
 def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
@@ -62,7 +66,7 @@ def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
     )
     if any(name.endswith(REFINED) for name in chosen):
         text += " Dashed: with non-linear refinement."
-    return make_picture(figure, "figure-4a", "Error by frame (Figure 4a)", text)
+    return make_picture(figure, "figure-4a", "Error by frame", text)
 
 
 def _distribution(cell: Cell, colors: dict[str, str]) -> Picture:
@@ -75,7 +79,7 @@ def _distribution(cell: Cell, colors: dict[str, str]) -> Picture:
     axes.set(xlim=(0.01, 60), ylim=(0, 1))
     text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}."
     text += _dashes(names)
-    return make_picture(figure, "figure-4b", "Distribution of errors (Figure 4b)", text)
+    return make_picture(figure, "figure-4b", "Distribution of errors", text)
 
 
 def _distances(cell: Cell, colors: dict[str, str]) -> Picture:
@@ -91,7 +95,7 @@ def _distances(cell: Cell, colors: dict[str, str]) -> Picture:
         axes.minorticks_off()
     views[0].set_ylabel("samples")
     text = f"Mean distances of the normalised points from the origin, {cell.title}. Hartley's is the square root of 2."
-    return make_picture(figure, "figure-5", "Normalised distances (Figure 5)", text)
+    return make_picture(figure, "figure-5", "Normalised distances", text)
 
 
 def _by_size(run: Run, colors: dict[str, str]) -> Picture:
@@ -115,7 +119,7 @@ def _by_size(run: Run, colors: dict[str, str]) -> Picture:
         "squares does not reject them: so errors of ground-truth inliers can grow with the size of the sample. Errors "
         "of the sample's own points grow too, because fewer points can be fitted more closely."
     )
-    return make_picture(figure, "figure-11", "Number of correspondences (Figure 11)", text)
+    return make_picture(figure, "figure-11", "Number of correspondences", text)
 
 
 def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
@@ -133,7 +137,7 @@ def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
         "Condition number of the design matrix, its largest over its eighth singular value, by normalisation. Dot: "
         f"median over samples; bar: quartiles. {cell.title}."
     )
-    return make_picture(figure, "figure-12", "Condition numbers (Figure 12)", text, legend=False)
+    return make_picture(figure, "figure-12", "Condition numbers", text, legend=False)
 
 
 def _rho(cell: Cell, colors: dict[str, str]) -> Picture:
@@ -150,7 +154,7 @@ def _rho(cell: Cell, colors: dict[str, str]) -> Picture:
         f"normalised matrix. The larger it is, the less the projection changes. Means of {RHO_WINDOW} successive "
         f"samples, {cell.title}.{_dashes(names)}"
     )
-    return make_picture(figure, "figure-13", "Singularity ratio (Figure 13)", text)
+    return make_picture(figure, "figure-13", "Singularity ratio", text)
 
 
 def _dashes(names: list[str]) -> str:

@@ -48,9 +48,10 @@ def known_parts(table: Table) -> Table | None:
         [['a', '1']]
 
     """
+    known = [row for row in table.rows if any(cell not in ("", "-") for cell in row[1:])]
     places = range(1, len(table.header))
-    columns = [0, *(place for place in places if any(row[place] not in ("", "-") for row in table.rows))]
-    rows = [[row[place] for place in columns] for row in table.rows if any(row[place] for place in columns[1:])]
+    columns = [0, *(place for place in places if any(row[place] not in ("", "-") for row in known))]
+    rows = [[row[place] for place in columns] for row in known]
     return table._replace(header=[table.header[place] for place in columns], rows=rows) if rows else None
 
 

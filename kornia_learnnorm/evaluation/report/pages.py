@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from kornia_learnnorm.evaluation.report.figures import report_figures
 from kornia_learnnorm.evaluation.report.formatting import known_parts
 from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_figures, hypothesis_tables
-from kornia_learnnorm.evaluation.report.rates import with_baseline
+from kornia_learnnorm.evaluation.report.rates import papers_data, with_baseline
 from kornia_learnnorm.evaluation.report.robust import robust_tables
 from kornia_learnnorm.evaluation.report.style import Picture
 from kornia_learnnorm.evaluation.report.summary import robust_summary, run_summary
@@ -105,11 +105,12 @@ def _about_run(run: Run) -> str:
     about = run.about
     most = about["max_samples"]
     samples = "All samples" if most is None else f"At most {most} random samples"
+    papers = any(map(papers_data, about["stores"].values()))
+    numbers = " Numbers of tables and figures are those of Fan et al." if papers else ""
     return (
         f"Stores: {_stores(about)}. Methods: {', '.join(about['methods'])}. {samples} of each store, filtered by the "
         f"ratio test (the nearest descriptor is less than {RATIO:g} times as far as the second nearest) and "
-        f"unfiltered, seed {about['seed']}. {', '.join(_versions(about))}. Numbers of tables and figures are those of "
-        f"Fan et al.{_missing(run.missing)}"
+        f"unfiltered, seed {about['seed']}. {', '.join(_versions(about))}.{numbers}{_missing(run.missing)}"
     )
 
 

@@ -51,7 +51,7 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
         f"matrices of one sample of eight, the sample with the pair's median error for {methods[0]}. Median distance "
         f"of the ground-truth inliers: {medians}."
     )
-    return [make_picture(figure, "figure-10", "Inliers, outliers and epipolar lines (Figure 10)", text)]
+    return [make_picture(figure, "figure-10", "Inliers, outliers and epipolar lines", text)]
 
 
 def example_inliers(pair: Arrays) -> NDArray[np.bool_]:

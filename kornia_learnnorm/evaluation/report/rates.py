@@ -67,12 +67,11 @@ def papers_data(description: str) -> str:
 
 def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     trained, protocol = run.about["trained_on"], cells[0].protocol
-    rows = []
-    for name in run.about["methods"]:
-        rates = [
-            _rate(cell, name, baseline) + (" *" if was_trained_on(cell.store, trained[name]) else "") for cell in cells
-        ]
-        rows.append([name, ", ".join(trained[name]) or "-", *rates])
+    rows = [
+        [name, ", ".join(trained[name]) or "-", *rates]
+        for name in run.about["methods"]
+        if name != baseline and any(rates := [_rate(cell, name, baseline, trained[name]) for cell in cells])
+    ]
     found = [
         better_rate(prediction["own"], cell.predictions[baseline]["own"])
         for cell in cells
@@ -103,10 +102,10 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     return Table(title, text, header, rows)
 
 
-def _rate(cell: Cell, name: str, baseline: str) -> str:
-    if name == baseline:
-        return "-"
-    return rate_text(cell, name, baseline, "own") if name in cell.predictions else ""
+def _rate(cell: Cell, name: str, baseline: str, trained_on: Iterable[str]) -> str:
+    """Return a better rate, with an asterisk if the method was trained on the store; empty if it is not known."""
+    rate = rate_text(cell, name, baseline, "own") if name in cell.predictions else ""
+    return f"{rate} *" if rate and was_trained_on(cell.store, trained_on) else rate
 
 
 def was_trained_on(store: str, trained_on: Iterable[str]) -> bool:

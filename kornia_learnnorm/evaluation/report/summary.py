@@ -80,7 +80,7 @@ def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> 
 
 
 def _about_methods(cell: Cell) -> str:
-    """Return which method has the smallest median error, as the table shows it, beside the baseline's."""
+    """Return which method has the smallest median error, as the table shows it, beside another one's."""
     key = next((key for key in ERRORS if not cell.predictions[BASELINE][key].isnan().all()), "own")
     logs = {name: p[key].clamp(min=MIN_DISTANCE).log() for name, p in cell.predictions.items()}
     ranking = _rank({name: median(p[key]).item() for name, p in cell.predictions.items()}, logs, cell.pair)
@@ -89,17 +89,27 @@ def _about_methods(cell: Cell) -> str:
     size = f"{len(used):,} samples of {len(torch.unique(used))} image pairs"
     text = f"**{cell.title}** ({size}): "
     text += f"`{winner}` has the smallest {ERRORS[key]}, median {median_text(best[key])} px"
-    if winner != BASELINE:
-        text += f"; {BASELINE} has {median_text(cell.predictions[BASELINE][key])} px"
-        if found := ranking.against.get(BASELINE):
-            low, mean, high = (percent_change(value) for value in (found.low, found.mean, found.high))
-            text += f" (change of the geometric mean {mean} % [{low}, {high}])"
-    text += f".{_level(ranking)}"
+    text += f"{_compared(cell, ranking, key)}.{_level(ranking)}"
     if ranking.ahead:
         text += f" The geometric mean of the errors is smaller for {_names(ranking.ahead)}."
     if key != "truth" and "inliers" in best:
         shares = [_inlier_share(cell, name) for name in dict.fromkeys((winner, BASELINE))]
         text += f" Share of the matches within {INLIER_THRESHOLD:g} px: {', '.join(shares)}. No ground truth is known."
+    return text
+
+
+def _compared(cell: Cell, ranking: _Ranking, key: str) -> str:
+    """Return the baseline's error, or the second's where the baseline has won, and the change against the baseline."""
+    won = ranking.winner == BASELINE
+    other = ranking.second if won else BASELINE
+    error = median_text(cell.predictions[other][key]) if other else ""
+    if not error:
+        return ""
+    text = f"; next is `{other}` with {error} px" if won else f"; {other} has {error} px"
+    if found := ranking.against.get(other):
+        logs = (-found.mean, -found.high, -found.low) if won else (found.mean, found.low, found.high)
+        mean, low, high = map(percent_change, logs)
+        text += f" (change of the geometric mean {mean} % [{low}, {high}])"
     return text
 
 

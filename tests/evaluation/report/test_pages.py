@@ -96,7 +96,7 @@ def test_what_is_there_of_a_run(copied, capsys):
     assert f"Not there yet, so left out: {left}." in (copied / "report.md").read_text()
     (copied / "example.npz").unlink()
     assert write_report(copied).missing[-1] == "the example of a pair"
-    assert "Figure 11" not in (copied / "report.md").read_text()
+    assert "Number of correspondences" not in (copied / "report.md").read_text()
 
 
 def test_robust_estimators_alone_and_beside_predictions(robust_copied, robust_store, monkeypatch):
@@ -116,6 +116,34 @@ def test_robust_estimators_alone_and_beside_predictions(robust_copied, robust_st
     text = (robust_copied / "report.md").read_text()
     assert "Better than Hartley, filtered (Table 1)" in text
     assert "unfiltered (Table 3)" in text
+    assert "Numbers of tables and figures are those of Fan et al." in text
+    assert re.findall(r"^## .+ \(Figure (.+)\)$", text, flags=re.MULTILINE) == ["4a", "4b", "5", "10", "11", "12"]
+
+
+def test_numbers_of_the_paper_are_only_beside_its_data(copied, capsys):
+    """The run's store is made of synthetic scenes."""
+    assert main(["report", str(copied), "--json", "-"]) == 0
+    for text in (capsys.readouterr().out, (copied / "report.md").read_text(), (copied / "report.html").read_text()):
+        assert not re.findall(r"Fan et al|Figure \d|Table \d", text)
+
+
+def test_no_form_of_the_report_has_the_row_of_a_method_against_itself(copied, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert main(["report", str(copied)]) == 0
+    printed = capsys.readouterr().out
+    assert main(["report", str(copied), "--json", "-"]) == 0
+    tables = {table["title"]: table["rows"] for table in json.loads(capsys.readouterr().out)["tables"]}
+    text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
+    for name in ("Hartley", "whitening"):
+        title = f"Better than {name}, filtered"
+        names = [row["method"] for row in tables[title]]
+        assert names == [one for one in ("none", "Hartley", "whitening", "crossview") if one != name] + names[3:]
+        section = text.split(f"## {title}\n")[1].split("\n## ")[0]
+        assert re.findall(r"^\| (\S+) ", section, flags=re.MULTILINE) == ["method", *names]
+        section = page.split(f">{title}</h2>")[1].split("</table>")[0]
+        assert re.findall(r"<tr><td>(.+?)</td>", section) == names
+        section = printed.split(title)[-1].split("└")[0]
+        assert re.findall(r"^│ (\S+) ", section, flags=re.MULTILINE) == names
 
 
 def test_incomplete_robust_run(robust_copied):

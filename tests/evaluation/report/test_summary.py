@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
 import torch
@@ -41,8 +42,20 @@ def test_the_smallest_error_wins_and_what_is_level_is_named():
 
 
 def test_hartley_may_win():
-    text = summary_of({"Hartley": errors(1.0), "mine": errors(1.5)})
-    assert "`Hartley` has the smallest error on the ground-truth inliers, median 6.500 px." in text
+    """The next method is named, with its change against Hartley as in the table of paired tests."""
+    noise = torch.where(torch.arange(SAMPLES) % 2 == 0, 1.1, 1 / 1.1)
+    text = summary_of({"bad": errors(3.0), "Hartley": errors(1.0), "mine": errors(1.5)})
+    assert "`Hartley` has the smallest error on the ground-truth inliers, median 6.500 px; next is `mine` with " in text
+    assert text.endswith("next is `mine` with 9.750 px (change of the geometric mean +50.0 % [+50.0, +50.0]).")
+    text = summary_of({"Hartley": errors(1.0), "close": errors(1.005 * noise)})
+    low, high = map(float, re.findall(r"change of the geometric mean \S+ % \[(\S+), (\S+)\]", text)[0])
+    assert low < 0 < high
+    assert text.endswith("Level with it: `close`.")
+
+
+def test_where_hartley_wins_a_method_without_an_error_is_not_next():
+    text = summary_of({"Hartley": errors(1.0), "broken": errors(math.nan)})
+    assert "`Hartley` has the smallest error on the ground-truth inliers, median 6.500 px. Not tested" in text
 
 
 def test_the_quoted_median_decides_and_a_smaller_geometric_mean_is_named():
@@ -64,6 +77,9 @@ def test_few_pairs_are_not_tested(pairs, text):
     found = summary_of({"Hartley": errors(1.0), "mine": errors(0.5)}, torch.arange(SAMPLES) % pairs)
     assert found.endswith(f" Not tested: there {text}, a test needs 8.") == bool(text)
     assert ("change of the geometric mean" in found) == (not text)
+    won = summary_of({"Hartley": errors(1.0), "mine": errors(2.0)}, torch.arange(SAMPLES) % pairs)
+    assert "; next is `mine` with 13.000 px" in won
+    assert ("change of the geometric mean" in won) == (not text)
 
 
 def test_one_method_has_nothing_to_compare():

@@ -17,6 +17,7 @@ from kornia_learnnorm.evaluation.report.style import method_colors
 from kornia_learnnorm.evaluation.report.tables import by_motion, report_tables
 from kornia_learnnorm.evaluation.robust.run import read_robust
 from kornia_learnnorm.evaluation.runs.run import Cell, Run, read_run
+from kornia_learnnorm.evaluation.tables import Table
 
 
 def test_rates_are_those_of_the_samples(run):
@@ -25,8 +26,9 @@ def test_rates_are_those_of_the_samples(run):
     own = {name: prediction["own"].numpy() for name, prediction in cell.predictions.items()}
     table = report_tables(found)[0]
     for row in table.rows:
-        if row[0] in own and row[0] != "Hartley":
+        if row[0] in own:
             assert row[2].startswith(f"{100 * np.mean(own[row[0]] < own['Hartley']):.1f} [")
+    assert [row[0] for row in table.rows] == [name for name in own if name != "Hartley"]
     assert table.header[2] == f"scenes: {len(cell.pair)} of {cell.drawn}"
     assert {row[0]: row[1] for row in table.rows}["crossview"] == "kitti_00, kitti_01, kitti_03"
     raw = np.load(run / "scenes" / "filtered" / "samples.npz")["plain_residual"]
@@ -176,16 +178,33 @@ def test_the_rate_of_known_distributions():
     about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(own, ""), "trained_on": trained_on}
     about["stores"] = {"kitti_06": "KITTI odometry 06, 200 pairs, 20000 matches"}
     (table,) = rate_tables(Run(about, [cell], {}, {}, {}))
-    rate, interval = table.rows[1][2].split(" ", 1)
+    rate, interval = table.rows[0][2].split(" ", 1)
     low, high = (float(end) for end in interval.strip("[] *").split(", "))
-    assert table.rows[1][1] == "kitti_06@0:3"
+    assert table.rows[0][:2] == ["crossview", "kitti_06@0:3"]
     assert interval.endswith(" *")
     assert low < 200 / 3 < high
     # The half width of independent samples: 1.96 standard deviations of a proportion.
     assert (high - low) / 2 == pytest.approx(196 * np.sqrt(2 / 9 / 20_000), rel=0.2)
     assert float(rate) == pytest.approx(200 / 3, abs=1)
     printed = {"KITTI 00-05": "86.68", "TUM": "84.22", "KITTI 00-05 and TUM": "87.05"}
-    assert {row[1]: row[2] for row in table.rows[2:]} == printed
+    assert {row[1]: row[2] for row in table.rows[1:]} == printed
+
+
+def test_rows_and_columns_without_a_number_are_left_out():
+    rows = [["a", "-", "1.5", ""], ["b", "-", "", ""], ["c", "-", "-", "-"]]
+    known = known_parts(Table("", "", ["method", "own", "truth", "angle"], rows))
+    assert (known.header, known.rows) == (["method", "truth"], [["a", "1.5"]])
+    assert known_parts(Table("", "", ["method", "own"], [["a", "-"], ["b", ""]])) is None
+
+
+def test_rates_have_no_row_of_the_baseline_or_of_a_method_without_predictions(run):
+    found = read_run(run)
+    for cell in found.cells:
+        cell.predictions.pop("crossview")
+    found.about["trained_on"]["crossview"] = ["scenes"]
+    others = {"none", "Hartley", "whitening", "Hartley+optimal", "Hartley+LM"}
+    names = [{row[0] for row in table.rows} for table in rate_tables(found)]
+    assert names == 2 * [others - {"Hartley"}] + 2 * [others - {"whitening"}]
 
 
 def test_numbers_of_robust_estimators(robust_run):
