@@ -131,7 +131,7 @@ table1: $(VENV)/.ready $(TABLE1_RUNS)
 	$(BIN)/learnnorm synthesize runs/table1 --scenes hand-held --pairs 60
 	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5@10:19 \
 		$(STORES)/tum_fr3_office_kitti_size.h5@10:19 runs/table1/synthetic.h5 \
-		--methods $(CLOSED_FORMS) paper crossview $(TABLE1_RUNS) searched
+		--methods $(CLOSED_FORMS) paper $(wildcard runs/paper-150/weights.safetensors) crossview $(TABLE1_RUNS) searched
 
 layer-ablations: $(VENV)/.ready $(LAYER_RUNS)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/sizes.py $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
