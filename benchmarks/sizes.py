@@ -258,6 +258,9 @@ def main() -> None:
     args = parser.parse_args()
     if unknown := [name for name in args.methods if name not in METHODS and not name.startswith(LEARNED)]:
         parser.error(f"--methods {' '.join(unknown)}: expected some of {', '.join(METHODS)} or learned:WEIGHTS")
+    for path in filter(None, (args.json, args.picture)):
+        if not Path(path).parent.is_dir():
+            parser.error(f"cannot write {path}: the folder {Path(path).parent} does not exist")
     everything: dict[str, dict] = {}
     missing: dict[str, ImportError] = {}
     for path in args.stores:

@@ -6,6 +6,7 @@
 All methods take turns in one process on the same synthetic correspondences, with 40 % outliers in sets of more than
 eight. The tables have the median time of a batch in milliseconds and, in brackets, its ratio to Kornia's
 ``find_fundamental``. Estimators of single pairs (OpenCV, PoseLib, RANSAC) are called once for each set of the batch.
+Tables of memory have the most that a call holds at once in tensors of PyTorch beside its input, in MiB.
 
 With --compile, a line for each compiled layer, forward and backward, has the time of the first call, which compiles it
 without any cache and with one thread, as wall time and as processor time, which other programs change little; and the
@@ -22,12 +23,14 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable
+from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from kornia.geometry.epipolar import find_fundamental
 from torch import Tensor, nn
+from torch.profiler import ProfilerActivity, profile
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import random_scenes
@@ -56,6 +59,7 @@ class Case(NamedTuple):
 
 
 EIGHTS = [Case(batch, 8) for batch in (1, 64, 2048, 16384)]
+LARGEST_ON_GPU = Case(65536, 8)
 COMPILED = {
     **dict.fromkeys((KORNIA, "Hartley", "whitening", "optimal"), EIGHTS[1:3]),
     **dict.fromkeys(("reweighted", "crossview"), EIGHTS[1:2]),
@@ -74,6 +78,7 @@ def solvers(device: str) -> dict[str, Method]:
     return {
         KORNIA: find_fundamental,
         "Hartley": ours(kln.Hartley()),
+        "EightPoint": kln.EightPoint().to(device),
         "whitening": ours(kln.Whitening()),
         "optimal": ours(kln.Hartley(), rank2="optimal"),
         "reweighted": ours(kln.ReweightedWhitening()),
@@ -165,6 +170,21 @@ def measure(methods: dict[str, Method], case: Case, args: argparse.Namespace, ba
     return {name: statistics.median(values) for name, values in times.items()}
 
 
+def peak_memory(method: Method, points: tuple[Tensor, Tensor], backward: bool) -> float:
+    """Return the MiB of tensors that one call holds at most, beside its input."""
+    if points[0].is_cuda:
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        run_once(method, points, backward)
+        return (torch.cuda.max_memory_allocated() - before) / 2**20
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler prints two lines for each use
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as found:
+        run_once(method, points, backward)
+    changes = [event for event in found.profiler.kineto_results.events() if event.name() == "[memory]"]
+    changes.sort(key=lambda event: event.start_ns())
+    return max(accumulate((event.nbytes() for event in changes), initial=0)) / 2**20
+
+
 def measure_compiled(method: Method, case: Case, args: argparse.Namespace) -> dict[str, float]:
     """Return the seconds of the first call of a compiled layer, and the milliseconds of later and uncompiled calls."""
     import torch._inductor.config as inductor
@@ -205,7 +225,7 @@ def machine(args: argparse.Namespace) -> dict[str, object]:
 
 
 def table(results: dict[str, dict[str, float]]) -> str:
-    """Return a table with a row for each method and a column for each size: milliseconds, and the ratio to Kornia's."""
+    """Return a table with a row for each method and a column for each size, with ratios to Kornia's in brackets."""
     methods = list(dict.fromkeys(name for times in results.values() for name in times))
 
     def cell(times: dict[str, float], name: str) -> str:
@@ -232,6 +252,8 @@ def main() -> None:
     )
     parser.add_argument("--quick", action="store_true", help="fewer turns and sizes")
     args = parser.parse_args()
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
     differentiable, outliers = solvers(args.device), robust(args.device)
     found: dict[str, object] = {"machine": machine(args)}
     print(json.dumps(found["machine"]), flush=True)
@@ -242,10 +264,15 @@ def main() -> None:
                 title = f"{name}, {case}"
                 found[title] = measure_compiled(layer, case, args)
                 print(f"{title}: " + ", ".join(f"{key} {value:.3g}" for key, value in found[title].items()), flush=True)
+                save(found, args.out)
     else:
         measure_all(differentiable, outliers, args, found)
-    if args.out is not None:
-        write_text(args.out, json.dumps(found, indent=1) + "\n")
+
+
+def save(found: dict[str, object], path: Path | None) -> None:
+    """Write what was measured so far."""
+    if path is not None:
+        write_text(path, json.dumps(found, indent=1) + "\n")
 
 
 def measure_all(
@@ -254,7 +281,9 @@ def measure_all(
     """Measure all methods at all sizes, print the tables and add the times to a dictionary."""
     pairs = single_pairs() if args.device == "cpu" else {}
     eights, sets = (EIGHTS[:3], [SETS[3], SETS[5]]) if args.quick else (EIGHTS, SETS)
-    solvers = {name: differentiable[name] for name in (KORNIA, "Hartley", "whitening", "optimal")}
+    if args.device.startswith("cuda"):
+        eights = [*eights, LARGEST_ON_GPU]
+    solvers = {name: differentiable[name] for name in (KORNIA, "Hartley", "EightPoint", "whitening", "optimal")}
     groups = {
         "sets of eight": (eights, differentiable, ("OpenCV FM_8POINT",)),
         "larger sets: solvers": (sets, solvers, ()),
@@ -262,14 +291,18 @@ def measure_all(
     }
     for group, (cases, methods, others) in groups.items():
         for backward in (False, True):
-            results = {}
+            times, memory = {}, {}
             for case in cases:
                 alone = {name: pairs[name] for name in others if name in pairs and not backward}
                 chosen = methods | (alone if case.batch <= LARGE_FOR_PAIRS else {})
-                results[str(case)] = measure(chosen, case, args, backward)
+                times[str(case)] = measure(chosen, case, args, backward)
+                points = correspondences(case, args.device, getattr(torch, args.dtype))
+                memory[str(case)] = {name: peak_memory(f, points, backward) for name, f in methods.items()}
             title = f"{group}, {'forward and backward' if backward else 'forward'}"
-            found[title] = results
-            print(f"\n{title}: ms a batch (ratio to Kornia)\n\n{table(results)}", flush=True)
+            for name, results, unit in ((title, times, "ms a batch"), (f"{title}, memory", memory, "MiB")):
+                found[name] = results
+                print(f"\n{name}: {unit} (ratio to Kornia)\n\n{table(results)}", flush=True)
+            save(found, args.out)
 
 
 if __name__ == "__main__":

@@ -156,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
         no_example = record_run(args.out, stores, methods, options, command=args.command_line)
         _print_tables(args, read_run(args.out), tables)
     if no_example:
-        print(f"without Figures 10 and 11: {no_example}", file=sys.stderr)
+        print(f"without a drawn pair and the errors by the number of matches: {no_example}", file=sys.stderr)
     done = f"\nwrote {args.out}; learnnorm report {args.out} makes tables and figures of it"
     print(done, file=sys.stderr if args.json == "-" else sys.stdout)
     return 0

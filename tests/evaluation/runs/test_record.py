@@ -230,7 +230,7 @@ def test_pairs_with_few_matches_have_no_example_and_nothing_held_out(tmp_path, c
     command = ["evaluate", str(tmp_path / "few.h5"), "--out", str(tmp_path / "run"), "--methods", "Hartley"]
     assert main([*command, "--max-residual", "inf"]) == 0
     printed = capsys.readouterr()
-    assert "without Figures 10 and 11: no pair of few has 256 matches" in printed.err
+    assert "without a drawn pair and the errors by the number of matches: no pair of few has 256 matches" in printed.err
     filtered, unfiltered = read_run(tmp_path / "run").cells
     assert filtered.predictions["Hartley"]["heldout"].isnan().tolist() == [True, False]
     assert torch.equal(unfiltered.predictions["Hartley"]["heldout"].isnan(), unfiltered.pair != 1)
