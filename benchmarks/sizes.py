@@ -112,7 +112,7 @@ METHODS: dict[str, Callable[[], Solver]] = {
     "reweighted": lambda: normalized(kln.EightPoint(kln.ReweightedWhitening())),
     **{
         name: partial(lambda name: normalized(kln.EightPoint(kln.LearnedNormalizer.from_pretrained(name))), name)
-        for name in ("paper", "crossview", "crossview-synthetic")
+        for name in ("paper", "crossview", "crossview-synthetic", "crossview-sets")
     },
     "Hartley+optimal": lambda: normalized(kln.EightPoint(rank2="optimal")),
     "Hartley+LM": lambda: partial(batched, hartley_lm),

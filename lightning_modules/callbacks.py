@@ -226,7 +226,7 @@ class ExportWeights(Callback):
             path.parent.mkdir(parents=True, exist_ok=True)
             if not isinstance(pl_module, NormalizerTask | EstimatorTask):
                 raise TypeError(f"expected a NormalizerTask or an EstimatorTask, got {type(pl_module).__name__}")
-            trained = pl_module.normalizer if isinstance(pl_module, NormalizerTask) else pl_module.estimator
+            trained = pl_module.normalizer if isinstance(pl_module, NormalizerTask) else pl_module.trained
             trained.trained_on = _names_of_sources(getattr(trainer, "datamodule", None))
             trained.save_pretrained(path)
             print(f"wrote {path}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import pytorch_lightning as pl
 import torch
@@ -13,9 +13,11 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.estimators.eight_point import EightPoint
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from lightning_modules.schedule import OneCycle
 
 __all__ = ["EstimatorTask"]
@@ -42,16 +44,24 @@ def _limit_gradients(module: nn.Module, args: Any, outputs: tuple[Tensor, ...]) 
 
 
 @contextmanager
+def _limited_gradients(networks: Iterable[nn.Module]) -> Iterator[None]:
+    """Limit the gradient of each set where it enters the networks."""
+    limits = [network.register_forward_hook(_limit_gradients) for network in networks]
+    try:
+        yield
+    finally:
+        for handle in limits:
+            handle.remove()
+
+
+@contextmanager
 def _stages_apart(estimator: LearnedEightPoint) -> Iterator[None]:
-    """Train each stage by its own losses; limit the gradient of each set where it enters the networks."""
-    limits = [network.register_forward_hook(_limit_gradients) for network in estimator.networks]
+    """Train each stage by its own losses."""
     before, estimator.detach_stages = estimator.detach_stages, True
     try:
         yield
     finally:
         estimator.detach_stages = before
-        for handle in limits:
-            handle.remove()
 
 
 class EstimatorTask(pl.LightningModule):
@@ -62,7 +72,9 @@ class EstimatorTask(pl.LightningModule):
     median distance of the held-out matches.
 
     Args:
-        estimator: the estimator to train.
+        estimator: the estimator to train: a :class:`~kornia_learnnorm.LearnedEightPoint`, or an
+            :class:`~kornia_learnnorm.EightPoint` with a :class:`~kornia_learnnorm.LearnedNormalizer`, which has one
+            stage and no logits.
         label_free: loss of the sets without ground truth, times ``label_free_weight``.
         labelled: loss of the sets with ground truth.
         inlier_weight: weight of the cross-entropy.
@@ -73,7 +85,7 @@ class EstimatorTask(pl.LightningModule):
 
     def __init__(
         self,
-        estimator: LearnedEightPoint,
+        estimator: LearnedEightPoint | EightPoint,
         label_free: BoundedEpipolarLoss | None = None,
         labelled: LogEpipolarLoss | None = None,
         inlier_weight: float = 0.3,
@@ -81,6 +93,10 @@ class EstimatorTask(pl.LightningModule):
         optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = _adamw,
     ) -> None:
         super().__init__()
+        if not isinstance(estimator, LearnedEightPoint | EightPoint):
+            raise TypeError(f"expected a LearnedEightPoint or an EightPoint, got {type(estimator).__name__}")
+        if isinstance(estimator, EightPoint) and not isinstance(estimator.normalizer, LearnedNormalizer):
+            raise TypeError(f"expected a LearnedNormalizer in EightPoint, got {type(estimator.normalizer).__name__}")
         self.estimator = estimator.train()  # shipped weights come in evaluation mode
         self.label_free = label_free or BoundedEpipolarLoss()
         self.labelled = labelled or LogEpipolarLoss()
@@ -88,6 +104,13 @@ class EstimatorTask(pl.LightningModule):
         self.inlier_weight, self.label_free_weight = inlier_weight, label_free_weight
         self.optimizer = optimizer
         self._medians: list[tuple[int, Tensor]] = []  # set sizes and errors since the last validation
+
+    @property
+    def trained(self) -> LearnedEightPoint | LearnedNormalizer:
+        """The module that learns, whose weights ``from_pretrained`` reads."""
+        if isinstance(self.estimator, LearnedEightPoint):
+            return self.estimator
+        return cast(LearnedNormalizer, self.estimator.normalizer)
 
     def configure_optimizers(self) -> Any:
         """Build the optimiser and its schedule."""
@@ -106,16 +129,25 @@ class EstimatorTask(pl.LightningModule):
     def compute_loss(self, batch: MatchSets) -> Tensor:
         """Return the loss of a batch: of all stages, and of the sets of both kinds."""
         heldout1, heldout2 = batch.heldout1.double(), batch.heldout2.double()
-        with _stages_apart(self.estimator):
-            found = self.estimator.estimate(batch.points1.double(), batch.points2.double(), scores=batch.scores)
         total = heldout1.new_zeros(())
-        for number, (F_mat, logits) in enumerate(found.stages):
+        stages = self._stages(batch)
+        for number, (F_mat, logits) in enumerate(stages):
             known = self.labelled(heldout1, heldout2, F_mat)
-            known = known + self.inlier_weight * self.inlier(logits, batch.inliers)
+            if logits is not None:
+                known = known + self.inlier_weight * self.inlier(logits, batch.inliers)
             unknown = self.label_free_weight * self.label_free(heldout1, heldout2, F_mat)
             loss = torch.where(batch.labelled, known, unknown).mean()
-            total = total + (1.0 if number + 1 == len(found.stages) else EARLY_STAGE) * loss
+            total = total + (1.0 if number + 1 == len(stages) else EARLY_STAGE) * loss
         return total
+
+    def _stages(self, batch: MatchSets) -> list[tuple[Tensor, Tensor | None]]:
+        """Return the matrices of each stage, and the logits of the matches where there are some."""
+        points1, points2 = batch.points1.double(), batch.points2.double()
+        if isinstance(self.trained, LearnedNormalizer):
+            with _limited_gradients([self.trained.network]):
+                return [(self.estimator(points1, points2), None)]
+        with _stages_apart(self.trained), _limited_gradients(self.trained.networks):
+            return [*self.trained.estimate(points1, points2, scores=batch.scores).stages]
 
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Skip a step whose gradient is not finite."""

@@ -128,7 +128,8 @@ class LearnedNormalizer(ProblemNormalizer):
         """Load a trained normaliser: one that ships with the package, by name, or a safetensors file.
 
         Args:
-            name: ``"crossview"``, ``"crossview-synthetic"``, ``"paper"``, or the path of a ``.safetensors`` file.
+            name: ``"crossview"`` or ``"crossview-synthetic"``, for up to twelve correspondences; ``"crossview-sets"``,
+                for more; ``"paper"``; or the path of a ``.safetensors`` file.
 
         Returns:
             the normaliser, in evaluation mode.

@@ -30,7 +30,8 @@ from lightning_modules.config_files import find_config
 pytestmark = pytest.mark.usefixtures("program")
 
 FOLDER = Path(__file__).parents[2] / "configs"
-CONFIGS = sorted(path for path in FOLDER.glob("*.yaml") if not path.stem.startswith("robust"))
+OF_SETS = ("crossview-sets", "robust", "robust-synthetic")
+CONFIGS = sorted(path for path in FOLDER.glob("*.yaml") if path.stem not in OF_SETS)
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 NETWORK = "model.normalizer.init_args.network.init_args"
 SMALL_PAPER_NETWORK = [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
@@ -100,15 +101,16 @@ def test_every_config_runs(config, data, tmp_path, monkeypatch, capsys):
     assert set(load_file(tmp_path / "predictions.safetensors")) == {"F_mat", "T1", "T2", "pair", "residual"}
 
 
-@pytest.mark.parametrize("name", ["robust-synthetic", "robust"])
+@pytest.mark.parametrize("name", OF_SETS)
 def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch, capsys, refused):
-    if name == "robust":  # it names pairs of the real stores
+    if name != "robust-synthetic":  # they name pairs of the real stores
         monkeypatch.setenv("LEARNNORM_DATA", str(request.getfixturevalue("real_data")))
     config = ["--config", str(FOLDER / f"{name}.yaml")]
     config += ["--data.init_args.correspondences=128", "--data.init_args.steps=2", "--trainer.limit_val_batches=1"]
     config += ["--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={tmp_path}"]
     assert main(["fit", *config, "--trainer.max_steps=2"]) == 0
-    layer = kln.LearnedEightPoint.from_pretrained(tmp_path / "weights.safetensors")
+    kind = kln.LearnedNormalizer if name == "crossview-sets" else kln.LearnedEightPoint
+    layer = kind.from_pretrained(tmp_path / "weights.safetensors")
     assert "synthetic scenes" in layer.trained_on
     assert all(bool(value.any()) for key, value in layer.state_dict().items() if "logit.weight" in key)
     checkpoint = f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"
@@ -302,7 +304,11 @@ def test_completion_in_bash(completion, tmp_path):
     assert completion("learnnorm evaluate --max-s", tmp_path) == ["--max-samples"]
     assert completion("learnnorm evaluate o", tmp_path) == ["own.h5"]
     assert completion("learnnorm match ki", tmp_path) == ["kitti"]
-    assert completion("learnnorm fit --config crossv", tmp_path) == ["crossview", "crossview-synthetic"]
+    assert completion("learnnorm fit --config crossv", tmp_path) == [
+        "crossview",
+        "crossview-sets",
+        "crossview-synthetic",
+    ]
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
@@ -459,7 +465,10 @@ def test_a_configuration_without_its_option_is_one_line(refused):
 
 @pytest.mark.parametrize(("command", "options"), [("fit", []), ("fit", ["--trainer.max_steps=9"]), ("validate", [])])
 def test_a_training_without_a_configuration_names_those_that_ship(command, options, refused):
-    refused([command, *options], "give one by --config, a file or one of crossview, crossview-synthetic, paper,")
+    refused(
+        [command, *options],
+        "give one by --config, a file or one of crossview, crossview-sets, crossview-synthetic, paper,",
+    )
     checkpoint = "" if command == "fit" else " --ckpt_path "
     refused([command, *options], f"for example learnnorm {command} --config crossview-synthetic{checkpoint}")
 

@@ -95,6 +95,7 @@ class TestTrainedOn:
     def test_shipped_weights(self):
         assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {
             *SHIPPED,
+            "crossview-sets",
             "robust",
             "robust-synthetic",
             "robust-tiny",

@@ -99,3 +99,40 @@ def test_batches_depend_on_seed_and_number_alone():
 def test_wrong_options(arguments, message):
     with pytest.raises(ValueError, match=message):
         MatchSetDataModule(**{"train": [SyntheticSets()]} | arguments)
+
+
+def make_normaliser_task():
+    torch.manual_seed(0)
+    network = kln.CrossViewNetwork(width=16, depth=1)
+    return EstimatorTask(kln.EightPoint(kln.LearnedNormalizer(kln.Hartley(), network)), optimizer=fast)
+
+
+def fast(params):
+    return torch.optim.AdamW(params, lr=1e-2)
+
+
+def test_a_normalisation_trains_on_sets_of_any_size(tmp_path):
+    """The same task trains a normaliser of the eight-point algorithm, and exports that."""
+    task, data = make_normaliser_task(), make_data(train=[SyntheticSets(32)])
+    batch = SyntheticSets(32).draw(64, 32, block_generator(9))
+    before = task.compute_loss(batch).item()
+    options = {"enable_checkpointing": False, "gradient_clip_val": 1.0, "limit_val_batches": 2}
+    make_trainer(tmp_path, [ExportWeights()], max_steps=100, **options).fit(task, data)
+    assert task.compute_loss(batch).item() < before - 0.02
+    assert not task.trained.network._forward_hooks
+    loaded = kln.LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
+    assert loaded.trained_on == ("synthetic scenes",)
+    for x, y in zip(loaded(batch.points1, batch.points2), task.trained(batch.points1, batch.points2), strict=True):
+        torch.testing.assert_close(x, y)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "message"),
+    [
+        (kln.Hartley(), "expected a LearnedEightPoint or an EightPoint, got Hartley"),
+        (kln.EightPoint(), "expected a LearnedNormalizer in EightPoint, got Hartley"),
+    ],
+)
+def test_estimators_that_learn_nothing_are_refused(estimator, message):
+    with pytest.raises(TypeError, match=message):
+        EstimatorTask(estimator)
