@@ -68,6 +68,7 @@ EIGHTS, SOLVERS, ROBUST = "sets of eight", "larger sets: solvers", "larger sets:
 LAYERS = {  # as benchmarks/speed.py names them, and the parts in which they take turns with Kornia's solver
     "Kornia": ("kornia", (EIGHTS, SOLVERS)),
     "Hartley": ("Hartley", (EIGHTS, SOLVERS)),
+    "`EightPoint`": ("EightPoint", (EIGHTS, SOLVERS)),
     '`rank2="optimal"`': ("optimal", (EIGHTS, SOLVERS)),
     "Kornia, in turn with the rows below": ("kornia", (EIGHTS, ROBUST)),
     "`crossview`": ("crossview", (EIGHTS, ROBUST)),

@@ -18,7 +18,7 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
-from lightning_modules.schedule import OneCycle
+from lightning_modules.schedule import OneCycle, steps_of
 
 __all__ = ["EstimatorTask"]
 
@@ -115,7 +115,7 @@ class EstimatorTask(pl.LightningModule):
     def configure_optimizers(self) -> Any:
         """Build the optimiser and its schedule."""
         optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
-        steps = max(2, int(self.trainer.estimated_stepping_batches))
+        steps = steps_of(self.trainer)
         warm_up = max(0.05, 1.5 / steps)  # the schedule divides by the warm-up's steps less one
         schedule = OneCycle(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=warm_up)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -4,9 +4,26 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytorch_lightning as pl
 from torch.optim.lr_scheduler import OneCycleLR
 
-__all__ = ["OneCycle"]
+__all__ = ["OneCycle", "steps_of"]
+
+
+def steps_of(trainer: pl.Trainer) -> int:
+    """Return the number of steps of a training, which a cycle needs: at least two.
+
+    Raises:
+        ValueError: if the training has no end.
+
+    """
+    steps = trainer.estimated_stepping_batches
+    if steps == float("inf"):
+        raise ValueError(
+            "the learning rate follows one cycle over all steps: give trainer.max_steps or trainer.max_epochs;"
+            " trainer.max_time may end the training before"
+        )
+    return max(2, int(steps))
 
 
 class OneCycle(OneCycleLR):

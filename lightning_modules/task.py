@@ -24,7 +24,7 @@ from kornia_learnnorm.normalizers.contract import Normalizer
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers.whitening import Whitening
-from lightning_modules.schedule import OneCycle
+from lightning_modules.schedule import OneCycle, steps_of
 
 __all__ = ["NormalizerTask"]
 
@@ -80,8 +80,7 @@ class NormalizerTask(pl.LightningModule):
         optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
         if self.lr_scheduler is not None:
             return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self.lr_scheduler(optimizer)}}
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = OneCycle(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=max(2, steps))
+        schedule = OneCycle(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps_of(self.trainer))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:

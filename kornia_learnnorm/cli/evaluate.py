@@ -10,8 +10,15 @@ from pathlib import Path
 
 import torch
 
-from kornia_learnnorm.evaluation.methods import KEPT_METHODS, SHIPPED, default_methods
+from kornia_learnnorm.evaluation.methods import (
+    KEPT_METHODS,
+    SHIPPED,
+    default_methods,
+    short_name_of,
+    short_names,
+)
 from kornia_learnnorm.evaluation.report.formatting import known_parts
+from kornia_learnnorm.evaluation.report.rates import was_trained_on
 from kornia_learnnorm.evaluation.runs.predict import SampleOptions
 from kornia_learnnorm.evaluation.runs.record import record_run, temporary_run
 from kornia_learnnorm.evaluation.runs.run import Run, read_run
@@ -33,6 +40,9 @@ __all__ = [
 EXAMPLES = """\
 learnnorm evaluate store.h5 --methods Hartley crossview Hartley+LM --size 16
 learnnorm evaluate store.h5 --out run && learnnorm report run"""
+
+LEGEND = "mean, median: symmetric epipolar distance of a sample's own points, the fit; searched: the limit of all methods"
+TRUTH = "truth: of the ground-truth inliers of its pair, the accuracy; a better fit need not be more accurate"
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
@@ -127,6 +137,9 @@ def run_arguments(
     stores = {name: path for path, name in names_of(args.stores).items()}
     weights = args.weights or ()
     methods = (*args.methods, *weights) if args.methods else default_methods(weights, kept=kept)
+    for path in weights:
+        if (name := short_name_of(path)) in SHIPPED and path != name:
+            print(f"{name} is {path} here, not the weights of this name that ship", file=sys.stderr)
     return stores, methods, SampleOptions(size, args.seed, args.max_samples or None, args.max_residual)
 
 
@@ -155,6 +168,9 @@ def run(args: argparse.Namespace) -> int:
             raise ValueError("--out is empty: expected a folder")
         no_example = record_run(args.out, stores, methods, options, command=args.command_line)
         _print_tables(args, read_run(args.out), tables)
+    further = [name for name in read_run(args.out).about["methods"] if name not in short_names(methods).values()]
+    if further:
+        print(f"{args.out} also holds, from before: {', '.join(further)}", file=sys.stderr)
     if no_example:
         print(f"without a drawn pair and the errors by the number of matches: {no_example}", file=sys.stderr)
     done = f"\nwrote {args.out}; learnnorm report {args.out} makes tables and figures of it"
@@ -164,10 +180,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> None:
     """Print the tables of a run, without columns that have no number, and append them to a list."""
-    limit = run.about["max_residual"]
+    limit, trained_on = run.about["max_residual"], run.about["trained_on"]
     for store, about in run.about["stores"].items():
         if args.json != "-":
             print(f"\n{store}: {about}{'' if _has_truth(run, store) else '; without ground truth'}")
+            if known := [name for name in run.about["methods"] if was_trained_on(store, trained_on[name])]:
+                print(f"trained on pairs of this store: {', '.join(known)}")
         for cell in run.cells:
             if cell.store != store or not cell.predictions:
                 continue
@@ -180,6 +198,10 @@ def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> No
             if table is not None:
                 tables.append(table)
                 print_table(args, text, table)
+    if args.json != "-":
+        print(f"\n{LEGEND}")
+        if any(_has_truth(run, store) for store in run.about["stores"]):
+            print(TRUTH)
 
 
 def _has_truth(run: Run, store: str) -> bool:

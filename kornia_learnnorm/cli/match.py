@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from itertools import accumulate, groupby
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches
 from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
-from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.data.writer import check_target
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
@@ -24,7 +25,8 @@ EXAMPLES = """\
 learnnorm match folder PHOTOS --out photos.h5
 learnnorm match kitti ROOT --sequences 00 03 --out kitti.h5 --jobs 2"""
 
-MAX_LISTED = 10  # skipped pairs that are printed
+MAX_LISTED = 10  # skipped pairs, or sequences, that are printed
+ENDINGS = (".h5", ".hdf5")
 READER_OPTIONS = ("sequences", "split", "camera", "max_difference", "model")  # arguments that a reader takes
 
 
@@ -80,6 +82,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write a store; a run that was stopped continues where it was."""
     options = MatchOptions(args.detector, args.num_features, args.matcher, args.max_matches or None, args.seed)
+    if args.out.suffix not in ENDINGS:
+        raise ValueError(f"--out {args.out}: expected the name of a store, which ends in {' or '.join(ENDINGS)}")
     check_target(args.out)
     check_jobs(args.jobs)
     given = {name: getattr(args, name) for name in READER_OPTIONS if getattr(args, name) is not None}
@@ -104,4 +108,15 @@ def run(args: argparse.Namespace) -> int:
     store = read_store(args.out)
     known = int(np.isfinite(store.F).all((1, 2)).sum())
     print(f"{wrote}{args.out}: {len(store)} pairs, {known} with ground truth, {store.offsets[-1]} matches")
+    parts = _sequences(store)
+    if 1 < len(parts) <= MAX_LISTED:
+        print("sequences: " + ", ".join(f"{name or '.'} @{first}:{stop}" for name, first, stop in parts))
     return 0
+
+
+def _sequences(store: CorrespondenceStore) -> list[tuple[str, int, int]]:
+    """Return the folders of the images of consecutive pairs, with the first pair and the one after the last."""
+    folders = [str(name).rpartition("/")[0] for name, _ in store.names]
+    runs = [(folder, len([*group])) for folder, group in groupby(folders)]
+    stops = [*accumulate(number for _, number in runs)]
+    return [(folder, stop - number, stop) for (folder, number), stop in zip(runs, stops, strict=True)]

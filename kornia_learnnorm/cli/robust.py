@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from kornia_learnnorm.evaluation.robust.estimators import DEFAULT_ESTIMATORS, DEFAULT_SOLVERS
@@ -57,6 +58,8 @@ def run(args: argparse.Namespace) -> int:
     """Record a run of robust estimators and minimal solvers."""
     stores = {name: path for path, name in names_of(args.stores).items()}
     options = {name: getattr(args, name) for name in DEFAULT_OPTIONS}
-    record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo, args.command_line)
+    missing = record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo, args.command_line)
+    if missing:
+        print(f"left out, since not installed: {', '.join(missing)}", file=sys.stderr)
     print(f"wrote {args.out}; learnnorm report {args.out} makes its tables and pictures")
     return 0

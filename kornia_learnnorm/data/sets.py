@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Generator, Tensor
 
-from kornia_learnnorm.data.sources import expand_path
+from kornia_learnnorm.data.sources import check_draws, expand_path
 from kornia_learnnorm.data.store import StoreReader
 from kornia_learnnorm.data.synthetic.matches import SyntheticMatches, random_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
@@ -75,6 +75,7 @@ class StoreSets:
     ) -> None:
         if not paths or not max_ratios:
             raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
+        check_draws(num_heldout, max_ratios)
         self.paths, self.num_heldout, self.max_ratios = tuple(paths), num_heldout, tuple(max_ratios)
         self._pairs = [pair for path in paths for pair in _read_pairs(path, labels)]
         if not self._pairs:

@@ -25,7 +25,7 @@ from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.protocol import MAX_RESIDUAL, RATIO
 
-__all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator", "expand_path"]
+__all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator", "check_draws", "expand_path"]
 
 SCENES_PER_BLOCK = 8192
 
@@ -81,6 +81,7 @@ class StoreSamples:
         if len(self.sizes) != 2 or not 8 <= self.sizes[0] <= self.sizes[1] or block_pairs < 1:
             got = f"size={size}, block_pairs={block_pairs}"
             raise ValueError(f"a sample needs at least 8 correspondences, a block at least one pair, got {got}")
+        check_draws(num_heldout, max_ratios)
         self.paths = tuple(paths)
         self.stores = [StoreReader(expand_path(path)) for path in paths]
         self.max_ratios = tuple(max_ratios)
@@ -193,6 +194,14 @@ class SyntheticSamples:
         points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
         pair = block * SCENES_PER_BLOCK + torch.arange(number)
         return Samples(points1, points2, heldout1, heldout2, pair).with_residual_below(self.max_residual)
+
+
+def check_draws(num_heldout: int, max_ratios: Sequence[float | None]) -> None:
+    """Raise ValueError for a negative number of held-out matches, or a limit of Lowe's ratio outside (0, 1]."""
+    if num_heldout < 0:
+        raise ValueError(f"num_heldout must be 0 or more, got {num_heldout}")
+    if wrong := [ratio for ratio in max_ratios if ratio is not None and not 0 < ratio <= 1]:
+        raise ValueError(f"max_ratios must be above 0 and at most 1, or null for no limit, got {wrong[0]:g}")
 
 
 def expand_path(path: str) -> str:

@@ -110,6 +110,7 @@ class Page:
         ]
         for index, widget in enumerate(self._inputs):
             widget.on_change("value", partial(self._uploaded, index))
+            widget.on_change("filename", partial(self._named, index))
         plain: dict[str, Any] = {"render_as_text": True, "disable_math": True, "sizing_mode": "stretch_width"}
         self._status = Div(css_classes=["status"], **plain)
         self._warnings = Div(css_classes=["warnings"], **plain)
@@ -152,6 +153,10 @@ class Page:
 
     def _choose_example(self, name: str) -> None:
         if name == OWN:
+            if self._example is not None:
+                self._example = None
+                self._set_pictures([None, None])
+                self._status.text = "Choose two images."
             return
         for title, widget in zip(IMAGES, self._inputs, strict=True):
             self._runs[title] += 1
@@ -165,6 +170,14 @@ class Page:
     def _uploaded(self, index: int, _name: str, _old: str, new: str) -> None:
         if new:  # the name arrives with the content, but after it
             self._document.add_next_tick_callback(partial(self._read, index, new))
+
+    def _named(self, index: int, _name: str, _old: str, new: str) -> None:
+        if new:  # an empty file has a name and no content
+            self._document.add_next_tick_callback(partial(self._check_empty, index))
+
+    def _check_empty(self, index: int) -> None:
+        if not self._inputs[index].value:
+            self._read(index, "")
 
     def _read(self, index: int, encoded: str) -> None:
         others = self._pictures if self._example is None else [None, None]

@@ -149,6 +149,23 @@ def test_evaluate_prints_the_same_with_and_without_a_folder(folder, tmp_path, ca
     assert [header for header, _ in read] == [["method", "than whitening %", "mean px", "median px"]] * 2
 
 
+def test_evaluate_says_what_its_rows_are(folder, tmp_path, capsys):
+    """Weights that replace shipped ones, those that were trained on the store, and methods of a command before."""
+    layer, own = kln.LearnedNormalizer(), tmp_path / "crossview" / "weights.safetensors"
+    layer.trained_on = ("known@0:1",)
+    own.parent.mkdir()
+    layer.save_pretrained(own)
+    command = ["evaluate", str(folder / "known.h5"), "--max-samples", "8", "--out", str(tmp_path / "run")]
+    assert main([*command, "--methods", "none", "Hartley"]) == 0
+    assert "from before" not in capsys.readouterr().err
+    assert main([*command, "--methods", "whitening", "--weights", str(own)]) == 0
+    printed = capsys.readouterr()
+    assert f"crossview is {own} here, not the weights of this name that ship" in printed.err
+    assert f"{tmp_path / 'run'} also holds, from before: none, Hartley" in printed.err
+    assert "trained on pairs of this store: crossview\n" in printed.out
+    assert "mean, median: symmetric epipolar distance" in printed.out
+
+
 @pytest.mark.parametrize("kept", [False, True])
 def test_weights_are_added_to_the_default_methods(folder, tmp_path, capsys, kept):
     def methods(out, *options):
@@ -231,7 +248,9 @@ def test_without_ground_truth_there_are_no_columns_of_it(folder, capsys):
     assert "truth: median px" in known
     assert "without ground truth" not in known
     assert unknown.splitlines()[0].endswith("; without ground truth")
-    assert unknown.count("truth") == 1
+    tables, legend = unknown.split("\nmean, median: ")
+    assert tables.count("truth") == 1
+    assert "truth: of the ground-truth inliers" in legend
     for header, rows in read_tables(unknown).values():
         assert header == ["method", "better than Hartley %", "mean px", "median px"]
         assert rows["Hartley"][0] == "-"

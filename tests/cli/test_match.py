@@ -47,6 +47,22 @@ def test_readers(written, tmp_path, capsys, reader, args, pairs, known):
     assert len(read_store(tmp_path / "s.h5")) == pairs
 
 
+def test_the_pairs_of_each_sequence_are_printed(written, tmp_path, capsys):
+    names = [f"{place}/{number}" for place in ("desk", "street") for number in (1, 2, 3)]
+    image = next((written / "folder").rglob("*.png")).read_bytes()
+    for name in names:
+        path = tmp_path / "photos" / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(image)
+    assert run("folder", tmp_path / "photos", tmp_path / "s.h5") == 0
+    assert "sequences: desk @0:2, street @2:4" in capsys.readouterr().out
+
+
+def test_a_store_has_an_ending(written, tmp_path, refused):
+    message = "own.txt: expected the name of a store, which ends in .h5 or .hdf5"
+    refused(command("folder", written / "folder", tmp_path / "own.txt"), message)
+
+
 def test_the_current_folder_has_its_name(written, tmp_path, monkeypatch):
     monkeypatch.chdir(written / "folder")
     assert run("folder", Path(), tmp_path / "s.h5") == 0

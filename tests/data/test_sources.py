@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from kornia_learnnorm.data.samples import draw_samples, plain_residual
+from kornia_learnnorm.data.sets import StoreSets
 from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic import forward_driving, handheld
@@ -151,6 +152,20 @@ def test_blocks_without_samples(store, tmp_path):
 def test_bad_sources(sources, arguments):
     with pytest.raises(ValueError, match="at least 8 correspondences, a block at least one pair, got"):
         sources(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_heldout": -1}, "num_heldout must be 0 or more, got -1"),
+        ({"max_ratios": [0.8, 2.0]}, "max_ratios must be above 0 and at most 1, or null for no limit, got 2"),
+        ({"max_ratios": [0.0]}, "max_ratios must be above 0 and at most 1, or null for no limit, got 0"),
+    ],
+)
+@pytest.mark.parametrize("kind", [StoreSamples, StoreSets])
+def test_draws_that_cannot_be(sources, arguments, message, kind):
+    with pytest.raises(ValueError, match=message):
+        kind(sources().paths, **arguments)
 
 
 def test_a_source_does_not_hold_the_stores(sources):

@@ -83,6 +83,10 @@ def test_a_visit(tmp_path):
         wait_for_status(page, "No result: <b>.png cannot be decoded: 9 bytes, not an image")
         inputs.nth(1).set_input_files(files[1])
         wait_for_status(page, "matches. Point at a spot")
+        inputs.nth(0).set_input_files({"name": "none.png", "mimeType": "image/png", "buffer": b""})
+        wait_for_status(page, "No result: none.png")
+        inputs.nth(0).set_input_files(files[0])
+        wait_for_status(page, "matches. Point at a spot")
         inputs.nth(1).set_input_files(files[0])
         wait_for_status(page, "No result: no motion between the images")
         assert foreign == []

@@ -136,3 +136,10 @@ def test_a_normalisation_trains_on_sets_of_any_size(tmp_path):
 def test_estimators_that_learn_nothing_are_refused(estimator, message):
     with pytest.raises(TypeError, match=message):
         EstimatorTask(estimator)
+
+
+@pytest.mark.parametrize("make", [make_task, make_normaliser_task])
+def test_a_training_without_an_end_has_no_cycle(tmp_path, make):
+    trainer = make_trainer(tmp_path, max_steps=-1, max_time="00:00:01:00", limit_val_batches=0)
+    with pytest.raises(ValueError, match=r"give trainer.max_steps or trainer.max_epochs"):
+        trainer.fit(make(), make_data())

@@ -291,6 +291,17 @@ class TestMaxPoints:
             assert torch.equal(found[0], hartley[0])
             assert torch.equal(found[1], unlimited[1])
 
+    def test_no_network_runs_for_larger_sets(self):
+        """With weights too, where no set has few correspondences."""
+        normalizer, points = shaken(), correspondences("handheld", 4, 20)
+        normalizer.max_points, calls = 12, []
+        normalizer.network.register_forward_hook(lambda *args: calls.append(args))
+        weights = torch.rand(4, 20) + 0.1
+        assert all(map(torch.equal, normalizer(*points, weights), Hartley()(*points, weights)))
+        weights[1, 12:] = 0
+        normalizer(*points, weights)
+        assert len(calls) == 1
+
     def test_is_saved(self, tmp_path):
         normalizer = LearnedNormalizer(Whitening(), max_points=9)
         normalizer.save_pretrained(tmp_path / "weights.safetensors")

@@ -68,7 +68,7 @@ def papers_data(description: str) -> str:
 def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     trained, protocol = run.about["trained_on"], cells[0].protocol
     rows = [
-        [name, ", ".join(trained[name]) or "-", *rates]
+        [name, *rates, ", ".join(trained[name]) or "-"]
         for name in run.about["methods"]
         if name != baseline and any(rates := [_rate(cell, name, baseline, trained[name]) for cell in cells])
     ]
@@ -93,11 +93,11 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     papers = [papers_data(run.about["stores"][cell.store]) for cell in cells] if baseline == BASELINE else []
     if protocol == "filtered" and any(papers):
         rows += [
-            ["Fan et al., as printed", train, *(values.get(name, "") for name in papers)]
+            ["Fan et al., as printed", *(values.get(name, "") for name in papers), train]
             for train, values in PRINTED.items()
         ]
         text += " Fan et al. test on KITTI 06-10 and on TUM freiburg3_long_office at KITTI's size."
-    header = ["method", "trained on", *(f"{cell.store}: {len(cell.pair)} of {cell.drawn}" for cell in cells)]
+    header = ["method", *(f"{cell.store}: {len(cell.pair)} of {cell.drawn}" for cell in cells), "trained on"]
     title = f"Better than {baseline}, {protocol}{' (Table 1)' if any(papers) else ''}"
     return Table(title, text, header, rows)
 

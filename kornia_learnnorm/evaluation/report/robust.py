@@ -101,8 +101,8 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
         "share of the estimator's matches with a symmetric epipolar distance below the threshold. "
         f"{agreement if truth else 'There is no ground truth: more inliers do not prove a more accurate matrix.'} "
         "`count:` is the best of 1,000 minimal samples, which all methods share, without refinement. "
-        "`time:` is the best of the samples drawn in 50 ms, which depends on the machine. `RANSAC` is the package's "
-        "own with its defaults. All other estimators come from other packages and run with their defaults."
+        "`time:` is the best of the samples drawn in 50 ms, which depends on the machine. `RANSAC`, `learned:` "
+        "and `guided:` are the package's own, all others come from other packages; all run with their defaults."
     )
     number = TABLE_NUMBER[cell.protocol] if printed else ""
     return Table(f"Robust estimation: {cell.title}{number}", text, header, rows)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.evaluation.methods import SHIPPED, base_name
 from kornia_learnnorm.evaluation.report.formatting import (
     BASELINE,
     MIN_BOOTSTRAP_PAIRS,
@@ -49,7 +50,9 @@ class _Ranking(NamedTuple):
 
 def run_summary(run: Run) -> list[str]:
     """Return a sentence or two for each store and protocol of a run of predictions, Markdown."""
-    return [_about_methods(cell) for cell in run.cells]
+    trained_on = run.about.get("trained_on", {})
+    own = [name for name, data in trained_on.items() if data and base_name(name) not in SHIPPED]
+    return [_about_methods(cell, own) for cell in run.cells]
 
 
 def robust_summary(run: RobustRun) -> list[str]:
@@ -79,8 +82,8 @@ def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> 
     return _Ranking(winner, others[0] if others else "", level, ahead, differences, pairs)
 
 
-def _about_methods(cell: Cell) -> str:
-    """Return which method has the smallest median error, as the table shows it, beside another one's."""
+def _about_methods(cell: Cell, own: list[str]) -> str:
+    """Return which method has the smallest median error, as the table shows it, beside others: the user's own too."""
     key = next((key for key in ERRORS if not cell.predictions[BASELINE][key].isnan().all()), "own")
     logs = {name: p[key].clamp(min=MIN_DISTANCE).log() for name, p in cell.predictions.items()}
     ranking = _rank({name: median(p[key]).item() for name, p in cell.predictions.items()}, logs, cell.pair)
@@ -90,6 +93,9 @@ def _about_methods(cell: Cell) -> str:
     text = f"**{cell.title}** ({size}): "
     text += f"`{winner}` has the smallest {ERRORS[key]}, median {median_text(best[key])} px"
     text += f"{_compared(cell, ranking, key)}.{_level(ranking)}"
+    for name in own:
+        if name in cell.predictions and name != winner:
+            text += f" `{name}` has {median_text(cell.predictions[name][key])} px."
     if ranking.ahead:
         text += f" The geometric mean of the errors is smaller for {_names(ranking.ahead)}."
     if key != "truth" and "inliers" in best:

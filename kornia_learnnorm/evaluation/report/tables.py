@@ -58,7 +58,7 @@ def report_tables(run: Run) -> list[Table]:
 
 def _accuracy(cell: Cell) -> Table:
     """Return the table of errors, poses and diagnostics by method."""
-    header = ["method", "own px", "held out px", "truth px", f"truth: better than {BASELINE} %"]
+    header = ["method", "fit px", "held out px", "truth px", f"truth: better than {BASELINE} %"]
     header += ["rotation deg", "translation deg", *POSE_HEADER, "condition number", "rho", "distance 1", "distance 2"]
     posed, rows = _posed(cell), []
     for name, p in cell.predictions.items():
@@ -93,8 +93,8 @@ def _accuracy_text(cell: Cell, posed: int) -> str:
         "pose that cannot be found counts as a failure."
     )
     return (
-        f"Medians over {len(cell.pair)} samples, {count}. `own` is the error of the fit: the mean symmetric epipolar "
-        f"distance of the sample's eight points. {others} of the symmetric epipolar distance."
+        f"Medians over {len(cell.pair)} samples, {count}. `fit` is the error of the sample itself: the mean symmetric "
+        f"epipolar distance of its eight points. {others} of the symmetric epipolar distance."
         f"{angles if posed else ''} `+LM` is refined on the eight points: no method fits "
         "them more closely. The condition number of the design matrix is its largest over its eighth singular value. "
         "`rho` is the second over the third singular value of the normalised matrix before the projection to rank 2: "
@@ -150,7 +150,7 @@ def _posed(cell: Cell) -> Tensor:
 
 def _tests(cell: Cell) -> Table:
     """Return the table of paired tests of each distance against the baseline."""
-    quantities = {"own": "own", "heldout": "held out", "truth": "truth"}
+    quantities = {"own": "fit", "heldout": "held out", "truth": "truth"}
     header = ["method", *(f"{name}: change %, p" for name in quantities.values())]
     logs = {
         name: {key: p[key].clamp(min=MIN_DISTANCE).log() for key in quantities} for name, p in cell.predictions.items()
@@ -163,7 +163,7 @@ def _tests(cell: Cell) -> Table:
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "
         f"p-value of a paired bootstrap over image pairs with {RESAMPLES:,} resamples, which cannot resolve p-values "
-        f"below {MIN_P_VALUE:g}; fewer than {MIN_BOOTSTRAP_PAIRS} pairs have neither. Negative is better. `own` and "
+        f"below {MIN_P_VALUE:g}; fewer than {MIN_BOOTSTRAP_PAIRS} pairs have neither. Negative is better. `fit` and "
         f"`held out` use {_count(cell.pair)}"
     )
     truth = cell.pair[_with_truth(cell)]
@@ -191,7 +191,7 @@ def by_motion(cell: Cell, run: Run, learned: str) -> Table:
             rates = [rate_text(cell, learned, BASELINE, quantity, inside) for quantity in ("own", "heldout", "truth")]
             counts = [int(chosen.sum()), int(inside.sum()), int((inside & truth).sum())]
             rows.append([name, half, *map(str, counts), *rates])
-    header = ["motion", "half", "pairs", "samples", "with truth", "own: better %", "held out: better %"]
+    header = ["motion", "half", "pairs", "samples", "with truth", "fit: better %", "held out: better %"]
     text = (
         f"Better rate of `{learned}` against {BASELINE} in the halves of the image pairs below and above the median of "
         "each motion. `with truth` is the number of samples whose pair has ground-truth inliers; the last column is "
@@ -226,7 +226,7 @@ def _worst_failures(cell: Cell, run: Run, learned: str) -> Table:
     mine, other = cell.predictions[learned], cell.predictions[BASELINE]
     ratio = (mine["truth"] / other["truth"]).nan_to_num(nan=-1.0, posinf=torch.inf)
     worst = ratio.argsort(descending=True)[:MAX_FAILURES]
-    header = ["pair", "truth px", f"{BASELINE}: truth px", "ratio", "own px", f"{BASELINE}: own px"]
+    header = ["pair", "truth px", f"{BASELINE}: truth px", "ratio", "fit px", f"{BASELINE}: fit px"]
     pairs, rows = run.pairs[cell.store], []
     for row in worst[ratio[worst] > 0].tolist():
         pair = int(cell.pair[row])
@@ -237,6 +237,6 @@ def _worst_failures(cell: Cell, run: Run, learned: str) -> Table:
     text = (
         f"The {len(rows)} samples with the largest ratio of `truth`, the median symmetric epipolar distance of the "
         f"ground-truth inliers, under `{learned}` to that under {BASELINE}, of {int((ratio >= 0).sum())} samples with "
-        "ground truth. `own` is the mean distance of the sample's eight points."
+        "ground truth. `fit` is the mean distance of the sample's eight points."
     )
     return Table(f"Worst failures: {cell.title}", text, [*header, "condition number", "parallax px"], rows)

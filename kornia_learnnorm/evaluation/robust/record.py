@@ -60,7 +60,7 @@ def record_robust(
     options: Mapping[str, int] | None = None,
     redo: Sequence[str] = (),
     command: str = "",
-) -> None:
+) -> list[str]:
     """Compute the missing results of a run, with a progress bar.
 
     An estimator whose package is not installed is left out, and the run records that.
@@ -73,6 +73,9 @@ def record_robust(
         options: options that differ from :data:`DEFAULT_OPTIONS`.
         redo: estimators or solvers whose results are computed again.
         command: the command line that asks for it, for the report.
+
+    Returns:
+        the names of the estimators that were left out, since their packages are not installed.
 
     Raises:
         ValueError: if the folder holds a run of other options, an option, a store or an estimator is wrong, an existing
@@ -106,6 +109,7 @@ def record_robust(
         leave_out(folder, "robust", [name for name in failed if not result_files(folder, [name])])
     if failed:
         raise ValueError(f"{'; '.join(dict.fromkeys(failed.values()))}. All others are in {folder}")
+    return [names[name] for name, estimator in found.items() if estimator is None]
 
 
 def _find(name: str) -> Estimator | None:

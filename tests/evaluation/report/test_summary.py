@@ -53,6 +53,13 @@ def test_hartley_may_win():
     assert text.endswith("Level with it: `close`.")
 
 
+def test_weights_of_ones_own_are_named_where_another_method_wins():
+    predictions = {"Hartley": errors(1.0), "best": errors(0.5), "own": errors(0.8), "crossview": errors(0.9)}
+    about = {"trained_on": {"Hartley": [], "best": [], "own": ["a@0:9"], "crossview": ["kitti_00"]}}
+    (text,) = run_summary(Run(about, [Cell("a", "filtered", PAIR, SAMPLES, predictions)], {}, {}, {}))
+    assert text.endswith("`own` has 5.200 px.")
+
+
 def test_where_hartley_wins_a_method_without_an_error_is_not_next():
     text = summary_of({"Hartley": errors(1.0), "broken": errors(math.nan)})
     assert "`Hartley` has the smallest error on the ground-truth inliers, median 6.500 px. Not tested" in text
