@@ -41,7 +41,7 @@ EXAMPLES = """\
 learnnorm evaluate store.h5 --methods Hartley crossview Hartley+LM --size 16
 learnnorm evaluate store.h5 --out run && learnnorm report run"""
 
-LEGEND = "mean, median: symmetric epipolar distance of a sample's own points, the fit; searched: the limit of all methods"
+LEGEND = "mean, median: symmetric epipolar distance of a sample's own points, the fit; searched: the limit of them all"
 TRUTH = "truth: of the ground-truth inliers of its pair, the accuracy; a better fit need not be more accurate"
 
 
