@@ -127,6 +127,8 @@ def _find_normalizer(name: str) -> Normalizer:
             f"{name} holds the weights of a LearnedEightPoint, expected those of a LearnedNormalizer, such as"
             f" {', '.join(shipped)}; learnnorm robust STORE --out RUN --estimators learned:{name} evaluates them"
         )
+    if Path(name).suffix == ".ckpt":
+        raise FileNotFoundError(f"{name} is a checkpoint: learnnorm fit writes weights.safetensors beside its folder")
     if name not in shipped and Path(name).suffix != ".safetensors":
         raise FileNotFoundError(
             f"no weights {name!r} and no such normalisation: expected {', '.join([*CLOSED_FORMS, *shipped])}, a"

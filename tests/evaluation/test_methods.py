@@ -57,6 +57,7 @@ def test_refined_is_the_better_fit(scene):
         ("Hartley+foo", FileNotFoundError, r"no weights 'Hartley\+foo'"),
         ("Hartley+optimal+LM", FileNotFoundError, "expected none, Hartley"),
         (":Whitening", ValueError, "expected module:Name"),
+        ("runs/own/checkpoints/last.ckpt", FileNotFoundError, "is a checkpoint: learnnorm fit writes"),
         ("no.such.module:Thing", ValueError, "no normaliser at"),
         ("kornia_learnnorm:Nothing", ValueError, "no normaliser at"),
         ("kornia_learnnorm:__version__", ValueError, "cannot be called"),
