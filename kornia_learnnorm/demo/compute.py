@@ -71,6 +71,7 @@ class Example:
     picture2: Picture
     points1: Tensor  # pixels in image 1, (M, 2), float64
     points2: Tensor  # their pixels in image 2, (M, 2), float64
+    determined: bool  # whether they determine F: those of a plane agree with many matrices
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +107,14 @@ class Comparison:
         return _median_distance(self.points1[ransac.inliers], self.points2[ransac.inliers], estimate)
 
     def true_error(self, method: str, example: Example) -> float:
-        """Return the median distance of exact correspondences to the matrix of a method, pixels; NaN without it."""
+        """Return the median distance of exact correspondences to the matrix of a method, pixels.
+
+        NaN where there is no matrix, or where the correspondences do not determine it: the distance says nothing then.
+        """
         estimate = self.results[method].estimate
-        return math.nan if estimate is None else _median_distance(example.points1, example.points2, estimate)
+        if estimate is None or not example.determined:
+            return math.nan
+        return _median_distance(example.points1, example.points2, estimate)
 
 
 def read_picture(name: str, content: bytes) -> Picture:
@@ -152,6 +158,7 @@ def render_example(name: str) -> Example:
         read_picture("image2.png", _png(pair.image2)),
         torch.from_numpy(pair.points1),
         torch.from_numpy(pair.points2),
+        EXAMPLES[name][0] != "plane",
     )
 
 

@@ -90,6 +90,10 @@ class TestComparison:
             assert (comparison.distance(method) < 0.5) == (method != "Hartley")
             assert comparison.results[method].seconds > 0
 
+    def test_the_points_of_a_plane_show_no_error(self):
+        plane = module.render_example("Plane (F undetermined)")
+        assert math.isnan(compare(plane.picture1, plane.picture2).true_error("RANSAC", plane))
+
     def test_a_method_without_a_matrix_says_why(self, example, monkeypatch):
         def fail(*_):
             raise NoReliableMatrixError("no_consensus", "1 and 2: nothing agrees")
