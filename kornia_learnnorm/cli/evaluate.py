@@ -167,8 +167,9 @@ def run(args: argparse.Namespace) -> int:
         if not args.out:
             raise ValueError("--out is empty: expected a folder")
         no_example = record_run(args.out, stores, methods, options, command=args.command_line)
-        _print_tables(args, read_run(args.out), tables)
-    further = [name for name in read_run(args.out).about["methods"] if name not in short_names(methods).values()]
+        recorded = read_run(args.out)
+        _print_tables(args, recorded, tables)
+    further = [name for name in recorded.about["methods"] if name not in short_names(methods).values()]
     if further:
         print(f"{args.out} also holds, from before: {', '.join(further)}", file=sys.stderr)
     if no_example:

@@ -475,7 +475,7 @@ def test_parameters_are_the_networks(normalizer):
 
 
 def test_the_weights_for_sets_are_more_accurate_than_hartleys_on_sets():
-    """On noisy matches of unseen synthetic scenes, a tenth of them wrong; eights are left to the other weights."""
+    """On synthetic matches, noisy and some of them wrong; eights are left to the other weights."""
     sets = SyntheticSets(32).draw(128, 64, block_generator(5))
     errors = []
     for normalizer in (LearnedNormalizer.from_pretrained("crossview-sets"), Hartley()):
