@@ -30,13 +30,13 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld, orbit
 from kornia_learnnorm.data.synthetic.kinds import KINDS, render_kind
 from kornia_learnnorm.data.synthetic.render import RenderedPair
-from kornia_learnnorm.evaluation.pair import estimate_pair
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.evaluation.two_view import estimate_matches
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
+from kornia_learnnorm.two_view.pair import estimate_pair
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.two_view.two_view import estimate_matches
 
 OUTLIERS = "outliers"
 MATCHES = 1000  # of a pair of the kind `outliers`

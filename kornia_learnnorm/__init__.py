@@ -16,11 +16,7 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedEstima
 from kornia_learnnorm.estimators.refinement import Refinement, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated, squared_loss
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
-from kornia_learnnorm.evaluation.pair import estimate_pair
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.evaluation.reliability import PairWarning
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
-from kornia_learnnorm.evaluation.two_view import estimate_matches
 from kornia_learnnorm.geometry.distances import (
     algebraic_distance,
     sampson_distance,
@@ -48,6 +44,10 @@ from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.ransac.soft import SoftChoice, expected_loss, sample_minimal_sets
+from kornia_learnnorm.two_view.pair import estimate_pair
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.two_view.reliability import PairWarning
+from kornia_learnnorm.two_view.two_view import estimate_matches
 
 __version__ = "0.1.0"
 

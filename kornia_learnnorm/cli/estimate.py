@@ -13,10 +13,10 @@ from kornia_learnnorm.data.images import image_size, read_colour, read_mask
 from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
-from kornia_learnnorm.evaluation.many_pairs import PairOptions, describe_failure, estimate_pairs, read_pair_list
-from kornia_learnnorm.evaluation.pair import estimate_pair
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.files import atomic_write, write_text
+from kornia_learnnorm.two_view.many_pairs import PairOptions, describe_failure, estimate_pairs, read_pair_list
+from kornia_learnnorm.two_view.pair import estimate_pair
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
 
@@ -140,7 +140,7 @@ def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
         picture = None if args.out is None else stack.enter_context(atomic_write(args.out))
         report = None if json_path is None else stack.enter_context(atomic_write(json_path))
         if picture is not None:
-            from kornia_learnnorm.evaluation.drawing import draw_pair, import_matplotlib
+            from kornia_learnnorm.two_view.drawing import draw_pair, import_matplotlib
 
             import_matplotlib()
         masks: list[Any] = [

@@ -20,11 +20,11 @@ from kornia_learnnorm.data.images import image_size, import_cv2, read_colour
 from kornia_learnnorm.data.synthetic.kinds import render_kind
 from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.evaluation.pair import MatchedPair, match_pair
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.two_view.pair import MatchedPair, match_pair
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
 
 __all__ = [
     "EXAMPLES",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_learnnorm.demo.compute import METHODS, Picture, epipolar_segment
-from kornia_learnnorm.evaluation.drawing import INLIER, OUTLIER
+from kornia_learnnorm.two_view.drawing import INLIER, OUTLIER
 
 __all__ = ["ImageView"]
 

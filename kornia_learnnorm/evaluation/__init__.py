@@ -1,1 +1,1 @@
-"""Using and measuring estimates: image pairs, predictions, tables and figures."""
+"""Measuring estimates: predictions, tables and figures."""

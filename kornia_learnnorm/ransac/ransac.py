@@ -14,10 +14,10 @@ from torch import Tensor, nn
 
 from kornia_learnnorm.geometry.checks import check_cameras, check_rank2, check_tensor, solve_dtype
 from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
+from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
 from kornia_learnnorm.normalizers.hartley import Hartley
-from kornia_learnnorm.ransac.distinct_points import distinct_points
 from kornia_learnnorm.ransac.models import EssentialModel, FundamentalModel
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.ransac.scoring import (

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.features import Features, detect_sift, pretrained
-from kornia_learnnorm.ransac.distinct_points import distinct_points
+from kornia_learnnorm.geometry.distinct_points import distinct_points
 
 __all__ = ["MATCHERS", "Matches", "match_both_ways", "match_images", "match_lightglue", "match_nearest", "one_to_one"]
 

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.evaluation.drawing import INLIER, WIDE, draw_line, draw_matches
 from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture
 from kornia_learnnorm.evaluation.runs.run import Run
 from kornia_learnnorm.evaluation.runs.store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
+from kornia_learnnorm.two_view.drawing import INLIER, WIDE, draw_line, draw_matches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from kornia_learnnorm.evaluation.drawing import import_matplotlib
 from kornia_learnnorm.evaluation.methods import CLOSED_FORMS, base_name
 from kornia_learnnorm.evaluation.robust.estimators import SEVEN_POINT
+from kornia_learnnorm.two_view.drawing import import_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

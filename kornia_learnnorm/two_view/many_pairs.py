@@ -14,14 +14,14 @@ from kornia_learnnorm.data.cameras import read_camera
 from kornia_learnnorm.data.images import image_size, import_cv2
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.evaluation.inputs import check_settings
-from kornia_learnnorm.evaluation.pair import MAX_SIZE, check_matching, estimate_pair
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, package_versions
-from kornia_learnnorm.evaluation.reliability import PairWarning
 from kornia_learnnorm.files import exclusive, write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.two_view.inputs import check_settings
+from kornia_learnnorm.two_view.pair import MAX_SIZE, check_matching, estimate_pair
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, package_versions
+from kornia_learnnorm.two_view.reliability import PairWarning
 
 __all__ = ["PairOptions", "describe_failure", "estimate_pairs", "read_pair_list"]
 
@@ -32,7 +32,7 @@ UNREADABLE = "unreadable"  # code of a pair of which an image cannot be read; tr
 
 @dataclass(frozen=True)
 class PairOptions:
-    """How image pairs are estimated; see :func:`~kornia_learnnorm.evaluation.pair.estimate_pair`.
+    """How image pairs are estimated; see :func:`~kornia_learnnorm.two_view.pair.estimate_pair`.
 
     Attributes:
         weights: weights of the learned layer, by name or file; None for RANSAC.
@@ -109,7 +109,7 @@ def estimate_pairs(
 ) -> list[dict[str, Any]]:
     """Estimate the pairs that are not done yet and append one JSON line each to ``pairs.jsonl``.
 
-    A line has what :meth:`~kornia_learnnorm.evaluation.pair_estimate.PairEstimate.as_dict` returns, or
+    A line has what :meth:`~kornia_learnnorm.two_view.pair_estimate.PairEstimate.as_dict` returns, or
     :func:`describe_failure` where there is no matrix or an image cannot be read.
 
     Args:

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.ransac.parallax import parallax
-from kornia_learnnorm.ransac.plane_distances import distances_from_plane
+from kornia_learnnorm.two_view.parallax import parallax
+from kornia_learnnorm.two_view.plane_distances import distances_from_plane
 
 SIZE = (1600, 1200)
 H = torch.tensor([[1.05, -0.08, 30.0], [0.06, 0.98, -20.0], [4e-5, -2e-5, 1.0]], dtype=torch.float64)

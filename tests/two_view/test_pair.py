@@ -20,11 +20,11 @@ from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.evaluation import pair as pair_module
-from kornia_learnnorm.evaluation.many_pairs import read_pair_list
-from kornia_learnnorm.evaluation.pair import estimate_pair, match_pair
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.two_view import pair as pair_module
+from kornia_learnnorm.two_view.many_pairs import read_pair_list
+from kornia_learnnorm.two_view.pair import estimate_pair, match_pair
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 

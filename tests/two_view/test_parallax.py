@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from two_view import epipolar_distances
 
-from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax, parallax_evidence
+from kornia_learnnorm.two_view.parallax import fit_plane_and_parallax, parallax, parallax_evidence
 
 K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
 R = np.array([[0.9998, 0, 0.02], [0, 1, 0], [-0.02, 0, 0.9998]])

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation.drawing import draw_line, draw_pair, import_matplotlib
-from kornia_learnnorm.evaluation.pair_estimate import PairEstimate
-from kornia_learnnorm.evaluation.reliability import PairWarning
+from kornia_learnnorm.two_view.drawing import draw_line, draw_pair, import_matplotlib
+from kornia_learnnorm.two_view.pair_estimate import PairEstimate
+from kornia_learnnorm.two_view.reliability import PairWarning
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 image_module = pytest.importorskip("matplotlib.image")

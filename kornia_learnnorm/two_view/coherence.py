@@ -12,7 +12,7 @@ from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.ransac.parallax import parallax
+from kornia_learnnorm.two_view.parallax import parallax
 
 __all__ = ["coherent_matches", "fitting_share"]
 

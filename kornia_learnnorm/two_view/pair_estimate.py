@@ -9,9 +9,9 @@ from typing import Any
 
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.reliability import PairWarning
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.two_view.reliability import PairWarning
 
 __all__ = ["NoReliableMatrixError", "PairEstimate", "package_versions"]
 

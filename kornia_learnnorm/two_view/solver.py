@@ -11,15 +11,15 @@ from torch import Tensor
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
-from kornia_learnnorm.evaluation.inputs import Cameras
-from kornia_learnnorm.evaluation.reliability import MAX_LOG_CHANCE_PARALLAX, MIN_PLANAR_SHARE, find_homography
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.models import EssentialModel
-from kornia_learnnorm.ransac.parallax import fit_plane_and_parallax, parallax, parallax_evidence
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
+from kornia_learnnorm.two_view.inputs import Cameras
+from kornia_learnnorm.two_view.parallax import fit_plane_and_parallax, parallax, parallax_evidence
+from kornia_learnnorm.two_view.reliability import MAX_LOG_CHANCE_PARALLAX, MIN_PLANAR_SHARE, find_homography
 
 __all__ = ["TwoViewSolver"]
 

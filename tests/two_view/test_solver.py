@@ -9,7 +9,7 @@ from two_view import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import orbit
-from kornia_learnnorm.evaluation.solver import TwoViewSolver
+from kornia_learnnorm.two_view.solver import TwoViewSolver
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 

@@ -16,12 +16,12 @@ from kornia_learnnorm.data.images import content_mask, image_size, import_cv2, r
 from kornia_learnnorm.data.matching.features import DETECTORS, Features, keep_features
 from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.evaluation.inputs import Points, check_number, check_settings, check_whole, read_cameras
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.evaluation.reliability import MIN_MUTUAL_SHARE, mutual_share
-from kornia_learnnorm.evaluation.two_view import estimate_matches, settle_repeats
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points, unit_fundamental
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, check_whole, read_cameras
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.two_view.reliability import MIN_MUTUAL_SHARE, mutual_share
+from kornia_learnnorm.two_view.two_view import estimate_matches, settle_repeats
 
 __all__ = ["MAX_SIZE", "MatchedPair", "check_matching", "estimate_pair", "match_pair"]
 

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from kornia_learnnorm.evaluation.pair_estimate import PairEstimate
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import import_extra
+from kornia_learnnorm.two_view.pair_estimate import PairEstimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,9 +12,17 @@ from torch import Tensor
 
 from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.evaluation.inputs import Points, check_settings, read_cameras, read_matches, read_size
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.evaluation.reliability import (
+from kornia_learnnorm.geometry.manifold import nearest_essential
+from kornia_learnnorm.geometry.pose import in_front, relative_pose
+from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.protocol import INLIER_THRESHOLD
+from kornia_learnnorm.ransac.scoring import finite_and_bounded
+from kornia_learnnorm.two_view.coherence import coherent_matches, fitting_share
+from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.two_view.plane_distances import distances_from_plane
+from kornia_learnnorm.two_view.reliability import (
     MAX_LOG_FALSE_ALARMS,
     MIN_MOTION,
     PairWarning,
@@ -28,15 +36,7 @@ from kornia_learnnorm.evaluation.reliability import (
     nominal_camera,
     random_parts,
 )
-from kornia_learnnorm.evaluation.solver import TwoViewSolver
-from kornia_learnnorm.geometry.manifold import nearest_essential
-from kornia_learnnorm.geometry.pose import in_front, relative_pose
-from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.metrics.summary import median
-from kornia_learnnorm.protocol import INLIER_THRESHOLD
-from kornia_learnnorm.ransac.coherence import coherent_matches, fitting_share
-from kornia_learnnorm.ransac.plane_distances import distances_from_plane
-from kornia_learnnorm.ransac.scoring import finite_and_bounded
+from kornia_learnnorm.two_view.solver import TwoViewSolver
 
 __all__ = ["estimate_matches", "settle_repeats"]
 

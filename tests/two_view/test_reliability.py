@@ -11,7 +11,8 @@ from two_view import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
-from kornia_learnnorm.evaluation.reliability import (
+from kornia_learnnorm.two_view.parallax import parallax
+from kornia_learnnorm.two_view.reliability import (
     Stability,
     assess,
     choose_found,
@@ -22,7 +23,6 @@ from kornia_learnnorm.evaluation.reliability import (
     nominal_camera,
     random_parts,
 )
-from kornia_learnnorm.ransac.parallax import parallax
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 

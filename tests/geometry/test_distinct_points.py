@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from two_view import scenes, uniform
 
 from kornia_learnnorm import RANSAC
-from kornia_learnnorm.ransac.distinct_points import distinct_points
+from kornia_learnnorm.geometry.distinct_points import distinct_points
 
 
 def reference(points1, points2, weights=None) -> list[bool]:

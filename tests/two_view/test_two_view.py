@@ -12,8 +12,8 @@ from two_view import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
-from kornia_learnnorm.evaluation import two_view as two_view_module
-from kornia_learnnorm.evaluation.solver import TwoViewSolver
+from kornia_learnnorm.two_view import two_view as two_view_module
+from kornia_learnnorm.two_view.solver import TwoViewSolver
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 

@@ -10,9 +10,9 @@ from two_view import epipolar_distances, repeated_wall, uniform
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.kinds import render_kind
-from kornia_learnnorm.evaluation.pair_estimate import NoReliableMatrixError
-from kornia_learnnorm.evaluation.reliability import mutual_share
-from kornia_learnnorm.evaluation.two_view import settle_repeats
+from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError
+from kornia_learnnorm.two_view.reliability import mutual_share
+from kornia_learnnorm.two_view.two_view import settle_repeats
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from two_view import WALL_SHIFT, homogeneous, repeated_wall
 
-from kornia_learnnorm.ransac.coherence import coherent_matches, fitting_share
+from kornia_learnnorm.two_view.coherence import coherent_matches, fitting_share
 
 
 def wall_homography() -> torch.Tensor:

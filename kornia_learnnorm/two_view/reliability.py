@@ -17,8 +17,8 @@ from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
-from kornia_learnnorm.ransac.parallax import parallax, parallax_evidence
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
+from kornia_learnnorm.two_view.parallax import parallax, parallax_evidence
 
 __all__ = [
     "MIN_MUTUAL_SHARE",
@@ -186,7 +186,7 @@ def assess(
         points2: pixels of all matches in image 2, (N, 2).
         distance: symmetric epipolar distances of the matches to the matrix, (N,), pixels.
         off_plane: distances of the matches from the plane that explains most inliers, pixels, (N,), or None; see
-            :func:`~kornia_learnnorm.ransac.plane_distances.distances_from_plane`.
+            :func:`~kornia_learnnorm.two_view.plane_distances.distances_from_plane`.
         threshold: largest distance of an inlier, pixels.
         size2: width and height of image 2.
         stability: of the matrix, see :func:`measure_stability`.
