@@ -19,11 +19,10 @@ class TestCameras:
         check_cameras(scale * K, K.expand(4, 3, 3), 4)
 
     def test_transposed(self):
-        """One line says which camera and what its last row is, also of a single one in a batch."""
-        text = "must have a last row of 0 0 1, up to scale, got 320 240 1; is it transposed"
-        with pytest.raises(ValueError, match=f"^K1 {text}.$"):
+        """The error names the camera and its last row, also of a single one in a batch."""
+        with pytest.raises(ValueError, match=r"^K1 .*320 240 1.*transposed"):
             check_cameras(K.T, K)
-        with pytest.raises(ValueError, match=f"^K2 {text}.$"):
+        with pytest.raises(ValueError, match=r"^K2 .*320 240 1.*transposed"):
             check_cameras(K, torch.stack([K, K.T]).requires_grad_(), 2)
 
     def test_values_are_not_read_in_transforms(self):
@@ -48,13 +47,9 @@ class TestCorrespondences:
         assert solve_dtype(torch.device("cuda:0")) == torch.float64
         assert solve_dtype(torch.device("mps")) == torch.float32
 
-    def test_check_correspondences(self):
-        """What it refuses is tested with the estimators and normalisers."""
-        points = torch.rand(2, 8, 2)
-        check_correspondences(points, points, torch.ones(2, 8))
-
     def test_errors_name_the_argument(self):
-        with pytest.raises(ShapeError, match=r"(?s)Actual shape: \[2, 8, 3\].*points2"):
+        """What else is refused is tested with the estimators and normalisers."""
+        with pytest.raises(ShapeError, match=r"(?s)\[2, 8, 3\].*points2"):
             check_correspondences(torch.rand(2, 8, 2), torch.rand(2, 8, 3))
-        with pytest.raises(TypeError, match=r"got <class 'numpy.ndarray'>; torch.from_numpy\(points1\)"):
+        with pytest.raises(TypeError, match=r"numpy.ndarray.*torch.from_numpy\(points1\)"):
             check_correspondences(np.zeros((2, 8, 2)), torch.rand(2, 8, 2))

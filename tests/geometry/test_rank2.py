@@ -58,6 +58,12 @@ def reference(F, points1, points2, iterations: int = 3) -> np.ndarray:
     return unit(np.stack(corrected))
 
 
+def mean_distances(points1, points2) -> tuple[np.ndarray, np.ndarray]:
+    """Mean symmetric distances of each set after Hartley's projection and after the optimal correction."""
+    plain, corrected = find_fundamental(points1, points2), optimal_rank2(linear(points1, points2), points1, points2)
+    return tuple(epipolar_distances(points1, points2, F_mat).mean(-1) for F_mat in (plain, corrected))
+
+
 class TestOptimalRank2:
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
     @pytest.mark.parametrize("num_points", [8, 12, 50])
@@ -75,10 +81,7 @@ class TestOptimalRank2:
 
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
     def test_fits_eight_points_far_better_than_hartley(self, name):
-        points1, points2 = correspondences(name, 200, 8, noise=0.5)
-        plain = epipolar_distances(points1, points2, find_fundamental(points1, points2)).mean(-1)
-        F_mat = optimal_rank2(linear(points1, points2), points1, points2)
-        corrected = epipolar_distances(points1, points2, F_mat).mean(-1)
+        plain, corrected = mean_distances(*correspondences(name, 200, 8, noise=0.5))
         assert (corrected < plain).mean() > 0.97
         assert np.median(corrected) < 0.3 * np.median(plain)
 
@@ -114,21 +117,19 @@ class TestOptimalRank2:
     def test_real_eights(self, real_data):
         store = read_store(real_data / "correspondences" / "kitti_06.h5")
         drawn = draw_samples(store, torch.Generator().manual_seed(0), max_residual=60)
-        points1, points2 = drawn.points1.double(), drawn.points2.double()
-        plain = epipolar_distances(points1, points2, find_fundamental(points1, points2)).mean(-1)
-        F_mat = optimal_rank2(linear(points1, points2), points1, points2)
-        corrected = epipolar_distances(points1, points2, F_mat).mean(-1)
+        plain, corrected = mean_distances(drawn.points1.double(), drawn.points2.double())
         assert (corrected < plain).mean() > 0.99
         assert corrected.mean() < 0.1 * plain.mean()
 
 
 class TestRank2Projection:
-    def test_is_the_truncated_decomposition(self, dtype, device):
-        F_mat = uniform(50, 3, 3, low=-1).to(device, dtype)
+    @pytest.mark.parametrize("shape", [(), (0,), (50,), (2, 4)])
+    def test_is_the_truncated_decomposition(self, shape, dtype, device):
+        F_mat = uniform(*shape, 3, 3, low=-1).to(device, dtype)
         U, s, Vh = np.linalg.svd(F_mat.cpu().double().numpy())
-        expected = U[:, :, :2] * s[:, None, :2] @ Vh[:, :2]
+        expected = U[..., :2] * s[..., None, :2] @ Vh[..., :2, :]
         found = rank2_projection(F_mat)
-        assert found.dtype == dtype
+        assert (found.shape, found.dtype) == ((*shape, 3, 3), dtype)
         np.testing.assert_allclose(found.cpu().numpy(), expected, atol=20 * torch.finfo(dtype).eps)
 
     def test_leaves_rank_two_alone(self):
@@ -139,11 +140,6 @@ class TestRank2Projection:
         F_mat = uniform(2, 3, 3, low=-1).requires_grad_()
         assert gradcheck(rank2_projection, [F_mat])
         assert gradgradcheck(rank2_projection, [F_mat])
-
-    def test_any_batch_shape(self):
-        assert rank2_projection(uniform(3, 3)).shape == (3, 3)
-        assert rank2_projection(uniform(2, 4, 3, 3)).shape == (2, 4, 3, 3)
-        assert rank2_projection(uniform(0, 3, 3)).shape == (0, 3, 3)
 
     def test_shape(self):
         with pytest.raises(ShapeError):
