@@ -57,7 +57,6 @@ TOOLS = {
     "robust": ("kornia_learnnorm.cli.robust", "robust estimators and minimal solvers on stores"),
     "report": ("kornia_learnnorm.cli.report", "tables and figures of what evaluate --out and robust wrote"),
     "match": ("kornia_learnnorm.cli.match", "a store of correspondences from folders of images"),
-    "convert": ("kornia_learnnorm.cli.convert", "a store from or to the files of hloc"),
     "synthesize": ("kornia_learnnorm.cli.synthesize", "a synthetic store and a rendered image pair"),
     "export": ("kornia_learnnorm.cli.export", "a layer as a program that runs without this package"),
     "config": ("kornia_learnnorm.cli.config", "print a configuration for training"),

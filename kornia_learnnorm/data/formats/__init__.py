@@ -1,1 +1,0 @@
-"""Stores of correspondences to and from file formats of other packages."""
