@@ -37,6 +37,24 @@ def texture(seed: int = 0, width: int = 240, height: int = 180) -> np.ndarray:
     return (np.clip((image - low) / (high - low), 0, 1) * 255).astype(np.uint8)
 
 
+def blobs(centres: np.ndarray, width: int = 240, height: int = 180, width_of_blob: float = 3.0) -> np.ndarray:
+    """A smooth bright blob about each centre (x, y)."""
+    y, x = np.ogrid[:height, :width]
+    falloff = 2 * width_of_blob**2
+    image = sum(np.exp(-((x - cx) ** 2) / falloff) * np.exp(-((y - cy) ** 2) / falloff) for cx, cy in centres)
+    return np.round(np.clip(image, 0, 1) * 250).astype(np.uint8)
+
+
+def centroids(image: np.ndarray, near: np.ndarray, reach: int = 14, floor: int = 0) -> np.ndarray:
+    """Centre of mass of the grey values above a floor about each of some pixels."""
+    found = []
+    for cx, cy in np.round(near).astype(int):
+        y, x = np.mgrid[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1]
+        mass = image[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1].astype(float).clip(floor) - floor
+        found.append([(mass * x).sum() / mass.sum(), (mass * y).sum() / mass.sum()])
+    return np.array(found)
+
+
 def write_image(path: Path, shift: int, size: tuple[int, int] = SIZE, seed: int = 0) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(texture(seed, 900, 500)[: size[1], shift : shift + size[0]]).save(path)

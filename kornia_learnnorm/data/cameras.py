@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.kitti import read_calibration
-from kornia_learnnorm.data.images import image_size
-from kornia_learnnorm.optional import import_extra
+from kornia_learnnorm.data.exif import focal_length_35mm
+from kornia_learnnorm.data.images import image_size, open_image
 
 __all__ = ["exif_camera", "read_camera"]
 
 KITTI_CAMERA = "P0"  # projection of image_0 in a calib.txt
-EXIF_IFD = 0x8769  # tag of EXIF 2.32, section 4.6.3
-FOCAL_LENGTH_35MM = 0xA405  # section 4.6.5, millimetres on a frame of 36 x 24 mm; zero for unknown
 FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
 
 
@@ -81,12 +79,10 @@ def exif_camera(path: str | Path) -> NDArray[np.float64]:
 
     """
     size = image_size(path)
-    Image = import_extra("PIL.Image", "images", "reading images")
-    try:
-        with Path(path).open("rb") as file, Image.open(file) as image:
-            focal = float(image.getexif().get_ifd(EXIF_IFD).get(FOCAL_LENGTH_35MM, 0))
-    except Image.UnidentifiedImageError as error:
-        raise ValueError(f"camera exif: {path} is not an image") from error
+    if size == (0, 0):
+        raise ValueError(f"camera exif: {path} is not an image")
+    with open_image(Path(path)) as image:
+        focal = focal_length_35mm(image)
     if not 0 < focal < math.inf:
         raise ValueError(f"camera exif: {path} has no focal length on 35 mm film; give --K fx,fy,cx,cy")
     pixels = focal * math.hypot(*size) / FILM_DIAGONAL

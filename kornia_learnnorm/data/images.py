@@ -1,49 +1,34 @@
-"""Reading images as grey values or colours, reduced to a size, and masks of the pixels that count.
+"""Reading image files as grey values or colours of eight bits, reduced to a size.
 
-Pillow decodes; OpenCV undistorts and resizes frames. Both come with the ``images`` extra and are imported on use.
-Pixels follow OpenCV: the centre of the top left pixel is (0, 0).
+Pillow decodes; it comes with the ``images`` extra and is imported on use. Pixels follow OpenCV: the centre of the top
+left pixel is (0, 0).
 """
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.datasets.frames import Frame, Size
-from kornia_learnnorm.data.decoding import (
-    QUARTER_TURNS,
-    PixelError,
-    decode,
-    import_pillow,
-    open_image,
-    orientation,
-    reduce,
-    reduced_size,
-)
+from kornia_learnnorm.data.exif import QUARTER_TURNS, orientation, turn_upright
 from kornia_learnnorm.optional import import_extra
 
-__all__ = [
-    "content_mask",
-    "image_size",
-    "import_cv2",
-    "read_colour",
-    "read_frame",
-    "read_image",
-    "read_mask",
-    "resize_image",
-    "scale_points",
-    "scaling",
-]
+__all__ = ["Size", "image_size", "import_cv2", "open_image", "read_colour", "read_image", "resize_image", "scaling"]
+__all__ += ["check_grey", "reduced_size", "scale_points"]
 
-TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
-MAX_BLACK = 2  # largest grey value of a black frame
-MAX_UNEVEN = 0.05  # share of a frame's row or column that may differ from its median; more is noise of a dark image
-MIN_USED = 128  # smallest grey value of a mask's pixel that counts
+Size = tuple[int, int]  # width and height, pixels
+
+# Weights of red, green and blue, and an offset that turns Pillow's rounding into rounding down: the integer arithmetic
+# of libpng, so that a PNG has the grey values that OpenCV reads.
+LUMA = (9797 / 32768, 19234 / 32768, 3737 / 32768, -0.5)
+REDUCING_GAP = 2.0  # the last step of reducing, which is filtered, is by this factor or more, where there are others
 
 
 def import_cv2() -> Any:
@@ -51,140 +36,164 @@ def import_cv2() -> Any:
     return import_extra("cv2", "images", "matching images")
 
 
-def read_image(path: str | Path, max_size: int | None = None) -> npt.NDArray[np.uint8]:
-    """Return the grey values of an image file, turned as its EXIF orientation says.
+def import_pillow() -> Any:
+    """Return the module ``PIL.Image``; the ImportError names the extra that installs it."""
+    return import_extra("PIL.Image", "images", "reading images")
 
-    Colours become the luma of ITU-R BT.601, rounded down as in libpng; a JPEG gives its own luma channel. These are the
-    grey values of OpenCV's ``IMREAD_GRAYSCALE``, which in other formats can be a level higher (two for CMYK).
 
-    - 16 bits: the depth is 8, 10, 12, 14 or 16, the smallest that holds the largest value, and the upper eight bits of
-      that depth are kept. An image of 12 bits whose values stay below 1024 is thus read as one of 10.
-    - Floating-point numbers: [0, 1] becomes [0, 255] if no value is outside; otherwise [0, 255] is kept if no value is
-      outside; otherwise the values are stretched from their minimum and maximum. They are rounded.
-    - Transparent pixels are composited over black.
-    - CMYK in a JPEG is inverted, as Adobe writes it.
-    - Of an animation the first frame is read, of several pages the first.
+def check_grey(image: NDArray[np.uint8]) -> None:
+    """Raise TypeError or ValueError unless an image is an array of grey values (H, W), uint8."""
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        raise TypeError(f"an image must be an array of uint8, got {getattr(image, 'dtype', type(image))}")
+    if image.ndim != 2 or image.size == 0:
+        raise ValueError(f"an image must be grey with shape (H, W), got {image.shape}")
+
+
+def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint8]:
+    """Return the grey values :math:`(H, W)`, uint8, of an image file, turned as its EXIF orientation says.
+
+    They are those of OpenCV's ``IMREAD_GRAYSCALE``, which in other formats than PNG and JPEG can be a level higher (two
+    for CMYK). Of 16 bits the upper eight are kept, of an animation the first image; transparency is over black.
 
     Args:
         path: a file in any format that Pillow decodes.
         max_size: largest number of pixels on the longer side; a larger image is reduced, its outer edges in place,
-            and a JPEG decoded at a fraction of its size. None keeps the size.
-
-    Returns:
-        grey values with shape :math:`(H, W)`, uint8. :func:`scale_points` moves points to the size of the file, which
-        :func:`image_size` gives.
+            and a JPEG decoded at a fraction of its size. None keeps the size of the file, as :func:`image_size` has it.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is a folder, not an image, a truncated or corrupt image, has more than twice
-            ``PIL.Image.MAX_IMAGE_PIXELS`` pixels, or pixels that are NaN, infinite, negative or above 16 bits; or
-            if ``max_size`` is below 1.
+        ValueError: if it is no image, is truncated, corrupt, larger than twice ``PIL.Image.MAX_IMAGE_PIXELS`` or of
+            another kind of pixels, as floating-point numbers; or if ``max_size`` is below 1.
         ImportError: if Pillow is not installed.
 
     """
     return _read(Path(path), "L", max_size)
 
 
-def read_colour(path: str | Path, max_size: int | None = None) -> npt.NDArray[np.uint8]:
-    """Return the red, green and blue of an image file with shape :math:`(H, W, 3)`, uint8, for pictures.
-
-    Arguments and errors are those of :func:`read_image`, and so are depth, alpha, turn and size.
-    """
+def read_colour(path: str | Path, max_size: int | None = None) -> NDArray[np.uint8]:
+    """Return the red, green and blue of an image file with shape :math:`(H, W, 3)`, uint8; see :func:`read_image`."""
     return _read(Path(path), "RGB", max_size)
 
 
-def read_mask(path: str | Path, size: Size, max_size: int | None = None) -> npt.NDArray[np.bool_]:
-    """Return which pixels of an image count by a mask file: those above 127, half of the largest grey value.
+def _read(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
+    """Decode an image file; errors name the file and what is wrong with it."""
+    if not path.exists():
+        raise FileNotFoundError(f"image {path} does not exist")
+    reduced_size((1, 1), max_size)  # checks the limit before a file is read
+    size = path.stat().st_size
+    if path.is_dir() or size == 0:
+        got = "a folder" if path.is_dir() else "empty (0 bytes)"
+        raise ValueError(f"image {path} is {got}, expected an image file")
+    Image = import_pillow()
+    try:
+        return _decode(path, mode, max_size)
+    except Image.DecompressionBombError as error:
+        limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels, the limit, 2 * PIL.Image.MAX_IMAGE_PIXELS"
+        raise ValueError(f"image {path} declares more than {limit}") from error
+    except Exception as error:  # a broken file can end in nearly any error of Pillow's decoders
+        reason = "truncated or corrupt"
+        if isinstance(error, Image.UnidentifiedImageError):
+            reason = "not an image of a kind that Pillow reads, or one with a truncated or corrupt header"
+        elif isinstance(error, TypeError | MemoryError):
+            reason = str(error) or "too large for the memory"
+        elif isinstance(error, OSError) and error.strerror:  # of the system; Pillow's own have no number
+            reason = error.strerror
+        raise ValueError(f"image {path} cannot be decoded: {size} bytes, {reason}") from error
 
-    Args:
-        path: an image file, read as :func:`read_image` does: EXIF turns it, and transparent pixels do not count.
-        size: (width, height) of the image file that the mask is for, turned by EXIF; see :func:`image_size`.
-        max_size: limit that the image was read with, so that the mask has the shape of the reduced image.
 
-    Returns:
-        a mask with shape :math:`(H, W)`, bool.
+def _decode(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
+    """Return the pixels in a mode, L or RGB; TypeError for pixels that are not converted to eight bits."""
+    with open_image(path) as image:
+        image.verify()  # the checksums of a PNG, which decoding skips
+    with open_image(path) as image:
+        turn = orientation(image)
+        width, height = size = reduced_size(image.size, max_size)
+        # for a grey image a JPEG gives its luma channel, without a way through RGB
+        drafted = image.draft(mode, None if size == image.size else (2 * width, 2 * height))
+        image.load()
+        if drafted is None:
+            size = reduced_size(image.size, max_size)  # again, since loading turns a TIFF
+        box = drafted[1] if drafted else (0, 0, *image.size)  # a JPEG at an eighth has a part of a last pixel
+        image = _eight_bits(image)
+    image = turn_upright(image if size == image.size else _reduce(image, size, box), turn)
+    if image.mode == "RGBA":  # over black
+        image = import_pillow().fromarray(np.asarray(image.convert("RGBa"))[..., :3])
+    if (image.mode, mode) == ("RGB", "L"):
+        image = image.convert("L", LUMA)
+    return np.array(image.convert(mode))
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is no image, its size is not that of the image, or no pixel counts.
-        ImportError: if Pillow is not installed.
 
-    """
-    grey = _read(Path(path), "L", max_size, "mask")
-    got = image_size(path)
-    if got != size:
-        raise ValueError(f"mask {path} has {got[0]} x {got[1]} pixels, its image {size[0]} x {size[1]}")
-    mask = grey >= MIN_USED
-    if not mask.any():
-        raise ValueError(f"mask {path} has no pixel above {MIN_USED - 1}, its largest value is {grey.max()}")
-    return mask
+def _eight_bits(image: Any) -> Any:
+    """Return a loaded image in one of the modes L, RGB and RGBA."""
+    if image.mode.startswith("I") and 0 <= image.getextrema()[0] <= image.getextrema()[1] < 1 << 16:
+        return import_pillow().fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    if image.mode[0] in "IF" or image.mode == "LAB":
+        raise TypeError(f"pixels of the kind {image.mode} are not read, expected grey, RGB, CMYK or a palette")
+    if "transparency" in image.info or image.mode[-1] in "Aa":
+        return image.convert("RGBA")
+    return image.convert("L" if image.mode in ("1", "L") else "RGB")
 
 
-def content_mask(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_] | None:
-    """Return which pixels lie inside of a black frame, as of a letterbox; None if there is no frame.
+def _reduce(image: Any, size: Size, box: tuple[float, float, float, float] | None = None) -> Any:
+    """Return an image of Pillow, or the part of it in a box (left, top, right, bottom), reduced to (width, height)."""
+    # not BOX or HAMMING, which move edges by up to a fifth of a pixel where the factor is no whole number
+    return image.resize(size, import_pillow().Resampling.BICUBIC, box, REDUCING_GAP)
 
-    The frame is made of the outermost rows and columns with grey values of at most 2, of which 95 % or more are equal.
-    The rows and columns of a dark photograph have noise and are kept. An image that is black all over has no frame.
 
-    Args:
-        image: grey values with shape :math:`(H, W)`, uint8.
+@contextmanager
+def open_image(path: Path) -> Iterator[Any]:
+    """Open an image without Pillow's warnings about large images and odd metadata."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # an open file, not the path: Pillow 13 maps an uncompressed TIFF into memory and then turns it wrongly
+        with path.open("rb") as file, import_pillow().open(file) as image:
+            yield image
 
-    Returns:
-        a mask with shape :math:`(H, W)`, bool: true in a rectangle, false in the frame around it.
 
-    Raises:
-        TypeError: if the image is not an array of uint8.
-        ValueError: if the image does not have two dimensions, or no pixel.
+def image_size(path: str | Path) -> Size:
+    """Return (width, height) of an image from its header, turned by EXIF; (0, 0) where it cannot be read."""
+    import_pillow()  # outside of the try block, which would hide that it is missing
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no image at {path}")
+    try:
+        with open_image(path) as image:
+            width, height = image.size
+            return (height, width) if orientation(image) in QUARTER_TURNS else (width, height)
+    except Exception:  # a broken header can end in nearly any error of Pillow's parsers
+        return 0, 0
+
+
+def reduced_size(size: Size, max_size: int | None) -> Size:
+    """Return (width, height) with at most ``max_size`` pixels on the longer side, each side rounded.
 
     Example:
-        >>> image = np.pad(np.full((2, 3), 90, np.uint8), ((1, 2), (0, 1)))
-        >>> content_mask(image).astype(int)
-        array([[0, 0, 0, 0],
-               [1, 1, 1, 0],
-               [1, 1, 1, 0],
-               [0, 0, 0, 0],
-               [0, 0, 0, 0]])
+        >>> reduced_size((1000, 601), 500), reduced_size((1000, 601), 1000), reduced_size((1000, 601), None)
+        ((500, 300), (1000, 601), (1000, 601))
 
     """
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
-        raise TypeError(f"an image must be an array of uint8, got {getattr(image, 'dtype', type(image))}")
-    if image.ndim != 2 or image.size == 0:
-        raise ValueError(f"an image must be grey with shape (H, W), got {image.shape}")
-    inside = [np.flatnonzero(~_black_rows(lines)) for lines in (image, image.T)]
-    if any(len(kept) == 0 for kept in inside):
-        return None
-    (top, bottom), (left, right) = ((kept[0], kept[-1] + 1) for kept in inside)
-    if (bottom - top, right - left) == image.shape:
-        return None
-    mask = np.zeros(image.shape, bool)
-    mask[top:bottom, left:right] = True
-    return mask
+    if max_size is not None and max_size < 1:
+        raise ValueError(f"max_size must be a number of pixels, 1 or more, or None for all, got {max_size}")
+    longest = max(size)
+    if max_size is None or longest <= max_size:
+        return size
+    width, height = (max(1, round(side * max_size / longest)) for side in size)
+    return width, height
 
 
-def _black_rows(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
-    """Return which rows are black and constant."""
-    black = np.asarray(image.max(1) <= MAX_BLACK)
-    rows = image[black]
-    black[black] = (rows != np.median(rows, 1, keepdims=True)).mean(1) <= MAX_UNEVEN if len(rows) else False
-    return black
+def resize_image(image: NDArray[np.uint8], max_size: int | None) -> NDArray[np.uint8]:
+    """Return grey values (H, W) or colours (H, W, 3) reduced as by :func:`read_image`; a small image as it is."""
+    size = (image.shape[1], image.shape[0])
+    small = reduced_size(size, max_size)
+    return image if small == size else np.array(_reduce(import_pillow().fromarray(image), small))
 
 
 def scaling(size_from: Size, size_to: Size) -> Tensor:
-    r"""Return the transform of pixels from an image of one (width, height) to the same image of another.
+    r"""Return the transform (3, 3), float64, of pixels from an image of one (width, height) to it at another.
 
-    Pixel centres are whole numbers and the outer edges stay in place: :math:`x' = (x + 0.5) s - 0.5` with a factor
-    :math:`s` for each axis. If ``S1`` and ``S2`` lead from full images to reduced ones, :math:`S_2^\top F S_1` is the
-    fundamental matrix of the full images for the matrix :math:`F` of the reduced ones.
-
-    Args:
-        size_from: (width, height) of the image whose pixels are given.
-        size_to: (width, height) of the image whose pixels are wanted.
-
-    Returns:
-        the transform with shape :math:`(3, 3)`, float64.
-
-    Raises:
-        ValueError: if a width or height is below 1.
+    The outer edges stay in place: :math:`x' = (x + 0.5) s - 0.5` with a factor :math:`s` for each axis. If ``S1`` and
+    ``S2`` lead from full images to reduced ones, :math:`S_2^\top F S_1` is the fundamental matrix of the full images
+    for the matrix :math:`F` of the reduced ones. A size below 1 is a ValueError.
 
     Example:
         >>> scaling((400, 200), (100, 100))
@@ -199,8 +208,8 @@ def scaling(size_from: Size, size_to: Size) -> Tensor:
     return torch.tensor([[x, 0.0, x / 2 - 0.5], [0.0, y, y / 2 - 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
-def scale_points(points: npt.NDArray[Any], size_from: Size, size_to: Size) -> npt.NDArray[np.float64]:
-    """Return pixels :math:`(*, 2)` of an image of one (width, height) in the same image of another, by :func:`scaling`.
+def scale_points(points: NDArray[Any], size_from: Size, size_to: Size) -> NDArray[np.float64]:
+    """Return pixels :math:`(*, 2)` of an image of one (width, height) in it at another, by :func:`scaling`.
 
     Example:
         >>> scale_points(np.array([[0.0, 0.0], [99.0, 99.0]]), (100, 100), (400, 200))
@@ -210,83 +219,3 @@ def scale_points(points: npt.NDArray[Any], size_from: Size, size_to: Size) -> np
     """
     factors = scaling(size_from, size_to).diagonal()[:2].numpy()
     return np.asarray((np.asarray(points, np.float64) + 0.5) * factors - 0.5)
-
-
-def resize_image(image: npt.NDArray[np.uint8], max_size: int | None) -> npt.NDArray[np.uint8]:
-    """Return grey values (H, W) or colours (H, W, 3) reduced as by :func:`read_image`; a small image as it is."""
-    size = (image.shape[1], image.shape[0])
-    if reduced_size(size, max_size) == size:
-        return image
-    return np.array(reduce(import_pillow().fromarray(image), reduced_size(size, max_size)))
-
-
-def read_frame(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Return the grey values (H, W) of a frame as it is matched: undistorted, of ``frame.matched_size``.
-
-    Undistortion keeps the camera matrix; pixels without a source in the file become black.
-    """
-    cv2 = import_cv2()
-    image = read_image(frame.path)
-    if image.shape[::-1] != frame.size:
-        got = f"{image.shape[1]} x {image.shape[0]}"
-        raise ValueError(f"image {frame.path} has {got} pixels, its camera {frame.size[0]} x {frame.size[1]}")
-    if any(frame.distortion):
-        if not np.isfinite(frame.camera).all():
-            raise ValueError(f"image {frame.path} has a distortion, but no camera matrix, which undistortion needs")
-        image = cv2.undistort(image, frame.camera, np.array(frame.distortion))
-    if frame.matched_size != frame.size:
-        image = cv2.resize(image, frame.matched_size, interpolation=cv2.INTER_AREA)
-    return np.asarray(image, np.uint8)
-
-
-def image_size(path: str | Path) -> Size:
-    """Return (width, height) of an image from its header, turned by EXIF; (0, 0) where it cannot be read."""
-    import_pillow()  # outside of the try block, which would hide that it is missing
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no image at {path}")
-    try:
-        with open_image(path) as image:
-            width, height = image.size
-            turned = orientation(image) in QUARTER_TURNS
-    except Exception:  # a broken header can end in nearly any error of Pillow's parsers
-        return 0, 0
-    return (height, width) if turned else (width, height)
-
-
-def _read(path: Path, mode: str, max_size: int | None, kind: str = "image") -> npt.NDArray[np.uint8]:
-    """Decode an image file; errors name the file and what is wrong with it."""
-    if not path.exists():
-        raise FileNotFoundError(f"{kind} {path} does not exist")
-    reduced_size((1, 1), max_size)  # checks the limit before a file is read
-    size = path.stat().st_size
-    if path.is_dir() or size == 0:
-        got = "a folder" if path.is_dir() else "empty (0 bytes)"
-        raise ValueError(f"{kind} {path} is {got}, expected an image file")
-    Image = import_pillow()
-    try:
-        return decode(path, mode, max_size)
-    except PixelError as error:
-        raise ValueError(f"{kind} {path} cannot be used: {error}") from error
-    except Image.DecompressionBombError as error:
-        limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels, the limit, 2 * PIL.Image.MAX_IMAGE_PIXELS"
-        raise ValueError(f"{kind} {path} declares more than {limit}") from error
-    except Image.UnidentifiedImageError as error:
-        raise ValueError(f"{kind} {path} cannot be decoded: {size} bytes, {_unknown_kind(path)}") from error
-    except Exception as error:  # a broken file can end in nearly any error of Pillow's decoders
-        reason = "truncated or corrupt"
-        if isinstance(error, MemoryError):
-            reason = "too large for the memory"
-        elif isinstance(error, OSError) and error.strerror:  # of the system; Pillow's own have no number
-            reason = error.strerror
-        raise ValueError(f"{kind} {path} cannot be decoded: {size} bytes, {reason}") from error
-
-
-def _unknown_kind(path: Path) -> str:
-    """Return what is wrong with a file that Pillow does not recognise."""
-    with path.open("rb") as file:
-        if file.read(4) in TIFF_SIGNATURES:
-            return (
-                "a corrupt TIFF, or one of pixels that Pillow does not read, such as colours of floating-point numbers"
-            )
-    return "not an image of a kind that Pillow reads, or one with a truncated or corrupt header"

@@ -1,9 +1,9 @@
-"""Reading images, and frames as they are matched."""
+"""Images of every kind as eight bits, turned and reduced, beside what OpenCV reads."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +11,15 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from make_sequences import texture
+from make_sequences import blobs, centroids, texture
 
-from kornia_learnnorm.data import decoding
-from kornia_learnnorm.data.datasets.frames import Frame
+from kornia_learnnorm.data import images
 from kornia_learnnorm.data.images import (
-    content_mask,
     image_size,
-    read_frame,
+    read_colour,
     read_image,
-    read_mask,
+    reduced_size,
+    resize_image,
     scale_points,
     scaling,
 )
@@ -29,64 +28,109 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
-CAMERA = np.array([[250.0, 0, 119.0], [0, 245.0, 92.0], [0, 0, 1]])
-DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # of the benchmark's first Kinect
+COLOURS = np.stack([texture(seed) for seed in range(3)], -1)
+SIZES = st.tuples(st.integers(1, 20000), st.integers(1, 20000))
 
 
-def blobs(centres: np.ndarray, width: int = 240, height: int = 180) -> np.ndarray:
-    """A smooth bright blob about each centre (x, y)."""
-    y, x = np.mgrid[:height, :width]
-    image = sum(np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 18.0) for cx, cy in centres)
-    return np.round(np.clip(image, 0, 1) * 250).astype(np.uint8)
+def exif(orientation: int) -> bytes:
+    data = Image.Exif()
+    data[0x0112] = orientation
+    return data.tobytes()
 
 
-def centroids(image: np.ndarray, near: np.ndarray, reach: int = 14) -> np.ndarray:
-    """Centre of mass of the grey values about each of some pixels."""
-    found = []
-    for cx, cy in np.round(near).astype(int):
-        y, x = np.mgrid[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1]
-        mass = image[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1].astype(float)
-        found.append([(mass * x).sum() / mass.sum(), (mass * y).sum() / mass.sum()])
-    return np.array(found)
+class TestPixels:
+    @pytest.mark.parametrize(
+        ("mode", "suffix", "limit"),
+        [(mode, *kind) for mode in ("RGB", "RGBA", "P", "LA", "1") for kind in ((".png", 0), (".tif", 1))]
+        + [("RGB", ".jpg", 0), ("L", ".bmp", 0), ("CMYK", ".jpg", 2), ("RGB", ".webp", 1)],
+    )
+    def test_grey_and_colours_as_opencv_reads_them(self, tmp_path, mode, suffix, limit):
+        path = tmp_path / f"a{suffix}"
+        Image.fromarray(COLOURS).convert(mode).save(path)
+        grey, expected = read_image(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert grey.dtype == np.uint8
+        assert np.abs(grey.astype(int) - expected).max() <= limit
+        colour, expected = read_colour(path), cv2.imread(str(path))[..., ::-1]
+        assert np.abs(colour.astype(int) - expected).max() <= max(limit, suffix == ".jpg")
+
+    @pytest.mark.parametrize("folder", ["kitti/sequences/06/image_0", "tum"])
+    def test_real_images_as_opencv_reads_them(self, real_data, folder):
+        for path in sorted((real_data / folder).rglob("*.png"))[:3]:
+            assert np.array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+
+    @pytest.mark.parametrize("suffix", [".png", ".tif", ".pgm"])
+    def test_sixteen_bits_keep_the_upper_eight(self, tmp_path, suffix):
+        deep = np.array([[0, 0xFF, 0x100, 0x80FF, 0xFFFF]], np.uint16)
+        cv2.imwrite(str(tmp_path / f"deep{suffix}"), deep)
+        assert read_image(tmp_path / f"deep{suffix}").tolist() == [[0, 0, 1, 0x80, 0xFF]]
+        colours = np.dstack([deep] * 3)
+        if suffix != ".pgm":
+            cv2.imwrite(str(tmp_path / f"deep{suffix}"), colours)
+            assert read_colour(tmp_path / f"deep{suffix}")[0, :, 0].tolist() == [0, 0, 1, 0x80, 0xFF]
+
+    @pytest.mark.parametrize("values", [np.array([[0, 70000]], np.int32), np.ones((1, 2), np.float32)])
+    def test_other_numbers_are_refused(self, tmp_path, values):
+        Image.fromarray(values).save(tmp_path / "a.tif")
+        with pytest.raises(ValueError, match=r"a\.tif .* pixels of the kind [IF] are not read, expected grey"):
+            read_image(tmp_path / "a.tif")
+
+    @pytest.mark.parametrize("mode", ["LA", "RGBA"])
+    @pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
+    def test_alpha_is_composited_over_black(self, tmp_path, mode, suffix):
+        colours = Image.fromarray(COLOURS).convert(mode[:-1])
+        alpha = texture(3)
+        colours.putalpha(Image.fromarray(alpha))
+        colours.save(tmp_path / f"a{suffix}", **({"lossless": True, "exact": True} if suffix == ".webp" else {}))
+        wanted = np.asarray(colours.convert("RGB")) * (alpha / 255.0)[..., None]
+        assert np.abs(read_colour(tmp_path / f"a{suffix}") - wanted).max() <= 0.51
+        grey = cv2.cvtColor(wanted.astype(np.float32), cv2.COLOR_RGB2GRAY)
+        assert np.abs(read_image(tmp_path / f"a{suffix}") - grey).max() <= 1.5
+
+    @pytest.mark.parametrize(
+        ("pixels", "key"),
+        [(np.array([[7, 9]], np.uint8), 7), (np.array([[[7, 8, 9], [9, 9, 9]]], np.uint8), (7, 8, 9))],
+    )
+    def test_transparent_colour(self, tmp_path, pixels, key):
+        Image.fromarray(pixels).save(tmp_path / "a.png", transparency=key)
+        grey = read_image(tmp_path / "a.png")
+        assert grey[0, 0] == 0 < grey[0, 1]
+
+    @pytest.mark.parametrize("suffix", [".gif", ".webp"])
+    def test_first_frame_of_several(self, tmp_path, suffix):
+        first, second = (Image.fromarray(texture(seed)) for seed in (0, 1))
+        exact = {"lossless": True} if suffix == ".webp" else {}
+        first.save(tmp_path / f"a{suffix}", save_all=True, append_images=[second], **exact)
+        assert np.array_equal(read_image(tmp_path / f"a{suffix}"), texture(0))
 
 
-def frame_of(path: Path, image: np.ndarray, **known) -> Frame:
-    cv2.imwrite(str(path), image)
-    return Frame(path, path.name, "", image.shape[::-1], **known)
-
-
-class TestReadImage:
-    def test_grey_values_survive(self, tmp_path):
-        image = texture()
-        path = tmp_path / "näme with spaces.png"
-        path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-        assert np.array_equal(read_image(path), image)
-        assert np.array_equal(read_image(str(path)), image)
-
-    def test_not_a_file(self, tmp_path):
-        with pytest.raises(FileNotFoundError, match=r"nothing\.png does not exist"):
-            read_image(tmp_path / "nothing.png")
-        with pytest.raises(ValueError, match="is a folder"):
-            read_image(tmp_path)
-
+class TestBroken:
     @pytest.mark.parametrize(
         ("name", "change", "message"),
         [
             ("empty.png", lambda data: b"", r"empty\.png is empty"),
             ("text.png", lambda data: b"hello", "5 bytes, not an image of a kind that Pillow reads"),
-            ("text.tif", lambda data: b"II*\0hello", "a corrupt TIFF"),
             ("half.png", lambda data: data[: len(data) // 2], "truncated"),
             ("half.jpg", lambda data: data[: len(data) // 2], "truncated"),
             ("half.bmp", lambda data: data[: len(data) // 2], "truncated"),
             ("hole.png", lambda data: data[: len(data) // 2] + bytes(50) + data[len(data) // 2 + 50 :], "corrupt"),
         ],
     )
-    def test_broken(self, tmp_path, name, change, message):
-        (tmp_path / name).write_bytes(change(cv2.imencode(name[-4:], texture())[1].tobytes()))
+    def test_files(self, tmp_path, name, change, message):
+        path = tmp_path / f"näme with spaces {name}"
+        data = cv2.imencode(name[-4:], texture())[1].tobytes()
+        path.write_bytes(data)
+        assert np.abs(read_image(str(path)).astype(int) - texture()).mean() < 3
+        path.write_bytes(change(data))
         with pytest.raises(ValueError, match=message) as caught:
-            read_image(tmp_path / name)
+            read_image(path)
         assert "\n" not in str(caught.value)
         assert "<_io" not in str(caught.value)
+
+    def test_not_a_file(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"nothing\.png does not exist"):
+            read_image(tmp_path / "nothing.png")
+        with pytest.raises(ValueError, match="is a folder"):
+            read_image(tmp_path)
 
     @pytest.mark.parametrize(
         ("error", "message"),
@@ -101,7 +145,7 @@ class TestReadImage:
             raise error
 
         cv2.imwrite(str(tmp_path / "a.png"), texture())
-        monkeypatch.setattr(decoding, "open_image", fail)
+        monkeypatch.setattr(images, "open_image", fail)
         with pytest.raises(ValueError, match=message):
             read_image(tmp_path / "a.png")
 
@@ -116,24 +160,6 @@ class TestReadImage:
         with pytest.raises(ValueError, match="truncated"):
             read_image(tmp_path / "cut.jpg")
 
-    @pytest.mark.parametrize(
-        ("mode", "suffix", "limit"),
-        [(mode, *kind) for mode in ("RGB", "RGBA", "P", "LA", "1") for kind in ((".png", 0), (".tif", 1))]
-        + [("RGB", ".jpg", 0)],
-    )
-    def test_modes_as_opencv_converts_them(self, tmp_path, mode, suffix, limit):
-        path = tmp_path / f"a{suffix}"
-        Image.fromarray(np.stack([texture(seed) for seed in range(3)], -1)).convert(mode).save(path)
-        image, expected = read_image(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert image.dtype == np.uint8
-        assert np.abs(image.astype(int) - expected).max() <= limit
-
-    @pytest.mark.parametrize("suffix", [".png", ".tif", ".pgm"])
-    def test_sixteen_bits_keep_the_upper_eight(self, tmp_path, suffix):
-        deep = np.array([[0, 0xFF, 0x100, 0x80FF, 0xFFFF]], np.uint16)
-        cv2.imwrite(str(tmp_path / f"deep{suffix}"), deep)
-        assert read_image(tmp_path / f"deep{suffix}").tolist() == [[0, 0, 1, 0x80, 0xFF]]
-
     def test_without_pillow(self, tmp_path, monkeypatch):
         cv2.imwrite(str(tmp_path / "image.png"), texture())
         monkeypatch.setitem(sys.modules, "PIL.Image", None)
@@ -141,28 +167,19 @@ class TestReadImage:
             with pytest.raises(ImportError, match=r"pip install '\.\[images\]'"):
                 read(tmp_path / "image.png")
 
-    @pytest.mark.parametrize("folder", ["kitti/sequences/06/image_0", "tum"])
-    def test_real_images_as_opencv_reads_them(self, real_data, folder):
-        for path in sorted((real_data / folder).rglob("*.png"))[:3]:
-            assert np.array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
 
-
-class TestImageSize:
-    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".webp", ".pgm"])
-    def test_formats(self, tmp_path, suffix):
-        Image.new("L", (31, 17)).save(tmp_path / f"a{suffix}")
-        assert image_size(tmp_path / f"a{suffix}") == image_size(str(tmp_path / f"a{suffix}")) == (31, 17)
-
+class TestSizeAndTurn:
     @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp"])
     @pytest.mark.parametrize("orientation", range(1, 9))
-    def test_orientation_as_opencv_decodes_it(self, tmp_path, suffix, orientation):
-        exif = Image.Exif()
-        exif[0x0112] = orientation
+    def test_as_opencv_decodes_it(self, tmp_path, suffix, orientation):
         path = tmp_path / f"turned{suffix}"
-        Image.fromarray(texture(width=48, height=32)).save(path, exif=exif)
+        Image.fromarray(texture(width=48, height=32)).save(path, exif=exif(orientation))
         expected = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
         assert image_size(path) == expected.shape[::-1] == ((32, 48) if orientation > 4 else (48, 32))
         assert np.abs(read_image(path).astype(int) - expected).max() <= (suffix == ".webp")
+        small = read_image(path, 24)
+        wanted = cv2.resize(expected, small.shape[::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(small.astype(int) - wanted).mean() < 8
 
     @pytest.mark.parametrize(
         "data", [b"", b"hello", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0", b"P5\n-1 x", b"II*\0" + b"\xff" * 9]
@@ -172,9 +189,8 @@ class TestImageSize:
         assert image_size(tmp_path / "broken.png") == (0, 0)
 
     def test_large_image_is_no_reason_to_warn(self, tmp_path):
-        path = tmp_path / "large.pgm"
-        path.write_bytes(b"P5\n10000 10000\n255\n")
-        assert image_size(path) == (10000, 10000)
+        (tmp_path / "large.pgm").write_bytes(b"P5\n10000 10000\n255\n")
+        assert image_size(tmp_path / "large.pgm") == (10000, 10000)
 
     def test_missing(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"no image at .*a\.png"):
@@ -183,9 +199,68 @@ class TestImageSize:
             image_size(tmp_path)
 
 
-class TestScale:
-    SIZES = st.tuples(st.integers(1, 20000), st.integers(1, 20000))
+class TestMaxSize:
+    @pytest.mark.parametrize("suffix", [".jpg", ".png"])
+    def test_points_follow(self, tmp_path, suffix):
+        """Also where an eighth, a quarter and half of a JPEG's size are no whole numbers."""
+        grid = np.stack(np.meshgrid(np.arange(60, 1141, 110), np.arange(60, 843, 110)), -1).reshape(-1, 2)
+        centres = grid + np.random.default_rng(0).uniform(-0.5, 0.5, grid.shape)
+        Image.fromarray(blobs(centres, 1201, 903, width_of_blob=8.0)).save(tmp_path / f"a{suffix}", quality=95)
+        for max_size in (2000, 1201, 1200, 1000, 801, 600, 333, 299, 150):
+            read = read_image(tmp_path / f"a{suffix}", max_size)
+            size = read.shape[::-1]
+            assert size == reduced_size((1201, 903), max_size)
+            wanted = scale_points(centres, image_size(tmp_path / f"a{suffix}"), size)
+            found = centroids(read, wanted, max(2, round(45 * size[0] / 1201)), floor=2)
+            assert np.abs(found - wanted).max() < 0.03
 
+    @pytest.mark.parametrize("mode", ["1", "LA", "P", "RGBA", "I;16"])
+    def test_modes(self, tmp_path, mode):
+        image = Image.fromarray(COLOURS)
+        if mode == "I;16":
+            image = Image.fromarray(texture().astype(np.uint16) * 257)
+        (image if mode == "I;16" else image.convert(mode)).save(tmp_path / "a.tif")
+        for read in (read_image, read_colour):
+            full, small = read(tmp_path / "a.tif"), read(tmp_path / "a.tif", 120)
+            assert small.shape[:2] == (90, 120)
+            wanted = cv2.resize(full, (120, 90), interpolation=cv2.INTER_AREA)
+            assert np.abs(small.astype(int) - wanted).mean() < {"1": 20, "P": 8}.get(mode, 3)  # dithered
+
+    def test_arrays_as_files(self, tmp_path):
+        Image.fromarray(COLOURS).save(tmp_path / "a.png")
+        assert np.array_equal(resize_image(COLOURS, 100), read_colour(tmp_path / "a.png", 100))
+        assert resize_image(COLOURS, 240) is COLOURS
+        assert resize_image(texture(), 60).shape == (45, 60)
+        with pytest.raises(ValueError, match=r"max_size must be a number of pixels, 1 or more, .* got 0"):
+            read_image(tmp_path / "a.png", 0)
+
+    @given(size=SIZES, max_size=st.integers(1, 10000))
+    def test_sizes(self, size, max_size):
+        reduced = reduced_size(size, max_size)
+        assert max(reduced) == min(max(size), max_size)
+        assert min(reduced) >= 1
+        wanted = np.array(size) * max(reduced) / max(size)
+        assert np.abs(np.maximum(wanted, 1) - reduced).max() <= 0.5
+
+    @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="there is no /proc")
+    def test_memory_of_a_large_jpeg(self, tmp_path):
+        """8,000 x 6,000 pixels take less memory than their grey values would."""
+        Image.new("L", (8000, 6000), 90).save(tmp_path / "large.jpg")
+        program = """
+import re, sys
+from pathlib import Path
+from kornia_learnnorm.data.images import read_image
+import PIL.Image
+peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024
+before = peak()
+assert read_image(sys.argv[1], 2000).shape == (1500, 2000)
+print(peak() - before)
+"""
+        run = [sys.executable, "-c", program, str(tmp_path / "large.jpg")]
+        assert float(subprocess.run(run, capture_output=True, text=True, check=True).stdout) < 8000 * 6000 / 2**20
+
+
+class TestScaling:
     def test_against_corners(self):
         """The outer corners of the image stay where they are: -0.5 and the size less 0.5."""
         corners = np.array([[-0.5, -0.5], [1000.5, 600.5]])
@@ -216,122 +291,3 @@ class TestScale:
     def test_no_size(self, sizes):
         with pytest.raises(ValueError, match=r"a positive width and height, got .*0\)"):
             scaling(*sizes)
-
-
-class TestContentMask:
-    @pytest.mark.parametrize(
-        ("top", "bottom", "left", "right"), [(30, 30, 0, 0), (0, 0, 25, 0), (1, 0, 0, 2), (5, 7, 9, 11)]
-    )
-    @pytest.mark.parametrize("level", [0, 2])
-    def test_frame(self, top, bottom, left, right, level):
-        image = np.pad(np.maximum(texture(), 40), ((top, bottom), (left, right)), constant_values=level)
-        wanted = np.pad(np.ones((180, 240), bool), ((top, bottom), (left, right)))
-        assert np.array_equal(content_mask(image), wanted)
-
-    @pytest.mark.parametrize("quality", [95, 60, 30])
-    def test_letterbox_in_a_jpeg(self, tmp_path, quality):
-        path = tmp_path / "a.jpg"
-        Image.fromarray(np.pad(texture(), ((37, 37), (0, 0)))).save(path, quality=quality)
-        rows = content_mask(read_image(path)).all(1)
-        assert rows[37:-37].all()
-        assert rows.sum() <= 180 + 2 * 8  # the blocks of 8 x 8 pixels at the edge have some of both
-
-    @pytest.mark.parametrize("mean", [0.0, 0.3, 1.0, 3.0, 10.0])
-    def test_photograph_at_night_loses_nothing(self, mean):
-        noise = np.random.default_rng(0).normal(mean, 1.0, (300, 400)).clip(0, 255)
-        image = np.round(noise).astype(np.uint8)
-        image[100:150, 180:260] = texture(width=80, height=50)  # what is lit
-        assert content_mask(image) is None
-
-    @pytest.mark.parametrize("image", [texture(), np.zeros((20, 30), np.uint8), np.full((20, 30), 255, np.uint8)])
-    def test_no_frame(self, image):
-        assert content_mask(image) is None
-
-    def test_black_inside(self):
-        image = np.full((20, 30), 90, np.uint8)
-        image[8:12], image[:, 5:9] = 0, 0
-        assert content_mask(image) is None
-
-    @pytest.mark.parametrize(
-        ("image", "error", "message"),
-        [
-            (np.zeros((4, 5)), TypeError, "array of uint8, got float64"),
-            (np.zeros((4, 5, 3), np.uint8), ValueError, r"must be grey .* got \(4, 5, 3\)"),
-            (np.zeros((0, 5), np.uint8), ValueError, r"got \(0, 5\)"),
-        ],
-    )
-    def test_wrong_arguments(self, image, error, message):
-        with pytest.raises(error, match=message):
-            content_mask(image)
-
-
-class TestReadMask:
-    def test_pixels_above_half_count(self, tmp_path):
-        cv2.imwrite(str(tmp_path / "m.png"), np.array([[0, 1, 127], [128, 254, 255]], np.uint8))
-        mask = read_mask(tmp_path / "m.png", (3, 2))
-        assert mask.dtype == bool
-        assert mask.tolist() == [[False, False, False], [True, True, True]]
-
-    @pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA"])
-    def test_modes(self, tmp_path, mode):
-        wanted = texture() > 127
-        Image.fromarray(wanted).convert(mode).save(tmp_path / "m.png")
-        assert np.array_equal(read_mask(tmp_path / "m.png", (240, 180)), wanted)
-
-    def test_reduced_as_its_image(self, tmp_path):
-        cv2.imwrite(str(tmp_path / "a.png"), texture())
-        cv2.imwrite(str(tmp_path / "m.png"), np.repeat([0, 255], 120).astype(np.uint8)[None].repeat(180, 0))
-        mask = read_mask(tmp_path / "m.png", image_size(tmp_path / "a.png"), max_size=100)
-        assert mask.shape == read_image(tmp_path / "a.png", max_size=100).shape == (75, 100)
-        assert np.array_equal(mask, (np.arange(100) >= 50)[None].repeat(75, 0))
-
-    @pytest.mark.parametrize(
-        ("mask", "size", "message"),
-        [
-            (np.full((4, 5), 255, np.uint8), (4, 5), r"m\.png has 5 x 4 pixels, its image 4 x 5"),
-            (np.ones((4, 5), np.uint8), (5, 4), r"m\.png has no pixel above 127, its largest value is 1"),
-        ],
-    )
-    def test_wrong(self, tmp_path, mask, size, message):
-        cv2.imwrite(str(tmp_path / "m.png"), mask)
-        with pytest.raises(ValueError, match=message):
-            read_mask(tmp_path / "m.png", size)
-        with pytest.raises(FileNotFoundError, match=r"^mask .*none\.png does not exist"):
-            read_mask(tmp_path / "none.png", size)
-        with pytest.raises(ValueError, match=r"^mask .* is a folder"):
-            read_mask(tmp_path, size)
-
-
-class TestReadFrame:
-    GRID = np.stack(np.meshgrid(np.arange(40.0, 210, 40), np.arange(40.0, 150, 33)), -1).reshape(-1, 2)
-
-    def test_as_it_is(self, tmp_path):
-        image = texture()
-        assert np.array_equal(read_frame(frame_of(tmp_path / "a.png", image)), image)
-
-    def test_undistortion_moves_points_as_opencv_says(self, tmp_path):
-        frame = frame_of(tmp_path / "a.png", blobs(self.GRID), camera=CAMERA, distortion=DISTORTION)
-        want = cv2.undistortPoints(self.GRID[:, None], CAMERA, np.array(DISTORTION), P=CAMERA)[:, 0]
-        assert np.abs(want - self.GRID).max() > 1  # there is something to undistort
-        assert np.abs(centroids(read_frame(frame), want) - want).max() < 0.1
-
-    @pytest.mark.parametrize("size", [(120, 90), (180, 135), (360, 270), (320, 180)])
-    def test_resizing_agrees_with_the_camera(self, tmp_path, size):
-        frame = replace(frame_of(tmp_path / "a.png", blobs(self.GRID), camera=CAMERA), resized=size)
-        image = read_frame(frame)
-        assert image.shape == size[::-1]
-        rays = np.linalg.solve(CAMERA, np.column_stack([self.GRID, np.ones(len(self.GRID))]).T)
-        want = (frame.K @ rays)[:2].T
-        reach = int(14 * max(size[0] / 240, size[1] / 180))
-        assert np.abs(centroids(image, want, reach) - want).max() < 0.05
-
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
-            ({"size": (640, 480)}, r"a\.png has 240 x 180 pixels, its camera 640 x 480"),
-            ({"distortion": DISTORTION}, "a distortion, but no camera matrix"),
-        ],
-    )
-    def test_does_not_fit_its_camera(self, tmp_path, change, message):
-        with pytest.raises(ValueError, match=message):
-            read_frame(replace(frame_of(tmp_path / "a.png", texture()), **change))

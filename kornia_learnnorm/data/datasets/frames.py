@@ -14,11 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kornia_learnnorm.data.images import Size, import_cv2, read_image, scaling
 from kornia_learnnorm.data.motion import fundamental_from_motion
 
-__all__ = ["Frame", "FramePair", "Size", "resize_frames"]
-
-Size = tuple[int, int]
+__all__ = ["Frame", "FramePair", "read_frame", "resize_frames"]
 
 
 def _unknown(*shape: int) -> NDArray[np.float64]:
@@ -57,13 +56,10 @@ class Frame:
 
     @property
     def K(self) -> NDArray[np.float64]:  # noqa: N802
-        """Return the camera matrix of the image that is matched, (3, 3).
-
-        Resizing keeps the outer edges of the image in place.
-        """
-        x, y = (new / old if old else 1.0 for new, old in zip(self.matched_size, self.size, strict=True))
-        scale = np.array([[x, 0.0, x / 2 - 0.5], [0.0, y, y / 2 - 0.5], [0.0, 0.0, 1.0]])
-        return np.asarray(scale @ self.camera)
+        """Return the camera matrix of the image that is matched, (3, 3)."""
+        if self.size == (0, 0):
+            return self.camera
+        return np.asarray(scaling(self.size, self.matched_size).numpy() @ self.camera)
 
 
 class FramePair(NamedTuple):
@@ -97,3 +93,22 @@ def resize_frames(frames: Iterable[Frame], size: Size) -> list[Frame]:
     if min(size) < 1:
         raise ValueError(f"a size must be a positive width and height, got {size[0]} x {size[1]}")
     return [replace(frame, resized=size) for frame in frames]
+
+
+def read_frame(frame: Frame) -> NDArray[np.uint8]:
+    """Return the grey values (H, W) of a frame as it is matched: undistorted, of ``frame.matched_size``.
+
+    Undistortion keeps the camera matrix; pixels without a source in the file become black.
+    """
+    cv2 = import_cv2()
+    image = read_image(frame.path)
+    if image.shape[::-1] != frame.size:
+        got = f"{image.shape[1]} x {image.shape[0]}"
+        raise ValueError(f"image {frame.path} has {got} pixels, its camera {frame.size[0]} x {frame.size[1]}")
+    if any(frame.distortion):
+        if not np.isfinite(frame.camera).all():
+            raise ValueError(f"image {frame.path} has a distortion, but no camera matrix, which undistortion needs")
+        image = cv2.undistort(image, frame.camera, np.array(frame.distortion))
+    if frame.matched_size != frame.size:
+        image = cv2.resize(image, frame.matched_size, interpolation=cv2.INTER_AREA)
+    return np.asarray(image, np.uint8)

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from kornia_learnnorm.data.datasets.frames import Frame, FramePair
-from kornia_learnnorm.data.images import import_cv2, read_frame
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair, read_frame
+from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.cache import FeatureCache
 from kornia_learnnorm.data.matching.features import DETECTORS, Features
 from kornia_learnnorm.data.matching.matchers import MATCHERS, one_to_one

@@ -16,7 +16,7 @@ import torch
 from kornia.feature import DISK, KeyNetAffNetHardNet
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.images import import_cv2
+from kornia_learnnorm.data.images import check_grey, import_cv2
 
 __all__ = [
     "DETECTORS",
@@ -131,8 +131,7 @@ def keep_features(features: Features, mask: NDArray[np.bool_]) -> Features:
 
     Args:
         features: features of one image.
-        mask: true for the pixels that count, (H, W) bool; see :func:`~kornia_learnnorm.data.images.content_mask` and
-            :func:`~kornia_learnnorm.data.images.read_mask`.
+        mask: true for the pixels that count, (H, W) bool; see :mod:`kornia_learnnorm.data.masks`.
 
     Returns:
         some of the features, in their order.
@@ -180,9 +179,6 @@ def _tensor(image: NDArray[np.uint8]) -> torch.Tensor:
 
 
 def _check(image: NDArray[np.uint8], num_features: int) -> None:
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
-        raise TypeError(f"an image must be an array of uint8, got {getattr(image, 'dtype', type(image))}")
-    if image.ndim != 2 or image.size == 0:
-        raise ValueError(f"an image must be grey with shape (H, W), got {image.shape}")
+    check_grey(image)
     if num_features < 2:
         raise ValueError(f"num_features must be at least 2, got {num_features}")

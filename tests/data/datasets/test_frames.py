@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from make_sequences import blobs, centroids, texture
 
-from kornia_learnnorm.data.datasets.frames import Frame, FramePair, resize_frames
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair, read_frame, resize_frames
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
 CAMERA = np.array([[500.0, 0, 310], [0, 510, 250], [0, 0, 1]])
+SMALL_CAMERA = np.array([[250.0, 0, 119.0], [0, 245.0, 92.0], [0, 0, 1]])
+DISTORTION = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)  # of the benchmark's first Kinect
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -120,3 +125,43 @@ class TestResizeFrames:
     def test_wrong_size(self, size):
         with pytest.raises(ValueError, match=f"positive width and height, got {size[0]} x {size[1]}"):
             resize_frames([frame()], size)
+
+
+def frame_of(path: Path, image: np.ndarray, **known) -> Frame:
+    cv2.imwrite(str(path), image)
+    return Frame(path, path.name, "", image.shape[::-1], **known)
+
+
+class TestReadFrame:
+    GRID = np.stack(np.meshgrid(np.arange(40.0, 210, 40), np.arange(40.0, 150, 33)), -1).reshape(-1, 2)
+
+    def test_as_it_is(self, tmp_path):
+        image = texture()
+        assert np.array_equal(read_frame(frame_of(tmp_path / "a.png", image)), image)
+
+    def test_undistortion_moves_points_as_opencv_says(self, tmp_path):
+        frame = frame_of(tmp_path / "a.png", blobs(self.GRID), camera=SMALL_CAMERA, distortion=DISTORTION)
+        want = cv2.undistortPoints(self.GRID[:, None], SMALL_CAMERA, np.array(DISTORTION), P=SMALL_CAMERA)[:, 0]
+        assert np.abs(want - self.GRID).max() > 1  # there is something to undistort
+        assert np.abs(centroids(read_frame(frame), want) - want).max() < 0.1
+
+    @pytest.mark.parametrize("size", [(120, 90), (180, 135), (360, 270), (320, 180)])
+    def test_resizing_agrees_with_the_camera(self, tmp_path, size):
+        frame = replace(frame_of(tmp_path / "a.png", blobs(self.GRID), camera=SMALL_CAMERA), resized=size)
+        image = read_frame(frame)
+        assert image.shape == size[::-1]
+        rays = np.linalg.solve(SMALL_CAMERA, np.column_stack([self.GRID, np.ones(len(self.GRID))]).T)
+        want = (frame.K @ rays)[:2].T
+        reach = int(14 * max(size[0] / 240, size[1] / 180))
+        assert np.abs(centroids(image, want, reach) - want).max() < 0.05
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"size": (640, 480)}, r"a\.png has 240 x 180 pixels, its camera 640 x 480"),
+            ({"distortion": DISTORTION}, "a distortion, but no camera matrix"),
+        ],
+    )
+    def test_does_not_fit_its_camera(self, tmp_path, change, message):
+        with pytest.raises(ValueError, match=message):
+            read_frame(replace(frame_of(tmp_path / "a.png", texture()), **change))

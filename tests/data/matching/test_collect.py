@@ -26,9 +26,8 @@ from PIL import Image
 
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.datasets.folder import read_folder
-from kornia_learnnorm.data.datasets.frames import FramePair
+from kornia_learnnorm.data.datasets.frames import FramePair, read_frame
 from kornia_learnnorm.data.datasets.pairs import pair_frames
-from kornia_learnnorm.data.images import read_frame
 from kornia_learnnorm.data.matching import collect
 from kornia_learnnorm.data.matching.cache import FeatureCache
 from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches, match_pair

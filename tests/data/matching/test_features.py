@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from kornia.feature import DISK, LightGlue
 from make_sequences import texture
 
-from kornia_learnnorm.data.images import content_mask
+from kornia_learnnorm.data.masks import content_mask
 from kornia_learnnorm.data.matching import features as module
 from kornia_learnnorm.data.matching import matchers as matching
 from kornia_learnnorm.data.matching.features import (
