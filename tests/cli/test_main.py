@@ -36,29 +36,28 @@ SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data
 NETWORK = "model.normalizer.init_args.network.init_args"
 SMALL_PAPER_NETWORK = [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
 
-# Configurations that are given together, by the name of the run; each changes those before it.
-BASE = [FOLDER / "ablations/base.yaml"]
+BASES = ("base", "paper-base", "reduction-log")  # what is no overlay of ablations/base
+
+
+def overlays(folder, *bases):
+    """Lists of configurations that are given together, by the name of the last; each changes those before it."""
+    paths = [path for path in sorted((FOLDER / folder).glob("*.yaml")) if path.stem not in BASES]
+    return {path.stem: [*(FOLDER / f"{base}.yaml" for base in bases), path] for path in paths}
+
+
 PAPER_BASE = [FOLDER / "paper-short.yaml", FOLDER / "ablations/paper-base.yaml"]
-ABLATIONS = {
-    path.stem: [*BASE, path]
-    for path in sorted((FOLDER / "ablations").glob("*.yaml"))
-    if path.stem not in ("base", "paper-base", "reduction-log")
-} | {
-    f"paper-{name}": [*PAPER_BASE, FOLDER / f"ablations/{name}.yaml"]
-    for name in ("loss-algebraic", "loss-sampson", "reduction-log")
-}
-TABLE1 = {
-    path.stem: [FOLDER / ("paper-short.yaml" if path.stem.startswith("paper") else "crossview.yaml"), path]
-    for path in sorted((FOLDER / "table1").glob("*.yaml"))
-}
-LAYER_BASE = [FOLDER / "robust.yaml", FOLDER / "ablations/layer/base.yaml"]
+PAPER = {f"paper-{path.stem}": [*PAPER_BASE, path] for path in (FOLDER / "ablations").glob("loss-[as]*.yaml")}
+PAPER["paper-reduction-log"] = [*PAPER_BASE, FOLDER / "ablations/reduction-log.yaml"]
+ABLATIONS = overlays("ablations", "ablations/base") | PAPER
 LAYER = {
-    path.stem: [*LAYER_BASE, path]
-    for path in sorted((FOLDER / "ablations/layer").glob("*.yaml"))
-    if path.stem != "base"
+    f"layer-{name}": files for name, files in overlays("ablations/layer", "robust", "ablations/layer/base").items()
 }
+TABLE1 = overlays("table1", "crossview") | {
+    name: files for name, files in overlays("table1", "paper-short").items() if name.startswith("paper")
+}
+RUNS = {path.stem: [path] for path in CONFIGS} | ABLATIONS | TABLE1
+RUNS |= {"base": [FOLDER / "ablations/base.yaml"], "paper-base": PAPER_BASE}
 STORES = ("kitti_00", "kitti_01", "kitti_03", "kitti_06", "tum_fr3_office")
-RUNS = {"base": BASE, "paper-base": PAPER_BASE} | ABLATIONS | TABLE1
 
 
 @pytest.fixture(scope="module")
@@ -83,22 +82,30 @@ def assert_trained(weights):
         assert not torch.isclose(T, base, rtol=1e-6).all()
 
 
-@pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
-def test_every_config_runs(config, data, tmp_path, monkeypatch, capsys):
+def together(configs):
+    """The options that give several configurations."""
+    return [word for config in configs for word in ("--config", str(config))]
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_every_config_runs(name, data, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LEARNNORM_DATA", str(data))
-    small = [*SMALL, f"--trainer.default_root_dir={tmp_path}"]
-    if "synthetic" in config.stem:
-        small += ["--data.train.init_args.number=200", "--data.test.init_args.number=50"]
-    if "paper" in config.stem:
-        small += SMALL_PAPER_NETWORK
-    small += ["--data.val.init_args.number=50"]
-    assert main(["fit", "--config", str(config), *small]) == 0
+    options = [*together(RUNS[name]), *SMALL, f"--trainer.default_root_dir={tmp_path}"]
+    options += ["--data.val.init_args.number=50"]
+    if name.endswith(("handheld", "synthetic")):
+        options += ["--data.train.init_args.number=200"]
+    if name == "paper-handheld":
+        options += ["--data.batch_pairs=20"]
+    if RUNS[name][0].stem.startswith("paper"):
+        options += [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
+    assert main(["fit", *options]) == 0
     assert_trained(tmp_path / "weights.safetensors")
-    checkpoint = f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"
-    for command in ("validate", "test", "predict"):
-        assert main([command, "--config", str(config), *small, checkpoint]) == 0
-    assert "better_than_hartley" in capsys.readouterr().out
-    assert set(load_file(tmp_path / "predictions.safetensors")) == {"F_mat", "T1", "T2", "pair", "residual"}
+    if len(RUNS[name]) == 1 and name != "base":
+        options += ["--data.test.init_args.number=50"] if name.endswith("synthetic") else []
+        options += [f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"]
+        assert [main([command, *options]) for command in ("validate", "test", "predict")] == [0, 0, 0]
+        assert "better_than_hartley" in capsys.readouterr().out
+        assert set(load_file(tmp_path / "predictions.safetensors")) == {"F_mat", "T1", "T2", "pair", "residual"}
 
 
 @pytest.mark.parametrize("name", OF_SETS)
@@ -117,26 +124,6 @@ def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch,
     assert main(["validate", *config, checkpoint]) == 0
     assert "val/median" in capsys.readouterr().out
     refused(["test", *config, checkpoint], "No `test_step()` method defined")
-
-
-def together(configs):
-    """The options that give several configurations."""
-    return [word for config in configs for word in ("--config", str(config))]
-
-
-@pytest.mark.parametrize("name", RUNS)
-def test_every_overlay_runs(name, data, tmp_path, monkeypatch):
-    monkeypatch.setenv("LEARNNORM_DATA", str(data))
-    small = [*SMALL, "--trainer.max_steps=2", "--data.val.init_args.number=50"]
-    small += [f"--trainer.default_root_dir={tmp_path}"]
-    if name.endswith("handheld"):
-        small += ["--data.train.init_args.number=100"]
-    if name == "paper-handheld":
-        small += ["--data.batch_pairs=20"]
-    if FOLDER / "paper-short.yaml" in RUNS[name]:
-        small += SMALL_PAPER_NETWORK
-    assert main(["fit", *together(RUNS[name]), *small]) == 0
-    assert_trained(tmp_path / "weights.safetensors")
 
 
 @functools.cache
@@ -164,48 +151,25 @@ def changes(*configs):
     return differences(settings(*configs[:-1]), settings(*configs))
 
 
-SEVERAL_LAYER_CHANGES = {
-    "hartley-optimal": {"estimator.init_args.learn_transforms", "estimator.init_args.rank2"},
-    "seed-1": {"seed_everything", "data.init_args.seed"},
-    "seed-2": {"seed_everything", "data.init_args.seed"},
-    "without-kitti": {"data.init_args.train", "data.init_args.shares"},
-    "without-photos": {"data.init_args.train", "data.init_args.shares"},
-    "without-synthetic": {"data.init_args.train", "data.init_args.shares"},
-}
-
-
-@pytest.mark.parametrize("name", LAYER)
-def test_an_ablation_of_the_layer_changes_one_thing(name):
-    changed = {setting.removeprefix("model.init_args.") for setting in changes(*LAYER[name])}
-    if name in SEVERAL_LAYER_CHANGES:
-        assert changed == SEVERAL_LAYER_CHANGES[name]
-    else:
-        assert len(changed) == 1, changed
-
-
+ESTIMATOR = "model.init_args.estimator.init_args"
 SEVERAL_CHANGES = {
     "seed-1": {"seed_everything", "data.seed"},
-    "seed-2": {"seed_everything", "data.seed"},
     "transform-paper": {"model.normalizer.init_args.transform", f"{NETWORK}.num_parameters"},
+    "layer-hartley-optimal": {f"{ESTIMATOR}.learn_transforms", f"{ESTIMATOR}.rank2"},
+    "layer-seed-1": {"seed_everything", "data.init_args.seed"},
+    "layer-without-kitti": {"data.init_args.train", "data.init_args.shares"},
 }
+SEVERAL_CHANGES |= {name.replace("1", "2"): SEVERAL_CHANGES[name] for name in ("seed-1", "layer-seed-1")}
+SEVERAL_CHANGES |= dict.fromkeys(
+    ("layer-without-photos", "layer-without-synthetic"), SEVERAL_CHANGES["layer-without-kitti"]
+)
 
 
-@pytest.mark.parametrize("name", ABLATIONS)
+@pytest.mark.parametrize("name", ABLATIONS | LAYER)
 def test_an_ablation_changes_one_thing(name):
-    changed = changes(*ABLATIONS[name])
-    if name in SEVERAL_CHANGES:
-        assert changed == SEVERAL_CHANGES[name]
-    else:
-        assert len(changed) == 1, changed
-
-
-def test_what_the_shorter_paper_runs_change():
-    paper, short, shorter = settings(FOLDER / "paper.yaml"), settings(PAPER_BASE[0]), settings(*PAPER_BASE)
-    schedule = {"model.lr_scheduler.init_args.step_size", "model.lr_scheduler.init_args.gamma"}
-    length = {"trainer.max_epochs", "trainer.check_val_every_n_epoch", "data.batch_pairs"} | schedule
-    loss = {"model.loss.init_args.log", "model.sample_gradient"}
-    assert differences(paper, short) == length | loss | {"trainer.default_root_dir"}
-    assert differences(paper, shorter) == length | {"trainer.default_root_dir"}  # the loss is the paper's again
+    changed = changes(*(ABLATIONS | LAYER)[name])
+    assert changed == SEVERAL_CHANGES.get(name, changed)
+    assert len(changed) == 1 or name in SEVERAL_CHANGES
 
 
 @pytest.mark.parametrize("name", TABLE1)
@@ -216,25 +180,17 @@ def test_other_training_data_leave_normalizer_and_loss_alone(name):
     assert all(setting.startswith(allowed) for setting in changed), changed
 
 
-FOREIGN = "is not a checkpoint of a training run, or not a whole one"
-
-
 @pytest.mark.parametrize(
     ("commands", "options", "message"),
     [
         ("validate test predict", [], "give the checkpoint by --ckpt_path"),
-        ("fit test", ["--ckpt_path=weights.safetensors"], f"weights.safetensors {FOREIGN}"),
-        ("fit test", ["--ckpt_path=text.ckpt"], f"text.ckpt {FOREIGN}"),
-        ("fit test", ["--ckpt_path=cut.ckpt"], f"cut.ckpt {FOREIGN}"),
+        ("fit test", ["--ckpt_path=weights.safetensors"], "weights.safetensors is not a checkpoint of a training run"),
         ("fit test", ["--ckpt_path=none.ckpt"], "no checkpoint at none.ckpt"),
         ("test", ["--ckpt_path=checkpoints/last.ckpt", f"--{NETWORK}.width=32"], "holds another network than the one"),
     ],
 )
 def test_missing_and_wrong_checkpoints(trained, monkeypatch, refused, commands, options, message):
     monkeypatch.chdir(trained[0])
-    Path("text.ckpt").write_text("not a checkpoint")
-    whole = Path("checkpoints/last.ckpt").read_bytes()
-    Path("cut.ckpt").write_bytes(whole[: len(whole) // 2])
     for command in commands.split():
         refused([command, *trained[1], *options], message)
 
@@ -263,7 +219,7 @@ sys.exit(kornia_learnnorm_command.main())
 """
 
 
-@pytest.mark.parametrize("module", ["torch", "kornia", "kornia_learnnorm", "kornia_learnnorm.cli.main"])
+@pytest.mark.parametrize("module", ["torch", "kornia_learnnorm.cli.main"])
 def test_interrupted_while_importing(module, tmp_path):
     command = [sys.executable, "-c", INTERRUPTED_IMPORT, module]
     environment = {**os.environ, "PYTHONPATH": str(FOLDER.parent)}
@@ -271,9 +227,8 @@ def test_interrupted_while_importing(module, tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
-@pytest.fixture(scope="module")
-def completion():
-    """A function that returns what bash offers for a line, by the script that the package prints."""
+def test_completion_in_bash(tmp_path):
+    """What bash offers for a line, by the script that the package prints."""
     pytest.importorskip("shtab", reason="shtab is not installed")
     if shutil.which("bash") is None:
         pytest.skip("bash is not installed")
@@ -288,48 +243,30 @@ def completion():
     printf '%s\\n' "${COMPREPLY[@]}"
     """
 
-    def offered(line, folder):
+    def offered(line):
+        options = {"cwd": tmp_path, "capture_output": True, "text": True, "check": True, "timeout": 60}
         command = ["bash", "--norc", "-c", ask, "bash", line]
-        text = script.getvalue()
-        found = subprocess.run(command, input=text, cwd=folder, capture_output=True, text=True, check=True, timeout=60)
-        return found.stdout.split()
+        return subprocess.run(command, input=script.getvalue(), **options).stdout.split()
 
-    return offered
-
-
-def test_completion_in_bash(completion, tmp_path):
     (tmp_path / "own.h5").touch()
-    assert completion("learnnorm ev", tmp_path) == ["evaluate"]
-    assert {*TOOLS, "fit", "completion"} <= {*completion("learnnorm ", tmp_path)}
-    assert completion("learnnorm evaluate --max-s", tmp_path) == ["--max-samples"]
-    assert completion("learnnorm evaluate o", tmp_path) == ["own.h5"]
-    assert completion("learnnorm match ki", tmp_path) == ["kitti"]
-    assert completion("learnnorm fit --config crossv", tmp_path) == [
-        "crossview",
-        "crossview-sets",
-        "crossview-synthetic",
-    ]
-
-
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_completion_of_other_shells(shell, capsys):
-    pytest.importorskip("shtab", reason="shtab is not installed")
-    assert main(["completion", shell]) == 0
-    assert "max-residual" in capsys.readouterr().out
+    assert {*TOOLS, "fit", "completion"} <= {*offered("learnnorm ")}
+    assert offered("learnnorm evaluate --max-s") == ["--max-samples"]
+    assert offered("learnnorm evaluate o") == ["own.h5"]
+    assert offered("learnnorm match ki") == ["kitti"]
+    assert offered("learnnorm fit --config crossview-sy") == ["crossview-synthetic"]
 
 
 def test_completion_names_what_to_install(monkeypatch, refused):
     monkeypatch.setitem(sys.modules, "shtab", None)
-    refused(["completion", "bash"], "completion in the shell needs shtab: run pip install '.[completion]'")
+    refused(["completion", "bash"], "needs shtab: run pip install '.[completion]'")
 
 
-@pytest.mark.parametrize("words", [["config", "crossview"], ["evaluate", "--help"]])
-def test_output_whose_reader_has_ended_is_no_error(words, monkeypatch, capsys):
+def test_output_whose_reader_has_ended_is_no_error(monkeypatch, capsys):
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as stream:  # closing it writes what is left in the buffer
         monkeypatch.setattr("sys.stdout", stream)
-        assert main(words) == 141
+        assert main(["config", "crossview"]) == 141
     assert capsys.readouterr().err == ""
 
 
@@ -348,20 +285,41 @@ def test_synthesize_evaluate_estimate(tmp_path, capsys, refused):
     refused(["synthesize", tmp_path / "F.json"], "F.json is a file: expected a folder")
 
 
+FIT = ["fit", "--config", "crossview-synthetic"]
+WITH_BAD = [*FIT, "--config", "bad.yaml"]
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "bad", "message"),
     [
-        (["fit", "--config", FOLDER / "crossview.yaml", *SMALL], "the environment variable LEARNNORM_DATA, named in "),
-        (["estimate", "none1.png", "none2.png"], "none1.png"),
-        (["synthesize", "folder", "--pairs", "0"], "0"),
-        (["synthesize", "folder", "--scenes", "moon"], "among forward driving, hand-held, orbit, got moon"),
+        (["fit", "--config", "crossview", *SMALL], "", "the environment variable LEARNNORM_DATA, named in "),
+        (["estimate", "none1.png", "none2.png"], "", "none1.png"),
+        (["synthesize", "folder", "--pairs", "0"], "", "0"),
+        (["synthesize", "folder", "--scenes", "moon"], "", "moon"),
+        (["fit"], "", "give one by --config, a file or one of crossview, crossview-sets, crossview-synthetic, paper,"),
+        (["validate"], "", "for example learnnorm validate --config crossview-synthetic --ckpt_path "),
+        (["fit", "crossview"], "", "'crossview'; a configuration is given by --config crossview"),
+        (["fit", "--config", "bad.yaml"], "trainer: {max_steps: 9}", "bad.yaml has no model.normalizer"),
+        ([*FIT, "--nonsense"], "", "unknown option --nonsense; learnnorm fit --help-all lists the options"),
+        ([*FIT, f"--{NETWORK}.widht=3"], "", "unknown option widht of kornia_learnnorm.CrossViewNetwork"),
+        ([*FIT, "--trainer.precision", "12"], "", "trainer.precision"),
+        ([*FIT, "--trainer.default_root_dir", "bad.yaml"], "", "bad.yaml is a file: expected a folder for the run"),
+        ([*FIT, "--config", "unknown"], "", "no configuration unknown: expected a file, or one of crossview, "),
+        ([*FIT, "--json", "a.json"], "", "unknown option --json"),
+        (WITH_BAD, "model: {nomalizer: 3}", "unknown option model.nomalizer"),
+        (WITH_BAD, "", "configuration bad.yaml is empty"),
+        (WITH_BAD, "- 1", "configuration bad.yaml: options by name expected, got list '[1]'"),
+        (WITH_BAD, "model: 3", "configuration bad.yaml, model: options by name expected, got int '3'"),
+        (WITH_BAD, "a: [1", "configuration bad.yaml is not YAML"),
+        (WITH_BAD, "\xff\xfe", "configuration bad.yaml is not YAML"),
     ],
 )
-def test_errors_are_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch, refused):
+def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("LEARNNORM_DATA", raising=False)
+    Path("bad.yaml").write_bytes(bad.encode("latin-1"))
     refused(arguments, message)
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.yaml"]
 
 
 @pytest.mark.parametrize(
@@ -375,58 +333,23 @@ def test_a_missing_package_is_one_line(blocked, extra, tmp_path, monkeypatch, re
         refused(command, f"needs {blocked}: run pip install '.[{extra}]'")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--nonsense"], "unknown option --nonsense"),
-        (["--trainer.max_stepz", "3"], "unknown option --trainer.max_stepz"),
-        ([f"--{NETWORK}.widht=3"], "unknown option widht of kornia_learnnorm.CrossViewNetwork"),
-        (["--config", "bad.yaml"], "unknown option model.nomalizer"),
-        (["--trainer.max_steps", "many"], "trainer.max_steps"),
-        (["--trainer.precision", "12"], "trainer.precision: Expected a typing.Literal[64, 32, 16], got 12"),
-        (["--model.optimizer.init_args.lr", "x"], "model.optimizer: lr: Expected a <class 'float'>, got x"),
-        (["--trainer.default_root_dir", "bad.yaml"], "bad.yaml is a file: expected a folder for the run"),
-        (["--config", "unknown"], "no configuration unknown: expected a file, or one of crossview, "),
-    ],
-)
-def test_wrong_options_of_a_training_are_one_line(options, message, tmp_path, monkeypatch, refused):
-    monkeypatch.chdir(tmp_path)
-    Path("bad.yaml").write_text("model: {nomalizer: 3}")
-    refused(["fit", "--config", "crossview-synthetic", *options], message)
-
-
-def test_an_unknown_option_of_a_training_names_the_list_of_all(refused):
-    message = "unknown option --nonsense; learnnorm fit --help-all lists the options"
-    refused(["fit", "--config", "crossview-synthetic", "--nonsense"], message)
-
-
-@pytest.mark.parametrize("command", ["validate", "test"])
-def test_json_of_a_checkpoint_has_its_metrics(command, trained, tmp_path, capsys):
+@pytest.mark.parametrize(("command", "stage"), [("validate", "val"), ("test", "test")])
+def test_json_of_a_checkpoint_has_its_metrics(command, stage, trained, tmp_path, capsys, refused):
     folder, options = trained
-    words = [command, *options, "--ckpt_path", str(folder / "checkpoints/last.ckpt")]
-    path = tmp_path / "metrics.json"
+    last, path = folder / "checkpoints/last.ckpt", tmp_path / "metrics.json"
+    words = [command, *options, "--ckpt_path", str(last)]
     assert main([*words, "--json", str(path)]) == 0
     out = capsys.readouterr().out
-    assert out.endswith(f"\nwrote {path}\n")
     assert main([*words, "--json=-"]) == 0
     found, again = json.loads(path.read_text()), json.loads(capsys.readouterr().out)
     assert found["command"] == shlex.join(["learnnorm", *words, "--json", str(path)])
     assert found["tables"] == again["tables"]
     (table,) = found["tables"]
-    assert table["title"] == command
-    stage = {"validate": "val", "test": "test"}[command]
     names = {f"{stage}/{name}" for name in ("log_sed", "better_than_hartley", "better_than_whitening", "left_out")}
     assert {row["metric"] for row in table["rows"]} == names
     assert all(row["metric"] in out and str(row["value"]) in out for row in table["rows"])
-
-
-def test_json_of_a_checkpoint_is_refused_where_it_cannot_be_written(trained, tmp_path, refused):
-    folder, options = trained
-    last = folder / "checkpoints/last.ckpt"
-    for command in (["test", "--ckpt_path", last], ["validate", f"--ckpt_path={last}"]):
-        refused([*command, *options, "--json", last], f"--json {last}: expected a new file or -")
-        refused([*command, *options, "--json", tmp_path / "none/a.json"], "none does not exist")
-    refused(["fit", *options, "--json", tmp_path / "a.json"], "unknown option --json")
+    refused([*words, "--json", last], f"--json {last}: expected a new file or -")
+    refused([*words, "--json", tmp_path / "none/a.json"], "none does not exist")
 
 
 @pytest.mark.parametrize(
@@ -438,48 +361,6 @@ def test_a_training_without_steps_is_refused(option, tmp_path, refused):
     options = [f"--trainer.{option}", f"--trainer.default_root_dir={folder}"]
     refused(["fit", "--config", "crossview-synthetic", *options], f"trainer.{option.partition('=')[0]} is 0")
     assert not folder.exists()
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "configuration own.yaml is empty: options by name expected, such as 'seed_everything: 0'"),
-        (b"- 1", "configuration own.yaml: options by name expected, got list '[1]'"),
-        (b"text", "got str 'text'"),
-        (b"trainer:", "configuration own.yaml, trainer: options by name expected, got NoneType 'None'"),
-        (b"a: [1", "configuration own.yaml is not YAML: while parsing a flow sequence"),
-        (b"\xff\xfe", "configuration own.yaml is not YAML: 'utf-8' codec"),
-        (b"model: 3", "configuration own.yaml, model: options by name expected, got int '3'"),
-    ],
-)
-@pytest.mark.parametrize("form", [["--config", "own.yaml"], ["--config=own.yaml"]])
-def test_a_wrong_configuration_is_named(content, message, form, tmp_path, monkeypatch, refused):
-    monkeypatch.chdir(tmp_path)
-    Path("own.yaml").write_bytes(content)
-    refused(["fit", "--config", "crossview-synthetic", *form], message)
-
-
-def test_a_configuration_without_its_option_is_one_line(refused):
-    refused(["fit", "crossview"], "an option expected, got 'crossview'; a configuration is given by --config crossview")
-
-
-@pytest.mark.parametrize(("command", "options"), [("fit", []), ("fit", ["--trainer.max_steps=9"]), ("validate", [])])
-def test_a_training_without_a_configuration_names_those_that_ship(command, options, refused):
-    refused(
-        [command, *options],
-        "give one by --config, a file or one of crossview, crossview-sets, crossview-synthetic, paper,",
-    )
-    checkpoint = "" if command == "fit" else " --ckpt_path "
-    refused([command, *options], f"for example learnnorm {command} --config crossview-synthetic{checkpoint}")
-
-
-def test_a_part_of_a_configuration_names_what_it_lacks(tmp_path, monkeypatch, refused):
-    monkeypatch.chdir(tmp_path)
-    Path("own.yaml").write_text("trainer: {max_steps: 9}")
-    message = (
-        "own.yaml has no model.normalizer: give a whole configuration before it, for example learnnorm fit --config"
-    )
-    refused(["fit", "--config", "own.yaml"], f"{message} crossview --config own.yaml")
 
 
 def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog, capsys):
@@ -500,11 +381,8 @@ def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog, capsys):
     assert "GPU available: False, used: False" not in caplog.messages
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.1, "1 s"), (89, "89 s"), (120, "2 min"), (5399, "90 min"), (9000, "2.5 h")]
-)
-def test_durations(seconds, text):
-    assert _duration(seconds) == text
+def test_durations():
+    assert [*map(_duration, (0.1, 89, 120, 5399, 9000))] == ["1 s", "89 s", "2 min", "90 min", "2.5 h"]
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -542,18 +420,17 @@ def test_a_training_does_not_replace_another(trained, refused):
 
 
 @pytest.mark.parametrize(
-    ("init_args", "message"),
+    ("stage", "init_args", "message"),
     [
-        ("{paths: [none.h5]}", "learnnorm fit: error: no store at none.h5\n"),
-        ("{paths: [s.h5], size: 3}", "error: a sample needs at least 8 correspondences, a block"),
-        ("{paths: [s.h5], max_ratios: 7}", "Parser key \"max_ratios\": Expected a <class 'collections.abc.Sequence'>"),
+        ("train", {"paths": ["none.h5"]}, "no store at none.h5\n"),
+        ("val", {"paths": ["s.h5"], "size": 3}, "error: a sample needs at least 8 correspondences"),
+        ("val", {"paths": ["s.h5"], "max_ratios": 7}, "max_ratios"),
     ],
 )
-@pytest.mark.parametrize("stage", ["train", "val"])
 def test_wrong_data_of_a_training_is_one_line(stage, init_args, message, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
     write_store(tmp_path / "s.h5", synthetic_store(pairs=1, points=40))
-    source = {"class_path": "kornia_learnnorm.data.sources.StoreSamples", "init_args": yaml.safe_load(init_args)}
+    source = {"class_path": "kornia_learnnorm.data.sources.StoreSamples", "init_args": init_args}
     Path("own.yaml").write_text(yaml.safe_dump({"data": {stage: source}}))
     refused(["fit", "--config", "crossview-synthetic", "--config", "own.yaml"], message)
 
@@ -606,11 +483,10 @@ def test_help_fits_a_screen_and_ends_with_examples_that_parse(command, monkeypat
         assert parser.parse_args(words[1:]).command == words[1]
 
 
-@pytest.mark.parametrize("words", [["-h"], ["--help"], ["--config", "crossview", "--help"]])
-def test_help_of_a_training_needs_no_extra(words, monkeypatch):
+def test_help_of_a_training_needs_no_extra(monkeypatch):
     for module in ("lightning_modules.training", "pytorch_lightning", "jsonargparse", "yaml"):
         monkeypatch.setitem(sys.modules, module, None)
-    assert "--help-all" in help_of("fit", *words)
+    assert "--help-all" in help_of("fit", "--config", "crossview", "-h")
 
 
 @pytest.mark.parametrize("command", TRAINING)
@@ -624,20 +500,18 @@ def test_the_options_of_the_help_are_among_all(command):
     assert "--trainer.limit_val_batches" in every
 
 
-@pytest.mark.parametrize("arguments", [[], ["unknown"], ["evaluate"], ["compare"]])
-def test_bad_usage_exits_with_2(arguments, capsys):
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "usage: learnnorm "),
+        (["unknown"], "usage: learnnorm "),
+        (["evaluate"], "usage: learnnorm evaluate "),
+        (["config", "crossview", "--unheard", "of"], "learnnorm config: error: unrecognized arguments: --unheard of"),
+        (["estimate", "a.png", "b.png", "--unheard"], "usage: learnnorm estimate "),
+    ],
+)
+def test_bad_usage_exits_with_2(arguments, message, capsys):
     with pytest.raises(SystemExit) as caught:
         main(arguments)
     assert caught.value.code == 2
-    assert "usage" in capsys.readouterr().err.lower()
-
-
-@pytest.mark.parametrize("arguments", [["config", "crossview"], ["compare", "s.h5"], ["estimate", "a.png", "b.png"]])
-def test_unknown_option_shows_the_usage_of_its_command(arguments, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main([*arguments, "--unheard", "of"])
-    assert caught.value.code == 2
-    usage, *_, last = capsys.readouterr().err.splitlines()
-    assert usage.startswith(f"usage: learnnorm {arguments[0]} ")
-    assert last.startswith(f"learnnorm {arguments[0]}: error: unrecognized arguments: --unheard")
-    assert last.endswith(f"learnnorm {arguments[0]} --help lists the options")
+    assert message in capsys.readouterr().err
