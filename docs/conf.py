@@ -19,7 +19,14 @@ copyright = author
 release = version = kornia_learnnorm.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
-extensions += ["sphinx.ext.autosummary", "sphinx_copybutton", "sphinxarg.ext", "sphinx-mathjax-offline"]
+sys.path.insert(0, str(Path(__file__).parent))
+extensions += [
+    "results_directive",
+    "sphinx.ext.autosummary",
+    "sphinx_copybutton",
+    "sphinxarg.ext",
+    "sphinx-mathjax-offline",
+]
 exclude_patterns = ["_build"]
 smartquotes = False  # they turn the two dashes of options into one
 html_theme = "furo"
@@ -27,7 +34,7 @@ html_title = f"kornia-learnnorm {release}"
 html_static_path = ["_static"]
 html_css_files = ["narrow.css"]
 
-# Names of the modules in the reference must resolve; other packages and the modules that it leaves out have no pages here.
+# Names of modules in the reference must resolve; other packages and modules that are not in it have no pages here.
 nitpicky = True
 LISTED = [re.findall(r"automodule:: (\S+)", page.read_text()) for page in (Path(__file__).parent / "api").glob("*.md")]
 HERE = "|".join(re.escape(module) for modules in LISTED for module in modules)

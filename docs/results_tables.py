@@ -1,7 +1,7 @@
-"""Tables and plots of the numbers in docs/results, for the hidden code cells of the pages.
+"""Tables and plots of the numbers in docs/results, for the directive ``results`` of the pages (results_directive.py).
 
 A page shows the file ``results/NAME.csv`` by ``table("NAME")``. ``results/commands.toml`` has the command that printed
-each file, which the page names too (tests/test_docs.py). sizes.json is what benchmarks/sizes.py writes with --json.
+each file. sizes.json is what benchmarks/sizes.py writes with --json.
 """
 
 from __future__ import annotations
@@ -74,6 +74,14 @@ LAYERS = {  # as benchmarks/speed.py names them, and the parts in which they tak
     "`crossview`": ("crossview", (EIGHTS, ROBUST)),
     "`LearnedEightPoint`": ("learned", (EIGHTS, ROBUST)),
 }
+NORMALIZERS = ("Hartley", "whitening", "reweighted", "paper", "crossview", "crossview-synthetic", "crossview-sets")
+NORMALIZERS += ("Hartley+optimal", "RANSAC")  # beside them
+LOSSES = {  # of the rows that train the network of Fan et al. with each of them
+    "paper-base": "symmetric epipolar",
+    "paper-loss-sampson": "Sampson",
+    "paper-loss-algebraic": "algebraic",
+    "paper-reduction-log": "symmetric epipolar, mean logarithm",
+}
 CASES = ("1 x 8", "64 x 8", "1 x 128", "32 x 128", "1 x 512", "32 x 512")  # batch x correspondences
 
 
@@ -115,6 +123,30 @@ def compile_times() -> Markdown:
     return Markdown(format_table(["layer, batch x correspondences", *columns], rows) + _on(found["machine"]))
 
 
+def speed_tables(memory: bool = False) -> Markdown:
+    """Return the times of all parts of a measurement and their ratios to Kornia's, or the memory."""
+    found = json.loads((RESULTS / "speed.json").read_text(encoding="utf-8"))
+    machine, texts = found.pop("machine"), []
+    for title, cases in found.items():
+        if title.endswith(", memory") == memory:
+            methods = dict.fromkeys(name for case in cases.values() for name in case)
+            rows = [[name, *(_beside_kornia(case, name) for case in cases.values())] for name in methods]
+            texts += [f"**{title}**", format_table(["method", *cases], rows)]
+    return Markdown("\n\n".join(texts) + _on(machine))
+
+
+def _beside_kornia(case: dict[str, float], name: str) -> str:
+    return f"{case[name]:.3g} ({case[name] / case['kornia']:.2f})" if name in case else "-"
+
+
+def losses_table() -> Markdown:
+    """Return the better rates on KITTI of the network of Fan et al. after training with different losses."""
+    files = "ablations-hartley", "ablations-whitening"
+    rates = [{row[0]: row[1] for row in read_rows(name)} for name in files]
+    rows = [[words, *(by_row[row] for by_row in rates)] for row, words in LOSSES.items()]
+    return Markdown(format_table(["loss", "better than Hartley %", "better than whitening %"], rows))
+
+
 def read_sizes() -> dict[str, dict[str, dict[str, list[float]]]]:
     """Return the errors (pixels) and times by store and protocol, method, and number of matches."""
     return json.loads((RESULTS / "sizes.json").read_text(encoding="utf-8"))
@@ -142,6 +174,13 @@ def sizes_table(
 ) -> Markdown:
     """Return the median errors of one store and protocol as a table."""
     return Markdown(format_table([corner, *(f"N = {size}" for size in sizes)], sizes_rows(title, methods, sizes)))
+
+
+def scores_table(title: str) -> Markdown:
+    """Return the median errors of one store and protocol where the estimators get Lowe's ratio as scores."""
+    names = ["RANSAC", *(name for name in ESTIMATORS if name.startswith("learned"))]
+    corner = f"{_words(title)}: median error, px"
+    return sizes_table(title, [f"{name}+scores" for name in names], SIZES[1:], corner)
 
 
 def sizes_ratios(method: str, reference: str) -> Markdown:
@@ -256,3 +295,11 @@ def dot_plot(panels: dict[str, tuple[str, dict[str, int]]], alt: str, log: bool 
         if len(axes[0, 0].get_legend_handles_labels()[1]) > 1:
             figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
         return show(figure, alt)
+
+
+def rates_plot(name: str, stores: dict[str, int]) -> HTML:
+    """Draw the better rates of three files of results, ``NAME-hartley.csv`` and so on, by the columns of stores."""
+    files = {"better than Hartley %": "hartley", "better than whitening %": "whitening"}
+    files["truth: better than Hartley %"] = "truth"
+    alt = "Better rates of all rows with 95 % intervals, but for none and Hartley; the tables below have the numbers"
+    return dot_plot({title: (f"{name}-{file}", stores) for title, file in files.items()}, alt)
