@@ -34,9 +34,9 @@ from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
-from kornia_learnnorm.two_view.pair import estimate_pair
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.two_view.two_view import estimate_matches
+from kornia_learnnorm.two_view.estimate_matches import estimate_matches
+from kornia_learnnorm.two_view.estimate_pair import estimate_pair
+from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 OUTLIERS = "outliers"
 MATCHES = 1000  # of a pair of the kind `outliers`

@@ -44,10 +44,10 @@ from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.ransac.soft import SoftChoice, expected_loss, sample_minimal_sets
-from kornia_learnnorm.two_view.pair import estimate_pair
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.two_view.reliability import PairWarning
-from kornia_learnnorm.two_view.two_view import estimate_matches
+from kornia_learnnorm.two_view.estimate_matches import estimate_matches
+from kornia_learnnorm.two_view.estimate_pair import estimate_pair
+from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.two_view.warnings import PairWarning
 
 __version__ = "0.1.0"
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError
+from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2")
 

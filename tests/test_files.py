@@ -10,7 +10,7 @@ import pytest
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.synthetic.stores import synthetic_store
 from kornia_learnnorm.data.writer import write_store
-from kornia_learnnorm.files import exclusive
+from kornia_learnnorm.files import atomic_write, exclusive
 
 HOLD = """
 import sys
@@ -56,6 +56,16 @@ def test_a_killed_process_does_not_block(tmp_path):
     with exclusive(tmp_path):
         pass
     assert not (tmp_path / ".lock").exists()
+
+
+def test_a_failed_write_keeps_the_old_file(tmp_path):
+    path = tmp_path / "F.json"
+    path.write_text("old")
+    with pytest.raises(RuntimeError, match="stop"), atomic_write(path) as temporary:  # noqa: PT012
+        temporary.write_text("half")
+        raise RuntimeError("stop")
+    assert path.read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["F.json"]
 
 
 @pytest.mark.usefixtures("program")

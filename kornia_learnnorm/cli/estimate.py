@@ -15,9 +15,9 @@ from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.files import atomic_write, write_text
+from kornia_learnnorm.two_view.estimate_pair import estimate_pair
 from kornia_learnnorm.two_view.many_pairs import PairOptions, describe_failure, estimate_pairs, read_pair_list
-from kornia_learnnorm.two_view.pair import estimate_pair
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
 
@@ -38,45 +38,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix or a doubtful one"
     )
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
-    parser.add_argument(
-        "--out", metavar="PATH", type=Path, help="picture of matches and epipolar lines; with --pairs, a folder"
-    )
+    picture = "picture of matches and epipolar lines; with --pairs, a folder"
+    parser.add_argument("--out", metavar="PATH", type=Path, help=picture)
     parser.add_argument("--json", metavar="FILE", help="write everything to this file; -: standard output")
-    estimation = parser.add_argument_group("estimation")
-    estimation.add_argument(
-        "--estimator",
-        metavar="NAME",
-        choices=("ransac", "learned"),
-        default="ransac",
-        help="ransac, learned (default: %(default)s)",
-    )
-    estimation.add_argument("--weights", metavar="NAME_OR_PATH", help="of the learned one (default: robust-synthetic)")
-    estimation.add_argument(
-        "--threshold",
-        metavar="PX",
-        type=float,
-        default=options.threshold,
-        help="largest symmetric epipolar distance of an inlier in the images as matched (default: %(default)s)",
-    )
-    estimation.add_argument("--seed", metavar="N", type=_seed, default=options.seed, help="(default: %(default)s)")
+    add = parser.add_argument_group("estimation").add_argument
+    names, default = ("ransac", "learned"), "(default: %(default)s)"
+    add("--estimator", metavar="NAME", choices=names, default=names[0], help=f"{', '.join(names)} {default}")
+    add("--weights", metavar="NAME_OR_PATH", help="of the learned one (default: robust-synthetic)")
+    distance = f"largest symmetric epipolar distance of an inlier in the images as matched {default}"
+    add("--threshold", metavar="PX", type=float, default=options.threshold, help=distance)
+    add("--seed", metavar="N", type=_seed, default=options.seed, help=default)
     camera = "one or two of fx,fy,cx,cy, a file of 4 or 9 numbers, KITTI's calib.txt, exif; adds E, R, t"
-    estimation.add_argument("--K", metavar="CAMERA", nargs="+", default=[], help=camera)
-    matching = parser.add_argument_group("matching")
-    for option, names, default in (
+    add("--K", metavar="CAMERA", nargs="+", default=[], help=camera)
+    add = parser.add_argument_group("matching").add_argument
+    for option, known, chosen in (
         ("--detector", DETECTORS, options.detector),
         ("--matcher", MATCHERS, options.matcher),
     ):
-        text = f"{', '.join(names)} (default: %(default)s)"
-        matching.add_argument(option, metavar="NAME", choices=names, default=default, help=text)
-    matching.add_argument("--ratio", type=float, default=options.ratio, help="ratio test (default: %(default)s)")
-    size = "reduce images to this longer side (default: %(default)s)"
-    matching.add_argument("--max-size", metavar="PX", type=int, default=options.max_size, help=size)
+        add(option, metavar="NAME", choices=known, default=chosen, help=f"{', '.join(known)} {default}")
+    add("--ratio", type=float, default=options.ratio, help=f"ratio test {default}")
+    size = f"reduce images to this longer side {default}"
+    add("--max-size", metavar="PX", type=int, default=options.max_size, help=size)
     mask = "one or two: features count where it is white"
-    matching.add_argument("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
-    many = parser.add_argument_group("many pairs")
-    many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line; a JSON line of each in --out")
-    many.add_argument("--jobs", type=int, default=-1, help="processes; -1: all cores (default: %(default)s)")
-    many.add_argument("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
+    add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
+    add = parser.add_argument_group("many pairs").add_argument
+    add("--pairs", metavar="LIST", type=Path, help="two files a line; a JSON line of each in --out")
+    add("--jobs", type=int, default=-1, help=f"processes; -1: all cores {default}")
+    add("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
 
 
 def _seed(text: str) -> int:
@@ -84,6 +72,57 @@ def _seed(text: str) -> int:
     if not text.isdecimal() or int(text) >= 2**63:
         raise argparse.ArgumentTypeError(f"a whole number from 0 to 2^63 - 1 expected, got {text}")
     return int(text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the fundamental matrix; write the picture and the JSON file if asked to, both or neither."""
+    _check_options(args)
+    weights = (args.weights or "robust-synthetic") if args.estimator == "learned" else None
+    names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher")
+    options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
+    if args.pairs is not None:
+        found = estimate_pairs(read_pair_list(args.pairs), args.out, options, args.jobs, args.dask)
+        _print_pairs(found, args.out)
+        return UNRELIABLE if any(line["warnings"] for line in found) else 0
+    (image1, image2), json_path = args.images, _json_path(args)
+    try:
+        estimate = _estimate(args, options)
+    except NoReliableMatrixError as error:
+        failure = _to_json(describe_failure(error.code, str(error), image1, image2, options))
+        if json_path is not None:
+            write_text(json_path, failure)
+            print(f"wrote    {json_path}")
+        elif args.json == "-":
+            print(failure, end="")
+        print(f"no reliable matrix ({error.code}): {error}", file=sys.stderr)
+        return UNRELIABLE
+    if args.json == "-":
+        print(_to_json(estimate.as_dict()), end="")
+        for warning in estimate.warnings:
+            print(f"warning ({warning.code}): {warning.text}", file=sys.stderr)
+    else:
+        print("\n".join([estimate.summary(), *(f"wrote    {path}" for path in (args.out, json_path) if path)]))
+    return UNRELIABLE if estimate.warnings else 0
+
+
+def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
+    """Return the estimate of one pair after its picture and its JSON file are written, both or neither."""
+    with ExitStack() as stack:
+        picture, report = (path and stack.enter_context(atomic_write(path)) for path in (args.out, _json_path(args)))
+        if picture:
+            from kornia_learnnorm.two_view.drawing import draw_pair, import_matplotlib
+
+            import_matplotlib()
+        masks = args.mask * 2 if len(args.mask) == 1 else args.mask
+        given: list[Any] = [read_mask(mask, image_size(image)) for mask, image in zip(masks, args.images, strict=False)]
+        (image1, image2), (mask1, mask2) = args.images, given or (None, None)
+        estimate = estimate_pair(image1, image2, **options.arguments(image1, image2), mask1=mask1, mask2=mask2)
+        if picture:
+            first, second = (read_colour(image, options.max_size) for image in args.images)
+            draw_pair(first, second, estimate, picture)
+        if report:
+            write_text(report, _to_json(estimate.as_dict()))
+    return estimate
 
 
 def _print_pairs(found: list[dict[str, Any]], folder: Path) -> None:
@@ -100,75 +139,12 @@ def _print_pairs(found: list[dict[str, Any]], folder: Path) -> None:
         print(f"and {len(failed) - MAX_FAILURES} more: lines of pairs.jsonl whose F is null", file=sys.stderr)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the fundamental matrix; write the picture and the JSON file if asked to, both or neither."""
-    _check_options(args)
-    weights = (args.weights or "robust-synthetic") if args.estimator == "learned" else None
-    names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher")
-    options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
-    if args.pairs is not None:
-        found = estimate_pairs(read_pair_list(args.pairs), args.out, options, args.jobs, args.dask)
-        _print_pairs(found, args.out)
-        return UNRELIABLE if any(line["warnings"] for line in found) else 0
-    image1, image2 = args.images
-    try:
-        estimate = _estimate(args, options)
-    except NoReliableMatrixError as error:
-        failure = describe_failure(error.code, str(error), image1, image2, options)
-        if (path := _json_path(args)) is not None:
-            write_text(path, _to_json(failure))
-            print(f"wrote    {path}")
-        if args.json == "-":
-            print(_to_json(failure), end="")
-        print(f"no reliable matrix ({error.code}): {error}", file=sys.stderr)
-        return UNRELIABLE
-    if args.json == "-":
-        print(_to_json(estimate.as_dict()), end="")
-        for warning in estimate.warnings:
-            print(f"warning ({warning.code}): {warning.text}", file=sys.stderr)
-    else:
-        print(estimate.summary())
-        for written in (args.out, _json_path(args)):
-            if written is not None:
-                print(f"wrote    {written}")
-    return UNRELIABLE if estimate.warnings else 0
-
-
-def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
-    """Return the estimate of one pair after its picture and its JSON file are written, both or neither."""
-    with ExitStack() as stack:
-        json_path = _json_path(args)
-        picture = None if args.out is None else stack.enter_context(atomic_write(args.out))
-        report = None if json_path is None else stack.enter_context(atomic_write(json_path))
-        if picture is not None:
-            from kornia_learnnorm.two_view.drawing import draw_pair, import_matplotlib
-
-            import_matplotlib()
-        masks: list[Any] = [
-            read_mask(path, image_size(image)) for path, image in zip(_both(args.mask), args.images, strict=False)
-        ]
-        mask1, mask2 = masks or (None, None)
-        image1, image2 = args.images
-        estimate = estimate_pair(image1, image2, **options.arguments(image1, image2), mask1=mask1, mask2=mask2)
-        if picture is not None:
-            first, second = (read_colour(image, options.max_size) for image in args.images)
-            draw_pair(first, second, estimate, picture)
-        if report is not None:
-            write_text(report, _to_json(estimate.as_dict()))
-    return estimate
-
-
 def _json_path(args: argparse.Namespace) -> Path | None:
     return None if args.json in (None, "-") else Path(args.json)
 
 
 def _to_json(content: dict[str, Any]) -> str:
     return json.dumps(content, allow_nan=False) + "\n"
-
-
-def _both(values: list[Path]) -> list[Path]:
-    """Return one value for each image."""
-    return values * 2 if len(values) == 1 else values
 
 
 def _check_options(args: argparse.Namespace) -> None:

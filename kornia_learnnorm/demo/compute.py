@@ -23,8 +23,8 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.ransac.ransac import RANSAC
-from kornia_learnnorm.two_view.pair import MatchedPair, match_pair
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
+from kornia_learnnorm.two_view.estimate_pair import MatchedPair, match_two_images
+from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 __all__ = [
     "EXAMPLES",
@@ -174,7 +174,7 @@ def compare(picture1: Picture, picture2: Picture) -> Comparison:
         path1.write_bytes(picture1.content)
         path2.write_bytes(picture2.content)
         try:
-            matched = match_pair(path1, path2)
+            matched = match_two_images(path1, path2)
         except NoReliableMatrixError as error:
             raise _without_paths(error) from error
     matched = replace(matched, path1=Path(picture1.name), path2=Path(picture2.name))

@@ -15,7 +15,7 @@ import torch
 
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import import_extra
-from kornia_learnnorm.two_view.pair_estimate import PairEstimate
+from kornia_learnnorm.two_view.result import PairEstimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,7 +16,7 @@ from kornia_learnnorm.geometry.checks import check_cameras
 __all__ = [
     "Cameras",
     "Points",
-    "as_float64",
+    "Size",
     "check_number",
     "check_settings",
     "check_whole",
@@ -27,22 +27,7 @@ __all__ = [
 
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]
-
-
-def as_float64(name: str, value: object) -> Tensor:
-    """Return an array or tensor of floating-point or whole numbers as a tensor on the CPU, float64.
-
-    Raises:
-        TypeError: if it is anything else, such as a list.
-
-    """
-    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
-        return torch.from_numpy(np.array(value, np.float64))  # a copy: strides and byte order may be any
-    if isinstance(value, Tensor) and not (value.dtype == torch.bool or value.is_complex()):
-        return value.detach().cpu().double()
-    got = f"one of {value.dtype}" if isinstance(value, np.ndarray | Tensor) else str(type(value))
-    hint = f"; numpy.array({name}, float) makes one" if isinstance(value, list | tuple) else ""
-    raise TypeError(f"{name} must be a NumPy array or a tensor of numbers, got {got}{hint}")
+Size = tuple[int, int]  # width and height, pixels
 
 
 def read_matches(points1: Points, points2: Points, scores: Points | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -55,8 +40,8 @@ def read_matches(points1: Points, points2: Points, scores: Points | None) -> tup
         ValueError: if shapes do not pair up, or the score of finite points is not from 0 to 1.
 
     """
-    x1, x2 = as_float64("points1", points1), as_float64("points2", points2)
-    score = torch.ones(len(x1), dtype=torch.float64) if scores is None else as_float64("scores", scores)
+    x1, x2 = _as_float64("points1", points1), _as_float64("points2", points2)
+    score = torch.ones(len(x1), dtype=torch.float64) if scores is None else _as_float64("scores", scores)
     if x1.shape != x2.shape or x1.shape[1:] != (2,) or score.shape != x1.shape[:1]:
         shapes = " and ".join(str([*value.shape]) for value in (x1, x2, score))
         raise ValueError(f"points of shape (N, 2) and scores of shape (N,) expected, got {shapes}")
@@ -76,12 +61,12 @@ def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
             last row of (0, 0, w).
 
     """
-    camera1, camera2 = (None if K is None else as_float64(name, K) for name, K in (("K1", K1), ("K2", K2)))
+    camera1, camera2 = (None if K is None else _as_float64(name, K) for name, K in (("K1", K1), ("K2", K2)))
     check_cameras(camera1, camera2)
     return None if camera1 is None or camera2 is None else (camera1, camera2)
 
 
-def read_size(name: str, size: tuple[int, int] | None, points: Tensor) -> tuple[int, int]:
+def read_size(name: str, size: Size | None, points: Tensor) -> Size:
     """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given.
 
     Raises:
@@ -123,3 +108,14 @@ def check_whole(name: str, value: object) -> None:
     """Raise a TypeError for anything but a whole number."""
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise TypeError(f"{name} must be a whole number, got {value!r}")
+
+
+def _as_float64(name: str, value: object) -> Tensor:
+    """Return an array or tensor of floating-point or whole numbers as a tensor on the CPU, float64."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
+        return torch.from_numpy(np.array(value, np.float64))  # a copy: strides and byte order may be any
+    if isinstance(value, Tensor) and not (value.dtype == torch.bool or value.is_complex()):
+        return value.detach().cpu().double()
+    got = f"one of {value.dtype}" if isinstance(value, np.ndarray | Tensor) else str(type(value))
+    hint = f"; numpy.array({name}, float) makes one" if isinstance(value, list | tuple) else ""
+    raise TypeError(f"{name} must be a NumPy array or a tensor of numbers, got {got}{hint}")

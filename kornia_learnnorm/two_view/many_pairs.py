@@ -18,10 +18,9 @@ from kornia_learnnorm.files import exclusive, write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.two_view.estimate_pair import MAX_SIZE, check_matching, estimate_pair
 from kornia_learnnorm.two_view.inputs import check_settings
-from kornia_learnnorm.two_view.pair import MAX_SIZE, check_matching, estimate_pair
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, package_versions
-from kornia_learnnorm.two_view.reliability import PairWarning
+from kornia_learnnorm.two_view.result import NoReliableMatrixError, package_versions
 
 __all__ = ["PairOptions", "describe_failure", "estimate_pairs", "read_pair_list"]
 
@@ -29,10 +28,13 @@ RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
 OPTIONS = "options.json"
 UNREADABLE = "unreadable"  # code of a pair of which an image cannot be read; tried again by the next run
 
+FilePair = tuple[Path, Path]
+Line = dict[str, Any]  # the JSON object of a pair
+
 
 @dataclass(frozen=True)
 class PairOptions:
-    """How image pairs are estimated; see :func:`~kornia_learnnorm.two_view.pair.estimate_pair`.
+    """How image pairs are estimated; see :func:`~kornia_learnnorm.two_view.estimate_pair.estimate_pair`.
 
     Attributes:
         weights: weights of the learned layer, by name or file; None for RANSAC.
@@ -55,18 +57,10 @@ class PairOptions:
 
     def arguments(self, image1: Path, image2: Path) -> dict[str, Any]:
         """Return the keyword arguments of ``estimate_pair`` for two image files."""
-        cameras = (
-            [
-                read_camera(text, image)
-                for text, image in zip(self.K * (2 // len(self.K)), (image1, image2), strict=True)
-            ]
-            if self.K
-            else [None, None]
-        )
-        options = {
-            name: getattr(self, name) for name in ("ratio", "threshold", "seed", "max_size", "detector", "matcher")
-        }
-        return {**options, "layer": _layer(self.weights), "K1": cameras[0], "K2": cameras[1]}
+        options = {name: value for name, value in vars(self).items() if name not in ("weights", "K")}
+        texts = self.K * 2 if len(self.K) == 1 else self.K
+        cameras = [read_camera(text, image) for text, image in zip(texts, (image1, image2), strict=False)]
+        return {**options, "layer": _layer(self.weights), **dict(zip(("K1", "K2"), cameras, strict=False))}
 
 
 @lru_cache(maxsize=1)
@@ -74,7 +68,7 @@ def _layer(weights: str | None) -> LearnedEightPoint | None:
     return None if weights is None else LearnedEightPoint.from_pretrained(weights)
 
 
-def read_pair_list(path: str | Path) -> list[tuple[Path, Path]]:
+def read_pair_list(path: str | Path) -> list[FilePair]:
     """Return the image files of a list, two names a line, relative to the folder of the list.
 
     Names with spaces stand in quotation marks; a # begins a comment.
@@ -87,29 +81,30 @@ def read_pair_list(path: str | Path) -> list[tuple[Path, Path]]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no list of pairs at {path}")
-    pairs = []
     try:
-        for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            try:
-                names = shlex.split(text, comments=True)
-            except ValueError as error:
-                raise ValueError(f"{path}, line {number}: {error}") from error
-            if names and len(names) != 2:
-                raise ValueError(f"{path}, line {number}: two image files expected, got {len(names)} names")
-            pairs += [(path.parent / names[0], path.parent / names[1])] if names else []
+        lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not a text file, a list of pairs expected") from error
+    pairs = []
+    for number, text in enumerate(lines, 1):
+        try:
+            names = shlex.split(text, comments=True)
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {error}") from error
+        if names and len(names) != 2:
+            raise ValueError(f"{path}, line {number}: two image files expected, got {len(names)} names")
+        pairs += [(path.parent / names[0], path.parent / names[1])] if names else []
     if not pairs:
         raise ValueError(f"{path} lists no pairs")
     return list(dict.fromkeys(pairs))
 
 
 def estimate_pairs(
-    pairs: list[tuple[Path, Path]], folder: str | Path, options: PairOptions, jobs: int = -1, dask: str | None = None
-) -> list[dict[str, Any]]:
+    pairs: list[FilePair], folder: str | Path, options: PairOptions, jobs: int = -1, dask: str | None = None
+) -> list[Line]:
     """Estimate the pairs that are not done yet and append one JSON line each to ``pairs.jsonl``.
 
-    A line has what :meth:`~kornia_learnnorm.two_view.pair_estimate.PairEstimate.as_dict` returns, or
+    A line has what :meth:`~kornia_learnnorm.two_view.result.PairEstimate.as_dict` returns, or
     :func:`describe_failure` where there is no matrix or an image cannot be read.
 
     Args:
@@ -133,38 +128,45 @@ def estimate_pairs(
     given = json.loads(json.dumps({**asdict(options), "K": cameras}))
     folder.mkdir(parents=True, exist_ok=True)
     with exclusive(folder):
-        done = _estimate_missing(pairs, folder, options, given, jobs, dask)
-    return [done[str(first), str(second)] for first, second in pairs]
+        _check_same_options(folder / OPTIONS, given)
+        done = _read_done(folder / RESULTS)
+        todo = [pair for pair in pairs if pair not in done]
+        tqdm = import_extra("tqdm", "images", "estimating many pairs").tqdm
+        with (
+            open_workers(jobs, dask) as workers,
+            (folder / RESULTS).open("a", encoding="utf-8") as file,
+            tqdm(total=len(pairs), initial=len(pairs) - len(todo), unit="pair", file=sys.stderr) as bar,
+            workers.results(_estimate, ((*pair, options) for pair in todo)) as results,
+        ):
+            for pair, line in zip(todo, results, strict=True):
+                file.write(json.dumps(line, allow_nan=False) + "\n")
+                file.flush()
+                done[pair] = line
+                bar.update()
+    return [done[pair] for pair in pairs]
 
 
-def _estimate_missing(
-    pairs: list[tuple[Path, Path]], folder: Path, options: PairOptions, given: Any, jobs: int, dask: str | None
-) -> dict[tuple[str, str], dict[str, Any]]:
-    """Return the JSON objects of all pairs by their files; those that are not there yet are estimated and written."""
-    if (folder / OPTIONS).exists():
-        had = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
-        if had != given:
-            raise ValueError(f"{folder} holds results with other options: {had}, got {given}")
-    else:
-        write_text(folder / OPTIONS, json.dumps(given, indent=2) + "\n")
-    done = {(line["image1"]["file"], line["image2"]["file"]): line for line in _done(folder / RESULTS)}
-    todo = [pair for pair in pairs if (str(pair[0]), str(pair[1])) not in done]
-    tqdm = import_extra("tqdm", "images", "estimating many pairs").tqdm
-    with (
-        open_workers(jobs, dask) as workers,
-        (folder / RESULTS).open("a", encoding="utf-8") as file,
-        tqdm(total=len(pairs), initial=len(pairs) - len(todo), unit="pair", file=sys.stderr) as bar,
-        workers.results(_estimate, ((*pair, options) for pair in todo)) as results,
-    ):
-        for pair, line in zip(todo, results, strict=True):
-            file.write(json.dumps(line, allow_nan=False) + "\n")
-            file.flush()
-            done[str(pair[0]), str(pair[1])] = line
-            bar.update()
-    return done
+def _check_same_options(path: Path, given: Line) -> None:
+    """Write the options of a run; raise ValueError where its folder has others."""
+    if not path.exists():
+        write_text(path, json.dumps(given, indent=2) + "\n")
+    elif (had := json.loads(path.read_text(encoding="utf-8"))) != given:
+        raise ValueError(f"{path.parent} holds results with other options: {had}, got {given}")
 
 
-def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> dict[str, Any]:
+def _read_done(path: Path) -> dict[FilePair, Line]:
+    """Return the results of a file of JSON lines; drop a last line that was not written whole, and unreadable pairs."""
+    if not path.exists():
+        return {}
+    texts = [text for text in path.read_text(encoding="utf-8").splitlines(keepends=True) if text.endswith("\n")]
+    lines = [
+        line for line in map(json.loads, texts) if UNREADABLE not in [warning["code"] for warning in line["warnings"]]
+    ]
+    write_text(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
+    return {(Path(line["image1"]["file"]), Path(line["image2"]["file"])): line for line in lines}
+
+
+def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> Line:
     """Return the JSON object of a pair without a matrix: ``F`` is null and ``warnings`` says why.
 
     Args:
@@ -176,7 +178,7 @@ def describe_failure(code: str, text: str, image1: Path, image2: Path, options: 
     """
     return {
         **dict.fromkeys(("F", "E", "R", "t", "predicted_error_px")),
-        "warnings": [PairWarning(code, text)._asdict()],
+        "warnings": [{"code": code, "text": text}],
         "image1": _describe_image(image1),
         "image2": _describe_image(image2),
         "estimator": (RANSAC if options.weights is None else LearnedEightPoint).__name__,
@@ -187,7 +189,7 @@ def describe_failure(code: str, text: str, image1: Path, image2: Path, options: 
     }
 
 
-def _describe_image(path: Path) -> dict[str, Any]:
+def _describe_image(path: Path) -> Line:
     """Return the file and its width and height, null where it cannot be read."""
     try:
         width, height = image_size(path)
@@ -196,7 +198,7 @@ def _describe_image(path: Path) -> dict[str, Any]:
     return {"file": str(path), "width": width or None, "height": height or None}
 
 
-def _estimate(image1: Path, image2: Path, options: PairOptions) -> dict[str, Any]:
+def _estimate(image1: Path, image2: Path, options: PairOptions) -> Line:
     """Return the JSON object of a pair."""
     import_cv2().setNumThreads(1)
     try:
@@ -204,15 +206,3 @@ def _estimate(image1: Path, image2: Path, options: PairOptions) -> dict[str, Any
     except (ValueError, OSError) as error:
         code = error.code if isinstance(error, NoReliableMatrixError) else UNREADABLE
         return describe_failure(code, str(error), image1, image2, options)
-
-
-def _done(path: Path) -> list[dict[str, Any]]:
-    """Return the results of a file of JSON lines; drop a last line that was not written whole, and unreadable pairs."""
-    if not path.exists():
-        return []
-    lines = [
-        json.loads(line) for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line[-1] == "\n"
-    ]
-    kept = [line for line in lines if not any(warning["code"] == UNREADABLE for warning in line["warnings"])]
-    write_text(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in kept))
-    return kept

@@ -1,4 +1,4 @@
-r"""The fundamental matrix of a scene that is mostly a plane: the plane's homography and the parallax of the rest.
+r"""The homography of a scene that is mostly a plane, the parallax of the rest, and the matrix of both.
 
 With the homography :math:`H` of the plane, two matches off the plane determine the epipole :math:`e_2`, since the line
 through :math:`H x_1` and :math:`x_2` passes through it, and :math:`F = [e_2]_\times H`.
@@ -8,22 +8,34 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import cross_product_matrix
 from torch import Tensor
 
+from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.transforms import unit_fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 
-__all__ = ["fit_plane_and_parallax", "parallax", "parallax_evidence"]
+__all__ = ["find_homography", "fit_plane_and_parallax", "parallax", "parallax_evidence"]
 
 OFF_PLANE = 2.0  # thresholds; a match that the homography misses by more lies off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
 MIN_PARALLAX_INLIERS = 3  # matches off the plane that a matrix must have to be more than a choice of two
+
+
+def find_homography(points1: Tensor, points2: Tensor, threshold: float) -> Tensor | None:
+    """Return the homography (3, 3) that explains most matches within a threshold (pixels), by OpenCV's MAGSAC."""
+    cv2 = import_cv2()
+    try:
+        H = cv2.findHomography(points1.numpy(), points2.numpy(), cv2.USAC_MAGSAC, threshold)[0]
+    except cv2.error:  # OpenCV 4 raises when too few points are left to sample from
+        H = None
+    return None if H is None or not np.isfinite(H).all() else torch.from_numpy(H).double()
 
 
 def parallax(points1: Tensor, points2: Tensor, H: Tensor) -> Tensor:

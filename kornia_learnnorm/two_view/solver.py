@@ -1,9 +1,10 @@
-"""The fundamental matrix of matches, or of some of them, by RANSAC or a learned layer, with plane and parallax."""
+"""The fundamental matrix of matches by RANSAC or a learned layer, plane and parallax, and parts of the matches."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,12 +18,21 @@ from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.models import EssentialModel
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
-from kornia_learnnorm.two_view.inputs import Cameras
-from kornia_learnnorm.two_view.parallax import fit_plane_and_parallax, parallax, parallax_evidence
-from kornia_learnnorm.two_view.reliability import MAX_LOG_CHANCE_PARALLAX, MIN_PLANAR_SHARE, find_homography
+from kornia_learnnorm.two_view.inputs import Cameras, Size
+from kornia_learnnorm.two_view.parallax import find_homography, fit_plane_and_parallax, parallax, parallax_evidence
+from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
+from kornia_learnnorm.two_view.result import NoReliableMatrixError
+from kornia_learnnorm.two_view.warnings import (
+    MAX_LOG_CHANCE_PARALLAX,
+    MAX_LOG_FALSE_ALARMS,
+    MIN_PLANAR_SHARE,
+    log_false_alarms,
+    log_false_samples,
+)
 
-__all__ = ["TwoViewSolver"]
+__all__ = ["MIN_MATCHES", "TwoViewSolver"]
 
+MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
 MIN_SCORE_GAIN = 1.02  # of another hypothesis over the one found first, which otherwise stays
 MIN_SCORE = 1e-3  # a match of weight zero would never be sampled
 NEAR = 20.0  # thresholds; among the matches this near a matrix, fewer are false than among all
@@ -30,6 +40,18 @@ MIN_NEAR = 16  # matches near a matrix, for a search among them
 MAX_NEAR_SEARCHES = 3
 MIN_INLIER_SHARE = 0.5  # of the matches; with as many inliers, the first search finds the best matrix
 MIN_LOSS_SCALE = 1e-3  # thresholds; of the loss for matches without noise
+FEW_MATCHES = 400  # so few determine a matrix only with more inliers than RANSAC misses again and again
+MAX_FAILED_PARTS = 6  # parts of few matches that are no better than chance, as all matches, before the search ends
+MAX_EMPTY_PARTS = 2  # parts with no more inliers than a search among random matches finds, before the search ends
+
+
+class Solution(NamedTuple):
+    """The matrix of all matches, and what tells how far it may be off."""
+
+    F_mat: Tensor  # (3, 3)
+    weights: Tensor  # of the matches as the estimator sees them, (N,)
+    F_parts: Tensor  # matrices of random parts, without those of failed searches, (P, 3, 3)
+    part_size: int  # matches in a part
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +71,51 @@ class TwoViewSolver:
         """Name of the class that estimates."""
         return RANSAC.__name__ if self.layer is None else type(self.layer).__name__
 
-    @cached_property
-    def _ransac(self) -> RANSAC:
-        return RANSAC(inl_th=self.threshold, seed=self.seed)
+    def search(self, size2: Size) -> Solution:
+        """Return the best matrix of all matches and of random parts of them.
+
+        Args:
+            size2: width and height of image 2, pixels.
+
+        Raises:
+            NoReliableMatrixError: if fewer than nine matches agree with it.
+
+        """
+        F_mat, weights = self.solve()
+        parts = random_parts(len(weights), int(self.inliers(F_mat).sum()), self.seed)
+        F_parts = self._solve_parts(F_mat, parts, size2)
+        F_mat = self.improve(F_mat, F_parts)
+        agree = int(self.inliers(F_mat).sum())
+        if agree < MIN_MATCHES:
+            text = f"{agree} of {len(weights)} matches agree on a fundamental matrix within {self.threshold:g} px"
+            raise NoReliableMatrixError("no_consensus", f"{text}, at least {MIN_MATCHES} are needed")
+        return Solution(F_mat, weights, drop_failed_parts(F_parts, self.support(F_parts), agree), parts.shape[1])
+
+    def solve(self) -> tuple[Tensor, Tensor]:
+        """Return the matrix (3, 3) of the matches, and their weights (N,), without a look at parts of them."""
+        if self.layer is None:
+            found = self._ransac()
+            F_mat, weights = self._search_near(found.F_mat), found.inliers.double()
+        else:
+            with torch.no_grad():
+                estimate = self.layer.estimate(self.points1[None], self.points2[None], scores=self.scores[None])
+            F_mat, weights = estimate.F_mat[0], estimate.weights[0]
+        if self.cameras is None:
+            F_mat = self._try_plane_and_parallax(F_mat)
+        elif self.layer is not None:
+            F_mat = self._refine(F_mat)
+        return F_mat, weights
+
+    def improve(self, F_mat: Tensor, F_parts: Tensor) -> Tensor:
+        """Return the matrix (3, 3) of all matches, or that of a part (P, 3, 3), refined, where it scores higher."""
+        best = self.scorer.best(self.scorer.from_pixels(F_parts), 1)
+        least = MIN_SCORE_GAIN * self._score(F_mat)
+        if float(best.score.sum()) <= least:
+            return F_mat
+        other = self._refine(self.scorer.to_pixels(best.F_mat)[0])
+        if self.layer is None:
+            other = self._search_near(other)
+        return other if self._score(other) > least else F_mat
 
     def distance(self, F_mat: Tensor) -> Tensor:
         """Return the symmetric epipolar distances of the matches to a matrix (3, 3), (N,), pixels."""
@@ -63,113 +127,100 @@ class TwoViewSolver:
 
     def support(self, F_mat: Tensor) -> Tensor:
         """Return how many matches lie within the threshold of each matrix (P, 3, 3), (P,)."""
-        number = len(F_mat)
-        distance = symmetric_epipolar_distance(
-            self.points1.expand(number, -1, -1), self.points2.expand(number, -1, -1), F_mat
-        )
-        return (distance < self.threshold).sum(-1)
+        points1, points2 = (points.expand(len(F_mat), -1, -1) for points in (self.points1, self.points2))
+        return (symmetric_epipolar_distance(points1, points2, F_mat) < self.threshold).sum(-1)
 
-    def solve(self, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the matrix (3, 3) of all matches or of some rows (M,), and the weights (M,) of these matches."""
-        rows = torch.arange(len(self.points1)) if rows is None else rows
-        x1, x2, score = self.points1[rows], self.points2[rows], self.scores[rows]
-        if self.layer is None:
-            found = self._search(x1, x2, score)
-            F_mat, weights = self._search_near(x1, x2, score, found.F_mat), found.inliers.double()
-        else:
-            with torch.no_grad():
-                estimate = self.layer.estimate(x1[None], x2[None], scores=score[None])
-            F_mat, weights = estimate.F_mat[0], estimate.weights[0]
-        if self.cameras is None:
-            F_mat = self._try_plane_and_parallax(x1, x2, F_mat)
-        elif self.layer is not None:
-            F_mat = self._refine(x1, x2, F_mat)
-        return F_mat, weights
+    def part(self, rows: Tensor) -> TwoViewSolver:
+        """Return the solver of some matches, from their rows or a mask."""
+        return replace(self, points1=self.points1[rows], points2=self.points2[rows], scores=self.scores[rows])
 
-    def best_of(self, F_mat: Tensor, F_parts: Tensor) -> Tensor:
-        """Return the matrix of all matches, or that of a part, refined on all, where it scores higher on all.
+    @cached_property
+    def scorer(self) -> PairScorer:
+        """Scores of matrices on the matches."""
+        return PairScorer(self.points1, self.points2, self.threshold)
 
-        Args:
-            F_mat: matrix of all matches, (3, 3).
-            F_parts: matrices of parts of the matches, (P, 3, 3).
-        """
-        scorer = PairScorer(self.points1, self.points2, self.threshold)
-        best = scorer.best(scorer.from_pixels(F_parts), 1)
-        least = MIN_SCORE_GAIN * _score(scorer, F_mat)
-        if float(best.score.sum()) <= least:
-            return F_mat
-        other = self._refine(self.points1, self.points2, scorer.to_pixels(best.F_mat)[0])
-        if self.layer is None:
-            other = self._search_near(self.points1, self.points2, self.scores, other)
-        return other if _score(scorer, other) > least else F_mat
+    def _score(self, F_mat: Tensor) -> float:
+        """Return the MSAC score of a matrix (3, 3); zero for a matrix of zeros."""
+        return float(self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1).score.sum())
 
-    def _search(self, points1: Tensor, points2: Tensor, scores: Tensor) -> RansacResult:
-        return self._ransac.estimate(points1, points2, scores.clamp(min=MIN_SCORE), *(self.cameras or ()))
+    def _ransac(self) -> RansacResult:
+        ransac = RANSAC(inl_th=self.threshold, seed=self.seed)
+        return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *(self.cameras or ()))
 
-    def _search_near(self, points1: Tensor, points2: Tensor, scores: Tensor, F_mat: Tensor) -> Tensor:
+    def _solve_parts(self, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
+        """Return the matrices of the parts; of few matches, only of the first where these find no more than chance."""
+        matches, found = len(self.scores), F_mat[None]
+        for rows in parts:
+            found = torch.cat([found, self.part(rows).solve()[0][None]])
+            if matches > FEW_MATCHES:  # a late part can find what all others missed
+                continue
+            most, failed = int(self.support(found).max()), len(found) - 1
+            empty = log_false_samples(matches, most, self.threshold, size2) > 0
+            by_chance = log_false_alarms(matches, most, self.threshold, size2) > MAX_LOG_FALSE_ALARMS
+            if (failed == MAX_EMPTY_PARTS and empty) or (failed == MAX_FAILED_PARTS and by_chance):
+                break
+        return found[1:]
+
+    def _search_near(self, F_mat: Tensor) -> Tensor:
         """Return a matrix (3, 3), or a better one that is found among the matches near it, where most are no inliers.
 
         Among 80 % of outliers and more, the matrix of a search is often one of a few inliers and some outliers. Near it
         lie most of the true matches and few of the outliers, so that a search among them finds the best matrix.
         """
-        scorer = PairScorer(points1, points2, self.threshold)
         for _ in range(MAX_NEAR_SEARCHES):
-            distance = symmetric_epipolar_distance(points1, points2, F_mat)
+            distance = self.distance(F_mat)
             near = distance < NEAR * self.threshold
             share = float((distance < self.threshold).double().mean())
             if share >= MIN_INLIER_SHARE or int(near.sum()) < MIN_NEAR:
                 break
-            other = self._search(points1[near], points2[near], scores[near]).F_mat
-            if _score(scorer, other) <= _score(scorer, F_mat):
+            other = self.part(near)._ransac().F_mat  # noqa: SLF001 (its own class)
+            if self._score(other) <= self._score(F_mat):
                 break
             F_mat = other
         return F_mat
 
-    def _refine(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+    def _refine(self, F_mat: Tensor) -> Tensor:
         """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
         if self.cameras is None:
-            loss = GemanMcClure(FINAL_LOSS_SCALE * self.threshold)
-            return refine_fundamental(points1[None], points2[None], F_mat[None], loss=loss).F_mat[0]
-        scorer = PairScorer(points1, points2, self.threshold)
-        start = scorer.best(scorer.from_pixels(F_mat[None]), 1)
+            return self._refine_at(FINAL_LOSS_SCALE * self.threshold, F_mat)
+        start = self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1)
         if len(start.F_mat) == 0:
             return F_mat
-        fitted = EssentialModel(scorer, *self.cameras).fit(start, refine=True)
-        return unit_fundamental(scorer.to_pixels(fitted.matrix()))[0]
+        fitted = EssentialModel(self.scorer, *self.cameras).fit(start, refine=True)
+        return unit_fundamental(self.scorer.to_pixels(fitted.matrix()))[0]
 
-    def _try_plane_and_parallax(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+    def _refine_at(self, scale: float, F_mat: Tensor) -> Tensor:
+        """Return the matrix refined on a loss of a scale, pixels."""
+        loss = GemanMcClure(scale)
+        return refine_fundamental(self.points1[None], self.points2[None], F_mat[None], loss=loss).F_mat[0]
+
+    def _try_plane_and_parallax(self, F_mat: Tensor) -> Tensor:
         """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher."""
-        inliers = symmetric_epipolar_distance(points1, points2, F_mat) < self.threshold
+        inliers = self.inliers(F_mat)
         if int(inliers.sum()) < 8:
             return F_mat
-        H = find_homography(points1[inliers], points2[inliers], self.threshold)
+        H = find_homography(self.points1[inliers], self.points2[inliers], self.threshold)
         if H is None:
             return F_mat
-        on_plane = parallax(points1, points2, H)[inliers] < 3 * self.threshold
-        if float(on_plane.double().mean()) <= MIN_PLANAR_SHARE:
+        off_plane = parallax(self.points1, self.points2, H)
+        if float((off_plane[inliers] < 3 * self.threshold).double().mean()) <= MIN_PLANAR_SHARE:
             return F_mat
-        other = fit_plane_and_parallax(points1, points2, H, self.threshold, self.seed)
-        scorer = PairScorer(points1, points2, self.threshold)
-        if other is not None and _score(scorer, other) > MIN_SCORE_GAIN * _score(scorer, F_mat):
+        other = fit_plane_and_parallax(self.points1, self.points2, H, self.threshold, self.seed)
+        if other is not None and self._score(other) > MIN_SCORE_GAIN * self._score(F_mat):
             F_mat = other
-        return self._refine_finely(points1, points2, H, F_mat)
+        return self._refine_finely(off_plane, F_mat)
 
-    def _refine_finely(self, points1: Tensor, points2: Tensor, H: Tensor, F_mat: Tensor) -> Tensor:
-        """Return the matrix, refined at the scale of the noise where no parallax exceeds the threshold.
+    def _refine_finely(self, off_plane: Tensor, F_mat: Tensor) -> Tensor:
+        """Return the matrix, refined at the scale of the noise where no parallax (N,) exceeds the threshold.
 
         Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would the
         inliers of largest error, if the scale of the loss were not the median distance of the inliers.
         """
-        distance = symmetric_epipolar_distance(points1, points2, F_mat)
+        distance = self.distance(F_mat)
         inliers = distance < self.threshold
-        evidence = parallax_evidence(parallax(points1, points2, H), inliers, self.threshold)
+        evidence = parallax_evidence(off_plane, inliers, self.threshold)
         if evidence <= MAX_LOG_CHANCE_PARALLAX or not bool(inliers.any()):
             return F_mat
         noise = float(distance[inliers].median())
         scale = min(max(noise, MIN_LOSS_SCALE * self.threshold), FINAL_LOSS_SCALE * self.threshold)
-        return refine_fundamental(points1[None], points2[None], F_mat[None], loss=GemanMcClure(scale)).F_mat[0]
-
-
-def _score(scorer: PairScorer, F_mat: Tensor) -> float:
-    """Return the MSAC score of a matrix (3, 3) in pixels; zero for a matrix of zeros."""
-    return float(scorer.best(scorer.from_pixels(F_mat[None]), 1).score.sum())
+        return self._refine_at(scale, F_mat)

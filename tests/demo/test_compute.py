@@ -13,8 +13,8 @@ from two_view import epipolar_distances
 
 from kornia_learnnorm.demo import compute as module
 from kornia_learnnorm.demo.compute import METHODS, compare, epipolar_segment, read_picture, render_example
-from kornia_learnnorm.two_view.pair import estimate_pair
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError
+from kornia_learnnorm.two_view.estimate_pair import estimate_pair
+from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")

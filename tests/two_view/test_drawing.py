@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from kornia_learnnorm.two_view.drawing import draw_line, draw_pair, import_matplotlib
-from kornia_learnnorm.two_view.pair_estimate import PairEstimate
-from kornia_learnnorm.two_view.reliability import PairWarning
+from kornia_learnnorm.two_view.result import PairEstimate
+from kornia_learnnorm.two_view.warnings import PairWarning
 
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 image_module = pytest.importorskip("matplotlib.image")

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from two_view import epipolar_distances
 
-from kornia_learnnorm.two_view.parallax import fit_plane_and_parallax, parallax, parallax_evidence
+from kornia_learnnorm.two_view.parallax import find_homography, fit_plane_and_parallax, parallax, parallax_evidence
 
 K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
 R = np.array([[0.9998, 0, 0.02], [0, 1, 0], [-0.02, 0, 0.9998]])
@@ -72,3 +72,10 @@ class TestEvidence:
         distance = torch.full((inliers + outliers + 1,), 30.0)
         less, more = (torch.arange(len(distance)) < number for number in (inliers, inliers + 1))
         assert parallax_evidence(distance, more, 1.0) <= parallax_evidence(distance, less, 1.0)
+
+
+def test_homography():
+    pytest.importorskip("cv2", reason="OpenCV is not installed")
+    points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (40, 2)))
+    found = find_homography(points, points + 7.0, 1.0)
+    assert np.allclose(found / found[2, 2], [[1, 0, 7], [0, 1, 7], [0, 0, 1]], atol=1e-6)

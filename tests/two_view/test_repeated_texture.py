@@ -1,22 +1,107 @@
-"""Estimates of repeated texture, where false matches agree with each other."""
+"""Coherent matches, and estimates of repeated texture, where false matches agree with each other."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from two_view import epipolar_distances, repeated_wall, uniform
+from two_view import WALL_SHIFT, epipolar_distances, homogeneous, repeated_wall, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.kinds import render_kind
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError
-from kornia_learnnorm.two_view.reliability import mutual_share
-from kornia_learnnorm.two_view.two_view import settle_repeats
+from kornia_learnnorm.two_view.repeated_texture import coherent_matches, fitting_share, mutual_share, resolve_ambiguity
+from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 
 SIZE = (640, 480)
+
+
+def wall_homography() -> torch.Tensor:
+    H = torch.eye(3, dtype=torch.float64)
+    H[:2, 2] = torch.from_numpy(WALL_SHIFT)
+    return H
+
+
+def agreeing_share(points: np.ndarray, vectors: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The share of the weights of the 48 nearest points that those with a vector like a point's own have."""
+    shares = []
+    for row in range(len(points)):
+        apart = np.linalg.norm(points - points[row], axis=1)
+        nearest = np.argsort(apart)[1:49]
+        change = np.linalg.norm(vectors[nearest] - vectors[row], axis=1)
+        shares.append(weights[nearest] @ (change < np.maximum(0.3 * apart[nearest], 3.0)) / weights[nearest].sum())
+    return np.array(shares)
+
+
+def coherent_rows(points1: np.ndarray, points2: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Which points have a vector like most of those around them, weighted by their own share in a first round."""
+    share = np.ones(len(vectors))
+    for _ in range(2):
+        share = np.minimum(*(agreeing_share(points, vectors, share) for points in (points1, points2)))
+    return share >= 0.8
+
+
+class TestCoherentMatches:
+    def test_true_matches_are_coherent(self):
+        points1, points2, label = repeated_wall()
+        coherent = coherent_matches(points1, points2, wall_homography(), 1.0)
+        assert coherent[label < 2].double().mean() > 0.95
+        assert not coherent[label == 2].any()
+
+    def test_agrees_with_numpy(self):
+        points1, points2, _ = repeated_wall(seed=1)
+        expected = coherent_rows(points1.numpy(), points2.numpy(), (points2 - points1).numpy() - WALL_SHIFT)
+        found = coherent_matches(points1, points2, wall_homography(), 1.0)
+        np.testing.assert_array_equal(found.numpy(), expected)
+
+    def test_most_neighbours_are_false(self):
+        """Of 100 matches 60 jump by 60 to 120 pixels, so that true ones agree with about 40 % of their neighbours."""
+        generator = torch.Generator().manual_seed(0)
+        points1 = torch.rand(100, 2, dtype=torch.float64, generator=generator) * 200
+        points2 = points1.clone()
+        angle, length = torch.rand(2, 60, dtype=torch.float64, generator=generator)
+        jump = torch.stack([(2 * torch.pi * angle).cos(), (2 * torch.pi * angle).sin()], 1)
+        points2[40:] += (60 + 60 * length)[:, None] * jump
+        coherent = coherent_matches(points1, points2, torch.eye(3, dtype=torch.float64), 1.0)
+        assert coherent[:40].double().mean() > 0.9
+        assert not coherent[40:].any()
+
+    def test_order_and_turns_of_image_2_have_no_effect(self):
+        points1, points2, _ = repeated_wall()
+        expected = coherent_matches(points1, points2, wall_homography(), 1.0)
+        order = torch.randperm(len(points1), generator=torch.Generator().manual_seed(0))
+        turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+        turned = (points2 @ turn[:2, :2].mT)[order]
+        assert (coherent_matches(points1[order], turned, turn @ wall_homography(), 1.0) == expected[order]).all()
+
+    def test_homography_of_a_slanted_wall(self):
+        """Images 1 that are warped by a homography leave the parallax as it was."""
+        points1, points2, _ = repeated_wall()
+        slant = torch.tensor([[1.0, 0.1, 5], [0, 1.1, 0], [8e-4, 2e-4, 1]], dtype=torch.float64)
+        warped = homogeneous(points1.numpy()) @ slant.numpy().T
+        warped1 = torch.from_numpy(warped[:, :2] / warped[:, 2:])
+        expected = coherent_rows(warped1.numpy(), points2.numpy(), (points2 - points1).numpy() - WALL_SHIFT)
+        H = wall_homography() @ torch.linalg.inv(slant)
+        np.testing.assert_array_equal(coherent_matches(warped1, points2, H, 1.0).numpy(), expected)
+
+    @pytest.mark.parametrize("number", [1, 2, 9])
+    def test_few_matches(self, number):
+        points = torch.rand(number, 2, dtype=torch.float64) * 100
+        assert coherent_matches(points, points, torch.eye(3, dtype=torch.float64), 1.0).shape == (number,)
+
+
+def test_fitting_share():
+    """Of 40 matches off the plane of no motion, 30 move along the rows, as under a sideways motion; 10 are on it."""
+    points1 = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 400
+    points2 = points1.clone()
+    points2[:30, 0] += 20
+    points2[30:40, 1] += 20
+    sideways = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    plane = torch.eye(3, dtype=torch.float64)
+    assert fitting_share(points1, points2, plane, sideways, 1.0) == pytest.approx(0.75)
+    assert fitting_share(points1[25:], points2[25:], plane, sideways, 1.0) == 1.0  # only 15 off the plane
 
 
 def test_share_of_mutual_matches():
@@ -40,7 +125,7 @@ def again(first):
     return lambda kept: kln.estimate_matches(first.points1[kept], first.points2[kept], None, SIZE, SIZE)
 
 
-class TestSettleRepeats:
+class TestResolveAmbiguity:
     @staticmethod
     def board_error(estimate) -> float:
         points1, points2, label = repeated_wall(copies=200)
@@ -55,7 +140,7 @@ class TestSettleRepeats:
 
     def test_false_matches_decide_no_more(self, first, again):
         assert self.board_error(first) > 3
-        settled = settle_repeats(first, *self.one_way(), again)
+        settled = resolve_ambiguity(first, *self.one_way(), again)
         assert self.board_error(settled) < 0.3
         assert settled.warnings == ()
         assert settled.num_matches < first.num_matches
@@ -68,21 +153,21 @@ class TestSettleRepeats:
 
         board, few = self.one_way(kind=1), [points[:9] for points in self.one_way()]
         for one_way, estimate in ((board, again), (few, again), (self.one_way(), fail)):
-            (warning,) = settle_repeats(first, *one_way, estimate).warnings
+            (warning,) = resolve_ambiguity(first, *one_way, estimate).warnings
             assert warning.code == "ambiguous"
 
     def test_coherent_matches_decide(self, first, again):
         """As many matches one way only fit the first matrix as that of the coherent matches, which fits these too."""
         one_way = zip(self.one_way(), self.one_way(kind=1), uniform(2, 400, 2, high=480), strict=True)
         false = [torch.cat([copies[:60], board[:60], anywhere]) for copies, board, anywhere in one_way]
-        settled = settle_repeats(first, *false, again)
+        settled = resolve_ambiguity(first, *false, again)
         assert self.board_error(settled) < 0.3
         assert settled.warnings == ()
 
     def test_coherent_matches_that_do_not_fit(self, first, again):
         """The board moves coherently and does not fit the first matrix, nor do matches one way only."""
         anywhere = uniform(2, 100, 2, high=480)
-        found = settle_repeats(first, *anywhere, again)
+        found = resolve_ambiguity(first, *anywhere, again)
         (warning,) = found.warnings
         assert warning.code == "ambiguous"
         assert found.F_mat is first.F_mat

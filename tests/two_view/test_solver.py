@@ -26,7 +26,7 @@ def test_search_near_a_coarse_matrix(seed):
     noisy1, noisy2 = (exact + 4.0 * torch.randn(1000, 4, generator=generator).double())[None, :100].split(2, -1)
     coarse = kln.find_fundamental(noisy1, noisy2)
     assert int(solver.support(coarse)) < 40
-    found = solver.best_of(torch.zeros(3, 3).double(), coarse)
+    found = solver.improve(torch.zeros(3, 3).double(), coarse)
     assert np.median(epipolar_distances(exact[100:, :2], exact[100:, 2:], found)) < 1
 
 

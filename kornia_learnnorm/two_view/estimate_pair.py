@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,16 +18,17 @@ from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points, unit_fundamental
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
-from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, check_whole, read_cameras
-from kornia_learnnorm.two_view.pair_estimate import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.two_view.reliability import MIN_MUTUAL_SHARE, mutual_share
-from kornia_learnnorm.two_view.two_view import estimate_matches, settle_repeats
+from kornia_learnnorm.two_view.estimate_matches import estimate_matches
+from kornia_learnnorm.two_view.inputs import Points, Size, check_number, check_settings, check_whole, read_cameras
+from kornia_learnnorm.two_view.repeated_texture import mutual_share, resolve_ambiguity
+from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
-__all__ = ["MAX_SIZE", "MatchedPair", "check_matching", "estimate_pair", "match_pair"]
+__all__ = ["MAX_SIZE", "MatchedPair", "check_matching", "estimate_pair", "match_two_images"]
 
 MAX_SIZE = 2000  # pixels of the longer side at which images are matched: SIFT then takes up to 0.5 GB and seconds
 MIN_SIZE = 64  # pixels of the longer side; smaller ones have too few features
 NUM_FEATURES = 4000  # of an image
+MIN_MUTUAL_SHARE = 0.85  # of the matches off the plane that fit; below, false ones may agree with each other
 
 Image = str | Path | NDArray[np.uint8] | Tensor
 Mask = NDArray[np.bool_] | Tensor
@@ -88,10 +88,9 @@ def estimate_pair(
 
     """
     check_settings(threshold, seed, layer)
-    check_matching(ratio, max_size, detector, matcher)
     read_cameras(K1, K2)  # before the work begins
-    matched = match_pair(image1, image2, ratio, mask1, mask2, max_size, detector, matcher)
-    return matched.estimate(layer, threshold, seed, K1, K2)
+    pair = match_two_images(image1, image2, ratio, mask1, mask2, max_size, detector, matcher)
+    return pair.estimate(layer, threshold, seed, K1, K2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,19 +101,13 @@ class MatchedPair:
     points2: Tensor  # pixels of image 2 as it was matched, (N, 2), float64
     ratios: Tensor  # larger ratio of the two directions, (N,), float64
     mutual: Tensor  # mask of the matches that pass the ratio test in both directions, (N,), bool
-    size1: tuple[int, int]  # width and height of image 1 as it was matched
-    size2: tuple[int, int]  # width and height of image 2 as it was matched
-    full_size1: tuple[int, int]  # width and height of image 1
-    full_size2: tuple[int, int]  # width and height of image 2
+    size1: Size  # of image 1 as it was matched
+    size2: Size  # of image 2 as it was matched
+    full_size1: Size  # of image 1
+    full_size2: Size  # of image 2
     ratio: float  # largest ratio of the nearest to the second-nearest descriptor distance
     path1: Path | None = None
     path2: Path | None = None
-
-    @property
-    def scale(self) -> float:
-        """Length of a full image as it was matched over its own, mean of both images and axes."""
-        S1, S2 = self._scalings()
-        return float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
 
     def estimate(
         self,
@@ -125,31 +118,34 @@ class MatchedPair:
         K2: Points | None = None,
     ) -> PairEstimate:
         """Return the estimate of the matches; arguments and errors are those of :func:`estimate_pair`."""
+        S1, S2 = scaling(self.full_size1, self.size1), scaling(self.full_size2, self.size2)
         cameras = read_cameras(K1, K2)
-        S1, S2 = self._scalings()
-        scaled = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
-        solve = partial(
-            estimate_matches,
-            size1=self.size1,
-            size2=self.size2,
-            layer=layer,
-            threshold=threshold,
-            seed=seed,
-            K1=scaled[0],
-            K2=scaled[1],
-        )
+        K1, K2 = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
+        options: dict[str, Any] = {"layer": layer, "threshold": threshold, "seed": seed, "K1": K1, "K2": K2}
+
+        def solve(points1: Tensor, points2: Tensor, scores: Tensor) -> PairEstimate:
+            return estimate_matches(points1, points2, scores, self.size1, self.size2, **options)
+
         try:
-            estimate = solve(self.points1[self.mutual], self.points2[self.mutual], 1 - self.ratios[self.mutual])
+            first = solve(self.points1[self.mutual], self.points2[self.mutual], 1 - self.ratios[self.mutual])
         except NoReliableMatrixError as error:
             raise _named(error, (self.path1, self.path2)) from error
-        estimate = self._settled(estimate, solve)
+        found = first
+        if mutual_share(self.points1, self.points2, self.mutual, first.F_mat, threshold) < MIN_MUTUAL_SHARE:
+            found = resolve_ambiguity(
+                first,
+                self.points1[~self.mutual],
+                self.points2[~self.mutual],
+                lambda kept: solve(first.points1[kept], first.points2[kept], first.scores[kept]),
+            )
+        scale = float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
         return replace(
-            estimate,
-            F_mat=unit_fundamental(transform_fundamental(estimate.F_mat, S1, S2)),
-            points1=transform_points(estimate.points1[None], torch.linalg.inv(S1)[None])[0],
-            points2=transform_points(estimate.points2[None], torch.linalg.inv(S2)[None])[0],
-            predicted_error=estimate.predicted_error / self.scale,
-            threshold=estimate.threshold / self.scale,
+            found,
+            F_mat=unit_fundamental(transform_fundamental(found.F_mat, S1, S2)),
+            points1=transform_points(found.points1[None], torch.linalg.inv(S1)[None])[0],
+            points2=transform_points(found.points2[None], torch.linalg.inv(S2)[None])[0],
+            predicted_error=found.predicted_error / scale,
+            threshold=threshold / scale,
             size1=self.full_size1,
             size2=self.full_size2,
             ratio=self.ratio,
@@ -157,22 +153,8 @@ class MatchedPair:
             path2=self.path2,
         )
 
-    def _settled(self, first: PairEstimate, solve: Callable[..., PairEstimate]) -> PairEstimate:
-        """Return an estimate, or where many false matches fit it that of the coherent matches."""
-        if mutual_share(self.points1, self.points2, self.mutual, first.F_mat, first.threshold) >= MIN_MUTUAL_SHARE:
-            return first
 
-        def again(kept: Tensor) -> PairEstimate:
-            return solve(first.points1[kept], first.points2[kept], first.scores[kept])
-
-        return settle_repeats(first, self.points1[~self.mutual], self.points2[~self.mutual], again)
-
-    def _scalings(self) -> tuple[Tensor, Tensor]:
-        """Return the transforms of pixels from the full images to those that were matched, (3, 3) each."""
-        return scaling(self.full_size1, self.size1), scaling(self.full_size2, self.size2)
-
-
-def match_pair(
+def match_two_images(
     image1: Image,
     image2: Image,
     ratio: float = RATIO,
@@ -185,19 +167,22 @@ def match_pair(
     """Return the matches of two images; arguments and errors are those of :func:`estimate_pair`."""
     check_matching(ratio, max_size, detector, matcher)
     path1, path2 = (Path(image) if isinstance(image, str | Path) else None for image in (image1, image2))
-    view1, full_size1 = _view(image1, mask1, max_size, detector)
-    view2, full_size2 = _view(image2, mask2, max_size, detector)
-    try:
-        matches = _match(view1, view2, ratio, matcher)
-    except NoReliableMatrixError as error:
-        raise _named(error, (path1, path2)) from error
-    return MatchedPair(*matches, view1.size, view2.size, full_size1, full_size2, float(ratio), path1, path2)
-
-
-def _named(error: NoReliableMatrixError, paths: tuple[Path | None, Path | None]) -> NoReliableMatrixError:
-    """Return the error with the names of both images before its text."""
-    names = " and ".join(str(path or f"image {number}") for number, path in enumerate(paths, 1))
-    return NoReliableMatrixError(error.code, f"{names}: {error}")
+    features1, full_size1 = _features(image1, mask1, max_size, detector)
+    features2, full_size2 = _features(image2, mask2, max_size, detector)
+    for number, features in enumerate((features1, features2), 1):
+        if len(features.points) < 2:
+            text = f"image {number} is blank, nearly so, or masked: {len(features.points)} features, expected 2 or more"
+            raise _named(NoReliableMatrixError("blank", text), (path1, path2))
+    if matcher == "nearest":
+        matches, back = match_both_ways(features1, features2)
+        larger = torch.maximum(matches.ratio, back)
+    else:
+        matches = MATCHERS[matcher](features1, features2)
+        larger = matches.ratio
+    kept = matches.ratio.double() < ratio
+    points1, points2, ratios = (value[kept].double() for value in (matches.points1, matches.points2, larger))
+    sizes = features1.size, features2.size, full_size1, full_size2
+    return MatchedPair(points1, points2, ratios, ratios < ratio, *sizes, float(ratio), path1, path2)
 
 
 def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> None:
@@ -215,20 +200,13 @@ def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> 
         raise ValueError(f"matcher lightglue needs detector disk, got {detector}")
 
 
-def _match(view1: Features, view2: Features, ratio: float, matcher: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the nearest neighbours that pass the ratio test, their larger ratios, and which pass it both ways."""
-    for number, view in enumerate((view1, view2), 1):
-        if len(view.points) < 2:
-            text = f"image {number} is blank, nearly so, or masked: {len(view.points)} features, expected 2 or more"
-            raise NoReliableMatrixError("blank", text)
-    matches, back = match_both_ways(view1, view2) if matcher == "nearest" else (MATCHERS[matcher](view1, view2), None)
-    points1, points2, ratios = (value.double() for value in matches)
-    larger = ratios if back is None else torch.maximum(ratios, back.double())
-    kept = ratios < ratio
-    return points1[kept], points2[kept], larger[kept], larger[kept] < ratio
+def _named(error: NoReliableMatrixError, paths: tuple[Path | None, Path | None]) -> NoReliableMatrixError:
+    """Return the error with the names of both images before its text."""
+    names = " and ".join(str(path or f"image {number}") for number, path in enumerate(paths, 1))
+    return NoReliableMatrixError(error.code, f"{names}: {error}")
 
 
-def _view(image: Image, mask: Mask | None, max_size: int, detector: str) -> tuple[Features, tuple[int, int]]:
+def _features(image: Image, mask: Mask | None, max_size: int, detector: str) -> tuple[Features, Size]:
     """Return the features of an image at the size at which it is matched, and its full size."""
     grey, size = _grey(image, max_size)
     frame = content_mask(grey)
@@ -244,7 +222,7 @@ def _view(image: Image, mask: Mask | None, max_size: int, detector: str) -> tupl
     return (features if frame is None else keep_features(features, frame)), size
 
 
-def _grey(image: Image, max_size: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
+def _grey(image: Image, max_size: int) -> tuple[NDArray[np.uint8], Size]:
     """Return the grey values of an image of at most a size, and its full size."""
     if isinstance(image, str | Path):
         return read_image(image, max_size), image_size(image)

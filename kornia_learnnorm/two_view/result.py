@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.summary import median
-from kornia_learnnorm.two_view.reliability import PairWarning
+from kornia_learnnorm.two_view.warnings import PairWarning
 
 __all__ = ["NoReliableMatrixError", "PairEstimate", "package_versions"]
 
@@ -68,17 +68,14 @@ class PairEstimate:
     def as_dict(self) -> dict[str, Any]:
         """Return all of it as what JSON can hold."""
 
-        def rows(value: Tensor | None) -> Any:
-            return None if value is None else value.tolist()
-
         def view(path: Path | None, size: tuple[int, int]) -> dict[str, Any]:
             return {"file": None if path is None else str(path), "width": size[0], "height": size[1]}
 
-        return {
-            "F": rows(self.F_mat),
-            "E": rows(self.E_mat),
-            "R": rows(self.R),
-            "t": rows(self.t),
+        content = {
+            "F": self.F_mat,
+            "E": self.E_mat,
+            "R": self.R,
+            "t": self.t,
             "convention": "x2^T F x1 = 0, x = (column, row, 1) in pixels, X2 = R X1 + t; F and E have unit norm",
             "predicted_error_px": self.predicted_error,
             "warnings": [warning._asdict() for warning in self.warnings],
@@ -90,14 +87,11 @@ class PairEstimate:
             "threshold_px": self.threshold,
             "num_matches": self.num_matches,
             "num_inliers": self.num_inliers,
-            "points1": rows(self.points1),
-            "points2": rows(self.points2),
-            "scores": rows(self.scores),
-            "weights": rows(self.weights),
-            "inliers": rows(self.inliers),
-            "in_front": rows(self.front),
+            **{name: getattr(self, name) for name in ("points1", "points2", "scores", "weights", "inliers")},
+            "in_front": self.front,
             "versions": package_versions(),
         }
+        return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in content.items()}
 
     def summary(self) -> str:
         """Return F row by row, the pose with cameras, the counts, the predicted error and the warnings as text."""
@@ -108,20 +102,13 @@ class PairEstimate:
         lines = ["F (x2^T F x1 = 0 in pixels, unit Frobenius norm)", *rows(self.F_mat)]
         if self.R is not None and self.t is not None:
             lines += ["R (X2 = R X1 + t)", *rows(self.R), "t (direction)", *rows(self.t[None])]
-        share = self.num_inliers / self.num_matches
         ratio = "" if self.ratio is None else f" (ratio test {self.ratio:g})"
+        share = self.num_inliers / self.num_matches
         within = f"symmetric epipolar distance < {self.threshold:.3g} px, median {self.median_distance:.2f} px"
         error = f"{self.predicted_error:.2f} px (typical error of epipolar lines where true matches lie)"
-        return "\n".join(
-            [
-                *lines,
-                f"by       {self.estimator}, seed {self.seed}",
-                f"matches  {self.num_matches}{ratio}",
-                f"inliers  {self.num_inliers} ({share:.1%}), {within}",
-                f"error    predicted error of F: {error}",
-                *(f"warning  {warning.code}: {warning.text}" for warning in self.warnings),
-            ]
-        )
+        lines += [f"by       {self.estimator}, seed {self.seed}", f"matches  {self.num_matches}{ratio}"]
+        lines += [f"inliers  {self.num_inliers} ({share:.1%}), {within}", f"error    predicted error of F: {error}"]
+        return "\n".join([*lines, *(f"warning  {warning.code}: {warning.text}" for warning in self.warnings)])
 
 
 def package_versions() -> dict[str, str]:

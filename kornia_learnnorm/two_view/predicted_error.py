@@ -1,0 +1,105 @@
+"""How far the fundamental matrix of matches may be off, from those of random parts of the matches."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from torch import Tensor
+
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.metrics.poses import pose_error
+from kornia_learnnorm.two_view.inputs import Size
+
+__all__ = ["PredictedError", "drop_failed_parts", "nominal_camera", "predict_error", "random_parts"]
+
+NUM_PARTS = 12  # random parts of the matches that are solved again
+PART_INLIERS = 48  # expected in a part, where these are more than half and less than four fifths of all inliers
+MIN_SUPPORT = 0.75  # of the inliers; the matrix of a part with fewer is that of a search that failed
+MIN_SOLVED_PARTS = 4  # with fewer matrices of as much support, those of all parts count
+NOMINAL_FOCAL = 1.2  # of the longer image side: focal length where no camera is given
+COMMON_ERRORS = 400  # matches beyond which more do not help: the errors of neighbours are alike
+
+
+class PredictedError(NamedTuple):
+    """Standard errors of a fundamental matrix.
+
+    Attributes:
+        distance: median symmetric epipolar distance, pixels.
+        angle: larger angle of the rotations and of the directions of translation, degrees.
+    """
+
+    distance: float
+    angle: float
+
+
+def random_parts(number: int, inliers: int, seed: int) -> Tensor:
+    """Return the rows (P, M) of random parts of the matches: half of them, or so many that 48 inliers are expected."""
+    share = min(max(0.5, PART_INLIERS / max(1, inliers)), 0.8)
+    size = min(max(8, round(share * number)), number - 1)
+    generator = torch.Generator().manual_seed(seed)
+    return torch.stack([torch.randperm(number, generator=generator)[:size] for _ in range(NUM_PARTS)])
+
+
+def drop_failed_parts(F_parts: Tensor, support: Tensor, inliers: int) -> Tensor:
+    """Return the matrices of parts that most inliers agree with; all of them where these are few.
+
+    Among many outliers the search in a part can fail. Its matrix has little support among all matches then, and says
+    nothing about how well the inliers determine theirs, unlike another matrix with as much support.
+
+    Args:
+        F_parts: matrices of the parts, (P, 3, 3).
+        support: number of all matches that agree with each, (P,).
+        inliers: number that agree with the matrix of all.
+    """
+    solved = support >= MIN_SUPPORT * inliers
+    return F_parts[solved] if int(solved.sum()) >= MIN_SOLVED_PARTS else F_parts
+
+
+def predict_error(
+    F_parts: Tensor, size: int, points1: Tensor, points2: Tensor, F_mat: Tensor, inliers: Tensor, K1: Tensor, K2: Tensor
+) -> PredictedError:
+    """Return the standard errors of ``F_mat`` from its distance to the matrices of random parts of the matches.
+
+    A part of m of N matches, drawn without replacement, differs from all of them with N / m - 1 times the variance of
+    the latter (delete-d jackknife: J. Shao, C. Wu, A general theory for jackknife variance estimation, Annals of
+    Statistics 1989). Errors of neighbouring matches are alike, so no more than 400 of them count.
+
+    Args:
+        F_parts: matrices of the parts of :func:`random_parts`, (P, 3, 3); zeros where there is none.
+        size: matches in a part.
+        points1: pixels of all matches in image 1, (N, 2), float64.
+        points2: pixels of all matches in image 2, (N, 2).
+        F_mat: matrix of all matches, (3, 3).
+        inliers: mask of its inliers, (N,).
+        K1: camera of image 1, (3, 3), or a guess.
+        K2: camera of image 2, (3, 3), or a guess.
+    """
+    number = len(points1)
+    unit = math.sqrt(1 / min(number, COMMON_ERRORS) / (1 / size - 1 / number))
+    x1 = points1[inliers].expand(len(F_parts), -1, -1)
+    x2 = _onto_lines(points1[inliers], points2[inliers], F_mat).expand(len(F_parts), -1, -1)
+    distance = symmetric_epipolar_distance(x1, x2, F_parts).nan_to_num(nan=math.inf).median()
+    cameras = K1.expand_as(F_parts), K2.expand_as(F_parts)
+    R, t = relative_pose(F_mat[None], *(value[:1] for value in (*cameras, x1, x2)))
+    R_parts, t_parts = relative_pose(F_parts, *cameras, x1, x2)
+    angles = pose_error(R_parts, t_parts, R.expand_as(R_parts), t.expand_as(t_parts))
+    angle = (math.sqrt(size / (number - size)) * angles.nan_to_num(nan=180.0)).clamp(max=180.0).median()
+    return PredictedError(unit * float(distance), float(angle))
+
+
+def _onto_lines(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+    """Return points2 (N, 2) moved onto their epipolar lines."""
+    line = convert_points_to_homogeneous(points1) @ F_mat.mT
+    normal = line[:, :2]
+    distance = ((normal * points2).sum(-1) + line[:, 2]) / normal.square().sum(-1)
+    return points2 - distance[:, None] * normal
+
+
+def nominal_camera(size: Size) -> Tensor:
+    """Return the camera (3, 3) of a common lens for an image of a width and height."""
+    focal = NOMINAL_FOCAL * max(size)
+    return torch.tensor([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]], dtype=torch.float64)

@@ -1,0 +1,136 @@
+"""Reasons to doubt the fundamental matrix of an image pair, from the matches alone, without a ground truth."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
+from kornia_learnnorm.two_view.inputs import Size
+from kornia_learnnorm.two_view.parallax import parallax_evidence
+
+__all__ = [
+    "MAX_LOG_CHANCE_PARALLAX",
+    "MAX_LOG_FALSE_ALARMS",
+    "MIN_INLIERS",
+    "MIN_PLANAR_SHARE",
+    "PairWarning",
+    "find_warnings",
+    "log_false_alarms",
+    "log_false_samples",
+]
+
+MAX_ANGLE = 8.0  # degrees; a pose that moves by more in half of the parts is unstable
+MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
+MIN_SPREAD = 0.02  # of the image diagonal; standard deviation of the inliers across their longest direction
+SEARCH_SAMPLES = 50_000  # minimal samples of a search that finds nothing
+MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of random models with as much support
+MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
+PARALLAX_SCALES = (1.0, 0.5, 0.25, 0.125)  # of the threshold at which parallax is sought; SIFT errs by 0.1 px or so
+MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
+
+
+class PairWarning(NamedTuple):
+    """A reason to doubt a fundamental matrix.
+
+    Attributes:
+        code: one word for programs: ``few_inliers``, ``chance``, ``clustered``, ``planar``, ``unstable``,
+            ``ambiguous`` or ``no_pose``.
+        text: one sentence for people.
+    """
+
+    code: str
+    text: str
+
+
+def find_warnings(
+    points1: Tensor,
+    points2: Tensor,
+    distance: Tensor,
+    off_plane: Tensor | None,
+    threshold: float,
+    size2: Size,
+    angle: float,
+) -> tuple[PairWarning, ...]:
+    """Return the reasons to doubt the matrix of a pair; none when all is well.
+
+    Args:
+        points1: pixels of all matches in image 1, (N, 2), float64.
+        points2: pixels of all matches in image 2, (N, 2).
+        distance: symmetric epipolar distances of the matches to the matrix, (N,), pixels.
+        off_plane: distances of the matches from the plane that explains most inliers, pixels, (N,), or None; see
+            :func:`~kornia_learnnorm.two_view.plane_distances.distances_from_plane`.
+        threshold: largest distance of an inlier, pixels.
+        size2: width and height of image 2.
+        angle: standard error of the pose, see :class:`~kornia_learnnorm.two_view.predicted_error.PredictedError`.
+    """
+    inliers = distance < threshold
+    found, total, matches = {}, int(inliers.sum()), len(inliers)
+    if total < MIN_INLIERS:
+        found["few_inliers"] = f"only {total} of {matches} matches agree on the matrix"
+    if log_false_alarms(matches, total, threshold, size2) > MAX_LOG_FALSE_ALARMS:
+        found["chance"] = f"{total} of {matches} matches agree within {threshold:g} px, no more than chance would give"
+    spread = min(_spread(points[inliers]) for points in (points1, points2)) / math.hypot(*size2)
+    if spread < MIN_SPREAD:
+        text = f"the inliers lie close to one line or one point: {spread:.1%} of the image diagonal apart"
+        found["clustered"] = text
+    if off_plane is not None:
+        found |= _find_plane(off_plane, distance, threshold)
+    if angle > MAX_ANGLE:
+        found["unstable"] = f"the pose changes by {angle:.0f} degrees when the matches are drawn anew"
+    return tuple(PairWarning(*item) for item in found.items())
+
+
+def _find_plane(off_plane: Tensor, distance: Tensor, threshold: float) -> dict[str, str]:
+    """Return a warning where most inliers lie on a plane and the parallax of the others is no more than chance."""
+    near, wide = (float((off_plane[distance < threshold] < k * threshold).double().mean()) for k in (1, 3))
+    evidence = min(parallax_evidence(off_plane, distance < k * threshold, k * threshold) for k in PARALLAX_SCALES)
+    if wide <= MIN_PLANAR_SHARE or evidence <= MAX_LOG_CHANCE_PARALLAX:
+        return {}
+    text = (
+        f"one homography explains {near:.0%} of the inliers within {threshold:g} px and {wide:.0%} within "
+        f"{3 * threshold:g} px (a plane, or a camera that only rotates), and the rest do not determine the epipole"
+    )
+    return {"planar": text}
+
+
+def _spread(points: Tensor) -> float:
+    """Return the standard deviation of points (N, 2) across the direction in which they spread most, pixels."""
+    return float(torch.linalg.svdvals(points - points.mean(0))[-1]) / math.sqrt(len(points))
+
+
+def log_false_alarms(matches: int, inliers: int, threshold: float, size: Size) -> float:
+    """Return log10 of the expected number of matrices with as many inliers among random matches.
+
+    L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches between two images and estimate the
+    fundamental matrix, IJCV 2004: models from seven matches, and the probability that a random point lies within the
+    threshold of a line.
+
+    Args:
+        matches: number of matches.
+        inliers: number of inliers.
+        threshold: largest distance of an inlier, pixels.
+        size: width and height of image 2, pixels.
+    """
+    tests = max(1, matches - 7) * math.comb(matches, inliers) * math.comb(inliers, 7)
+    return math.log10(max(1, tests)) + (inliers - 7) * _log_strip(threshold, size)
+
+
+def log_false_samples(matches: int, inliers: int, threshold: float, size: Size) -> float:
+    """Return log10 of the expected number of a search's samples with as many inliers among random matches.
+
+    A search tries 50,000 samples of eight, far fewer than all that :func:`log_false_alarms` counts. A true matrix with
+    too few inliers to be told from all those can have more than a search among random matches finds. Arguments are
+    those of :func:`log_false_alarms`.
+    """
+    others = max(0, inliers - SAMPLE_SIZE)
+    samples = SEARCH_SAMPLES * math.comb(max(0, matches - SAMPLE_SIZE), others)
+    return math.log10(max(1, samples)) + others * _log_strip(threshold, size)
+
+
+def _log_strip(threshold: float, size: Size) -> float:
+    """Return log10 of a bound on the share of an image within a threshold (pixels) of a line."""
+    return math.log10(min(1.0, 2 * threshold * math.hypot(*size) / math.prod(size)))

@@ -1,0 +1,267 @@
+"""The command ``learnnorm estimate`` on one pair and on many."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kornia_learnnorm.cli import estimate as command_module
+from kornia_learnnorm.cli.estimate import add_arguments, run
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.two_view.estimate_pair import estimate_pair
+from kornia_learnnorm.two_view.many_pairs import read_pair_list
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+
+from two_planes import HEIGHT, WIDTH, write_images  # noqa: E402 (needs OpenCV)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_images(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="module")
+def result(folder):
+    return estimate_pair(folder / "left.png", folder / "right.png")
+
+
+@pytest.fixture
+def command(folder, tmp_path, monkeypatch):
+    """Run the command in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments, images=("left", "right")):
+        parser = argparse.ArgumentParser()
+        add_arguments(parser)
+        return run(parser.parse_args([*(f"{folder}/{name}.png" for name in images), *arguments]))
+
+    return call
+
+
+@pytest.fixture
+def many(command, folder):
+    """Run the command on a list of pairs."""
+    Path("list.txt").write_text(f"{folder}/left.png {folder}/right.png\n")
+
+    def call(*arguments):
+        return command("--pairs", "list.txt", *arguments, images=())
+
+    return call
+
+
+class TestOnePair:
+    def test_prints_the_estimate(self, command, result, capsys):
+        assert command() == 0
+        lines = capsys.readouterr().out.splitlines()
+        printed = [[float(value) for value in line.split()] for line in lines[1:4]]
+        assert np.allclose(printed, result.F_mat.numpy(), rtol=1e-8)
+        assert re.match(r"by +RANSAC, seed 0", lines[4])
+        assert re.match(rf"matches +{result.num_matches} \(ratio test 0\.8\)", lines[5])
+        assert re.match(rf"inliers +{result.num_inliers} ", lines[6])
+        assert f"predicted error of F: {result.predicted_error:.2f} px (typical error of epipolar lines" in lines[7]
+        assert len(lines) == 8
+        assert not list(Path().iterdir())
+
+    def test_writes_picture_and_json(self, command, capsys):
+        pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
+        LearnedEightPoint.from_pretrained("robust-tiny").save_pretrained("mine.safetensors")
+        estimator = ("--estimator", "learned", "--weights", "mine.safetensors", "--ratio", "0.7", "--threshold", "2")
+        assert command("--out", "pair.png", "--json", "F.json", *estimator) == 0
+        Path("mine.safetensors").unlink()
+        assert sorted(path.name for path in Path().iterdir()) == ["F.json", "pair.png"]
+        assert cv2.imread("pair.png").shape[1] == 1200
+        printed = capsys.readouterr().out
+        assert printed.splitlines()[-2:] == ["wrote    pair.png", "wrote    F.json"]
+        assert "by       LearnedEightPoint" in printed
+        assert "(ratio test 0.7)" in printed
+        assert "< 2 px" in printed
+
+    def test_json_to_standard_output(self, command, result, capsys):
+        assert command("--json", "-", "--K", "300,300,160,120") == 0
+        content = json.loads(capsys.readouterr().out)
+        assert content["num_matches"] == result.num_matches
+        assert np.array(content["R"]).shape == (3, 3)
+
+    def test_exit_codes(self, command, folder, capsys):
+        """3 with a warning, and where there is no matrix; no picture is written in the latter case."""
+        assert command("--json", "F.json", images=("left", "plane")) == 3
+        assert "\nwarning  planar: one homography explains" in capsys.readouterr().out
+        assert "planar" in [warning["code"] for warning in json.loads(Path("F.json").read_text())["warnings"]]
+        assert command("--json", "F.json", images=("left", "left")) == 3
+        captured = capsys.readouterr()
+        assert captured.out == "wrote    F.json\n"
+        assert "no reliable matrix (no_motion): " in captured.err
+        failure = json.loads(Path("F.json").read_text())
+        assert [failure[name] for name in ("F", "E", "R", "t", "predicted_error_px")] == [None] * 5
+        assert [warning["code"] for warning in failure["warnings"]] == ["no_motion"]
+        assert "no motion" in failure["warnings"][0]["text"]
+        assert failure["image1"] == {"file": f"{folder}/left.png", "width": WIDTH, "height": HEIGHT}
+        assert [failure[name] for name in ("estimator", "seed", "ratio", "threshold_px")] == ["RANSAC", 0, 0.8, 1]
+        assert command("--json", "-", "--out", "pair.png", images=("left", "left")) == 3
+        assert json.loads(capsys.readouterr().out) == failure
+        assert [path.name for path in Path().iterdir()] == ["F.json"]
+
+    def test_masks(self, command, result, capsys):
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:, WIDTH // 2 :] = 0
+        cv2.imwrite("mask.png", mask)
+        command("--mask", "mask.png", "--json", "-")
+        content = json.loads(capsys.readouterr().out)
+        assert np.array(content["points1"])[:, 0].max() < WIDTH // 2
+        assert np.array(content["points2"])[:, 0].max() < WIDTH // 2
+        assert 8 <= content["num_matches"] < result.num_matches
+
+    @pytest.mark.parametrize(
+        ("arguments", "error", "message"),
+        [
+            (["--out", "pair.txt"], ValueError, r"--out pair\.txt: expected a name that ends in one of \.png"),
+            (["--out", "pair"], ValueError, "--out pair: expected"),
+            (["--out", "none/pair.png"], FileNotFoundError, "folder none does not exist"),
+            (["--json", "none/F.json"], FileNotFoundError, "folder none does not exist"),
+            (["--json", "."], ValueError, "not a regular file"),
+            (["--out", "a.png", "--json", "a.png"], ValueError, "would overwrite another file"),
+            (["--out", "IMAGE"], ValueError, r"--out .*left\.png: would overwrite"),
+            (["--out", "pair.png"], ImportError, r"pip install '\.\[report\]'"),  # without Matplotlib
+            (["--K", "1,2"], ValueError, "camera 1,2: expected fx,fy,cx,cy, .* got 2 numbers"),
+            (["--K", "a", "b", "c"], ValueError, "--K: one value for both images or one for each expected, got 3"),
+            (["--mask", "none.png"], FileNotFoundError, "none.png"),
+            (["--jobs", "3"], ValueError, "--jobs: only for --pairs LIST, which was not given"),
+            (["--jobs", "3", "--dask", "tcp://a:1"], ValueError, "--jobs and --dask: only for --pairs"),
+            (["--pairs", "l.txt"], ValueError, r"--pairs l\.txt: cannot be combined with image files$"),
+            (["--pairs", "l.txt", "--json", "-"], ValueError, "cannot be combined with image files and --json$"),
+            (["--matcher", "lightglue"], ValueError, "matcher lightglue needs detector disk, got sift"),
+            (["--ratio", "2"], ValueError, "ratio must be above 0 and at most 1, got 2"),
+            (["--weights", "robust"], ValueError, "--weights robust: only --estimator learned has weights"),
+        ],
+    )
+    def test_bad_options_are_refused_before_the_work(
+        self, command, folder, arguments, error, message, monkeypatch, capsys
+    ):
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: pytest.fail("the work was begun"))
+        with pytest.raises(error, match=message):
+            command(*(f"{folder}/left.png" if text == "IMAGE" else text for text in arguments))
+        assert not list(Path().iterdir())
+        assert capsys.readouterr().out == ""
+
+    @pytest.mark.parametrize("seed", ["-1", "1.5", "x", str(2**63)])
+    def test_seeds_are_checked_while_parsing(self, command, seed, capsys):
+        with pytest.raises(SystemExit, match="2"):
+            command("--seed", seed)
+        assert f"a whole number from 0 to 2^63 - 1 expected, got {seed}" in capsys.readouterr().err
+
+    def test_help_fits_a_screen(self, monkeypatch, capsys):
+        monkeypatch.setenv("COLUMNS", "100")
+        with pytest.raises(SystemExit, match="0"):
+            main(["estimate", "--help"])
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) <= 45
+        assert max(map(len, lines)) <= 100
+        assert [line.split()[:2] for line in lines[-2:]] == [["learnnorm", "estimate"]] * 2
+
+    def test_failures_write_nothing(self, command, result, monkeypatch, capsys):
+        """Not even the picture, when the last step fails."""
+
+        def full(path, text):
+            Path(path).write_text("half")
+            raise OSError("no space left")
+
+        monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: result)
+        monkeypatch.setattr(command_module, "write_text", full)
+        with pytest.raises(OSError, match="no space left"):
+            command("--out", "pair.png", "--json", "F.json")
+        assert not list(Path().iterdir())
+        assert capsys.readouterr().out == ""
+
+
+class TestManyPairs:
+    def test_one_line_a_pair_and_what_is_done_stays(self, many, folder, result, capsys):
+        with Path("list.txt").open("a") as file:
+            file.write(f"\n{folder}/left.png {folder}/blank.png\n")
+        options = ("--out", "found", "--jobs", "1")
+        assert many(*options) == 3
+        printed = capsys.readouterr()
+        assert printed.out.endswith("wrote found: 1 of 2 pairs solved, 1 failed\n")
+        assert f"failed: {folder}/left.png {folder}/blank.png: " in printed.err
+        assert "(blank)" in printed.err
+        path = Path("found/pairs.jsonl")
+        first = path.read_text()
+        path.write_text(first + '{"F": nu')  # as a killed run leaves it
+        with Path("list.txt").open("a") as file:
+            file.write(f"{folder}/left.png late.png\n")
+        Path("late.png").write_bytes((folder / "half.png").read_bytes())
+        assert many(*options) == 3
+        assert path.read_text().startswith(first)
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        codes = [[warning["code"] for warning in line["warnings"]] for line in lines]
+        assert codes == [[], ["blank"], ["unreadable"]]
+        assert np.allclose(lines[0]["F"], result.F_mat)
+        assert lines[1]["F"] is None
+        assert lines[1]["image2"] == {"file": f"{folder}/blank.png", "width": WIDTH, "height": HEIGHT}
+        assert lines[1]["versions"] == lines[0]["versions"]
+        with pytest.raises(ValueError, match="results with other options"):
+            many(*options, "--ratio", "0.7")
+        # what was unreadable is tried again
+        Path("late.png").write_bytes((folder / "right.png").read_bytes())
+        many(*options)
+        assert [json.loads(line)["F"] is None for line in path.read_text().splitlines()] == [False, True, False]
+
+    def test_failures_and_warnings_are_counted_apart(self, capsys):
+        warning = [{"code": "why", "text": "A reason"}]
+        images = {"image1": {"file": "a"}, "image2": {"file": "b"}}
+        solved, doubtful, failed = (
+            {"F": F, "warnings": w, **images} for F, w in ((1, []), (1, warning), (None, warning))
+        )
+        command_module._print_pairs([solved, solved], Path("found"))
+        command_module._print_pairs([solved, doubtful, *7 * [failed]], Path("found"))
+        printed = capsys.readouterr()
+        assert printed.out.splitlines() == [
+            "wrote found: 2 of 2 pairs solved",
+            "wrote found: 2 of 9 pairs solved, 7 failed; 1 solved with warnings",
+        ]
+        *named, more = printed.err.splitlines()
+        assert named == 5 * ["failed: a b: A reason (why)"]
+        assert more.startswith("and 2 more: ")
+
+    def test_names_with_spaces_and_comments(self, tmp_path):
+        (tmp_path / "list.txt").write_text("# two images\n'a b.png' c.png\n")
+        assert read_pair_list(tmp_path / "list.txt") == [(tmp_path / "a b.png", tmp_path / "c.png")]
+
+    @pytest.mark.parametrize(
+        ("options", "error", "message"),
+        [
+            (["--out", "list.txt"], ValueError, r"--out list\.txt: a folder expected with --pairs, got a file"),
+            ([], ValueError, "--out FOLDER is needed"),
+            (["--out", "found", "--mask", "a.png"], ValueError, r"--pairs list\.txt: cannot be combined with --mask$"),
+            (["--out", "found", "--jobs", "2", "--dask", "tcp://a:1"], ValueError, "exclude each other"),
+            (["--out", "found", "--threshold", "-1"], ValueError, "threshold must be positive"),
+            (["--out", "found", "--estimator", "learned", "--weights", "no"], (ValueError, OSError), "no"),
+            (["--out", "found", "--K", "none.txt"], FileNotFoundError, r"camera none\.txt"),
+        ],
+    )
+    def test_bad_options_are_refused_before_the_work(self, many, options, error, message):
+        with pytest.raises(error, match=message):
+            many(*options)
+        assert not Path("found").exists()
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("'a.png b.png\n", "line 1: No closing quotation"),
+            ("a.png b.png c.png\n", "line 1: two image files expected, got 3"),
+            ("\n", "lists no pairs"),
+        ],
+    )
+    def test_bad_lists(self, many, text, message):
+        Path("list.txt").write_text(text)
+        with pytest.raises(ValueError, match=message):
+            many("--out", "found")
+        assert not Path("found").exists()

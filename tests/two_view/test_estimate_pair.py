@@ -1,0 +1,219 @@
+"""The estimate of two images, against the true geometry of rendered ones, and its errors."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from two_view import epipolar_distances
+
+from kornia_learnnorm.data.datasets.frames import FramePair
+from kornia_learnnorm.data.datasets.reading import read_dataset
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.two_view import estimate_pair as pair_module
+from kornia_learnnorm.two_view.estimate_pair import estimate_pair, match_two_images
+from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+
+from two_planes import HEIGHT, WIDTH, F, K, R, t, write_images  # noqa: E402 (needs OpenCV)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_images(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="module")
+def images(folder):
+    return folder / "left.png", folder / "right.png"
+
+
+@pytest.fixture(scope="module")
+def result(images) -> PairEstimate:
+    return estimate_pair(*images)
+
+
+def distances(points: PairEstimate, F_mat) -> np.ndarray:
+    """Epipolar distances of the inliers of an estimate."""
+    return epipolar_distances(points.points1[points.inliers], points.points2[points.inliers], F_mat)
+
+
+class TestEstimatePair:
+    def test_finds_the_true_geometry(self, result):
+        assert result.num_inliers > max(150, 0.8 * result.num_matches)
+        assert np.median(distances(result, F)) < 0.3
+        # Exact projections of points between and behind the planes, which the estimate has not seen.
+        X = np.random.default_rng(2).uniform([-1.5, -1.0, 4.0], [1.5, 1.0, 12.0], (200, 3))
+        x1, x2 = X @ K.T, (X @ R.T + t) @ K.T
+        unseen = epipolar_distances(x1[:, :2] / x1[:, 2:], x2[:, :2] / x2[:, 2:], result.F_mat)
+        assert np.median(unseen) < 0.5
+
+    def test_fields(self, images, result):
+        """Among them the matches, which are distinct, and the inliers and errors, which belong to the returned F."""
+        assert result.F_mat.dtype == result.points1.dtype == torch.float64
+        assert abs(result.F_mat.norm().item() - 1) < 1e-12
+        assert np.linalg.svd(result.F_mat.numpy())[1][2] < 1e-12
+        assert (result.size1, result.size2) == ((WIDTH, HEIGHT), (WIDTH, HEIGHT))
+        assert (result.path1, result.path2) == images
+        for points in (result.points1, result.points2):
+            assert len(points.unique(dim=0)) == result.num_matches == len(points)
+        d = epipolar_distances(result.points1, result.points2, result.F_mat)
+        assert np.array_equal(d < 1.0, result.inliers.numpy())
+        assert result.median_distance == pytest.approx(np.median(d[d < 1]), rel=1e-6)
+        assert 0 < result.predicted_error < 0.5
+        assert (result.estimator, result.warnings) == ("RANSAC", ())
+
+    def test_seeds(self, images, result):
+        """The same files and seed give the same estimate, other seeds a similar one."""
+        again = estimate_pair(*map(str, images))
+        assert torch.equal(again.F_mat, result.F_mat)
+        assert torch.equal(again.inliers, result.inliers)
+        other = estimate_pair(*images, seed=7)
+        assert abs(other.num_inliers - result.num_inliers) < 0.05 * result.num_inliers
+
+    def test_matches_are_estimated_by_several_methods(self, images, result):
+        matched = match_two_images(*images)
+        assert torch.equal(matched.estimate().F_mat, result.F_mat)
+        other = matched.estimate(LearnedEightPoint.from_pretrained())
+        assert other.estimator == "LearnedEightPoint"
+        assert torch.equal(other.points1, result.points1)
+        assert not other.F_mat.requires_grad
+        assert abs(other.num_inliers - result.num_inliers) < 0.05 * result.num_inliers
+        assert np.median(distances(other, F)) < 0.3
+
+    def test_arrays_give_what_files_give(self, images, result):
+        """Grey values of any strides in NumPy, with a mask that leaves nothing out, and colours in PyTorch."""
+        grey = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in images]
+        turned = [image[::-1, ::-1].copy()[::-1, ::-1] for image in grey]
+        colours = [torch.from_numpy(np.stack([image] * 3, -1)) for image in grey]
+        for arrays, mask in ((turned, torch.ones(HEIGHT, WIDTH, dtype=torch.bool)), (colours, None)):
+            found = estimate_pair(*arrays, mask1=mask)
+            assert torch.equal(found.F_mat, result.F_mat)
+            assert (found.path1, found.path2) == (None, None)
+
+    def test_the_size_of_matching(self, images, result):
+        """Points and matrices are those of the full image, in which all exact points lie on their lines."""
+        found = estimate_pair(*images, max_size=240)
+        assert (found.size1, found.size2) == ((WIDTH, HEIGHT), (WIDTH, HEIGHT))
+        assert found.points1[:, 0].max() > 240
+        assert found.threshold == pytest.approx(WIDTH / 240, rel=0.01)
+        assert np.median(distances(result, found.F_mat)) < 0.5
+
+    def test_masks(self, images, result):
+        left = np.zeros((HEIGHT, WIDTH), bool)
+        left[:, : WIDTH // 2] = True
+        found = match_two_images(*images, mask1=left)
+        assert found.points1[:, 0].max() < WIDTH // 2
+        assert 8 < found.mutual.sum() < result.num_matches
+
+    def test_cameras(self, images):
+        found = estimate_pair(*images, K1=K, K2=torch.from_numpy(K))
+        angle = np.rad2deg(np.arccos((np.trace(found.R.numpy().T @ R) - 1) / 2))
+        assert angle < 0.5
+        assert found.t @ torch.from_numpy(t / np.linalg.norm(t)) > np.cos(np.deg2rad(3))
+        assert np.allclose(np.linalg.svd(found.E_mat)[1], [0.5**0.5, 0.5**0.5, 0], atol=1e-9)
+        assert found.front[found.inliers].double().mean() > 0.95
+        E_mat = K.T @ found.F_mat.numpy() @ K
+        assert np.allclose(abs((E_mat / np.linalg.norm(E_mat) * found.E_mat.numpy()).sum()), 1)
+
+    def test_json(self, result):
+        content = json.loads(json.dumps(result.as_dict(), allow_nan=False))
+        assert content["F"] == result.F_mat.tolist()
+        assert (content["E"], content["R"], content["t"], content["in_front"]) == (None, None, None, None)
+        assert (content["num_matches"], content["num_inliers"]) == (result.num_matches, result.num_inliers)
+        for name in ("points1", "points2", "scores", "weights", "inliers"):
+            assert content[name] == getattr(result, name).tolist()
+        assert content["image1"] == {"file": str(result.path1), "width": WIDTH, "height": HEIGHT}
+        assert (content["predicted_error_px"], content["warnings"]) == (result.predicted_error, [])
+        assert (content["estimator"], content["seed"]) == ("RANSAC", 0)
+        assert (content["ratio"], content["threshold_px"]) == (0.8, 1.0)
+        assert content["versions"]["torch"].partition("+")[0] == torch.__version__.partition("+")[0]
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("first", "second", "code", "message", "options"),
+        [
+            ("blank", "right", "blank", r"blank\.png and .*right\.png: image 1 is blank", {}),
+            ("left", "blank", "blank", "image 2 is blank", {}),
+            ("left", "right", "few_matches", r"\d distinct matches of \d+ are left, at least 9", {"ratio": 0.001}),
+            ("left", "left", "no_motion", "no motion", {}),
+            ("left", "noisy", "no_motion", "no motion", {}),
+        ],
+    )
+    def test_images_without_a_matrix(self, folder, first, second, code, message, options):
+        with pytest.raises(NoReliableMatrixError, match=message) as caught:
+            estimate_pair(folder / f"{first}.png", folder / f"{second}.png", **options)
+        assert caught.value.code == code
+        assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("options", "error", "message"),
+        [
+            ({"K1": np.zeros((3, 3)), "K2": K}, ValueError, "K1 must be finite and invertible"),
+            ({"K1": K, "K2": K * np.nan}, ValueError, "K2 must be finite and invertible"),
+            ({"K1": K[None], "K2": K}, ValueError, r"K1 must have shape \[3, 3\], got \[1, 3, 3\]"),
+            ({"K1": K}, ValueError, "K1 and K2 must be given together"),
+            ({"threshold": "x"}, TypeError, "threshold must be a number, got 'x'"),
+            *(({"threshold": t}, ValueError, "threshold must be positive") for t in (0.0, -1.0, np.inf, np.nan)),
+            ({"ratio": "x"}, TypeError, "ratio must be a number, got 'x'"),
+            *(({"ratio": ratio}, ValueError, "ratio must be above 0") for ratio in (0.0, -1.0, 1.5, np.nan)),
+            ({"max_size": 99.5}, TypeError, "max_size must be a whole number, got 99.5"),
+            ({"max_size": 10}, ValueError, "max_size must be at least 64"),
+            ({"seed": -1}, ValueError, "seed must lie in"),
+            ({"layer": K}, TypeError, "layer must be a LearnedEightPoint or None"),
+            ({"detector": "surf"}, ValueError, "detector must be one of sift, .*, got 'surf'"),
+            ({"matcher": "lightglue"}, ValueError, "matcher lightglue needs detector disk, got sift"),
+        ],
+    )
+    def test_options_are_checked_before_the_work(self, options, error, message, monkeypatch):
+        monkeypatch.setattr(pair_module, "read_image", lambda *_: pytest.fail("an image was read"))
+        with pytest.raises(error, match=message):
+            estimate_pair("left.png", "right.png", **options)
+
+    @pytest.mark.parametrize(
+        ("mask", "error", "message"),
+        [
+            (np.ones((HEIGHT, WIDTH), np.uint8), TypeError, "a mask must be an array of bool, got uint8"),
+            (np.ones((WIDTH, HEIGHT), bool), ValueError, r"shape of its image, \(240, 320\), got \(320, 240\)"),
+        ],
+    )
+    def test_wrong_masks(self, images, mask, error, message):
+        with pytest.raises(error, match=message):
+            match_two_images(*images, mask1=mask)
+
+    @pytest.mark.parametrize("image", [np.zeros((8, 8)), np.zeros((8, 8, 4), np.uint8), 3])
+    def test_arrays_that_are_no_images(self, images, image):
+        with pytest.raises((TypeError, ValueError), match="an image must"):
+            estimate_pair(image, images[1])
+
+    @pytest.mark.parametrize(
+        ("name", "error", "message"),
+        [
+            ("no.png", FileNotFoundError, r"no\.png does not exist"),
+            ("half.png", ValueError, r"half\.png.*truncated or corrupt"),
+        ],
+    )
+    def test_files_that_are_no_images(self, folder, images, name, error, message):
+        with pytest.raises(error, match=message):
+            estimate_pair(images[0], folder / name)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "options", "first", "inliers", "own", "true"),
+    [
+        ("kitti", {"sequences": ["06"]}, 40, 500, 0.3, 1.0),
+        # Images are not undistorted and poses the nearest in time: the ground truth is good to about 3 px.
+        ("tum", {"max_difference": 0.1}, 0, 300, 0.5, 4.0),
+    ],
+)
+def test_real_images(real_data, dataset, options, first, inliers, own, true):
+    frames = read_dataset(dataset, real_data / dataset, **options)
+    pair = FramePair(*frames[first : first + 2])
+    result = estimate_pair(pair.frame1.path, pair.frame2.path)
+    assert result.num_inliers > inliers
+    assert result.median_distance < own
+    assert np.median(distances(result, pair.F)) < true

@@ -1,0 +1,85 @@
+"""Reasons to doubt a matrix."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.two_view.parallax import parallax
+from kornia_learnnorm.two_view.warnings import find_warnings, log_false_alarms, log_false_samples
+
+SIZE = (640, 480)
+ALL = torch.ones(100, dtype=torch.bool)
+MOST = torch.arange(100) < 80
+
+
+def codes(points1, points2, inliers, H=None, angle=0.1) -> list[str]:
+    distance = torch.where(inliers, 0.3, 5.0).double()
+    off_plane = None if H is None else parallax(points1, points2, H)
+    found = find_warnings(points1, points2, distance, off_plane, 1.0, SIZE, angle)
+    assert all(warning.text and "\n" not in warning.text for warning in found)
+    return [warning.code for warning in found]
+
+
+@pytest.fixture
+def points() -> tuple[torch.Tensor, torch.Tensor]:
+    rng = np.random.default_rng(0)
+    return tuple(torch.from_numpy(rng.uniform([0, 0], SIZE, (100, 2))) for _ in range(2))
+
+
+class TestFindWarnings:
+    @pytest.mark.parametrize(
+        ("inliers", "options", "found"),
+        [
+            (MOST, {}, []),
+            (torch.arange(100) < 12, {}, ["few_inliers", "chance"]),
+            (MOST, {"angle": 20.0}, ["unstable"]),
+        ],
+    )
+    def test_of_numbers(self, points, inliers, options, found):
+        assert codes(*points, inliers, **options) == found
+
+    def test_clustered(self, points):
+        line = points[0] * torch.tensor([1.0, 0.01])
+        assert codes(line, points[1], ALL) == ["clustered"]
+
+    def test_planar(self, points):
+        H = torch.eye(3, dtype=torch.float64)
+        points1, points2 = points[0], points[0].clone()
+        assert codes(points1, points2, ALL, H) == ["planar"]
+        points2[:40, 0] += torch.linspace(10, 60, 40)  # forty matches with parallax along one direction
+        assert codes(points1, points2, ALL, H) == []
+
+    @pytest.mark.parametrize(
+        ("relief", "distance", "found"),
+        [(1.5, 0.3, []), (1.5, 0.7, ["planar"]), (0.4, 0.1, []), (0.4, 0.3, ["planar"])],
+    )
+    def test_little_relief(self, points, relief, distance, found):
+        """Parallax in one direction is evidence where the matches fit within less than half of it."""
+        points2 = points[0].clone()
+        points2[:60, 0] += relief
+        distances = torch.full((100,), distance, dtype=torch.float64)
+        warnings = find_warnings(points[0], points2, distances, (points2 - points[0]).norm(dim=-1), 1.0, SIZE, 0.1)
+        assert [warning.code for warning in warnings] == found
+
+
+@pytest.mark.parametrize(("inliers", "chance"), [(12, True), (16, True), (29, False), (60, False)])
+def test_support_that_chance_would_give(inliers, chance):
+    """By hand for 12 of 100 in 1226 x 370: 10^(15.0 + 2.9 + 2.0 - 5 * 2.25) models expected, far more than one."""
+    found = log_false_alarms(100, inliers, 1.0, (1226, 370))
+    assert (found > -2) == chance
+    if inliers == 12:
+        assert found == pytest.approx(15.02 + 2.90 + 1.97 - 5 * 2.248, abs=0.02)
+
+
+def test_false_samples():
+    """No less than the binomial tail, summed term by term, and small where the tail is."""
+    strip, others = 2 * 800 / (640 * 480), 300 - 8
+    for inliers in (12, 18, 24):
+        terms = [math.comb(others, k) * strip**k * (1 - strip) ** (others - k) for k in range(inliers - 8, others)]
+        value, exact = log_false_samples(300, inliers, 1.0, (640, 480)), math.log10(50_000 * sum(terms))
+        assert exact < value < exact + 1
+    assert log_false_samples(5, 0, 1.0, (640, 480)) > 0
