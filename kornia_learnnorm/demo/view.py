@@ -14,7 +14,7 @@ from bokeh.plotting import figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.demo.compute import METHODS, Picture, epipolar_segment
+from kornia_learnnorm.demo.compute import METHODS, ImageFile, epipolar_segment
 from kornia_learnnorm.two_view.drawing import INLIER, OUTLIER
 
 __all__ = ["ImageView"]
@@ -78,31 +78,28 @@ class ImageView:
         self._figure.on_event(MouseMove, handle)
         self._figure.on_event(Tap, handle)
 
-    def show(self, picture: Picture | None) -> None:
+    def show(self, image: ImageFile | None) -> None:
         """Show an image, or none."""
-        self._size = width, height = EMPTY_SIZE if picture is None else picture.size
+        self._size = width, height = EMPTY_SIZE if image is None else image.size
         self._figure.aspect_ratio = max(width / height, MIN_ASPECT)
         margin = (self._figure.aspect_ratio * height - width) / 2
         left, right = -0.5 - margin, width - 0.5 + margin
         self._figure.x_range.update(start=left, end=right, reset_start=left, reset_end=right)
         self._figure.y_range.update(start=height - 0.5, end=-0.5, reset_start=height - 0.5, reset_end=-0.5)
-        if picture is None:
-            self._caption.text = self._title
-            self._image.data = {"image": [], "width": [], "height": []}
-            return
-        self._caption.text = f"{self._title}: {picture.name}, {width} x {height} pixels"
-        self._image.data = {"image": [_rgba(picture.pixels)], "width": [width], "height": [height]}
+        shown = [] if image is None else [image]
+        self._caption.text = self._title + "".join(f": {x.name}, {width} x {height} pixels" for x in shown)
+        data = {"image": [_rgba(x.pixels) for x in shown]}
+        self._image.data = {**data, "width": [width] * len(shown), "height": [height] * len(shown)}
 
     def clear(self) -> None:
         """Remove everything but the image."""
         for source in (self._inliers, self._outliers, self._pointer, *self._lines.values()):
             source.data = NOTHING
 
-    def show_matches(self, points: NDArray[np.float64], inliers: NDArray[np.bool_] | None, with_outliers: bool) -> None:
-        """Show the inliers (N, 2), and the other matches too if wanted; without a mask (N,) there are no inliers."""
-        inside = np.zeros(len(points), bool) if inliers is None else inliers
-        self._inliers.data = dict(zip("xy", points[inside].T, strict=True))
-        self._outliers.data = dict(zip("xy", points[~inside & with_outliers].T, strict=True))
+    def show_matches(self, points: NDArray[np.float64], inliers: NDArray[np.bool_], with_outliers: bool) -> None:
+        """Show the matches (N, 2) that are inliers by a mask (N,), and the others too if wanted."""
+        self._inliers.data = dict(zip("xy", points[inliers].T, strict=True))
+        self._outliers.data = dict(zip("xy", points[~inliers & with_outliers].T, strict=True))
 
     def mark(self, point: tuple[float, float]) -> None:
         """Mark the pixel under the mouse and remove the lines."""
@@ -115,7 +112,7 @@ class ImageView:
         self._pointer.data = NOTHING
         for name, source in self._lines.items():
             ends = epipolar_segment(matrices[name], point, self._size) if name in matrices else None
-            source.data = NOTHING if ends is None else dict(zip("xy", zip(*ends, strict=True), strict=True))
+            source.data = NOTHING if ends is None else dict(zip("xy", ends.T, strict=True))
 
 
 def _rgba(pixels: NDArray[np.uint8]) -> NDArray[np.uint32]:

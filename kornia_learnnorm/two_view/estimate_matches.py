@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.manifold import nearest_essential
@@ -14,7 +15,7 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.summary import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
-from kornia_learnnorm.two_view.inputs import Points, Size, check_settings, read_cameras, read_matches, read_size
+from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.parallax import find_homography
 from kornia_learnnorm.two_view.plane_distances import distances_from_plane
 from kornia_learnnorm.two_view.predicted_error import nominal_camera, predict_error

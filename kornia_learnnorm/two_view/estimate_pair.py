@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.images import image_size, import_cv2, read_image, resize_image, scaling
+from kornia_learnnorm.data.images import Size, image_size, import_cv2, read_image, resize_image, scaling
 from kornia_learnnorm.data.masks import content_mask
 from kornia_learnnorm.data.matching.features import DETECTORS, Features, keep_features
 from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
@@ -19,7 +19,7 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points, unit_fundamental
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
-from kornia_learnnorm.two_view.inputs import Points, Size, check_number, check_settings, check_whole, read_cameras
+from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, check_whole, read_cameras
 from kornia_learnnorm.two_view.repeated_texture import mutual_share, resolve_ambiguity
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 

@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.checks import check_cameras
 
 __all__ = [
     "Cameras",
     "Points",
-    "Size",
     "check_number",
     "check_settings",
     "check_whole",
@@ -27,7 +27,6 @@ __all__ = [
 
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]
-Size = tuple[int, int]  # width and height, pixels
 
 
 def read_matches(points1: Points, points2: Points, scores: Points | None) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,10 +9,10 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
+from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
-from kornia_learnnorm.two_view.inputs import Size
 
 __all__ = ["PredictedError", "drop_failed_parts", "nominal_camera", "predict_error", "random_parts"]
 

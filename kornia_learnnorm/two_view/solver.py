@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
@@ -18,7 +19,7 @@ from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.models import EssentialModel
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
-from kornia_learnnorm.two_view.inputs import Cameras, Size
+from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.parallax import find_homography, fit_plane_and_parallax, parallax, parallax_evidence
 from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
 from kornia_learnnorm.two_view.result import NoReliableMatrixError

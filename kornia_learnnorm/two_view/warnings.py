@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
-from kornia_learnnorm.two_view.inputs import Size
 from kornia_learnnorm.two_view.parallax import parallax_evidence
 
 __all__ = [
