@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
-from kornia_learnnorm import (
-    CrossViewNetwork,
-    Hartley,
-    LearnedEightPoint,
-    LearnedNormalizer,
-    PaperNetwork,
-    ReweightedWhitening,
-    Whitening,
-    paper_transform,
-)
+import kornia_learnnorm as kln
+from kornia_learnnorm import LearnedEightPoint, LearnedNormalizer
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
 
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
+DTYPES = [torch.float32, torch.float64]
 WALL_SHIFT = np.array([4.0, 3.0])  # of the wall of `repeated_wall`, pixels
 
 
@@ -42,17 +36,17 @@ def uniform(*shape: int, low: float = 0.0, high: float = 1.0, seed: int = 0, dty
 
 
 def small(base=None) -> LearnedNormalizer:
-    return LearnedNormalizer(base or Whitening(), CrossViewNetwork(width=16, depth=2))
+    return LearnedNormalizer(base or kln.Whitening(), kln.CrossViewNetwork(width=16, depth=2))
 
 
 def paper() -> LearnedNormalizer:
-    return LearnedNormalizer(Hartley(), PaperNetwork(16, 3), paper_transform)
+    return LearnedNormalizer(kln.Hartley(), kln.PaperNetwork(16, 3), kln.paper_transform)
 
 
 def shaken(normalizer: LearnedNormalizer | None = None, scale: float = 0.3, seed: int = 0) -> LearnedNormalizer:
     """A learned normaliser whose last layer holds random numbers, so that it differs from its base."""
     torch.manual_seed(seed)
-    normalizer = small(ReweightedWhitening()) if normalizer is None else normalizer
+    normalizer = small(kln.ReweightedWhitening()) if normalizer is None else normalizer
     with torch.no_grad():
         for value in getattr(normalizer.network, "set_network", normalizer.network).head[-1].parameters():
             value.normal_(0, scale)
@@ -192,7 +186,13 @@ def _wrong_correspondences() -> list[tuple]:
     return wrong
 
 
-WRONG_CORRESPONDENCES = _wrong_correspondences()
+def check_refuses(call) -> None:
+    """Check that a function of correspondences and weights raises the right error for every kind of wrong ones."""
+    for points1, points2, weights, error, message in _wrong_correspondences():
+        with pytest.raises(error, match=message):
+            call(points1, points2, weights)
+
+
 WRONG_MATRICES = [  # with two sets of points
     (None, TypeError, "F_mat must be a floating-point tensor, got <class 'NoneType'>"),
     (torch.ones(2, 3, 3, dtype=torch.int64), TypeError, "F_mat must be .* got torch.int64"),

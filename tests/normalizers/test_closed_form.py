@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.geometry.epipolar import normalize_points
+from pairwise import pairwise
 from torch.autograd import gradcheck
 from two_view import SCENES, correspondences, mapped, numpy_hartley, numpy_whitening, uniform
 
@@ -20,19 +21,16 @@ def test_identity(device, dtype):
         assert torch.equal(T.cpu(), torch.eye(3, dtype=dtype).expand(2, 3, 3))
 
 
-@pytest.mark.parametrize(
-    ("normalizer", "reference", "rtol", "atol"),
-    [
-        (Hartley(), numpy_hartley, 1e-12, 1e-12),
-        (Whitening(), numpy_whitening, 1e-9, 1e-10),
-        (PerView(normalize_points), numpy_hartley, 1e-8, 0),  # Kornia adds 1e-8 to the mean distance
-    ],
-    ids=["hartley", "whitening", "kornia"],
-)
-@pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("num_points", [8, 50])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_agrees_with_numpy(normalizer, reference, rtol, atol, name, num_points, weighted, device):
+CASES = {
+    "hartley": (Hartley(), numpy_hartley, 1e-12, 1e-12),
+    "whitening": (Whitening(), numpy_whitening, 1e-9, 1e-10),
+    "kornia": (PerView(normalize_points), numpy_hartley, 1e-8, 0),  # Kornia adds 1e-8 to the mean distance
+}
+
+
+@pairwise(case=CASES, name=SCENES, num_points=[8, 50], weighted=[False, True])
+def test_agrees_with_numpy(case, name, num_points, weighted, device):
+    normalizer, reference, rtol, atol = CASES[case]
     points = correspondences(name, 20, num_points)
     weights = uniform(20, num_points) if weighted else None
     found = normalizer(*(p.to(device) for p in points), None if weights is None else weights.to(device))

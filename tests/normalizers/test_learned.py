@@ -5,8 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import pickle
-import re
-from functools import partial
 
 import numpy as np
 import pytest
@@ -14,10 +12,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.geometry.epipolar import normalize_points
+from pairwise import pairwise
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import nn
 from two_view import (
+    DTYPES,
     correspondences,
     eight_point,
     epipolar_distances,
@@ -49,8 +49,6 @@ from kornia_learnnorm.data.sets import SyntheticSets
 from kornia_learnnorm.data.sources import block_generator
 from kornia_learnnorm.geometry.transforms import affine_transform
 
-SHIPPED = ["crossview", "crossview-synthetic"]  # for eights
-
 
 def public(module: nn.Module) -> dict[str, object]:
     return {name: value for name, value in vars(module).items() if not name.startswith("_")}
@@ -69,24 +67,18 @@ def file(tmp_path):
 
 
 class TestForward:
-    @pytest.mark.parametrize(
-        "make", [paper, *(partial(small, base) for base in (Identity(), Hartley(), Whitening(), ReweightedWhitening()))]
-    )
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_untrained_is_exactly_the_base(self, make, num_points, dtype):
-        normalizer = make()
+    @pairwise(base=["paper", Identity, Hartley, Whitening, ReweightedWhitening], num_points=[8, 20], dtype=DTYPES)
+    def test_untrained_is_exactly_the_base(self, base, num_points, dtype):
+        normalizer = paper() if base == "paper" else small(base())
         points = [p.to(dtype) for p in correspondences("handheld", 5, num_points)]
-        weights = uniform(5, num_points, low=0.1)
-        for w in (None, weights):
+        for w in (None, uniform(5, num_points, low=0.1)):
             expected = normalizer.base(*(p.double() for p in points), w)
             torch.testing.assert_close(normalizer(*points, w), tuple(T.to(dtype) for T in expected), rtol=0, atol=0)
 
-    def test_defaults(self):
-        normalizer = LearnedNormalizer()
-        assert isinstance(normalizer.base, ReweightedWhitening)
-        assert isinstance(normalizer.network, CrossViewNetwork)
-        assert normalizer.transform is spd_transform
-        normalizer.load_state_dict(LearnedNormalizer.from_pretrained("crossview").state_dict())
+    def test_defaults_are_those_of_the_shipped_weights(self):
+        LearnedNormalizer().load_state_dict(LearnedNormalizer.from_pretrained("crossview").state_dict())
+        default, named = LearnedNormalizer.from_pretrained(), LearnedNormalizer.from_pretrained("crossview")
+        assert all(torch.equal(value, named.state_dict()[key]) for key, value in default.state_dict().items())
 
     def test_composes_builder_and_base(self):
         """With known parameters: T = B(p) T_base."""
@@ -105,9 +97,8 @@ class TestForward:
         for T, H, p, x, seen in zip(found, base, (0.1, -0.2), points, network.seen[:2], strict=True):
             B = np.array([[p, 0, -p * p], [0, p, -p * p], [0, 0, 1]])
             np.testing.assert_allclose(T.numpy(), B @ H.numpy(), rtol=1e-12)
-            np.testing.assert_allclose(
-                seen.numpy(), normalize_points(x, weights=weights)[0].numpy(), rtol=1e-6, atol=1e-9
-            )
+            expected = normalize_points(x, weights=weights)[0].numpy()
+            np.testing.assert_allclose(seen.numpy(), expected, rtol=1e-6, atol=1e-9)
         assert torch.equal(network.seen[2], weights)
 
     def test_any_base_of_the_contract(self):
@@ -125,12 +116,18 @@ class TestForward:
         single, double = normalizer(*points), copy.deepcopy(normalizer).double()(*points)
         torch.testing.assert_close(single, double, rtol=1e-3, atol=1e-3)  # both in float64
 
+    @pairwise(base=[Whitening, ReweightedWhitening], num_points=[8, 10], dtype=DTYPES)
+    def test_gradients_reach_points_weights_and_parameters(self, base, num_points, dtype):
+        normalizer, points = shaken(small(base())), correspondences("handheld", 4, num_points)
+        values = [p.to(dtype).requires_grad_() for p in (*points, uniform(4, num_points))]
+        signless(find_fundamental(*values, normalizer)).sum().backward()
+        for value in (*values, *normalizer.parameters()):
+            assert torch.isfinite(value.grad).all()
+            assert value.grad.count_nonzero() > 0
+
 
 class TestInvariances:
-    """Of the fundamental matrix, where all entries count; see also test_contract.py and, of the order, propositions."""
-
-    def same(self, found, expected, points, tolerance=1e-4):
-        assert hartley_difference(found.detach(), expected.detach(), *points) < tolerance
+    """Of the fundamental matrix, where all entries count; see also test_contract.py."""
 
     @pytest.mark.parametrize(("make", "tolerance"), [(small, 1e-4), (lambda: paper().double(), 1e-6)])
     @given(
@@ -145,43 +142,26 @@ class TestInvariances:
         S[:, 0, 0] = S[:, 1, 1] = 10 ** torch.tensor(log_scales).double()
         S[:, :2, 2] = S[:, :1, 0] * torch.tensor(shifts).double().view(2, 2)
         moved = [p @ s[:2, :2] + s[:2, 2] for p, s in zip(points, S, strict=True)]
-        pulled_back = S[1].mT @ find_fundamental(*moved, normalizer=normalizer) @ S[0]
-        self.same(pulled_back, find_fundamental(*points, normalizer=normalizer), points, tolerance)
+        with torch.no_grad():
+            pulled_back = S[1].mT @ find_fundamental(*moved, normalizer=normalizer) @ S[0]
+            expected = find_fundamental(*points, normalizer=normalizer)
+        assert hartley_difference(pulled_back, expected, *points) < tolerance
 
+    @torch.no_grad()
     def test_common_factor_of_the_weights(self, normalizer):
         points, weights = correspondences("handheld", 10, 12), uniform(10, 12, low=0.1)
-        expected = find_fundamental(*points, weights, normalizer)
-        self.same(find_fundamental(*points, 1e3 * weights, normalizer), expected, points)
-        self.same(
-            find_fundamental(*points, torch.full_like(weights, 1e-3), normalizer),
-            find_fundamental(*points, normalizer=normalizer),
-            points,
-        )
-
-
-class TestGradients:
-    @pytest.mark.parametrize("num_points", [8, 10])
-    @pytest.mark.parametrize("base", [Whitening(), ReweightedWhitening()])
-    def test_reach_points_weights_and_parameters(self, base, num_points, dtype):
-        normalizer = shaken(small(base))
-        values = [
-            p.to(dtype).requires_grad_() for p in (*correspondences("handheld", 4, num_points), uniform(4, num_points))
-        ]
-        signless(find_fundamental(*values, normalizer)).sum().backward()
-        for value in (*values, *normalizer.parameters()):
-            assert torch.isfinite(value.grad).all()
-            assert value.grad.count_nonzero() > 0
+        for given_weights, equivalent in ((1e3 * weights, weights), (torch.full_like(weights, 1e-3), None)):
+            F_mats = [find_fundamental(*points, w, normalizer) for w in (given_weights, equivalent)]
+            assert hartley_difference(*F_mats, *points) < 1e-4
 
 
 class TestFiles:
     @pytest.mark.parametrize(
         "parts",
         [
-            *(
-                (base, CrossViewNetwork(8, 1, bound=2.0), spd_transform)
-                for base in (Identity(), Hartley(), Whitening(), Whitening(1e-4), ReweightedWhitening(3, 0.2))
-            ),
-            *((Whitening(), CrossViewNetwork(8, 1, features=features), spd_transform) for features in ("own", "both")),
+            *((base, CrossViewNetwork(8, 1, bound=2.0)) for base in (Identity(), Hartley(), Whitening(1e-4))),
+            (ReweightedWhitening(3, 0.2), CrossViewNetwork(8, 1, features="own")),
+            (Whitening(), CrossViewNetwork(8, 1, features="both")),
             (Hartley(), PaperNetwork(16, 3), paper_transform),
         ],
     )
@@ -207,43 +187,28 @@ class TestFiles:
         torch.testing.assert_close(loaded(*points), changed(*points), rtol=0, atol=0)
         assert [entry.name for entry in file.parent.iterdir()] == [file.name]
 
-    def test_dtype_and_mode_survive(self, tmp_path):
+    def test_dtype_and_mode_survive(self, file):
         """A float64 network comes back as one, and others may read the file as any that its owner makes."""
-        normalizer = shaken(small()).double()
-        normalizer.save_pretrained(tmp_path / "weights.safetensors")
-        loaded = LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors")
-        assert loaded.network.dtype == torch.float64
-        (tmp_path / "other").touch()
-        assert (tmp_path / "weights.safetensors").stat().st_mode == (tmp_path / "other").stat().st_mode
-
-    def test_saving_changes_nothing(self, file):
-        normalizer = shaken(small()).train()
+        normalizer = shaken(small()).double().train()
         before = copy.deepcopy(normalizer.state_dict())
         normalizer.save_pretrained(file)
-        assert normalizer.training
+        assert LearnedNormalizer.from_pretrained(file).network.dtype == torch.float64
+        file.with_name("other").touch()
+        assert file.stat().st_mode == file.with_name("other").stat().st_mode
+        assert normalizer.training  # saving changes nothing
         assert all(torch.equal(value, before[key]) for key, value in normalizer.state_dict().items())
 
     def test_what_the_file_holds(self, file):
         with safe_open(file, "pt") as opened:
-            metadata = opened.metadata()
-        assert json.loads(metadata["architecture"]) == {
-            "base": {"name": "Whitening", "floor": 1e-6},
-            "network": {
-                "name": "CrossViewNetwork",
-                "width": 16,
-                "depth": 2,
-                "num_parameters": 5,
-                "bound": 3.0,
-                "features": "epipolar",
-            },
-            "transform": "spd_transform",
-            "max_points": None,
-        }
-        state = load_file(file)
-        assert state.keys() == small().state_dict().keys()
+            architecture = json.loads(opened.metadata()["architecture"])
+        assert architecture["base"] == {"name": "Whitening", "floor": 1e-6}
+        options = {"width": 16, "depth": 2, "num_parameters": 5, "bound": 3.0, "features": "epipolar"}
+        assert architecture["network"] == {"name": "CrossViewNetwork"} | options
+        assert (architecture["transform"], architecture["max_points"]) == ("spd_transform", None)
+        assert load_file(file).keys() == small().state_dict().keys()
 
-    @pytest.mark.parametrize("name", SHIPPED)
-    def test_shipped_weights(self, name, dtype):
+    @pytest.mark.parametrize("name", ["crossview", "crossview-synthetic"])  # for eights
+    def test_shipped_weights_of_eights(self, name, dtype):
         normalizer = LearnedNormalizer.from_pretrained(name)
         assert not normalizer.training
         for scene in ("driving", "handheld"):
@@ -253,18 +218,22 @@ class TestFiles:
             better = epipolar_distances(*points, found).mean(1) < epipolar_distances(*points, hartley).mean(1)
             assert better.mean() > 0.9
 
-    def test_default_is_crossview(self):
-        default, named = LearnedNormalizer.from_pretrained(), LearnedNormalizer.from_pretrained("crossview")
-        assert all(torch.equal(value, named.state_dict()[key]) for key, value in default.state_dict().items())
+    def test_shipped_weights_of_sets(self):
+        """On synthetic matches, noisy and some of them wrong; eights are left to the other weights."""
+        sets = SyntheticSets(32).draw(128, 64, block_generator(5))
+        errors = []
+        for normalizer in (LearnedNormalizer.from_pretrained("crossview-sets"), Hartley()):
+            with torch.no_grad():
+                F_mat = find_fundamental(sets.points1.double(), sets.points2.double(), normalizer=normalizer)
+            errors.append(symmetric_epipolar_distance(sets.heldout1.double(), sets.heldout2.double(), F_mat).median())
+        assert errors[0] < 0.9 * errors[1]
 
     @pytest.mark.parametrize("name", ["nonsense", "", "nonsense.safetensors", "crossview.pt", "folder.safetensors"])
     def test_unknown_name(self, name, tmp_path, monkeypatch):
         """The message lists those that ship, without weights of another kind."""
         (tmp_path / "folder.safetensors").mkdir()
         monkeypatch.chdir(tmp_path)
-        shipped = "crossview, crossview-sets, crossview-synthetic, paper$"
-        message = rf"no weights {re.escape(repr(name))}: expected a .safetensors file or one of {shipped}"
-        with pytest.raises(FileNotFoundError, match=message):
+        with pytest.raises(FileNotFoundError, match=f"{name!r}.* crossview, crossview-sets, .*, paper$"):
             LearnedNormalizer.from_pretrained(name)
 
 
@@ -277,17 +246,15 @@ class TestMaxPoints:
             assert torch.equal(found, hartley)
             assert not torch.allclose(found, unlimited)
         normalizer.max_points = 20
-        assert all(torch.equal(found, before) for found, before in zip(normalizer(*points), own, strict=True))
+        assert all(map(torch.equal, normalizer(*points), own))
 
     def test_absent_correspondences_do_not_count(self):
         normalizer, points = shaken().double(), correspondences("handheld", 2, 20)
         weights = torch.ones(2, 20)
         weights[1, 12:] = 0
-        own = normalizer(*points, weights)
+        own, base = normalizer(*points, weights), Hartley()(*points, weights)
         normalizer.max_points = 12
-        for found, hartley, unlimited in zip(
-            normalizer(*points, weights), Hartley()(*points, weights), own, strict=True
-        ):
+        for found, hartley, unlimited in zip(normalizer(*points, weights), base, own, strict=True):
             assert torch.equal(found[0], hartley[0])
             assert torch.equal(found[1], unlimited[1])
 
@@ -302,14 +269,13 @@ class TestMaxPoints:
         normalizer(*points, weights)
         assert len(calls) == 1
 
-    def test_is_saved(self, tmp_path):
-        normalizer = LearnedNormalizer(Whitening(), max_points=9)
-        normalizer.save_pretrained(tmp_path / "weights.safetensors")
-        assert LearnedNormalizer.from_pretrained(tmp_path / "weights.safetensors").max_points == 9
+    def test_is_saved(self, file):
+        LearnedNormalizer(Whitening(), max_points=9).save_pretrained(file)
+        assert LearnedNormalizer.from_pretrained(file).max_points == 9
         assert LearnedNormalizer.from_pretrained("paper").max_points is None  # a file without it
 
     def test_too_few(self):
-        with pytest.raises(ValueError, match="max_points must be at least 8 or None, got 7"):
+        with pytest.raises(ValueError, match=r"max_points .* 8 .*got 7"):
             LearnedNormalizer(max_points=7)
 
 
@@ -354,12 +320,9 @@ class TestStrictness:
     @pytest.mark.parametrize(
         ("key", "text", "message"),
         [
-            ("format", "another.v9", r"expected format 'kornia_learnnorm\.normalizer\.v1', got 'another\.v9'"),
+            ("format", "another.v9", r"kornia_learnnorm\.normalizer\.v1.* got 'another\.v9'"),
             *(("architecture", text, UNKNOWN) for text in ("", "no json", "[]", "3", "null", "{}")),
-            *(
-                ("trained_on", text, "trained_on must be a JSON list of names, got")
-                for text in ("kitti_00", '"kitti_00"', "[0]")
-            ),
+            *(("trained_on", text, "trained_on must be .*, got") for text in ("kitti_00", '"kitti_00"', "[0]")),
         ],
     )
     def test_garbled_metadata(self, file, key, text, message):
@@ -373,25 +336,12 @@ class TestStrictness:
     @pytest.mark.parametrize(
         ("part", "value"),
         [
-            *(
-                ("base", value)
-                for value in (
-                    {"name": "Unknown"},
-                    {"name": "os"},
-                    {"name": "Module"},
-                    {"floor": 1e-6},
-                    {"name": "Whitening", "ceiling": 3},
-                    {"name": "ReweightedWhitening", "iterations": -1, "damping": 0.1},
-                    "Whitening",
-                )
-            ),
-            ("network", {"name": "Whitening"}),
+            *(("base", {"name": name}) for name in ("Unknown", "os", "Module")),
+            *(("base", value) for value in ({"floor": 1e-6}, {"name": "Whitening", "ceiling": 3}, "Whitening")),
+            ("base", {"name": "ReweightedWhitening", "iterations": -1, "damping": 0.1}),
             ("network", {"name": "CrossViewNetwork", "width": "wide"}),
-            ("network", None),
-            ("transform", "CrossViewNetwork"),
-            ("transform", "__builtins__"),
-            ("transform", 3),
-            ("network", OTHER_WIDTH),
+            *(("network", value) for value in ({"name": "Whitening"}, None, OTHER_WIDTH)),
+            *(("transform", value) for value in ("CrossViewNetwork", "__builtins__", 3)),
         ],
     )
     def test_other_architecture(self, file, part, value):
@@ -410,10 +360,10 @@ class TestStrictness:
 class TestSavingFails:
     """A failure leaves what was there, and nothing else."""
 
-    def unchanged(self, file, error, message, call):
+    def unchanged(self, file, error, message, normalizer):
         before = file.read_bytes()
         with pytest.raises(error, match=message):
-            call()
+            normalizer.save_pretrained(file)
         assert file.read_bytes() == before
         assert [entry.name for entry in file.parent.iterdir()] == [file.name]
 
@@ -428,10 +378,8 @@ class TestSavingFails:
         ],
     )
     def test_parts_of_others(self, file, parts):
-        message = r"only this package's parts|cannot be saved with its architecture"
-        if "network" in parts:
-            message = r"only this package's parts .* got <class '.*\.Linear'>"
-        self.unchanged(file, TypeError, message, lambda: LearnedNormalizer(**parts).save_pretrained(file))
+        message = "only this package's parts|cannot be saved with its architecture"
+        self.unchanged(file, TypeError, message, LearnedNormalizer(**parts))
 
     def test_interrupted(self, normalizer, file, monkeypatch):
         def half(state, path, metadata):
@@ -439,25 +387,22 @@ class TestSavingFails:
             raise OSError("no space left")
 
         monkeypatch.setattr(pretrained, "save_file", half)
-        self.unchanged(file, OSError, "no space left", lambda: normalizer.save_pretrained(file))
+        self.unchanged(file, OSError, "no space left", normalizer)
 
     def test_no_folder(self, normalizer, tmp_path):
-        with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
+        with pytest.raises(FileNotFoundError, match="nowhere"):
             normalizer.save_pretrained(tmp_path / "nowhere" / "weights.safetensors")
         assert not list(tmp_path.iterdir())
 
     def test_target_is_a_folder(self, normalizer, tmp_path):
         (tmp_path / "weights.safetensors").mkdir()
-        with pytest.raises(ValueError, match="it is not a regular file"):
+        with pytest.raises(ValueError, match="not a regular file"):
             normalizer.save_pretrained(tmp_path / "weights.safetensors")
 
 
 def test_copies_have_the_state_and_are_independent(normalizer):
-    loaded, copied, pickled = (
-        copy.deepcopy(normalizer),
-        copy.deepcopy(normalizer),
-        pickle.loads(pickle.dumps(normalizer)),
-    )
+    loaded, copied = copy.deepcopy(normalizer), copy.deepcopy(normalizer)
+    pickled = pickle.loads(pickle.dumps(normalizer))
     torch.nn.init.zeros_(list(loaded.parameters())[-1])
     loaded.load_state_dict(normalizer.state_dict())
     points = correspondences("driving", 5)
@@ -465,21 +410,10 @@ def test_copies_have_the_state_and_are_independent(normalizer):
     with torch.no_grad():
         list(normalizer.parameters())[-1].add_(1)
     for other in (loaded, copied, pickled):
-        assert all(torch.equal(T, want) for T, want in zip(other(*points), expected, strict=True))
+        assert all(map(torch.equal, other(*points), expected))
     assert not torch.equal(normalizer(*points)[0], expected[0])
 
 
 def test_parameters_are_the_networks(normalizer):
     names = [f"network.{name}" for name, _ in normalizer.network.named_parameters()]
     assert [name for name, _ in normalizer.named_parameters()] == names
-
-
-def test_the_weights_for_sets_are_more_accurate_than_hartleys_on_sets():
-    """On synthetic matches, noisy and some of them wrong; eights are left to the other weights."""
-    sets = SyntheticSets(32).draw(128, 64, block_generator(5))
-    errors = []
-    for normalizer in (LearnedNormalizer.from_pretrained("crossview-sets"), Hartley()):
-        with torch.no_grad():
-            F_mat = find_fundamental(sets.points1.double(), sets.points2.double(), normalizer=normalizer)
-        errors.append(symmetric_epipolar_distance(sets.heldout1.double(), sets.heldout2.double(), F_mat).median())
-    assert errors[0] < 0.9 * errors[1]

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from pairwise import pairwise
 from two_view import (
     SCENES,
     correspondences,
@@ -65,10 +66,9 @@ def mean_distances(points1, points2, normalizer):
 
 
 class TestReweightedWhitening:
-    @pytest.mark.parametrize("name", SCENES)
-    @pytest.mark.parametrize("num_points", [8, 9, 50])
-    @pytest.mark.parametrize(("iterations", "damping"), [(0, 0.1), (1, 0.1), (3, 0.1), (2, 0.01), (2, 1.0)])
-    def test_agrees_with_numpy(self, name, num_points, iterations, damping, device):
+    @pairwise(name=SCENES, num_points=[8, 9, 50], options=[(0, 0.1), (1, 0.1), (3, 0.1), (2, 0.01), (2, 1.0)])
+    def test_agrees_with_numpy(self, name, num_points, options, device):
+        iterations, damping = options
         points1, points2 = correspondences(name, 20, num_points, seed=1)
         found = ReweightedWhitening(iterations, damping)(points1.to(device), points2.to(device))
         rtol, atol = (1e-6, 1e-8) if iterations else (1e-8, 1e-10)
@@ -85,9 +85,7 @@ class TestReweightedWhitening:
     @pytest.mark.parametrize(("name", "better", "ratio"), [("driving", 0.98, 0.6), ("handheld", 0.98, 0.8)])
     def test_beats_hartley(self, name, better, ratio):
         points1, points2 = correspondences(name, 2000, noise=0.5)
-        found, hartley = (
-            mean_distances(points1, points2, normalizer) for normalizer in (ReweightedWhitening(), Hartley())
-        )
+        found, hartley = (mean_distances(points1, points2, n) for n in (ReweightedWhitening(), Hartley()))
         assert (found < hartley).mean() > better
         assert found.mean() < ratio * hartley.mean()
         assert np.median(found) < np.median(hartley)
@@ -102,10 +100,8 @@ class TestReweightedWhitening:
         points1, points2 = correspondences("driving", 4, num_points, seed)
         scales, shifts = 10 ** torch.tensor(log_scales).double(), torch.tensor(shifts).double().view(2, 2)
         moved = [s * (p + o) for p, s, o in zip((points1, points2), scales, shifts, strict=True)]
-        pairs = zip(
-            ReweightedWhitening(2)(points1, points2), ReweightedWhitening(2)(*moved), scales, shifts, strict=True
-        )
-        for T, found, s, o in pairs:
+        transforms = zip(*(ReweightedWhitening(2)(*points) for points in ((points1, points2), moved)), strict=True)
+        for (T, found), s, o in zip(transforms, scales, shifts, strict=True):
             S = torch.eye(3, dtype=torch.float64)
             S[:2] = torch.stack([s, 0 * s, s * o[0], 0 * s, s, s * o[1]]).view(2, 3)
             difference = (found @ S - T).norm(dim=(-2, -1)) / T.norm(dim=(-2, -1))

@@ -8,7 +8,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from two_view import numpy_hartley, numpy_whitening, prepared, shaken, uniform
+from pairwise import pairwise
+from two_view import DTYPES, numpy_hartley, numpy_whitening, prepared, shaken, uniform
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer, PaperNetwork
 
@@ -43,26 +44,23 @@ def case(request):
     return Case(request.param)
 
 
-@pytest.mark.parametrize("name", UNTRAINED)
-class TestUntrained:
-    @pytest.mark.parametrize("batch_size", [0, 1, 3])
-    @pytest.mark.parametrize("num_points", [8, 9, 30])
-    @pytest.mark.parametrize("weighted", [False, True])
-    def test_answers_zero(self, name, batch_size, num_points, weighted, device, dtype):
-        net = UNTRAINED[name]().to(device)
-        points = [uniform(batch_size, num_points, 2, low=-1, seed=k).to(device, dtype) for k in (0, 1)]
-        weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
-        for params in net(*points, weights):
-            assert params.shape == (batch_size, net.num_parameters)
-            assert params.dtype == dtype
-            assert params.device.type == device.type
-            assert params.count_nonzero() == 0
+@pairwise(name=UNTRAINED, batch_size=[0, 1, 3], num_points=[8, 9, 30], weighted=[False, True], dtype=DTYPES)
+def test_untrained_answers_zero(name, batch_size, num_points, weighted, dtype, device):
+    net = UNTRAINED[name]().to(device)
+    points = [uniform(batch_size, num_points, 2, low=-1, seed=k).to(device, dtype) for k in (0, 1)]
+    weights = uniform(batch_size, num_points, low=0.1).to(device, dtype) if weighted else None
+    for params in net(*points, weights):
+        assert params.shape == (batch_size, net.num_parameters)
+        assert (params.dtype, params.device.type) == (dtype, device.type)
+        assert params.count_nonzero() == 0
 
-    def test_can_start_to_learn(self, name):
-        net = UNTRAINED[name]()
-        torch.cat(net(*Case(name).points())).sum().backward()
-        assert getattr(net, "set_network", net).head[-1].weight.grad.abs().sum() > 0
-        assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters())
+
+@pytest.mark.parametrize("name", UNTRAINED)
+def test_untrained_can_start_to_learn(name):
+    net = UNTRAINED[name]()
+    torch.cat(net(*Case(name).points())).sum().backward()
+    assert getattr(net, "set_network", net).head[-1].weight.grad.abs().sum() > 0
+    assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters())
 
 
 @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.booleans(), st.randoms(), st.sampled_from([*UNTRAINED]))
@@ -74,10 +72,9 @@ def test_order_does_not_matter(seed, num_points, weighted, random, name):
     assert case.agree(shuffled, case.network(*values), 1e-5 if case.solves else None)
 
 
-@pytest.mark.parametrize("scene", ["driving", "handheld"])
-@pytest.mark.parametrize("num_points", [8, 20])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_swapped_views_swap_the_answers(case, scene, num_points, weighted):
+@pairwise(name=UNTRAINED, scene=["driving", "handheld"], num_points=[8, 20], weighted=[False, True])
+def test_swapped_views_swap_the_answers(name, scene, num_points, weighted):
+    case = Case(name)
     points1, points2 = case.points(scene, 10, num_points)
     weights = uniform(10, num_points, low=0.1) if weighted else None
     answers = case.network(points1, points2, weights)
@@ -85,9 +82,9 @@ def test_swapped_views_swap_the_answers(case, scene, num_points, weighted):
     assert case.agree(case.network(points2, points1, weights)[::-1], answers)
 
 
-@pytest.mark.parametrize("num_points", [8, 9, 20])
-@pytest.mark.parametrize("size", [1.0, 20.0, 1e4])
-def test_zero_weight_is_absence(case, num_points, size):
+@pairwise(name=UNTRAINED, num_points=[8, 9, 20], size=[1.0, 20.0, 1e4])
+def test_zero_weight_is_absence(name, num_points, size):
+    case = Case(name)
     points = case.points("handheld", 10, num_points)
     weights = torch.ones(10, 8).double() if case.solves and num_points == 8 else uniform(10, num_points, low=0.5)
     junk = [uniform(10, 5, 2, low=-size, high=size, seed=seed) for seed in (1, 2)]
@@ -101,9 +98,9 @@ def test_whole_weights_are_repetitions(case):
     assert case.agree(case.network(*points, COUNTS.double().expand(10, -1)), case.network(*repeated))
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
-@pytest.mark.parametrize("num_points", [8, 12, 20])
-def test_equal_weights_are_none(case, factor, num_points):
+@pairwise(name=UNTRAINED, factor=[1e-3, 1.0, 1e3], num_points=[8, 12, 20])
+def test_equal_weights_are_none(name, factor, num_points):
+    case = Case(name)
     points = case.points("handheld", 10, num_points)
     weights = torch.full((10, num_points), factor).double()
     assert case.agree(case.network(*points, weights), case.network(*points))

@@ -7,8 +7,9 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from pairwise import pairwise
 from torch.autograd import gradcheck
-from two_view import correspondences, numpy_hartley, prepared, shaken, uniform
+from two_view import DTYPES, correspondences, numpy_hartley, prepared, shaken, uniform
 
 from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork, paper_transform
 
@@ -79,9 +80,7 @@ class TestArchitecture:
 
 
 class TestForward:
-    @pytest.mark.parametrize("name", ["driving", "handheld"])
-    @pytest.mark.parametrize("num_points", [8, 30])
-    @pytest.mark.parametrize("weighted", [False, True])
+    @pairwise(name=["driving", "handheld"], num_points=[8, 30], weighted=[False, True])
     def test_agrees_with_numpy(self, name, num_points, weighted, device):
         net, points = network().to(device), normalized(name, 5, num_points)
         weights = uniform(5, num_points) * (torch.arange(num_points) % 4 > 0) if weighted else None
@@ -124,8 +123,7 @@ class TestGradients:
         assert gradcheck(net, [p.clone().requires_grad_() for p in points])
         assert gradcheck(net, [p.clone().requires_grad_() for p in (*points, weights)])
 
-    @pytest.mark.parametrize("weights", [None, torch.zeros(3, 8), torch.eye(8)[:3]], ids=["none", "zeros", "one"])
-    @pytest.mark.parametrize("spread", [0.0, 1e-8, 1.0])
+    @pairwise(weights=[None, torch.zeros(3, 8), torch.eye(8)[:3]], spread=[0.0, 1e-8, 1.0], dtype=DTYPES)
     def test_finite_on_absent_and_coincident_points(self, weights, spread, dtype):
         net = network().to(dtype)
         values = [spread * uniform(3, 8, 2, low=-1, seed=k).to(dtype) + 1 for k in (0, 1)]
@@ -139,9 +137,8 @@ class TestGradients:
 def test_transforms_are_those_of_the_paper():
     """diag(alpha1, alpha2, 1) R(theta) of Hartley's coordinates."""
     points, net = correspondences("driving", 5, 8), network()
-    for T, p, h in zip(
-        LearnedNormalizer(Hartley(), net, paper_transform)(*points), points, normalized("driving", 5, 8), strict=True
-    ):
+    found = LearnedNormalizer(Hartley(), net, paper_transform)(*points)
+    for T, p, h in zip(found, points, normalized("driving", 5, 8), strict=True):
         H = numpy_hartley(p)
         for k in range(5):
             log1, log2, theta = numpy_params(net, h[k].numpy())
