@@ -186,6 +186,36 @@ def _wrong_correspondences() -> list[tuple]:
     return wrong
 
 
+def check_gradients(function, *values: Tensor, eps: float = 1e-6, atol: float = 1e-5, rtol: float = 1e-3) -> None:
+    """Check gradients of numbers (B, K) of B independent sets against central differences, all of them in one call.
+
+    As ``torch.autograd.gradcheck``, which calls the function twice for each entry.
+    """
+    flat = torch.cat([value.detach().flatten(1) for value in values], 1).requires_grad_()
+
+    def numbers(rows: Tensor) -> Tensor:
+        parts = rows.split([value[0].numel() for value in values], 1)
+        return function(*(part.reshape(-1, *value.shape[1:]) for part, value in zip(parts, values, strict=True)))
+
+    gradients = [torch.autograd.grad(column.sum(), flat, retain_graph=True)[0] for column in numbers(flat).unbind(1)]
+    steps = eps * torch.eye(flat.shape[1], dtype=flat.dtype)[:, None]
+    plus, minus = (numbers((flat.detach() + step).flatten(0, 1)).detach() for step in (steps, -steps))
+    differences = ((plus - minus) / (2 * eps)).view(flat.shape[1], len(flat), -1)
+    torch.testing.assert_close(torch.stack(gradients, -1).movedim(1, 0), differences, atol=atol, rtol=rtol)
+
+
+def derivative(function):
+    """Return the gradient of a weighted sum of a function's numbers, for `check_gradients` of second derivatives."""
+
+    def gradient(*values: Tensor) -> Tensor:
+        values = [value if value.requires_grad else value.clone().requires_grad_() for value in values]
+        numbers = function(*values)
+        total = (numbers * torch.arange(1.0, 1 + numbers.shape[1])).sum()
+        return torch.cat([g.flatten(1) for g in torch.autograd.grad(total, values, create_graph=True)], 1)
+
+    return gradient
+
+
 def check_refuses(call) -> None:
     """Check that a function of correspondences and weights raises the right error for every kind of wrong ones."""
     for points1, points2, weights, error, message in _wrong_correspondences():

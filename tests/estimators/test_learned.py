@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from torch.autograd import gradcheck
-from two_view import correspondences, scenes, seeded, shaken_estimator, signless, uniform, up_to_sign
+from two_view import check_gradients, correspondences, scenes, seeded, shaken_estimator, signless, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators.match_features import CommonFrame, masked_median
@@ -22,30 +21,29 @@ def shaken_double(**options) -> kln.LearnedEightPoint:
 
 
 class TestInvariances:
-    @pytest.mark.parametrize("num_points", [8, 9, 40])
-    @given(seed=st.integers(0, 2**20))
+    @given(num_points=st.sampled_from([8, 9, 40]), seed=st.integers(0, 2**20))
+    @torch.no_grad()
     def test_order_of_the_correspondences(self, num_points, seed):
         layer, points = shaken_double(), correspondences("handheld", 4, num_points)
         order = torch.randperm(num_points, generator=torch.Generator().manual_seed(seed))
         estimate = layer.estimate(*points)
         shuffled = layer.estimate(*(p[:, order] for p in points))
-        assert up_to_sign(shuffled.F_mat.detach(), estimate.F_mat.detach()) < 1e-6
+        assert up_to_sign(shuffled.F_mat, estimate.F_mat) < 1e-6
         assert torch.allclose(shuffled.weights, estimate.weights[:, order], atol=1e-8)
 
-    @pytest.mark.parametrize("num_points", [8, 9, 40])
-    @given(seed=st.integers(0, 2**20))
+    @given(num_points=st.sampled_from([8, 9, 40]), seed=st.integers(0, 2**20))
+    @torch.no_grad()
     def test_swap_of_the_views(self, num_points, seed):
         layer, (points1, points2) = shaken_double(), correspondences("handheld", 4, num_points, seed=seed)
-        F_mat, swapped = layer(points1, points2), layer(points2, points1)
-        assert up_to_sign(swapped.detach(), F_mat.detach().mT) < 1e-6
+        assert up_to_sign(layer(points2, points1), layer(points1, points2).mT) < 1e-6
 
-    @pytest.mark.parametrize("num_points", [9, 40])
-    @given(factor=st.floats(1e-3, 1e3), shift=st.floats(-1e3, 1e3))
+    @given(num_points=st.sampled_from([9, 40]), factor=st.floats(1e-3, 1e3), shift=st.floats(-1e3, 1e3))
+    @torch.no_grad()
     def test_one_scale_and_translation_of_both_images(self, num_points, factor, shift):
         layer, points = shaken_double(), correspondences("handheld", 4, num_points)
-        moved = layer(*(factor * (p + shift) for p in points)).detach()
+        moved = layer(*(factor * (p + shift) for p in points))
         T = torch.tensor([[factor, 0, factor * shift], [0, factor, factor * shift], [0, 0, 1]], dtype=torch.float64)
-        assert up_to_sign(T.mT @ moved @ T, layer(*points).detach()) < 1e-5
+        assert up_to_sign(T.mT @ moved @ T, layer(*points)) < 1e-5
 
 
 class TestSmallSets:
@@ -128,17 +126,20 @@ class TestEstimate:
             assert not gradient.any()
 
     def test_gradcheck_of_the_scores(self):
-        points, layer = correspondences("handheld", 2, 12), shaken_double()
-        scores = uniform(2, 12).requires_grad_()
-        assert gradcheck(lambda s: signless(layer(*points, scores=s)), scores, eps=1e-6, atol=1e-4, rtol=1e-3)
+        points, layer = correspondences("handheld", 1, 12), shaken_double()
+
+        def numbers(scores):
+            return signless(layer(*(p.expand(len(scores), -1, -1) for p in points), scores=scores))
+
+        check_gradients(numbers, uniform(1, 12), atol=1e-4)
 
     @pytest.mark.parametrize(
         ("scores", "error", "message"),
         [
-            (torch.rand(2, 9), ValueError, r"scores must have shape \[2, 12\], got \[2, 9\]"),
-            (torch.full((2, 12), 1.5), ValueError, r"between 0 and 1, got 1\.5 to 1\.5"),
-            (torch.full((2, 12), torch.nan), ValueError, "between 0 and 1, got nan"),
-            (torch.ones(2, 12, dtype=torch.int64), TypeError, r"scores must be .* got torch\.int64"),
+            (torch.rand(2, 9), ValueError, r"scores .*\[2, 12\], got \[2, 9\]"),
+            (torch.full((2, 12), 1.5), ValueError, r"scores .* got 1\.5 to 1\.5"),
+            (torch.full((2, 12), torch.nan), ValueError, r"scores .* got nan"),
+            (torch.ones(2, 12, dtype=torch.int64), TypeError, r"scores .* got torch\.int64"),
         ],
     )
     def test_wrong_scores(self, scores, error, message):
