@@ -24,11 +24,11 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from rendered import KINDS, render_kind
 from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld, orbit
-from kornia_learnnorm.data.synthetic.kinds import KINDS, render_kind
 from kornia_learnnorm.data.synthetic.render import RenderedPair
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write, write_text

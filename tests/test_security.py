@@ -22,7 +22,7 @@ from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.images import image_size, read_image
 from kornia_learnnorm.data.sources import StoreSamples
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.runs.store import read_arrays
 

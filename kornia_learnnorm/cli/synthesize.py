@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
-from kornia_learnnorm.data.synthetic.stores import SCENES, synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import SCENES, synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]

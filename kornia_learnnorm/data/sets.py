@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from kornia_learnnorm.data.sources import check_draws, expand_path
 from kornia_learnnorm.data.store import StoreReader
-from kornia_learnnorm.data.synthetic.matches import SyntheticMatches, random_matches
+from kornia_learnnorm.data.synthetic.random_matches import SyntheticMatches, random_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 

@@ -15,7 +15,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.samples import draw_samples
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.tables import Table, tables_as_json
 from kornia_learnnorm.metrics.bootstrap import bootstrap_interval

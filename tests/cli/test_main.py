@@ -22,7 +22,7 @@ from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import TOOLS, TRAINING, main, make_parser
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from lightning_modules.callbacks import _duration
 from lightning_modules.config_files import find_config

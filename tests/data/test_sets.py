@@ -12,7 +12,7 @@ from two_view import correspondences, scenes, seeded
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.augmentation import augment
 from kornia_learnnorm.data.sets import MatchSets, StoreSets, SyntheticSets
-from kornia_learnnorm.data.synthetic.matches import random_matches, wide_baseline
+from kornia_learnnorm.data.synthetic.random_matches import random_matches, wide_baseline
 
 
 def assert_equal(first: MatchSets, second: MatchSets) -> None:

@@ -11,7 +11,7 @@ from kornia_learnnorm.data.sets import StoreSets
 from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic import forward_driving, handheld
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import estimators, hypotheses
 from kornia_learnnorm.evaluation.runs import example

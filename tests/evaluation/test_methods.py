@@ -10,7 +10,7 @@ import torch
 import yaml
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.evaluation.methods import SHIPPED, default_methods, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.report.rates import was_trained_on
 from kornia_learnnorm.evaluation.tables import names_of

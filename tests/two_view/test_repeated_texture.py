@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from rendered import render_kind
 from two_view import WALL_SHIFT, epipolar_distances, homogeneous, repeated_wall, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
-from kornia_learnnorm.data.synthetic.kinds import render_kind
 from kornia_learnnorm.two_view.repeated_texture import coherent_matches, fitting_share, mutual_share, resolve_ambiguity
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 

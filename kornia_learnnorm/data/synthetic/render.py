@@ -1,15 +1,14 @@
-r"""Rendered image pairs with an exact fundamental matrix: two views of a room made of textured planes.
+r"""A rendered image pair with an exact fundamental matrix: two views of a room made of textured planes.
 
 For a first run without a data set; use real images to compare methods. A back wall, a floor and slanted boards are
 warped into each view by the homographies of their planes, from back to front. The scene is far from planar, so
-:math:`F` is well determined.
-Images need OpenCV (the extra ``images``), which is imported on use.
+:math:`F` is well determined. Images need OpenCV (the extra ``images``), which is imported on use.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,20 +18,19 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.motion import fundamental_from_motion
-from kornia_learnnorm.data.synthetic.planes import (
-    SUPERSAMPLING,
-    Array,
-    Plane,
-    correspondences,
-    expose,
-    relief_of,
-    render_planes,
-    rotation,
-)
-from kornia_learnnorm.data.synthetic.textures import Random, circles, framed, letters, masonry, polygons
 from kornia_learnnorm.files import atomic_write, write_text
 
-__all__ = ["RenderedPair", "camera", "check_size", "render_pair", "render_views", "room", "write_pair"]
+__all__ = ["Plane", "RenderedPair", "check_size", "circles", "framed", "letters", "masonry", "noise", "polygons"]
+__all__ += ["render_pair", "render_views", "room", "rotation", "write_pair"]
+
+SUPERSAMPLING = 3  # samples per pixel and axis
+GRID = 80  # exact correspondences in a row of the first image, before occlusions
+
+Array = NDArray[np.float64]
+Texture = NDArray[np.float32]  # brightness in 0-1
+Random = np.random.Generator
+Painter = Callable[[Random, Any, Texture], None]
+Metres = tuple[float, float]  # width and height
 
 
 class RenderedPair(NamedTuple):
@@ -49,8 +47,6 @@ class RenderedPair(NamedTuple):
         points1: exact correspondences on the surfaces that both images show, pixels with shape :math:`(M, 2)`: a grid
             in the first image.
         points2: their pixels in the second image with shape :math:`(M, 2)`.
-        relief: how far surfaces stand out from the rearmost plane, at most, as a share of the first camera's distance
-            to it; 0 for a plane.
 
     """
 
@@ -62,7 +58,15 @@ class RenderedPair(NamedTuple):
     F_mat: Array
     points1: Array
     points2: Array
-    relief: float
+
+
+class Plane(NamedTuple):
+    """A textured rectangle in space: its top left corner and its two sides, in metres of the first camera's frame."""
+
+    corner: Array
+    right: Array
+    down: Array
+    texture: Texture
 
 
 def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedPair:
@@ -104,38 +108,10 @@ def check_size(seed: int, width: int, height: int) -> None:
         raise ValueError(f"images must be at least 64 pixels high and no higher than wide, got {width} x {height}")
 
 
-def camera(width: int, height: int) -> Array:
-    """Return the intrinsics of rendered images: the focal length is 0.9 widths."""
-    return np.array([[0.9 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]])
-
-
-def render_views(
-    rng: Random, cv2: Any, planes: Sequence[Plane], R: Array, t: Array, size: tuple[int, int]
-) -> RenderedPair:
-    """Render planes, given from back to front, from the origin and from a camera with :math:`X_2 = R X_1 + t`."""
-    K = camera(*size)
-    image1 = expose(render_planes(cv2, planes, K, np.eye(3), np.zeros(3), size), rng)
-    image2 = expose(render_planes(cv2, planes, K, R, t, size), rng)
-    F_mat = fundamental_from_motion(*map(torch.from_numpy, (K, K, R, t))).numpy()
-    points1, points2 = correspondences(planes, K, R, t, size)
-    return RenderedPair(image1, image2, K, R, t, F_mat, points1, points2, relief_of(planes))
-
-
 def write_pair(folder: str | Path, pair: RenderedPair) -> None:
-    """Write ``image1.png``, ``image2.png`` and ``ground_truth.json``, each complete or not at all.
+    """Write ``image1.png``, ``image2.png`` and ``ground_truth.json`` to a folder, each complete or not at all.
 
-    Args:
-        folder: folder to write to; created if missing. Existing files of these names are replaced.
-        pair: the rendered pair. The ground truth holds ``K``, ``R``, ``t``, ``F_mat``, ``width`` and ``height``;
-            ``F_mat`` is null where the camera only turns.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_pair(folder, render_pair(width=160, height=120))
-        ...     sorted(path.name for path in Path(folder).iterdir())
-        ['ground_truth.json', 'image1.png', 'image2.png']
-
+    The ground truth holds ``K``, ``R``, ``t``, ``F_mat`` (null where the camera only turns), ``width`` and ``height``.
     """
     cv2, folder = import_cv2(), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -185,3 +161,155 @@ def _darken_floor(cv2: Any, floor: Plane, foot: Array, right: Array) -> None:
     shadow = np.zeros(floor.texture.shape, np.float32)
     cv2.fillConvexPoly(shadow, pixels.round().astype(np.int32), 0.6)
     floor.texture[...] *= 1 - cv2.blur(shadow, (int(0.3 * density), int(0.3 * density)))
+
+
+def render_views(
+    rng: Random, cv2: Any, planes: Sequence[Plane], R: Array, t: Array, size: tuple[int, int]
+) -> RenderedPair:
+    """Render planes, given from back to front, from the origin and from a camera with :math:`X_2 = R X_1 + t`."""
+    width, height = size
+    K = np.array([[0.9 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]])
+    image1 = expose(render_planes(cv2, planes, K, np.eye(3), np.zeros(3), size), rng)
+    image2 = expose(render_planes(cv2, planes, K, R, t, size), rng)
+    F_mat = fundamental_from_motion(*map(torch.from_numpy, (K, K, R, t))).numpy()
+    points1, points2 = correspondences(planes, K, R, t, size)
+    return RenderedPair(image1, image2, K, R, t, F_mat, points1, points2)
+
+
+def rotation(yaw: float, pitch: float, roll: float) -> Array:
+    """Return the rotation about the axes y, then x, then z, in radians."""
+    (cy, sy), (cx, sx), (cz, sz) = ((np.cos(angle), np.sin(angle)) for angle in (yaw, pitch, roll))
+    Ry = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+    Rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return np.asarray(Rz @ Rx @ Ry)
+
+
+def render_planes(cv2: Any, planes: Sequence[Plane], K: Array, R: Array, t: Array, size: tuple[int, int]) -> Texture:
+    """Render the planes from back to front on a finer grid and average it."""
+    fine = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
+    centre = (SUPERSAMPLING - 1) / 2
+    K_fine = np.array([[SUPERSAMPLING, 0, centre], [0, SUPERSAMPLING, centre], [0, 0, 1]]) @ K
+    image = np.zeros(fine[::-1], np.float32)
+    for plane in planes:
+        height, width = plane.texture.shape
+        # Texel centres are at whole numbers: texel u lies (u + 1/2) / width along the side.
+        to_space = np.stack([plane.right / width, plane.down / height, plane.corner], -1)
+        to_space[:, 2] += (to_space[:, 0] + to_space[:, 1]) / 2
+        H = K_fine @ (R @ to_space + np.outer(t, [0, 0, 1]))
+        painted = cv2.warpPerspective(plane.texture, H, fine, flags=cv2.INTER_LINEAR)
+        cover = cv2.warpPerspective(np.ones_like(plane.texture), H, fine, flags=cv2.INTER_LINEAR)
+        image = painted + (1 - cover) * image
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def expose(image: Texture, rng: Random) -> NDArray[np.uint8]:
+    """Return the grey levels of brightness in 0-1, with noise of one level."""
+    levels = 235 * image + 8 + rng.standard_normal(image.shape)
+    return levels.round().clip(0, 255).astype(np.uint8)
+
+
+def correspondences(
+    planes: Sequence[Plane], K: Array, R: Array, t: Array, size: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Return exact correspondences, pixels ``(M, 2)``, of a grid of pixels of the first image.
+
+    Points that the second image does not show, or that another plane hides there, are left out.
+    """
+    step = max(1, size[0] // GRID)
+    x, y = np.meshgrid(np.arange(step // 2, size[0], step), np.arange(step // 2, size[1], step))
+    points1 = np.stack([x.ravel(), y.ravel()], -1).astype(float)
+    surface1, X1 = _front_surface(planes, K, np.eye(3), np.zeros(3), points1)
+    shown = surface1 >= 0
+    points1, surface1 = points1[shown], surface1[shown]
+    X2 = X1[shown] @ R.T + t
+    ahead = X2[:, 2] > 0
+    projected = X2[ahead] @ K.T
+    points1, surface1, points2 = points1[ahead], surface1[ahead], projected[:, :2] / projected[:, 2:]
+    surface2, _ = _front_surface(planes, K, R, t, points2)
+    both = (surface1 == surface2) & ((points2 >= 0) & (points2 <= np.array(size) - 1)).all(-1)
+    return points1[both], points2[both]
+
+
+def _front_surface(
+    planes: Sequence[Plane], K: Array, R: Array, t: Array, pixels: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Return the index of the plane that a camera sees at each pixel, -1 for none, and the point in its frame."""
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
+    surface, X = np.full(len(pixels), -1), np.full((len(pixels), 3), np.nan)
+    for index, plane in enumerate(planes):  # from back to front, as they are painted
+        to_camera = R @ np.stack([plane.right, plane.down, plane.corner], -1) + np.outer(t, [0, 0, 1])
+        u, v, inverse_depth = np.linalg.solve(to_camera, rays.T)  # shares of the sides, times the inverse depth
+        inside = (inverse_depth > 0) & (u >= 0) & (v >= 0) & (u <= inverse_depth) & (v <= inverse_depth)
+        surface[inside], X[inside] = index, rays[inside] / inverse_depth[inside, None]
+    return surface, X
+
+
+def noise(rng: Random, cv2: Any, shape: tuple[int, int], finest: int) -> Texture:
+    """Return noise of all scales from the whole texture to ``finest`` texels, with standard deviation one."""
+    total = np.zeros(shape, np.float32)
+    cell = max(shape) // 2
+    while cell >= finest:
+        grid = rng.standard_normal((shape[0] // cell + 2, shape[1] // cell + 2)).astype(np.float32)
+        total += cv2.resize(grid, shape[::-1], interpolation=cv2.INTER_CUBIC) * np.float32(cell**0.3)
+        cell //= 2
+    return np.asarray(total / total.std(), np.float32)
+
+
+def masonry(rng: Random, cv2: Any, size: Metres, density: float, brick: Metres, shift: float) -> Texture:
+    """Return bricks or tiles of random tones; every other row is shifted by a share of a brick."""
+    rows, columns = (np.arange(int(metres * density)) / density for metres in size[::-1])
+    row = rows / brick[1]
+    column = columns / brick[0] + shift * (row.astype(int)[:, None] % 2)
+    tones = rng.uniform(0.3, 0.75, (int(row[-1]) + 1, int(column.max()) + 1))
+    tone = tones[row.astype(int)[:, None], column.astype(int)]
+    joint = (row % 1 < 0.02 / brick[1])[:, None] | (column % 1 < 0.02 / brick[0])
+    texture = np.where(joint, 0.85, tone).astype(np.float32)
+    texture += 0.09 * noise(rng, cv2, texture.shape, finest=4)
+    return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)
+
+
+def framed(rng: Random, cv2: Any, paint: Painter, size: Metres, density: float) -> Texture:
+    """Return a painting in a dark frame with a pale mount."""
+    width, height = (int(metres * density) for metres in size)
+    texture = 0.55 + 0.12 * noise(rng, cv2, (height, width), finest=4)
+    paint(rng, cv2, texture)
+    edge = int(0.05 * density)
+    for inset, tone in ((2 * edge, 0.92), (edge, 0.12)):
+        border = np.ones(texture.shape, bool)
+        border[inset:-inset, inset:-inset] = False
+        texture[border] = tone
+    texture += 0.03 * noise(rng, cv2, texture.shape, finest=4)
+    return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)
+
+
+def circles(rng: Random, cv2: Any, texture: Texture) -> None:
+    """Paint rings and discs, large ones first."""
+    height, width = texture.shape
+    for radius in np.sort(rng.uniform(0.015, 0.16, 70))[::-1] * min(height, width):
+        centre = (int(rng.integers(width)), int(rng.integers(height)))
+        for share in (1.0, rng.uniform(0.5, 0.85), rng.uniform(0.15, 0.4)):
+            cv2.circle(texture, centre, max(1, int(share * radius)), rng.uniform(0.05, 1.0), -1, cv2.LINE_AA)
+
+
+def polygons(rng: Random, cv2: Any, texture: Texture) -> None:
+    """Paint triangles and quadrilaterals, large ones first."""
+    height, width = texture.shape
+    for radius in np.sort(rng.uniform(0.02, 0.25, 110))[::-1] * min(height, width):
+        angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 5)))
+        corners = rng.uniform((0, 0), (width, height)) + radius * np.stack([np.cos(angles), np.sin(angles)], -1)
+        cv2.fillPoly(texture, [corners.round().astype(np.int32)], rng.uniform(0.05, 1.0), cv2.LINE_AA)
+
+
+def letters(rng: Random, cv2: Any, texture: Texture) -> None:
+    """Set lines of random letters in several sizes on pale paper."""
+    height, width = texture.shape
+    ink = np.zeros(texture.shape, np.uint8)  # OpenCV writes on eight bits only
+    left, baseline = int(0.1 * width), int(0.06 * height)
+    while baseline < height:
+        scale = rng.uniform(0.0018, 0.005) * width
+        baseline += int(32 * scale)
+        text = "".join(rng.choice(list("ABCDEFGHJKLMNPRSTUVWXYZ23456789&"), 24))
+        thickness = max(1, int(2.5 * scale))
+        cv2.putText(ink, text, (left, baseline), cv2.FONT_HERSHEY_DUPLEX, scale, 255, thickness, cv2.LINE_AA)
+    texture[...] = (0.3 * texture + 0.6) * (1 - ink.astype(np.float32) / 280)

@@ -9,12 +9,14 @@ on the generator's device, and depend only on the arguments and the generator's 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from torch import Generator
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_points_from_homogeneous
+from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
+from kornia_learnnorm.data.motion import fundamental_from_motion
 from kornia_learnnorm.data.synthetic.draws import (
     draw_depths,
     fixed_camera,
@@ -26,10 +28,39 @@ from kornia_learnnorm.data.synthetic.draws import (
     spread_points,
     student_t,
     uniform,
+    viewing_rays,
 )
-from kornia_learnnorm.data.synthetic.two_views import TwoViewScene, corrupt, corrupt_evenly, two_views
 
-__all__ = ["forward_driving", "handheld", "orbit", "random_scenes", "random_views"]
+__all__ = ["TwoViewScene", "forward_driving", "handheld", "orbit", "random_scenes", "random_views", "two_views"]
+
+MAX_SCALE_CHANGE = 4.0  # ratio of a point's depths in view 1 and view 2; no descriptor matches beyond
+
+
+class TwoViewScene(NamedTuple):
+    r"""Correspondences of a batch of image pairs and their ground truth; :math:`X_2 = R X_1 + t` for points in space.
+
+    Args:
+        points1: pixels in the first image with shape :math:`(B, N, 2)`.
+        points2: pixels in the second image with shape :math:`(B, N, 2)`.
+        F_mat: fundamental matrices with shape :math:`(B, 3, 3)`, unit Frobenius norm, :math:`x_2^\top F x_1 = 0`.
+        inliers: boolean, :math:`(B, N)`; false for gross outliers.
+        K1: intrinsics of the first camera with shape :math:`(B, 3, 3)`.
+        K2: intrinsics of the second camera with shape :math:`(B, 3, 3)`.
+        R: rotations with shape :math:`(B, 3, 3)`.
+        t: translations with shape :math:`(B, 3)`, in the unit of depth.
+        image_size: width and height in pixels with shape :math:`(B, 2)`.
+
+    """
+
+    points1: Tensor
+    points2: Tensor
+    F_mat: Tensor
+    inliers: Tensor
+    K1: Tensor
+    K2: Tensor
+    R: Tensor
+    t: Tensor
+    image_size: Tensor
 
 
 def random_scenes(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
@@ -65,7 +96,7 @@ def random_scenes(batch_size: int, num_points: int, generator: Generator) -> Two
     noise1, noise2 = (scale * student_t(scene.points1.shape, generator) for _ in range(2))
     contaminated = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
     share = torch.where(contaminated, uniform((batch_size, 1), 0.0, 0.3, generator), 0.0)
-    return corrupt(scene, noise1, noise2, share, generator)
+    return _corrupt(scene, noise1, noise2, share, generator)
 
 
 def random_views(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
@@ -117,7 +148,7 @@ def forward_driving(
     baseline = uniform((batch_size, 1), 0.6, 1.4, generator)
     R, t = motions(axes, log_uniform((batch_size, 1), 0.002, 0.05, generator), forward, baseline)
     scene = two_views(points1, depths, K, R, t, size, num_points)
-    return corrupt_evenly(scene, noise, outliers, generator)
+    return _corrupt_evenly(scene, noise, outliers, generator)
 
 
 def handheld(
@@ -142,7 +173,7 @@ def handheld(
     axes, direction = (normal((batch_size, 1, 3), generator) for _ in range(2))
     R, t = motions(axes, angle, direction, baseline)
     scene = two_views(points1, depths, K, R, t, size, num_points)
-    return corrupt_evenly(scene, noise, outliers, generator)
+    return _corrupt_evenly(scene, noise, outliers, generator)
 
 
 def orbit(
@@ -170,7 +201,7 @@ def orbit(
     R = axis_angle_to_rotation_matrix(angle * normalize(axes, dim=-1))
     centre = size.new_tensor([0.0, 0.0, 4.0])
     scene = two_views(points1, depths, K, R, centre - R @ centre, size, num_points)
-    return corrupt_evenly(scene, noise, outliers, generator)
+    return _corrupt_evenly(scene, noise, outliers, generator)
 
 
 def _check_arguments(
@@ -190,3 +221,49 @@ def _check_arguments(
 def _num_candidates(num_points: int) -> int:
     """Return how many candidate points to draw so that the second view shows at least ``num_points``."""
     return 2 * num_points + 16
+
+
+def two_views(
+    points1: Tensor, depths: Tensor, K: Tensor, R: Tensor, t: Tensor, size: Tensor, num_points: int
+) -> TwoViewScene:
+    """Return scenes without noise, of candidate points ``(B, M)`` and candidate motions ``(B, C)``.
+
+    The motion is the first that shows half of the candidate points, or else the one that shows most. If it shows fewer
+    than ``num_points``, the missing points are outliers; fewer than one point in a thousand is.
+    """
+    X = (viewing_rays(points1, K) * depths[..., None]).mT.contiguous()
+    probe = _project(X[..., : X.shape[-1] // 2], K, R, t, size)[1]  # half of the points, to save time
+    motion = probe.sum(-1).clamp(max=(probe.shape[-1] + 1) // 2).argmax(1)
+    row = torch.arange(len(K), device=K.device)
+    R, t = R[row, motion], t[row, motion]
+    x2, shown = (values[:, 0] for values in _project(X, K, R[:, None], t[:, None], size))
+    order = shown.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :num_points]
+    pick = order[..., None].expand(-1, -1, 2)
+    points2 = convert_points_from_homogeneous(x2.mT).gather(1, pick)
+    F_mat = fundamental_from_motion(K, K, R, t)
+    return TwoViewScene(points1.gather(1, pick), points2, F_mat, shown.gather(1, order), K, K.clone(), R, t, size)
+
+
+def _corrupt(scene: TwoViewScene, noise1: Tensor, noise2: Tensor, share: Tensor, generator: Generator) -> TwoViewScene:
+    """Return the scenes with noise ``(B, N, 2)`` added and a share ``(B, 1)`` of points2 at random pixels."""
+    shape = scene.inliers.shape
+    rank = uniform(shape, 0.0, 1.0, generator).argsort(1)
+    inliers = scene.inliers & (rank >= (share * shape[1]).round())
+    anywhere = (scene.image_size[:, None] - 1) * uniform((*shape, 2), 0.0, 1.0, generator)
+    points2 = torch.where(inliers[..., None], scene.points2 + noise2, anywhere)
+    return scene._replace(points1=scene.points1 + noise1, points2=points2, inliers=inliers)
+
+
+def _corrupt_evenly(scene: TwoViewScene, noise: float, outliers: float, generator: Generator) -> TwoViewScene:
+    """Return the scenes with Gaussian noise (standard deviation in pixels) and the same share of gross outliers."""
+    noise1, noise2 = (noise * normal(scene.points1.shape, generator) for _ in range(2))
+    return _corrupt(scene, noise1, noise2, torch.full_like(scene.t[:, :1], outliers), generator)
+
+
+def _project(X: Tensor, K: Tensor, R: Tensor, t: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Return homogeneous pixels ``(B, C, 3, M)`` of points ``(B, 3, M)`` in ``C`` views, and a mask of those shown."""
+    KR, Kt = K[:, None] @ R, K[:, None] @ t[..., None]
+    x2 = torch.baddbmm(Kt.flatten(1, 2), KR.flatten(1, 2), X).reshape(*R.shape[:3], -1)
+    (x, y, z), last = x2.unbind(2), size[:, None] - 1
+    inside = (x >= 0) & (y >= 0) & (x <= last[..., :1] * z) & (y <= last[..., 1:] * z)
+    return x2, inside & (MAX_SCALE_CHANGE * z > X[:, 2:])

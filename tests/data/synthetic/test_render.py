@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from two_view import epipolar_distances
 
-from kornia_learnnorm.data.synthetic.render import RenderedPair, render_pair, write_pair
+from kornia_learnnorm.data.synthetic.render import correspondences, render_pair, room, rotation, write_pair
 
 cv2 = pytest.importorskip("cv2")
 
@@ -27,7 +27,6 @@ def matches(pair):
 
 
 def test_images(pair):
-    assert isinstance(pair, RenderedPair)
     for image in (pair.image1, pair.image2):
         assert image.shape == (480, 640)
         assert image.dtype == np.uint8
@@ -75,6 +74,30 @@ def test_the_seed_determines_the_pair():
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     assert not np.array_equal(first.image1, other.image1)
     assert not np.array_equal(first.F_mat, other.F_mat)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_correspondences_are_in_front_of_all_other_planes(wide):
+    planes = room(np.random.default_rng(0), cv2, texels=0.5)
+    K, size = np.array([[288.0, 0, 159.5], [0, 288.0, 119.5], [0, 0, 1]]), (320, 240)
+    R = rotation(-0.25, 0.02, 0.01) if wide else rotation(0.01, 0.0, 0.0)
+    t = -R @ (np.array([1.8, 0.2, 0.5]) if wide else np.array([0.1, 0.0, 0.0]))
+    points1, points2 = correspondences(planes, K, R, t, size)
+    assert len(points1) > 1000
+    for points, R_view, t_view in ((points1, np.eye(3), np.zeros(3)), (points2, R, t)):
+        rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(K).T @ R_view  # in the first frame
+        centre, nearest = -R_view.T @ t_view, np.full(len(points), np.inf)
+        for plane in planes:
+            normal = np.cross(plane.right, plane.down)
+            depth = (plane.corner - centre) @ normal / (rays @ normal)
+            local = centre + depth[:, None] * rays - plane.corner
+            u, v = np.linalg.lstsq(np.stack([plane.right, plane.down], -1), local.T, rcond=None)[0]
+            hit = (depth > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+            nearest = np.where(hit, np.minimum(nearest, depth), nearest)
+        X = centre + nearest[:, None] * rays
+        seen = [V[:, :2] / V[:, 2:] for V in (X @ K.T, (X @ R.T + t) @ K.T)]
+        np.testing.assert_allclose(seen[0], points1, atol=1e-6)
+        np.testing.assert_allclose(seen[1], points2, atol=1e-6)
 
 
 def test_write_pair(tmp_path):

@@ -11,7 +11,6 @@ from kornia_learnnorm.data.synthetic import (
     orbit,
     random_scenes,
     scenes,
-    two_views,
 )
 
 NAMED = [forward_driving, handheld, orbit]
@@ -204,10 +203,10 @@ BACK = torch.diag(torch.tensor([-1.0, 1.0, -1.0])).double()  # a camera that loo
 def test_points_that_no_motion_shows_become_outliers():
     points, depths, K, size = flat(2, 32)
     R = BACK.expand(2, 1, 3, 3)
-    scene = two_views.two_views(points, depths, K, R, torch.ones(2, 1, 3).double(), size, 8)
+    scene = scenes.two_views(points, depths, K, R, torch.ones(2, 1, 3).double(), size, 8)
     assert not scene.inliers.any()
     zero = torch.zeros(2, 8, 2).double()
-    scene = two_views.corrupt(scene, zero, zero, torch.zeros(2, 1).double(), seeded())
+    scene = scenes._corrupt(scene, zero, zero, torch.zeros(2, 1).double(), seeded())
     assert not scene.inliers.any()
     assert (scene.points2 >= 0).all()
     assert (scene.points2 <= size[:, None] - 1).all()
@@ -217,7 +216,7 @@ def test_the_first_motion_that_shows_enough_is_chosen():
     points, depths, K, size = flat(1, 64)
     R = torch.stack([BACK, torch.eye(3).double(), torch.eye(3).double()])[None]
     t = torch.tensor([[[0.0, 0, 0], [0.125, 0, 0], [0.01, 0, 0]]]).double()
-    scene = two_views.two_views(points, depths, K, R, t, size, 24)
+    scene = scenes.two_views(points, depths, K, R, t, size, 24)
     assert scene.inliers.all()
     assert scene.t.tolist() == [[0.125, 0.0, 0.0]]
 

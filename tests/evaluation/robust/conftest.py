@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.evaluation.robust.matches import draw_matches
 
 

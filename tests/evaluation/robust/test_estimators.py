@@ -10,7 +10,7 @@ import torch
 from two_view import shaken_estimator
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.evaluation.robust import peers
 from kornia_learnnorm.evaluation.robust.budgets import minimal_samples, run_estimator
 from kornia_learnnorm.evaluation.robust.estimators import (

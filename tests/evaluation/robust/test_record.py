@@ -10,7 +10,7 @@ import torch
 
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import peers, record
 from kornia_learnnorm.evaluation.robust.estimators import find_estimator

@@ -10,7 +10,7 @@ import torch
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.evaluation.runs.pairs import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import consensus, predict
 from kornia_learnnorm.metrics.pairs import f1_score, inlier_share

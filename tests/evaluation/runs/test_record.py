@@ -17,7 +17,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.samples import plain_residual
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.stores import synthetic_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method
 from kornia_learnnorm.evaluation.robust.run import read_robust

@@ -19,8 +19,14 @@ from kornia_learnnorm.data.synthetic.draws import (
     uniform,
     viewing_rays,
 )
-from kornia_learnnorm.data.synthetic.scenes import forward_driving, handheld, orbit, random_views
-from kornia_learnnorm.data.synthetic.two_views import TwoViewScene, two_views
+from kornia_learnnorm.data.synthetic.scenes import (
+    TwoViewScene,
+    forward_driving,
+    handheld,
+    orbit,
+    random_views,
+    two_views,
+)
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["SyntheticMatches", "random_matches", "wide_baseline"]

@@ -1,37 +1,39 @@
-r"""Rendered image pairs of kinds that are difficult for two-view estimation, with exact ground truth.
+"""Rendered image pairs of kinds that are difficult for two-view estimation, with exact ground truth.
 
-.. list-table::
-
-   * - ``room``
-     - the scene of :func:`~kornia_learnnorm.data.synthetic.render.render_pair`
-   * - ``facade``
-     - a wall with boards that stand out from it by up to 0-20 % of its distance, more often little than much
-   * - ``plane``
-     - a wall with pictures painted on it: the correspondences do not determine :math:`F`, which the motion does
-   * - ``rotation``
-     - the room, from a camera that only turns: :math:`t` is zero and :math:`F` NaN
-   * - ``repeated``
-     - a wall of equal windows, with balconies of equal bars and a few unlike boards that stand out by 3-20 %
-   * - ``borders``
-     - the room inside of a constant black frame (even seeds) or below a constant caption and logo (odd seeds)
+- `room`: the scene of `kornia_learnnorm.data.synthetic.render`
+- `facade`: a wall with boards that stand out from it by up to 0-20 % of its distance, more often little than much
+- `plane`: a wall with pictures painted on it: the correspondences do not determine F, which the motion does
+- `rotation`: the room, from a camera that only turns: t is zero and F NaN
+- `repeated`: a wall of equal windows, with balconies of equal bars and a few unlike boards that stand out by 3-20 %
+- `borders`: the room inside of a constant black frame (even seeds) or below a constant caption and logo (odd seeds)
 
 Where the camera moves, the baseline is 2-35 % of the distance to the scene, and the camera turns to keep the scene in
-view.
+view. Tests and tutorials use these pairs too.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.images import import_cv2
-from kornia_learnnorm.data.synthetic.planes import SUPERSAMPLING, Array, Plane, rotation
-from kornia_learnnorm.data.synthetic.render import RenderedPair, check_size, render_views, room
-from kornia_learnnorm.data.synthetic.textures import PAINTERS, Random, Texture, framed, masonry, windows
-
-__all__ = ["KINDS", "render_kind"]
+from kornia_learnnorm.data.synthetic.render import (
+    SUPERSAMPLING,
+    Array,
+    Metres,
+    Plane,
+    Random,
+    RenderedPair,
+    Texture,
+    check_size,
+    circles,
+    framed,
+    letters,
+    masonry,
+    noise,
+    polygons,
+    render_views,
+    room,
+    rotation,
+)
 
 KINDS = ("room", "facade", "plane", "rotation", "repeated", "borders")
 DISTANCE = 6.0  # of facades and of the middle of the room, metres
@@ -39,48 +41,28 @@ BASELINES = (0.02, 0.35)  # shares of the distance
 MAX_RELIEF = 0.2  # share of the distance to the wall
 WALL = (13.0, 8.5)  # width and height, metres; fills every view
 TEXELS = 85  # of a wall, per metre and sample of an image 640 pixels wide; those of nearer boards are denser
+PAINTERS = (circles, polygons, letters)
 
 
 def render_kind(kind: str, seed: int = 0, width: int = 640, height: int = 480) -> RenderedPair:
-    """Render an image pair of a kind; equal seeds give equal images.
-
-    Args:
-        kind: one of :data:`KINDS`, see the table of the module.
-        seed: seed of textures, relief and motion, 0 or more.
-        width: width of the images in pixels.
-        height: height of the images in pixels.
-
-    Returns:
-        the pair. No correspondence of it lies below a frame, caption or logo.
-
-    Raises:
-        ImportError: if OpenCV is not installed.
-        ValueError: if the kind is unknown, the seed negative, or the height below 64 pixels or above the width.
-
-    Example:
-        >>> pair = render_kind("plane", seed=1, width=160, height=120)
-        >>> pair.image1.shape, pair.relief
-        ((120, 160), 0.0)
-
-    """
+    """Return an image pair of a kind; equal seeds give equal images, and no correspondence lies below a caption."""
     if kind not in KINDS:
         raise ValueError(f"unknown kind {kind!r}: expected one of {', '.join(KINDS)}")
     check_size(seed, width, height)
-    cv2 = import_cv2()
     rng = np.random.default_rng([*kind.encode(), seed])
     texels = SUPERSAMPLING * width / 640
     R, t = _turn(rng) if kind == "rotation" else _motion(rng)
     if kind == "facade":
-        planes = _facade(rng, cv2, texels, MAX_RELIEF * rng.uniform() ** 2)
+        planes = _facade(rng, texels, MAX_RELIEF * rng.uniform() ** 2)
     elif kind == "plane":
-        planes = _facade(rng, cv2, texels, 0.0)
+        planes = _facade(rng, texels, 0.0)
     elif kind == "repeated":
-        planes = _repeated(rng, cv2, texels)
+        planes = _repeated(rng, texels)
     else:
         planes = room(rng, cv2, texels)
     pair = render_views(rng, cv2, planes, R, t, (width, height))
     if kind == "borders":
-        overlay = _caption(rng, cv2, width, height) if seed % 2 else _frame(rng, width, height)
+        overlay = _caption(rng, width, height) if seed % 2 else _frame(rng, width, height)
         pair = _covered(pair, *overlay)
     return pair
 
@@ -120,32 +102,32 @@ class _Wall:
         return Plane(place - (right + down) / 2, right, down, texture)
 
 
-def _facade(rng: Random, cv2: Any, texels: float, relief: float) -> list[Plane]:
+def _facade(rng: Random, texels: float, relief: float) -> list[Plane]:
     """Return a wall with nine pictures, of which the one that stands out most does so by the relief."""
     wall = _Wall(rng, masonry(rng, cv2, WALL, TEXELS * texels, brick=(0.62, 0.27), shift=0.5))
     shares = np.sort(relief * rng.uniform(size=9))
     shares[-1] = relief
     places = rng.permutation([(x, y) for x in (-2.2, 0.0, 2.2) for y in (-1.6, 0.0, 1.6)])
-    boards = [_picture(rng, cv2, wall, place, share, texels) for place, share in zip(places, shares, strict=True)]
+    boards = [_picture(rng, wall, place, share, texels) for place, share in zip(places, shares, strict=True)]
     return [wall.plane, *boards]
 
 
-def _repeated(rng: Random, cv2: Any, texels: float) -> list[Plane]:
+def _repeated(rng: Random, texels: float) -> list[Plane]:
     """Return a wall of equal windows with two rows of balconies and three pictures in front of it."""
     cell = (rng.uniform(0.8, 1.3), rng.uniform(1.1, 1.5))
-    wall = _Wall(rng, windows(rng, cv2, WALL, TEXELS * texels, cell))
+    wall = _Wall(rng, windows(rng, WALL, TEXELS * texels, cell))
     relief = rng.uniform(0.03, MAX_RELIEF)
-    planes, bars = [wall.plane], windows(rng, cv2, (WALL[0], 0.4), 110 * texels, (0.3, 0.4))
+    planes, bars = [wall.plane], windows(rng, (WALL[0], 0.4), 110 * texels, (0.3, 0.4))
     for y in (-1.3, 1.4):
         share = relief * rng.uniform(0.3, 0.7)
         planes.append(wall.board((0.0, y + rng.uniform(-0.2, 0.2)), (WALL[0], 0.4), share, bars))
     shares = np.sort([relief, *(relief * rng.uniform(0.7, 1.0, 2))])
     places = rng.permutation([(x, rng.uniform(-1.6, 1.6)) for x in (-2.0, 0.0, 2.0)])
-    boards = [_picture(rng, cv2, wall, place, share, texels) for place, share in zip(places, shares, strict=True)]
+    boards = [_picture(rng, wall, place, share, texels) for place, share in zip(places, shares, strict=True)]
     return [*planes, *boards]  # from back to front: every picture stands out further than the balconies
 
 
-def _picture(rng: Random, cv2: Any, wall: _Wall, place: Array, share: float, texels: float) -> Plane:
+def _picture(rng: Random, wall: _Wall, place: Array, share: float, texels: float) -> Plane:
     """Return a framed picture around a place of the wall."""
     size = (rng.uniform(1.0, 1.7), rng.uniform(0.9, 1.3))
     middle = place + rng.uniform(-0.15, 0.15, 2)
@@ -162,7 +144,7 @@ def _frame(rng: Random, width: int, height: int) -> tuple[NDArray[np.bool_], NDA
     return mask, np.zeros((height, width), np.uint8)
 
 
-def _caption(rng: Random, cv2: Any, width: int, height: int) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
+def _caption(rng: Random, width: int, height: int) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
     """Return the mask and the grey levels of lines of text below and of a logo in a corner."""
     mask, levels = np.zeros((height, width), bool), np.zeros((height, width), np.uint8)
     lines, scale = int(rng.integers(1, 4)), width / 640
@@ -195,3 +177,23 @@ def _covered(pair: RenderedPair, mask: NDArray[np.bool_], levels: NDArray[np.uin
 def _masked(mask: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
     x, y = points.round().astype(int).T
     return np.asarray(mask[y, x])
+
+
+def windows(rng: Random, size: Metres, density: float, cell: Metres) -> Texture:
+    """Return rows of one window with its frame, curtain and patch of wall; only stains of 2 % tell the cells apart."""
+    width, height = (int(metres * density) for metres in cell)
+    one = (0.55 + 0.08 * noise(rng, cv2, (height, width), finest=4)).astype(np.float32)
+    x, y = (np.round(np.array([0.2, 0.8]) * side).astype(int) for side in (width, height))
+    bar = max(1, int(0.025 * width))
+    curtain = (0.45 + 0.1 * noise(rng, cv2, (y[1] - y[0], x[1] - x[0]), finest=4)).astype(np.float32)
+    circles(rng, cv2, curtain)
+    one[y[0] - 2 * bar : y[1] + 2 * bar, x[0] - 2 * bar : x[1] + 2 * bar] = 0.95
+    one[y[0] : y[1], x[0] : x[1]] = curtain
+    for share in rng.uniform(0.25, 0.75, 2):
+        middle = int(x[0] + share * (x[1] - x[0])), int(y[0] + share * (y[1] - y[0]))
+        one[y[0] : y[1], middle[0] - bar : middle[0] + bar] = 0.15
+        one[middle[1] - bar : middle[1] + bar, x[0] : x[1]] = 0.85
+    columns, rows = (int(np.ceil(side / part)) for side, part in zip(size, cell, strict=True))
+    texture = np.tile(one, (rows, columns))
+    texture += 0.02 * noise(rng, cv2, texture.shape, finest=4)
+    return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)

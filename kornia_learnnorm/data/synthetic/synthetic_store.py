@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.data.synthetic.scenes import forward_driving, handheld, orbit
-from kornia_learnnorm.data.synthetic.two_views import TwoViewScene
+from kornia_learnnorm.data.synthetic.scenes import TwoViewScene, forward_driving, handheld, orbit
 
 __all__ = ["SCENES", "synthetic_store"]
 

@@ -1,0 +1,123 @@
+"""The difficult pairs of benchmarks/rendered.py."""
+
+import numpy as np
+import pytest
+from two_view import epipolar_distances
+
+cv2 = pytest.importorskip("cv2")
+from rendered import KINDS, MAX_RELIEF, render_kind  # noqa: E402
+
+from kornia_learnnorm.data.synthetic.render import RenderedPair  # noqa: E402
+
+SIZE = (320, 240)
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    """Return pairs by kind and seed, each rendered once."""
+    found = {}
+
+    def pair(kind: str, seed: int) -> RenderedPair:
+        if (kind, seed) not in found:
+            found[kind, seed] = render_kind(kind, seed, *SIZE)
+        return found[kind, seed]
+
+    return pair
+
+
+def mapped(H: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Map points by a homography."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ H.T
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def depths(pair: RenderedPair) -> np.ndarray:
+    """Depths in the first camera, from s2 x2 = s1 R x1 + t in least squares."""
+    rays1, rays2 = (
+        np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(pair.K).T
+        for points in (pair.points1, pair.points2)
+    )
+    return np.array(
+        [
+            np.linalg.lstsq(np.stack([pair.R @ ray1, -ray2], -1), -pair.t, rcond=None)[0][0]
+            for ray1, ray2 in zip(rays1, rays2, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize(("kind", "seed"), [*((kind, 0) for kind in KINDS), ("borders", 1)])
+def test_images_show_the_correspondences(rendered, kind, seed):
+    pair = rendered(kind, seed)
+    assert len(pair.points1) == len(pair.points2) >= 500
+    for points in (pair.points1, pair.points2):
+        assert (points >= 0).all()
+        assert (points <= np.array(SIZE) - 1).all()
+    values = [
+        cv2.remap(cv2.GaussianBlur(image, None, 1.0), points.astype(np.float32)[:, None], None, cv2.INTER_LINEAR)
+        for image, points in ((pair.image1, pair.points1), (pair.image2, pair.points2))
+    ]
+    assert np.corrcoef(values[0].ravel(), values[1].ravel())[0, 1] > 0.85  # 0 for points that do not correspond
+    if kind == "rotation":
+        H = pair.K @ pair.R @ np.linalg.inv(pair.K)
+        np.testing.assert_allclose(mapped(H, pair.points1), pair.points2, atol=1e-9)
+        assert np.isnan(pair.F_mat).all()
+        assert pair.t.tolist() == [0, 0, 0]
+        assert 3 <= np.degrees(np.arccos((np.trace(pair.R) - 1) / 2)) <= 16
+        return
+    assert epipolar_distances(pair.points1, pair.points2, pair.F_mat).max() < 1e-6
+    assert 0.02 * 6 - 1e-9 <= np.linalg.norm(pair.t) <= 0.35 * 6 + 1e-9
+    assert depths(pair).min() > 0.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_kind_and_seed_determine_the_pair(kind):
+    first, again, other = (render_kind(kind, seed, 96, 72) for seed in (1, 1, 2))
+    for name, value in first._asdict().items():
+        np.testing.assert_array_equal(value, getattr(again, name))  # NaN is equal to NaN
+    assert not np.array_equal(first.image1, other.image1)
+    assert not np.array_equal(first.R, other.R)
+
+
+def test_plane_has_a_homography(rendered):
+    pair = rendered("plane", 0)
+    H, _ = cv2.findHomography(pair.points1, pair.points2, 0)
+    np.testing.assert_allclose(mapped(H, pair.points1), pair.points2, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["facade", "repeated"])
+def test_relief(rendered, kind):
+    pair = rendered(kind, 0)
+    # The wall has most of the points: a plane through them, and the distances of the points to it.
+    _, on_wall = cv2.findHomography(pair.points1, pair.points2, cv2.RANSAC, 1e-3)
+    X = np.column_stack([pair.points1, np.ones(len(pair.points1))]) @ np.linalg.inv(pair.K).T * depths(pair)[:, None]
+    wall = np.linalg.lstsq(X[on_wall.ravel() > 0], np.ones(on_wall.sum()), rcond=None)[0]  # wall @ X = 1
+    shares = 1 - X @ wall
+    assert (0.03 if kind == "repeated" else 0) < shares.max() <= MAX_RELIEF + 1e-6
+    assert shares.min() > -1e-6
+
+
+def test_a_frame_is_black_and_hides_its_correspondences(rendered):
+    pair = rendered("borders", 0)
+    black = (pair.image1 == 0) & (pair.image2 == 0)
+    for side in (black[:, :8], black[:, -8:], black[:6], black[-6:]):
+        assert side.all()
+    assert black.mean() < 0.5
+    for points in (pair.points1, pair.points2):
+        x, y = points.round().astype(int).T
+        assert black[y, x].mean() < 0.01
+
+
+def test_a_caption_is_equal_in_both_images(rendered):
+    pair = rendered("borders", 1)
+    equal = pair.image1 == pair.image2
+    assert equal[-12:].all()
+    assert equal[:20, :20].all() or equal[:20, -20:].all()  # the logo
+    assert pair.image1[-12:].std() > 20
+    assert np.median(np.linalg.norm(pair.points1 - pair.points2, axis=1)) > 2
+    for points in (pair.points1, pair.points2):
+        assert points[:, 1].max() < SIZE[1] - 12
+
+
+def test_an_unknown_kind():
+    with pytest.raises(ValueError, match=r"garden.*room"):
+        render_kind("garden")
