@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import importlib
+import importlib.util
 import json
 import re
 import tomllib
@@ -74,6 +74,7 @@ def test_the_reference_has_every_public_name():
     assert sorted(re.findall(r"^   (\w+)$", TEXTS["docs/api.md"], flags=re.MULTILINE)) == sorted(kln.__all__)
     modules = re.findall(r"automodule:: (\S+)", "".join(text for page, text in TEXTS.items() if "docs/api/" in page))
     assert len(modules) == len(set(modules))
+    assert [module for module in modules if not importlib.util.find_spec(module)] == []
     assert [name for name in kln.__all__ if getattr(kln, name).__module__ not in modules] == []
 
 
