@@ -30,7 +30,6 @@ __all__ += ["compare", "epipolar_segment", "read_file", "render_example"]
 
 METHODS = ("Hartley", "Learned", "RANSAC")
 MAX_BYTES = 50_000_000  # of an uploaded file
-MAX_PIXELS = 150_000_000  # of an uploaded image; Pillow's own limit is a little above
 SHOWN_SIZE = 1200  # pixels of the longer side of an image as the browser gets it
 REPETITIONS = 3  # of a timed call, the fastest counts
 EDGE = 1e-9  # pixels by which rounding may move the end of a line off the border of an image
@@ -85,7 +84,7 @@ def read_file(name: str, content: bytes) -> ImageFile:
         content: the bytes of the file.
 
     Raises:
-        ValueError: if the file is too large, has too many pixels, or is not an intact image.
+        ValueError: if the file is too large or not an intact image.
 
     Example:
         >>> read_file("notes.txt", b"no pixels")
@@ -99,12 +98,8 @@ def read_file(name: str, content: bytes) -> ImageFile:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "image"
         path.write_bytes(content)
-        width, height = image_size(path)
-        if width * height > MAX_PIXELS:
-            limit = f"at most {MAX_PIXELS // 10**6} million pixels are taken"
-            raise ValueError(f"{name} has {width} x {height} pixels, {limit}")
         try:
-            return ImageFile(name, content, read_colour(path, SHOWN_SIZE), (width, height))
+            return ImageFile(name, content, read_colour(path, SHOWN_SIZE), image_size(path))
         except ValueError as error:
             raise ValueError(str(error).replace(f"image {path}", name)) from error
 

@@ -32,12 +32,7 @@ Cameras = tuple[Tensor, Tensor]
 def read_matches(points1: Points, points2: Points, scores: Points | None) -> tuple[Tensor, Tensor, Tensor]:
     """Return matches (N, 2), (N, 2) and scores (N,) in float64; scores of one where there are none.
 
-    Rows of points that are not finite may have any score.
-
-    Raises:
-        TypeError: if an argument is neither an array nor a tensor of numbers.
-        ValueError: if shapes do not pair up, or the score of finite points is not from 0 to 1.
-
+    TypeError for other than numbers, ValueError for shapes that do not pair up and scores of points beyond [0, 1].
     """
     x1, x2 = _as_float64("points1", points1), _as_float64("points2", points2)
     score = torch.ones(len(x1), dtype=torch.float64) if scores is None else _as_float64("scores", scores)
@@ -52,27 +47,14 @@ def read_matches(points1: Points, points2: Points, scores: Points | None) -> tup
 
 
 def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
-    """Return the cameras (3, 3) of both images in float64, or None where none is given.
-
-    Raises:
-        TypeError: if a camera is neither an array nor a tensor of numbers.
-        ValueError: if only one is given, or one is not a finite and invertible matrix of shape (3, 3) with a
-            last row of (0, 0, w).
-
-    """
+    """Return the cameras (3, 3) of both images in float64, or None where none is given; see ``check_cameras``."""
     camera1, camera2 = (None if K is None else _as_float64(name, K) for name, K in (("K1", K1), ("K2", K2)))
     check_cameras(camera1, camera2)
     return None if camera1 is None or camera2 is None else (camera1, camera2)
 
 
 def read_size(name: str, size: Size | None, points: Tensor) -> Size:
-    """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given.
-
-    Raises:
-        TypeError: if a number is not whole.
-        ValueError: if there are not two, or one is not positive.
-
-    """
+    """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given."""
     if size is None:
         width, height = (points.amax(0).clamp(min=1.0).ceil() + 1).tolist()
         return int(width), int(height)

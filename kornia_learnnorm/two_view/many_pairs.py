@@ -34,18 +34,13 @@ Line = dict[str, Any]  # the JSON object of a pair
 
 @dataclass(frozen=True)
 class PairOptions:
-    """How image pairs are estimated; see :func:`~kornia_learnnorm.two_view.estimate_pair.estimate_pair`.
+    """How image pairs are estimated; see :func:`~kornia_learnnorm.two_view.estimate_pair.estimate_pair`."""
 
-    Attributes:
-        weights: weights of the learned layer, by name or file; None for RANSAC.
-        K: a camera for each image, or one for both, see :func:`~kornia_learnnorm.data.cameras.read_camera`.
-    """
-
-    weights: str | None = None
+    weights: str | None = None  # of the learned layer, by name or file; None for RANSAC
     ratio: float = RATIO
     threshold: float = INLIER_THRESHOLD
     seed: int = 0
-    K: tuple[str, ...] = ()
+    K: tuple[str, ...] = ()  # a camera for each image, or one for both, as ``read_camera`` reads it
     max_size: int = MAX_SIZE
     detector: str = "sift"
     matcher: str = "nearest"
@@ -167,20 +162,11 @@ def _read_done(path: Path) -> dict[FilePair, Line]:
 
 
 def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> Line:
-    """Return the JSON object of a pair without a matrix: ``F`` is null and ``warnings`` says why.
-
-    Args:
-        code: one word for programs.
-        text: one sentence for people.
-        image1: file of image 1.
-        image2: file of image 2.
-        options: of the estimate.
-    """
+    """Return the JSON object of a pair without a matrix: ``F`` is null, and the warning has a code and a text."""
     return {
         **dict.fromkeys(("F", "E", "R", "t", "predicted_error_px")),
         "warnings": [{"code": code, "text": text}],
-        "image1": _describe_image(image1),
-        "image2": _describe_image(image2),
+        **{name: _describe_image(path) for name, path in (("image1", image1), ("image2", image2))},
         "estimator": (RANSAC if options.weights is None else LearnedEightPoint).__name__,
         "seed": options.seed,
         "ratio": options.ratio,

@@ -7,6 +7,8 @@ parallax would. What one distortion of both images explains is therefore no evid
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -42,31 +44,17 @@ def distances_from_plane(
     """
     centre1, radius1 = _centre_and_radius(size1)
     centre2, radius2 = _centre_and_radius(size2)
-    u1, u2 = (points1 - centre1) / radius1, (points2 - centre2) / radius2
+    linearise = partial(_linearise, u1=(points1 - centre1) / radius1, u2=(points2 - centre2) / radius2)
     H = torch.linalg.inv(_to_pixels(centre2, radius2)) @ H @ _to_pixels(centre1, radius1)
-    H, bend = H / torch.linalg.matrix_norm(H), H.new_zeros(())  # the distortion is bounded through tanh(bend)
-    offsets, J = _linearise(u1, u2, H, bend)
-    scale, damping = threshold / radius2, FIRST_DAMPING
-    for _ in range(STEPS):
-        usable = J.isfinite().all(-1).all(-1) & offsets.isfinite().all(-1)
-        weights = (1 + offsets[usable].square().sum(-1) / scale**2).pow(-2)
-        weighted, rest = (weights[:, None, None] * J[usable]).flatten(0, 1), offsets[usable].flatten()
-        normal = weighted.mT @ J[usable].flatten(0, 1)
-        damped = normal + damping * normal.diagonal().mean() * torch.eye(10, dtype=J.dtype)
-        step = torch.linalg.solve_ex(damped, weighted.mT @ rest)[0]
-        tried = H - torch.unflatten(step[:9], 0, (3, 3)), bend - step[9]
-        moved, moved_J = _linearise(u1, u2, *tried)
-        if not _cost(moved, scale) < _cost(offsets, scale):  # or NaN
-            damping *= 10
-            continue
-        (H, bend), offsets, J, damping = tried, moved, moved_J, damping / 10
-    distances: Tensor = radius2 * offsets.norm(dim=-1).nan_to_num(nan=math.inf)
-    return distances
+    start = torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])
+    distance = radius2 * _minimize(linearise, start, threshold / radius2).norm(dim=-1)
+    return distance.nan_to_num(nan=math.inf)
 
 
-def _linearise(u1: Tensor, u2: Tensor, H: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the offsets (N, 2) of u2 and their derivatives by the entries of H and by the bend, (N, 2, 10)."""
-    k, slope = MAX_DISTORTION * torch.tanh(bend), MAX_DISTORTION * (1 - torch.tanh(bend).square())
+def _linearise(parameters: Tensor, u1: Tensor, u2: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the offsets (N, 2) of u2 and their derivatives by the entries of H and the distortion, (N, 2, 10)."""
+    H, bend = parameters[:9].view(3, 3), torch.tanh(parameters[9])  # the distortion is bounded
+    k, slope = MAX_DISTORTION * bend, MAX_DISTORTION * (1 - bend.square())
     square1, square2 = (u.square().sum(-1, keepdim=True) for u in (u1, u2))
     ideal1 = convert_points_to_homogeneous(u1 * (1 + k * square1))
     moved = ideal1 @ H.mT
@@ -81,6 +69,31 @@ def _linearise(u1: Tensor, u2: Tensor, H: Tensor, bend: Tensor) -> tuple[Tensor,
     return offsets, torch.cat([torch.stack(rows, 1) / stretch[..., None], slope * by_k[..., None]], -1)
 
 
+def _minimize(linearise: Callable[[Tensor], tuple[Tensor, Tensor]], start: Tensor, scale: float) -> Tensor:
+    """Return the residuals (N, 2) after steps of Levenberg-Marquardt on Geman and McClure's loss from (P,) on."""
+    parameters, damping, eye = start, FIRST_DAMPING, torch.eye(len(start), dtype=start.dtype)
+    residual, J = linearise(start)
+    for _ in range(STEPS):
+        usable = J.isfinite().all(-1).all(-1) & residual.isfinite().all(-1)
+        weights = (1 + residual[usable].square().sum(-1) / scale**2).pow(-2)
+        weighted = (weights[:, None, None] * J[usable]).flatten(0, 1)
+        normal = weighted.mT @ J[usable].flatten(0, 1)
+        damped = normal + damping * normal.diagonal().mean() * eye
+        tried = parameters - torch.linalg.solve_ex(damped, weighted.mT @ residual[usable].flatten())[0]
+        moved, moved_J = linearise(tried)
+        if not _cost(moved, scale) < _cost(residual, scale):  # or NaN
+            damping *= 10
+            continue
+        parameters, residual, J, damping = tried, moved, moved_J, damping / 10
+    return residual
+
+
+def _cost(offsets: Tensor, scale: float) -> Tensor:
+    """Return the sum of Geman and McClure's losses; those of points at infinity are one."""
+    square = offsets.square().sum(-1) / scale**2
+    return (square / (1 + square)).nan_to_num(nan=1.0).sum()
+
+
 def _centre_and_radius(size: tuple[int, int]) -> tuple[Tensor, float]:
     """Return the centre (2,) of an image and the half of its diagonal, pixels."""
     return torch.tensor(size, dtype=torch.float64) / 2, math.hypot(*size) / 2
@@ -89,9 +102,3 @@ def _centre_and_radius(size: tuple[int, int]) -> tuple[Tensor, float]:
 def _to_pixels(centre: Tensor, radius: float) -> Tensor:
     """Return the transform (3, 3) from halves of the diagonal, from the centre, to pixels."""
     return torch.cat([torch.cat([radius * torch.eye(2).double(), centre[:, None]], 1), torch.eye(3)[2:].double()])
-
-
-def _cost(offsets: Tensor, scale: float) -> Tensor:
-    """Return the sum of Geman and McClure's losses; those of points at infinity are one."""
-    square = offsets.square().sum(-1) / scale**2
-    return (square / (1 + square)).nan_to_num(nan=1.0).sum()

@@ -8,42 +8,55 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 import torch
-from two_view import epipolar_distances
+from two_view import epipolar_distances, seeded, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
-from kornia_learnnorm.two_view import estimate_matches as matches_module
+from kornia_learnnorm.two_view import estimate_matches as module
 from kornia_learnnorm.two_view.solver import TwoViewSolver
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 
+SCENE = handheld(1, 160, seeded(), noise=0.3)
+CAMERAS = {"K1": SCENE.K1[0], "K2": SCENE.K2[0]}
 
-def make_matches(inliers: int = 160, outliers: int = 40, noise: float = 0.3, seed: int = 0):
-    """Matches of a scene with random ones among them, and the scene."""
-    generator = torch.Generator().manual_seed(seed)
-    scene = handheld(1, inliers, generator, noise=noise)
-    size = scene.image_size[0]
-    wrong = torch.rand(outliers, 4, generator=generator, dtype=torch.float64) * size.repeat(2)
-    matches = torch.cat([torch.cat([scene.points1[0], scene.points2[0]], -1), wrong])
-    return matches[:, :2], matches[:, 2:], scene
+
+def make_matches(outliers: int = 40):
+    """The matches of the scene with random ones among them."""
+    wrong = uniform(outliers, 4) * SCENE.image_size[0].repeat(2)
+    return torch.cat([torch.cat([SCENE.points1[0], SCENE.points2[0]], -1), wrong]).split(2, -1)
+
+
+@pytest.fixture(scope="module")
+def matches():
+    return make_matches()
+
+
+@pytest.fixture(scope="module")
+def result(matches):
+    return kln.estimate_matches(*matches)
+
+
+def codes(found) -> list[str]:
+    return [warning.code for warning in found.warnings]
 
 
 class TestEstimateMatches:
-    def test_finds_the_geometry(self):
-        points1, points2, _ = make_matches()
-        exact = handheld(1, 160, torch.Generator().manual_seed(0), noise=0.0)
-        found = kln.estimate_matches(points1, points2)
-        assert found.warnings == ()
-        error = np.median(epipolar_distances(exact.points1[0], exact.points2[0], found.F_mat))
+    def test_finds_the_geometry(self, result):
+        exact = handheld(1, 160, seeded(), noise=0.0)
+        error = np.median(epipolar_distances(exact.points1[0], exact.points2[0], result.F_mat))
         assert error < 0.3
-        assert 0.2 < found.predicted_error / error < 5
-        json.dumps(found.as_dict(), allow_nan=False)
+        assert 0.2 < result.predicted_error / error < 5
+        assert result.warnings == ()
+        json.dumps(result.as_dict(), allow_nan=False)
 
-    def test_cameras_give_the_pose(self):
-        points1, points2, scene = make_matches()
-        found = kln.estimate_matches(points1, points2, K1=scene.K1[0], K2=scene.K2[0])
-        error = kln.pose_error(found.R[None], found.t[None], scene.R, scene.t)
-        assert float(error) < 5
+    def test_no_ratio_test_is_reported_where_none_was_made(self, result):
+        assert (result.ratio, result.as_dict()["ratio"]) == (None, None)
+        assert "ratio" not in result.summary()
+
+    def test_cameras_give_the_pose(self, matches):
+        found = kln.estimate_matches(*matches, **CAMERAS)
+        assert float(kln.pose_error(found.R[None], found.t[None], SCENE.R, SCENE.t)) < 5
         assert found.front[found.inliers].double().mean() > 0.9
 
     def test_cameras_solve_a_plane(self):
@@ -51,22 +64,18 @@ class TestEstimateMatches:
         rng = np.random.default_rng(0)
         K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
         x1 = rng.uniform([0, 0], [640, 480], (150, 2))
-        X = np.c_[x1, np.ones(150)] @ np.linalg.inv(K).T * 5
-        t = np.array([0.8, 0.1, 0.1])
-        x2 = (X + t) @ K.T
+        x2 = (np.c_[x1, np.ones(150)] @ np.linalg.inv(K).T * 5 + [0.8, 0.1, 0.1]) @ K.T
         x2 = x2[:, :2] / x2[:, 2:] + rng.normal(0, 0.2, (150, 2))
-        without = kln.estimate_matches(x1, x2, size1=(640, 480), size2=(640, 480))
-        assert "planar" in [warning.code for warning in without.warnings]
-        found = kln.estimate_matches(x1, x2, size1=(640, 480), size2=(640, 480), K1=K, K2=K)
-        assert "planar" not in [warning.code for warning in found.warnings]
+        sizes = {"size1": (640, 480), "size2": (640, 480)}
+        assert "planar" in codes(kln.estimate_matches(x1, x2, **sizes))
+        assert "planar" not in codes(kln.estimate_matches(x1, x2, **sizes, K1=K, K2=K))
 
-    def test_a_tie_between_poses(self, monkeypatch):
-        points1, points2, scene = make_matches()
+    def test_a_tie_between_poses(self, matches, monkeypatch):
         nothing = torch.full((1, 3, 3), torch.nan).double()
-        monkeypatch.setattr(matches_module, "relative_pose", lambda *_: (nothing, nothing[:, 0]))
-        found = kln.estimate_matches(points1, points2, K1=scene.K1[0], K2=scene.K2[0])
+        monkeypatch.setattr(module, "relative_pose", lambda *_: (nothing, nothing[:, 0]))
+        found = kln.estimate_matches(*matches, **CAMERAS)
         assert (found.R, found.t, found.front) == (None, None, None)
-        assert [warning.code for warning in found.warnings] == ["no_pose"]
+        assert codes(found) == ["no_pose"]
         json.dumps(found.as_dict(), allow_nan=False)
 
     @pytest.mark.parametrize(
@@ -74,14 +83,14 @@ class TestEstimateMatches:
     )
     def test_random_matches_are_given_up_early(self, number, agree, solved, monkeypatch):
         """Of few matches after two parts with no more inliers than a search finds by chance, after six with more."""
-        solve, calls = TwoViewSolver.solve, []
+        calls = []
 
         def counted(self):
             calls.append(self)
             F_mat = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # of a sideways motion
             return F_mat if agree else torch.zeros(3, 3).double(), torch.zeros(number).double()
 
-        points = torch.rand(2, number, 2, generator=torch.Generator().manual_seed(0)).double() * 500
+        points = uniform(2, number, 2, high=500)
         points[1, :, 1] += 1000 + torch.arange(number)  # no row in common with image 1
         points[1, :agree, 1] = points[0, :agree, 1]
         monkeypatch.setattr(TwoViewSolver, "solve", counted)
@@ -89,108 +98,92 @@ class TestEstimateMatches:
             kln.estimate_matches(*points, size1=(500, 500), size2=(500, 500))
         assert len(calls) == solved
 
-        calls.clear()
+    def test_true_matches_are_not_given_up(self, matches, monkeypatch):
+        solve, calls = TwoViewSolver.solve, []
         monkeypatch.setattr(TwoViewSolver, "solve", lambda self: calls.append(self) or solve(self))
-        kln.estimate_matches(*make_matches()[:2])
+        kln.estimate_matches(*matches)
         assert len(calls) == 13
 
-    def test_the_learned_layer(self):
-        points1, points2, _ = make_matches()
-        found = kln.estimate_matches(points1, points2, layer=kln.LearnedEightPoint.from_pretrained())
+    def test_the_learned_layer(self, matches):
+        found = kln.estimate_matches(*matches, layer=kln.LearnedEightPoint.from_pretrained("robust-tiny"))
         assert found.estimator == "LearnedEightPoint"
         assert found.weights[found.inliers].mean() > found.weights[~found.inliers].mean() + 0.3
 
-    def test_order_has_no_effect(self):
-        points1, points2, _ = make_matches()
-        scores = torch.rand(len(points1), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        order = torch.randperm(len(points1), generator=torch.Generator().manual_seed(2))
-        first, second = (kln.estimate_matches(points1[o], points2[o], scores[o]) for o in (slice(None), order))
+    def test_order_has_no_effect(self, matches):
+        scores, order = uniform(200, seed=1), torch.randperm(200, generator=seeded(2))
+        first, second = (kln.estimate_matches(*(x[o] for x in (*matches, scores))) for o in (slice(None), order))
         assert torch.equal(first.F_mat, second.F_mat)
         assert first.predicted_error == second.predicted_error
 
-    def test_rows_that_are_not_finite_or_far_away_are_left_out(self):
+    def test_rows_that_are_not_finite_or_far_away_are_left_out(self, matches, result):
         """As in RANSAC; their scores do not matter."""
-        points1, points2, _ = make_matches()
         wrong = torch.tensor([[torch.nan, 5.0], [5.0, torch.inf], [1e12, 5.0]], dtype=torch.float64)
-        scores = torch.cat([torch.ones(len(points1)), torch.tensor([torch.nan, 0.5, 0.5])])
-        found = kln.estimate_matches(torch.cat([points1, wrong]), torch.cat([points2, wrong + 1]), scores)
-        expected = kln.estimate_matches(points1, points2)
-        assert torch.equal(found.F_mat, expected.F_mat)
-        assert found.num_matches == expected.num_matches
-        assert found.size1 == expected.size1
+        scores = torch.cat([torch.ones(200), torch.tensor([torch.nan, 0.5, 0.5])])
+        found = kln.estimate_matches(*(torch.cat([x, wrong + i]) for i, x in enumerate(matches)), scores)
+        assert torch.equal(found.F_mat, result.F_mat)
+        assert (found.num_matches, found.size1) == (result.num_matches, result.size1)
 
-    def test_arrays_of_any_number_type(self):
-        """Whole numbers, other strides and byte orders are what float64 of the same values is."""
-        points1, points2 = (points.round().numpy() for points in make_matches(noise=0.0)[:2])
-        expected = kln.estimate_matches(points1, points2)
-        for convert in (
+    @pytest.mark.parametrize(
+        "convert",
+        [
             lambda points: points.astype(np.int32),
             lambda points: points.astype(">f4"),
             lambda points: points[::-1, ::-1].copy()[::-1, ::-1],
             lambda points: torch.from_numpy(points).int(),
             lambda points: torch.from_numpy(points).requires_grad_(),
-        ):
-            assert torch.equal(kln.estimate_matches(convert(points1), convert(points2)).F_mat, expected.F_mat)
-
-    def test_no_ratio_test_is_reported_where_none_was_made(self):
-        found = kln.estimate_matches(*make_matches()[:2])
-        assert (found.ratio, found.as_dict()["ratio"]) == (None, None)
-        assert "ratio" not in found.summary()
-        assert f"predicted error of F: {found.predicted_error:.2f} px (typical error" in found.summary()
+        ],
+    )
+    def test_arrays_of_any_number_type(self, matches, convert, monkeypatch):
+        """Whole numbers, other strides and byte orders are read as float64 of the same values is."""
+        points = [x.round().numpy() for x in matches]
+        read = module.read_matches(*map(convert, points), None)
+        assert all(torch.equal(found, torch.from_numpy(x)) for found, x in zip(read, points, strict=False))
+        assert not any(found.requires_grad for found in read)
 
     def test_what_stands_still_is_left_out(self):
-        points1, points2, _ = make_matches(outliers=0)
-        overlay = torch.rand(60, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 400
-        found = kln.estimate_matches(torch.cat([points1, overlay]), torch.cat([points2, overlay]))
-        assert found.num_matches <= len(points1)
+        overlay = uniform(60, 2, high=400)
+        found = kln.estimate_matches(*(torch.cat([x, overlay]) for x in make_matches(outliers=0)))
+        assert found.num_matches <= 160
         assert found.num_inliers > 100
 
     def test_shared_points_count_once(self):
-        points1, points2, _ = make_matches(outliers=0)
-        shared = torch.where(torch.arange(160)[:, None] < 60, points2[:1], points2)
-        found = kln.estimate_matches(points1, shared)
-        assert found.num_matches == 101
-        assert len(found.points2.unique(dim=0)) == 101
+        points1, points2 = make_matches(outliers=0)
+        found = kln.estimate_matches(points1, torch.where(torch.arange(160)[:, None] < 60, points2[:1], points2))
+        assert found.num_matches == len(found.points2.unique(dim=0)) == 101
 
-    @pytest.mark.parametrize(
-        ("changes", "code"),
-        [
-            ({"points1": np.zeros((5, 2)), "points2": np.ones((5, 2))}, "few_matches"),
-            ({"points1": np.random.default_rng(0).uniform(0, 500, (50, 2)), "points2": None}, "no_motion"),
-        ],
-    )
-    def test_no_matrix(self, changes, code):
-        if changes["points2"] is None:
-            changes = {**changes, "points2": changes["points1"] + 0.01}
-        with pytest.raises(kln.NoReliableMatrixError) as caught:
-            kln.estimate_matches(**changes)
-        assert caught.value.code == code
 
-    @pytest.mark.parametrize(
-        ("changes", "error", "message"),
-        [
-            ({"points1": torch.zeros(9, 3)}, ValueError, "shape"),
-            ({"points2": torch.zeros(8, 2)}, ValueError, "shape"),
-            ({"scores": torch.full((9,), 2.0)}, ValueError, "from 0 to 1, got 9 others, the first 2"),
-            ({"scores": torch.full((9,), torch.nan)}, ValueError, "from 0 to 1, got 9 others, the first nan"),
-            ({"points1": [[0.0, 1.0]]}, TypeError, r"points1 must be .* got <class 'list'>; numpy\.array\(points1"),
-            ({"points1": np.zeros((9, 2), bool)}, TypeError, "points1 must be .* of bool"),
-            ({"points1": torch.zeros(9, 2, dtype=torch.complex64)}, TypeError, "points1 must be .* of torch.complex64"),
-            ({"points1": np.full((9, 2), "a")}, TypeError, "points1 must be .* of <U1"),
-            ({"threshold": -1.0}, ValueError, "threshold must be positive"),
-            ({"threshold": "x"}, TypeError, "threshold must be a number, got 'x'"),
-            ({"seed": -1}, ValueError, r"seed must lie in \[0, 2\^63\), got -1"),
-            ({"seed": None}, TypeError, "seed must be a whole number, got None"),
-            ({"layer": "robust"}, TypeError, "layer must be a LearnedEightPoint or None, got <class 'str'>"),
-            ({"size1": (0, 0)}, ValueError, r"size1 must be a positive width and height, got \(0, 0\)"),
-            ({"size2": (640.5, 480)}, TypeError, "width and height of size2 must be a whole number, got 640.5"),
-            ({"size2": (640,)}, ValueError, r"size2 must be a width and a height, got \(640,\)"),
-            ({"K1": torch.eye(3)}, ValueError, "given together"),
-            ({"K1": torch.zeros(3, 3), "K2": torch.eye(3)}, ValueError, "K1 must be finite and invertible"),
-            ({"K1": torch.eye(3), "K2": torch.eye(3)[None]}, ValueError, r"K2 must have .* got \[1, 3, 3\]"),
-        ],
-    )
-    def test_wrong_arguments(self, changes, error, message):
-        points = dict(zip(("points1", "points2"), torch.rand(2, 9, 2) * 100, strict=True))
-        with pytest.raises(error, match=message):
-            kln.estimate_matches(**{**points, **changes})
+@pytest.mark.parametrize(
+    ("points1", "shift", "code"), [(torch.zeros(5, 2), 1.0, "few_matches"), (500 * uniform(50, 2), 0.01, "no_motion")]
+)
+def test_no_matrix(points1, shift, code):
+    with pytest.raises(kln.NoReliableMatrixError) as caught:
+        kln.estimate_matches(points1, points1 + shift)
+    assert caught.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"points1": torch.zeros(9, 3)}, ValueError, "shape"),
+        ({"points2": torch.zeros(8, 2)}, ValueError, "shape"),
+        ({"scores": torch.full((9,), 2.0)}, ValueError, "from 0 to 1, got 9 others, the first 2"),
+        ({"scores": torch.full((9,), torch.nan)}, ValueError, "from 0 to 1, got 9 others, the first nan"),
+        ({"points1": [[0.0, 1.0]]}, TypeError, r"points1 must be .* got <class 'list'>; numpy\.array\(points1"),
+        ({"points1": np.zeros((9, 2), bool)}, TypeError, "points1 must be .* of bool"),
+        ({"points1": torch.zeros(9, 2, dtype=torch.complex64)}, TypeError, "points1 must be .* of torch.complex64"),
+        ({"points1": np.full((9, 2), "a")}, TypeError, "points1 must be .* of <U1"),
+        ({"threshold": -1.0}, ValueError, "threshold must be positive"),
+        ({"seed": -1}, ValueError, r"seed must lie in \[0, 2\^63\), got -1"),
+        ({"seed": None}, TypeError, "seed must be a whole number, got None"),
+        ({"layer": "robust"}, TypeError, "layer must be a LearnedEightPoint or None, got <class 'str'>"),
+        ({"size1": (0, 0)}, ValueError, r"size1 must be a positive width and height, got \(0, 0\)"),
+        ({"size2": (640.5, 480)}, TypeError, "width and height of size2 must be a whole number, got 640.5"),
+        ({"size2": (640,)}, ValueError, r"size2 must be a width and a height, got \(640,\)"),
+        ({"K1": torch.eye(3)}, ValueError, "given together"),
+        ({"K1": torch.eye(3), "K2": torch.eye(3)[None]}, ValueError, r"K2 must have .* got \[1, 3, 3\]"),
+    ],
+)
+def test_wrong_arguments(changes, error, message):
+    points = dict(zip(("points1", "points2"), torch.rand(2, 9, 2) * 100, strict=True))
+    with pytest.raises(error, match=message):
+        kln.estimate_matches(**{**points, **changes})

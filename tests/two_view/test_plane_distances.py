@@ -33,6 +33,13 @@ def matches(distortion, relief=0.0, noise=0.1, number=300):
     return tuple(p + noise * torch.from_numpy(rng.normal(size=(number, 2))) for p in points)
 
 
+@pytest.fixture(scope="module")
+def relief():
+    """Matches of a bent plane with relief, and their distances from it."""
+    points = matches(0.05, relief=5.0)
+    return points, distances_from_plane(*points, H, SIZE, SIZE, 1.0)
+
+
 class TestDistancesFromPlane:
     @pytest.mark.parametrize("distortion", [-0.1, -0.04, 0.0, 0.05, 0.15])
     def test_a_bent_plane_is_a_plane(self, distortion):
@@ -55,22 +62,19 @@ class TestDistancesFromPlane:
         assert distances_from_plane(points1, points2, H, SIZE, SIZE, 1.0).isnan().sum() == 0
 
     @given(scale=st.floats(0.1, 10))
-    def test_moves_with_the_scale_of_the_images(self, scale):
-        points1, points2 = matches(0.05, relief=5.0)
+    def test_moves_with_the_scale_of_the_images(self, relief, scale):
+        (points1, points2), expected = relief
         S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
         size = (SIZE[0] * scale, SIZE[1] * scale)
         scaled = distances_from_plane(scale * points1, scale * points2, S @ H @ S.inverse(), size, size, scale)
-        expected = scale * distances_from_plane(points1, points2, H, SIZE, SIZE, 1.0)
-        torch.testing.assert_close(scaled, expected, rtol=1e-4, atol=1e-4 * scale)
+        torch.testing.assert_close(scaled, scale * expected, rtol=1e-4, atol=1e-4 * scale)
 
     @given(seed=st.integers(0, 100))
-    def test_does_not_depend_on_the_order(self, seed):
-        points1, points2 = matches(0.05, relief=5.0)
+    def test_does_not_depend_on_the_order(self, relief, seed):
+        (points1, points2), expected = relief
         order = torch.randperm(len(points1), generator=torch.Generator().manual_seed(seed))
         moved = distances_from_plane(points1[order], points2[order], H, SIZE, SIZE, 1.0)
-        torch.testing.assert_close(
-            moved, distances_from_plane(points1, points2, H, SIZE, SIZE, 1.0)[order], rtol=1e-4, atol=1e-4
-        )
+        torch.testing.assert_close(moved, expected[order], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("distortion", [-0.08, 0.08])
