@@ -12,8 +12,8 @@ import numpy as np
 from kornia_learnnorm.data.datasets.frames import resize_frames
 from kornia_learnnorm.data.datasets.pairs import choose_pairs
 from kornia_learnnorm.data.datasets.reading import DATASETS, missing_ground_truth, read_dataset
-from kornia_learnnorm.data.matching.collect import MatchOptions, collect_matches
 from kornia_learnnorm.data.matching.features import DETECTORS
+from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store

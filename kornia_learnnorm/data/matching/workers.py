@@ -1,4 +1,4 @@
-"""Worker processes on this machine or on a Dask cluster."""
+"""Worker processes on this machine or on a Dask cluster, and what comes after one of them crashed."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any, TypeVar
 
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["Workers", "check_jobs", "open_workers"]
+__all__ = ["Workers", "check_jobs", "open_workers", "restart_crashed"]
+
+MAX_RESTARTS = 3  # consecutive worker crashes without progress
+
+Result = TypeVar("Result")
 
 
 class Workers:
@@ -48,6 +52,30 @@ class Workers:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # about cancelled tasks
                 results.close()
+
+
+def restart_crashed(
+    run: Callable[[], Generator[Result, None, None]], log: Callable[[str], Any]
+) -> Generator[Result, None, None]:
+    """Yield the results of ``run()``, which is called again, for the results that are left, after a worker crashed.
+
+    The error is an OSError if workers crash again and again without a result between.
+    """
+    from joblib.externals.loky.process_executor import BrokenProcessPool
+
+    restarts = 0
+    while True:
+        try:
+            with closing(run()) as results:
+                for result in results:
+                    yield result
+                    restarts = 0
+                return
+        except BrokenProcessPool as error:
+            restarts += 1
+            if restarts > MAX_RESTARTS:
+                raise OSError(f"the worker processes were killed {restarts} times in a row: {error}") from error
+            log("a worker process was killed; continuing with new ones")
 
 
 def check_jobs(jobs: int) -> None:

@@ -25,10 +25,10 @@ class FeatureCache:
     def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
         self.folder = folder
         self.uses = Counter(frame.name for pair in pairs for frame in pair)
-        self.held: dict[str, Path | str] = {}
+        self.held: dict[str, str] = {}  # name -> reason why there are none; empty where there are some
 
     def __enter__(self) -> FeatureCache:
-        shutil.rmtree(self.folder, ignore_errors=True)
+        self.__exit__()
         self.folder.mkdir()
         return self
 
@@ -42,34 +42,27 @@ class FeatureCache:
 
     def put(self, frame: Frame, features: Features | str) -> None:
         """Keep the features of a frame, or the reason why it has none; OSError on a full disk."""
-        if isinstance(features, str):
-            self.held[frame.name] = features
-            return
-        path = self.folder / f"{sha256(frame.name.encode()).hexdigest()}.npz"
-        try:
-            np.savez(path, points=features.points, descriptors=features.descriptors, size=features.size)
-        except OSError as error:  # NumPy's message does not name the file
-            target = f"the features of {frame.name} to {self.folder}"
-            raise OSError(f"cannot write {target}, is the disk full? {error}") from error
-        self.held[frame.name] = path
+        self.held[frame.name] = features if isinstance(features, str) else ""
+        if not isinstance(features, str):
+            try:
+                np.savez(self._path(frame), **features._asdict())
+            except OSError as error:  # NumPy's message does not name the file
+                target = f"the features of {frame.name} to {self.folder}"
+                raise OSError(f"cannot write {target}, is the disk full? {error}") from error
 
-    def get(self, pair: FramePair) -> tuple[Features | str, Features | str]:
-        """Return the features of both frames of a pair, or the reason why there are none."""
-        return self._get(pair.frame1), self._get(pair.frame2)
-
-    def _get(self, frame: Frame) -> Features | str:
-        held = self.held[frame.name]
-        if isinstance(held, str):
-            return held
-        with np.load(held) as data:
-            width, height = data["size"].tolist()
-            return Features(data["points"], data["descriptors"], (width, height))
+    def get(self, frame: Frame) -> Features | str:
+        """Return the features of a frame, or the reason why there are none."""
+        if reason := self.held[frame.name]:
+            return reason
+        with np.load(self._path(frame)) as data:
+            return Features(data["points"], data["descriptors"], tuple(data["size"].tolist()))
 
     def release(self, pair: FramePair) -> None:
         """Mark a pair as done and delete features that no other pair needs."""
         for frame in pair:
             self.uses[frame.name] -= 1
             if self.uses[frame.name] == 0:
-                held = self.held.pop(frame.name)
-                if isinstance(held, Path):
-                    held.unlink()
+                self._path(frame).unlink(missing_ok=True)
+
+    def _path(self, frame: Frame) -> Path:
+        return self.folder / f"{sha256(frame.name.encode()).hexdigest()}.npz"

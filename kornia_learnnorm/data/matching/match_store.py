@@ -10,6 +10,7 @@ import sys
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -19,22 +20,21 @@ import numpy as np
 
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair, read_frame
 from kornia_learnnorm.data.images import import_cv2
-from kornia_learnnorm.data.matching.cache import FeatureCache
+from kornia_learnnorm.data.matching.feature_cache import FeatureCache
 from kornia_learnnorm.data.matching.features import DETECTORS, Features
 from kornia_learnnorm.data.matching.matchers import MATCHERS, one_to_one
-from kornia_learnnorm.data.matching.workers import Workers, open_workers
+from kornia_learnnorm.data.matching.workers import Workers, open_workers, restart_crashed
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.writer import StoreWriter, check_target
 from kornia_learnnorm.files import exclusive
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import MAX_FILTERED, RATIO
 
-__all__ = ["MatchOptions", "collect_matches", "match_pair"]
+__all__ = ["MatchOptions", "collect_matches", "match_frames"]
 
 # one of the options of a store: those of earlier versions have matches that share points, and are not continued
 METHOD = {"matches": "one-to-one"}
 WINDOW = 8  # pairs per process that are matched before unneeded features are deleted
-MAX_RESTARTS = 3  # consecutive worker crashes without progress
 LOG_INTERVAL = 30.0  # seconds between lines of progress where stderr is not a terminal
 
 
@@ -74,17 +74,10 @@ class MatchOptions:
             raise ValueError(f"the matcher lightglue needs features of the detector disk, got {self.detector}")
 
 
-def match_pair(
-    pair: FramePair,
-    features1: Features,
-    features2: Features,
-    options: MatchOptions,
-    place: int = 0,
+def match_frames(
+    pair: FramePair, features1: Features, features2: Features, options: MatchOptions, place: int = 0
 ) -> CorrespondenceStore:
-    """Match two frames by their features and return a store of this pair, its matches one-to-one and in random order.
-
-    The index of the pair in the whole store, ``place``, determines the order together with the seed.
-    """
+    """Return a store of one pair: its matches, one-to-one and in an order of the seed and of ``place``, its index."""
     matches = MATCHERS[options.matcher](features1, features2)
     kept = one_to_one(*matches)
     points1, points2, ratio = (part[kept].numpy() for part in matches)
@@ -178,28 +171,23 @@ def _match_all(
     pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: Mapping[str, Any], workers: Workers
 ) -> dict[str, str]:
     """Match the pairs that are not done; continue after a worker was killed. Return the skipped pairs and why."""
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
     done = writer.done()
     skipped: dict[str, str] = {}
-    restarts = 0
+
+    def match_rest() -> Generator[tuple[int, CorrespondenceStore | str], None, None]:
+        todo = [place for place in range(len(pairs)) if place not in done]
+        return _match_some(pairs, todo, writer.folder, options, workers)
+
     with _progress(len(pairs), len(done)) as bar:
-        while todo := [place for place in range(len(pairs)) if place not in done]:
-            before = len(done)
-            try:
-                with closing(_match_some(pairs, todo, writer.folder, options, workers)) as results:
-                    for place, result in results:
-                        if isinstance(result, str):
-                            skipped[" ".join(frame.name for frame in pairs[place])] = result
-                        else:
-                            writer.add(place, replace(result, **about))
-                        done.add(place)
-                        bar.update()
-            except BrokenProcessPool as error:
-                restarts = restarts + 1 if len(done) == before else 1
-                if restarts > MAX_RESTARTS:
-                    raise OSError(f"the worker processes were killed {restarts} times in a row: {error}") from error
-                bar.write("a worker process was killed; continuing with new ones", file=sys.stderr)
+        log = partial(bar.write, file=sys.stderr)
+        with closing(restart_crashed(match_rest, log)) as results:
+            for place, result in results:
+                if isinstance(result, str):
+                    skipped[" ".join(frame.name for frame in pairs[place])] = result
+                else:
+                    writer.add(place, replace(result, **about))
+                done.add(place)
+                bar.update()
     return skipped
 
 
@@ -222,7 +210,7 @@ def _match_some(
             with workers.results(_detect, ((frame, options) for frame in missing)) as found:
                 for frame, features in zip(missing, found, strict=True):
                     cache.put(frame, features)
-            tasks = ((pairs[i], cache.get(pairs[i]), i, options) for i in places)
+            tasks = ((pair, *map(cache.get, pair), options, place) for place in places for pair in [pairs[place]])
             with workers.results(_match, tasks) as results:
                 for place, result in zip(places, results, strict=True):
                     yield place, result
@@ -240,16 +228,15 @@ def _detect(frame: Frame, options: MatchOptions) -> Features | str:
 
 
 def _match(
-    pair: FramePair, features: tuple[Features | str, Features | str], place: int, options: MatchOptions
+    pair: FramePair, features1: Features | str, features2: Features | str, options: MatchOptions, place: int
 ) -> CorrespondenceStore | str:
     """Return the store of a pair, or the reason why there is none."""
-    features1, features2 = features
     if isinstance(features1, str):
         return features1
     if isinstance(features2, str):
         return features2
     import_cv2().setNumThreads(1)
     try:
-        return match_pair(pair, features1, features2, options, place)
+        return match_frames(pair, features1, features2, options, place)
     except ValueError as error:
         return str(error)
