@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 from pathlib import Path
 
 import pytest
@@ -21,12 +20,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 def example(monkeypatch):
     """Import an example as when it is run: its folder is on the path."""
     monkeypatch.syspath_prepend(EXAMPLES)
-    names = [path.stem for path in EXAMPLES.glob("*.py")]
-    for name in names:
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    yield importlib.import_module
-    for name in names:
-        sys.modules.pop(name, None)
+    return importlib.import_module
 
 
 @pytest.fixture
@@ -37,12 +31,9 @@ def synthetic(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "steps", "points", "gain"), [("predict_weights", 64, 128, 0.3), ("guided_sampling", 32, 128, 0.5)]
 )
-def test_learns_from_synthetic_pairs(name, steps, points, gain, example, synthetic, capsys):
+def test_learns_from_synthetic_pairs(name, steps, points, gain, example, synthetic):
     before, after = example(name).main(["--steps", str(steps), "--points", str(points)])
     assert after < gain * before
-    printed = capsys.readouterr().out
-    assert f"step {steps:4d}: loss " in printed
-    assert f"{after:.3f} px" in printed
 
 
 @pytest.mark.parametrize("name", ["predict_weights", "guided_sampling"])
@@ -89,12 +80,9 @@ def test_kornia_ransac_example(example, synthetic):
     assert all(f1 > 50 and error < 3 for f1, error in results.values())
 
 
-def test_lightglue_learns_through_the_layer(example):
+def test_lightglue_learns_through_the_layer_and_the_learned_one_needs_no_scores(example, synthetic):
     before, after = example("match_and_estimate").main(["--steps", "60"])
     assert after < 0.9 * before
-
-
-def test_the_learned_layer_needs_no_trained_scores(example, synthetic):
     before, _ = example("match_and_estimate").main(["--layer", "learned", "--steps", "1"])
     assert before < 1
 
@@ -109,8 +97,8 @@ def test_gradients_reach_all_that_makes_lightglues_scores(layer, example):
     module.error(found, sides, F_mat).sum().backward()
     gradients = {name: p.grad for name, p in lightglue.named_parameters()}
     # What stops early and the matching of the layers before the last do not enter the scores.
-    without = {name for name, gradient in gradients.items() if gradient is None}
-    assert all(name.startswith(("token_confidence", "log_assignment.0")) for name in without)
+    without = ("token_confidence", "log_assignment.0")
+    assert all(name.startswith(without) for name, gradient in gradients.items() if gradient is None)
     reached = [gradient for gradient in gradients.values() if gradient is not None]
     assert all(gradient.isfinite().all() for gradient in reached)
     assert sum(bool(gradient.any()) for gradient in reached) > 0.9 * len(reached)
@@ -129,9 +117,8 @@ def test_images_are_matched_with_gradients(example, tmp_path):
     assert norm > 0
 
 
-def test_one_line_changes_nothing_but_the_solver(example, capsys):
+def test_one_line_changes_nothing_but_the_solver(example):
     errors = example("one_line").main(["--scenes", "300"])
     kornia, same, whitening, learned = errors.values()
     assert same == pytest.approx(kornia, rel=1e-3)
     assert learned < whitening < kornia
-    assert f"{learned:.4f} degrees" in capsys.readouterr().out
