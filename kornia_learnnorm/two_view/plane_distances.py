@@ -47,7 +47,7 @@ def distances_from_plane(
     linearise = partial(_linearise, u1=(points1 - centre1) / radius1, u2=(points2 - centre2) / radius2)
     H = torch.linalg.inv(_to_pixels(centre2, radius2)) @ H @ _to_pixels(centre1, radius1)
     start = torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])
-    distance = radius2 * _minimize(linearise, start, threshold / radius2).norm(dim=-1)
+    distance: Tensor = radius2 * _minimize(linearise, start, threshold / radius2).norm(dim=-1)
     return distance.nan_to_num(nan=math.inf)
 
 

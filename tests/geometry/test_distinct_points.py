@@ -34,21 +34,21 @@ class TestMask:
         weights = (uniform(number, seed=seed + 1) * 4).floor() if weighted else None
         assert distinct_points(points1, points2, weights).tolist() == reference(points1, points2, weights)
 
-    def test_of_a_chain_every_second_is_kept(self):
-        points1 = torch.tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
-        assert distinct_points(points1, torch.tensor([[5.0, 5.0], [6.0, 5.0], [6.0, 5.0]])).tolist() == [
-            True,
-            False,
-            True,
-        ]
-
-    def test_zeros_of_both_signs_are_equal(self):
-        points = torch.tensor([[0.0, 1.0], [-0.0, 1.0]])
-        assert distinct_points(points, uniform(2, 2)).tolist() == [True, False]
-
-    def test_equal_coordinates_are_no_shared_point(self):
-        grid = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0))
-        assert distinct_points(grid, grid.flip(0)).all()
+    @pytest.mark.parametrize(
+        ("points1", "points2", "kept"),
+        [
+            ([[0, 0], [0, 0], [1, 0]], [[5, 5], [6, 5], [6, 5]], [True, False, True]),  # of a chain every second
+            ([[0, 1], [-0.0, 1]], [[2, 3], [4, 5]], [True, False]),  # zeros of both signs are equal
+            ([[0, 1], [1, 0], [0, 0], [1, 1]], [[1, 1], [0, 0], [1, 0], [0, 1]], [True] * 4),  # equal coordinates
+        ],
+    )
+    def test_by_hand(self, points1, points2, kept):
+        assert (
+            distinct_points(
+                torch.tensor(points1, dtype=torch.float32), torch.tensor(points2, dtype=torch.float32)
+            ).tolist()
+            == kept
+        )
 
 
 class TestRansac:
