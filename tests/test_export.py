@@ -28,54 +28,19 @@ class Blocker:
 sys.meta_path.insert(0, Blocker())
 import torch
 
-for program, cases in torch.load(sys.argv[1]):
-    if program.endswith(".aoti.pt2"):
-        run = torch._inductor.aoti_load_package(program)
-    else:
-        run = torch.export.load(program).module()
-    for points, given, expected in cases:
-        found = run(*points, **given)
-        torch.testing.assert_close(tuple(found), tuple(expected), rtol=1e-4, atol=1e-5)
+program, cases = torch.load(sys.argv[1])
+if program.endswith(".aoti.pt2"):
+    run = torch._inductor.aoti_load_package(program)
+else:
+    run = torch.export.load(program).module()
+for points, given, expected in cases:
+    torch.testing.assert_close(tuple(run(*points, **given)), tuple(expected), rtol=1e-4, atol=1e-5)
 assert not [name for name in sys.modules if name.partition(".")[0] in ("kornia_learnnorm", "kornia")]
 """
 
 
-def sets(batch_size: int, num_points: int) -> list[torch.Tensor]:
-    return [points.float() for points in correspondences("handheld", batch_size, num_points)]
-
-
-def estimates(layer, *points, **given) -> tuple[torch.Tensor, ...]:
-    """What a program of the layer returns."""
-    with torch.no_grad():
-        found = layer.estimate(*points, **given)
-    return (found.F_mat, found.determined, *([found.weights] if isinstance(layer, LearnedEightPoint) else []))
-
-
-def check(program, layer, *points, **given) -> None:
-    """Check that a program returns what the layer does."""
-    found, expected = program(*points, **given), estimates(layer, *points, **given)
-    assert [v.dtype for v in found] == [v.dtype for v in expected]
-    assert up_to_sign(found[0].detach(), expected[0]) < 1e-6
-    torch.testing.assert_close(tuple(found)[1:], expected[1:], rtol=1e-5, atol=1e-6)
-
-
-def small_eight_point() -> EightPoint:
-    return EightPoint(shaken(small(Whitening())))
-
-
-@pytest.fixture(scope="module")
-def small_layer():
-    return shaken_estimator(stages=1, depth=1, refine_steps=1)
-
-
-@pytest.fixture(scope="module")
-def small_program(small_layer):
-    return export_layer(small_layer, ["mask", "scores"])
-
-
-@pytest.fixture(scope="module")
-def run_small(small_program):
-    return small_program.module()
+def sets(batch_size: int, num_points: int, device="cpu") -> list[torch.Tensor]:
+    return [points.float().to(device) for points in correspondences("handheld", batch_size, num_points)]
 
 
 def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
@@ -85,53 +50,64 @@ def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], d
     return sets(batch_size, num_points), {"mask": mask, "scores": torch.rand(batch_size, num_points)}
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_any_batch_and_number_of_points(small_layer, run_small, size):
-    points, given = masked_sets(*size)
-    check(run_small, small_layer, *points, **given)
-    check(run_small, small_layer, *points, **{**given, "mask": torch.ones_like(given["mask"])})
-    eight = small_layer(*(p[:1, :8] for p in points), scores=given["scores"][:1, :8])
-    assert up_to_sign(run_small(*points, **given)[0][:1], eight.detach()) < 1e-5
+@torch.no_grad()
+def estimates(layer, *points, **given) -> tuple[torch.Tensor, ...]:
+    """What a program of the layer returns."""
+    found = layer.estimate(*points, **given)
+    return (found.F_mat, found.determined, *([found.weights] if isinstance(layer, LearnedEightPoint) else []))
 
 
-def test_a_program_needs_no_package(small_layer, small_program, tmp_path):
-    torch.export.save(small_program, tmp_path / "layer.pt2")
-    cases = []
-    for points, given in (masked_sets(*size) for size in SIZES):
-        cases.append((points, given, estimates(small_layer, *points, **given)))
-    run_without_the_package([(str(tmp_path / "layer.pt2"), cases)], tmp_path)
+def check(program, layer, *points, **given) -> None:
+    """Check that a program returns what the layer does."""
+    found, expected = program(*points, **given), estimates(layer, *points, **given)
+    assert [v.dtype for v in found] == [v.dtype for v in expected]
+    assert up_to_sign(found[0].detach().cpu(), expected[0].cpu()) < 1e-6
+    torch.testing.assert_close(tuple(found)[1:], expected[1:], rtol=1e-5, atol=1e-6)
 
 
-def run_without_the_package(programs, folder) -> None:
-    torch.save(programs, folder / "cases.pt")
+def check_without_the_package(program, cases, folder) -> None:
+    torch.save((str(program), cases), folder / "cases.pt")
     command = [sys.executable, "-I", "-c", WITHOUT_THE_PACKAGE, str(folder / "cases.pt")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_a_program_says_what_sizes_it_takes(run_small):
+@pytest.fixture(scope="module")
+def layer():
+    return shaken_estimator(stages=1, depth=1, refine_steps=1)
+
+
+@pytest.fixture(scope="module")
+def program(layer):
+    return export_layer(layer, ["mask", "scores"])
+
+
+def test_any_batch_and_number_of_points_also_without_the_package(layer, program, tmp_path):
+    run, cases = program.module(), []
+    for points, given in (masked_sets(*size) for size in SIZES):
+        check(run, layer, *points, **given)
+        check(run, layer, *points, **given | {"mask": torch.ones_like(given["mask"])})
+        eight = layer(*(p[:1, :8] for p in points), scores=given["scores"][:1, :8])
+        assert up_to_sign(run(*points, **given)[0][:1], eight.detach()) < 1e-5
+        cases.append((points, given, estimates(layer, *points, **given)))
+    torch.export.save(program, tmp_path / "layer.pt2")
+    check_without_the_package(tmp_path / "layer.pt2", cases, tmp_path)
     with pytest.raises(AssertionError, match=r"points1.size\(\)\[1\] >= 9"):
-        run_small(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
+        run(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
 
 
-def test_a_program_without_gradients_sends_none(run_small):
+def test_gradients(program):
     (points1, points2), given = masked_sets(2, 20)
-    assert not any(value.requires_grad for value in run_small(points1.requires_grad_(), points2, **given))
-
-
-def test_a_program_with_gradients_sends_those_of_the_layer():
-    layer = small_eight_point()
-    program = export_layer(layer, gradients=True).module()
-    found = []
-    for call in (program, lambda *points: (layer(*points),)):
+    assert not any(value.requires_grad for value in program.module()(points1.requires_grad_(), points2, **given))
+    layer, found = EightPoint(shaken(small(Whitening()))), []
+    for call in (export_layer(layer, gradients=True).module(), lambda *points: (layer(*points),)):
         points = [points.requires_grad_() for points in sets(3, 20)]
         found.append(torch.autograd.grad(signless(call(*points)[0]).sum(), points))
     torch.testing.assert_close(*found, rtol=1e-3, atol=1e-6)
 
 
 def test_eights_with_weights_and_mask():
-    layer = small_eight_point()
-    points = sets(4, 8)
+    layer, points = EightPoint(shaken(small(Whitening()))), sets(4, 8)
     points[0][2] = points[0][2, :1]  # coincident
     mask, weights = torch.ones(4, 8, dtype=torch.bool), torch.rand(4, 8) + 0.5
     mask[3, 5:] = False
@@ -157,46 +133,15 @@ def test_shipped_weights(name):
 @pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
 @pytest.mark.timeout(900)
 def test_compiled_ahead_of_time(tmp_path):
-    layer = shaken_estimator(stages=2, depth=1, refine_steps=1)
-    path = tmp_path / "layer.aoti.pt2"
+    layer, path = shaken_estimator(stages=2, depth=1, refine_steps=1), tmp_path / "layer.aoti.pt2"
     torch._inductor.aoti_compile_and_package(export_layer(layer), package_path=str(path))
-    cases = []
-    for size in SIZES:
-        points = sets(*size)
-        cases.append((points, {}, estimates(layer, *points)))
-    run_without_the_package([(str(path), cases)], tmp_path)
+    check_without_the_package(path, [(p, {}, estimates(layer, *p)) for p in (sets(*size) for size in SIZES)], tmp_path)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
-class TestGPU:
-    @pytest.mark.parametrize("make", [EightPoint, lambda: EightPoint(shaken()), shaken_estimator])
-    @pytest.mark.parametrize("num_points", [8, 64])
-    @pytest.mark.xfail(reason="eigh and svd read on the host whether they converged, which stops a capture")
-    def test_cuda_graph(self, make, num_points):
-        layer = make().cuda()
-        points = [points.cuda() for points in sets(4, num_points)]
-        program = export_layer(layer, num_points=num_points).module()
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.no_grad(), torch.cuda.stream(stream):
-            for _ in range(3):
-                program(*points)
-        torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.no_grad(), torch.cuda.graph(graph):
-            captured = program(*points)
-        others = [p.flip(0) * 1.5 for p in points]
-        for held, other in zip(points, others, strict=True):
-            held.copy_(other)
-        graph.replay()
-        torch.cuda.synchronize()
-        assert up_to_sign(captured[0].cpu(), estimates(layer, *others)[0].cpu()) < 1e-5
-
-    def test_program_of_a_layer_on_the_gpu(self):
-        layer = shaken_estimator(stages=1, depth=1, refine_steps=1).cuda()
-        points = [points.cuda() for points in sets(5, 64)]
-        found = export_layer(layer).module()(*points)
-        assert up_to_sign(found[0].cpu(), estimates(layer, *points)[0].cpu()) < 1e-5
+def test_program_of_a_layer_on_the_gpu():
+    layer = shaken_estimator(stages=1, depth=1, refine_steps=1).cuda()
+    check(export_layer(layer).module(), layer, *sets(5, 64, "cuda"))
 
 
 class TestNetworks:
@@ -205,49 +150,40 @@ class TestNetworks:
         for name in ("onnx", "onnxscript", "onnxruntime"):
             pytest.importorskip(name, reason=f"{name} is not installed")
 
-    def run(self, program, example):
+    def check(self, program, network, example):
+        """Check that ONNX Runtime answers as the network does."""
         import onnxruntime
 
-        session = onnxruntime.InferenceSession(
-            program.model_proto.SerializeToString(), providers=["CPUExecutionProvider"]
-        )
-        return session.run(None, {name: value.numpy() for name, value in example.items()})
+        run = onnxruntime.InferenceSession(program.model_proto.SerializeToString(), providers=["CPUExecutionProvider"])
+        with torch.no_grad():
+            expected = network(**example)
+        found = run.run(None, {name: value.numpy() for name, value in example.items()})
+        for got, value in zip(found, expected, strict=True):
+            torch.testing.assert_close(torch.from_numpy(got), value, rtol=1e-4, atol=1e-4)
 
     def test_stages(self):
         layer = shaken_estimator(depth=1)
         programs = export_networks(layer)
         assert [*programs] == ["stage1", "stage2"]
         for network, program, features in zip(layer.networks, programs.values(), (9, 14), strict=True):
-            for batch_size, num_points in [(1, 8), (5, 300)]:
-                example = {
-                    "features": torch.randn(batch_size, num_points, features),
-                    "absent": torch.rand(batch_size, num_points) < 0.2,
-                }
-                with torch.no_grad():
-                    expected = network(**example)
-                for found, value in zip(self.run(program, example), expected, strict=True):
-                    torch.testing.assert_close(torch.from_numpy(found), value, rtol=1e-4, atol=1e-4)
+            for size in [(1, 8), (5, 300)]:
+                self.check(
+                    program, network, {"features": torch.randn(*size, features), "absent": torch.rand(size) < 0.2}
+                )
 
     @pytest.mark.parametrize("name", ["crossview", "paper"])
     def test_network_of_a_normaliser(self, name):
-        layer = EightPoint(shaken())
-        if name == "paper":
-            layer = EightPoint(shaken(LearnedNormalizer(network=PaperNetwork(16, 2, num_parameters=5))))
+        """The layer stays as it is, in training and float64."""
+        network = PaperNetwork(16, 2, num_parameters=5) if name == "paper" else None
+        layer = EightPoint(shaken(LearnedNormalizer(network=network))).double().train()
         (program,) = export_networks(layer).values()
+        assert layer.training
+        assert next(layer.parameters()).dtype == torch.float64
         for batch_size, num_points in [(1, 8), (5, 12)]:
             example = {key: torch.randn(batch_size, num_points, 2) for key in ("points1", "points2")}
             if name == "crossview":
                 example["null_matrix"] = torch.nn.functional.normalize(torch.randn(batch_size, 3, 3), dim=(1, 2))
-            with torch.no_grad():
-                expected = layer.normalizer.network(**example)
-            for found, value in zip(self.run(program, example), expected, strict=True):
-                torch.testing.assert_close(torch.from_numpy(found), value, rtol=1e-4, atol=1e-4)
-
-    def test_leaves_the_layer_as_it_is(self):
-        layer = EightPoint(shaken(LearnedNormalizer(network=PaperNetwork(8, 2, num_parameters=5)))).double().train()
-        export_networks(layer)
-        assert layer.training
-        assert next(layer.parameters()).dtype == torch.float64
+            self.check(program, layer.float().eval().normalizer.network, example)
 
     def test_a_layer_without_network(self):
         with pytest.raises(ValueError, match="no network: its normaliser is Hartley"):
@@ -257,9 +193,9 @@ class TestNetworks:
 @pytest.mark.parametrize(
     ("layer", "options", "error", "message"),
     [
-        (torch.nn.Linear(2, 2), {}, TypeError, "must be an EightPoint or a LearnedEightPoint, got .*Linear"),
-        (EightPoint(), {"inputs": ["scores"]}, ValueError, "inputs of EightPoint are weights, mask, got scores"),
-        (EightPoint(), {"num_points": 7}, ValueError, "num_points must be at least 8, got 7"),
+        (torch.nn.Linear(2, 2), {}, TypeError, "got .*Linear"),
+        (EightPoint(), {"inputs": ["scores"]}, ValueError, "weights, mask, got scores"),
+        (EightPoint(), {"num_points": 7}, ValueError, "num_points .* 8, got 7"),
     ],
 )
 def test_wrong_arguments(layer, options, error, message):
@@ -270,7 +206,7 @@ def test_wrong_arguments(layer, options, error, message):
 def test_load_layer():
     assert isinstance(load_layer("robust-tiny"), LearnedEightPoint)
     assert load_layer("crossview").normalizer.max_points == 12
-    with pytest.raises(FileNotFoundError, match=r"no weights 'rubust': expected .* crossview.* robust"):
+    with pytest.raises(FileNotFoundError, match=r"'rubust'.* crossview.* robust"):
         load_layer("rubust")
-    with pytest.raises(ValueError, match=r"not a \.safetensors file by its name"):
+    with pytest.raises(ValueError, match=r"\.safetensors"):
         load_layer(__file__)

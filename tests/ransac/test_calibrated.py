@@ -11,8 +11,8 @@ from two_view import homogeneous, scenes, uniform, unit, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
-from kornia_learnnorm.estimators.essential import refine_essential
-from kornia_learnnorm.geometry.pose import in_front, relative_pose
+from kornia_learnnorm.geometry.pose import in_front
+from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.ransac.samplers import ProsacSampler, UniformSampler, WeightedSampler
 
 
@@ -20,8 +20,7 @@ def pair(name: str = "handheld", num_points: int = 200, noise: float = 0.3, outl
     """Correspondences (N, 2) of one pair, both cameras, its essential matrix, and which are no outliers."""
     scene = scenes(name, 1, num_points, seed, noise=noise, outliers=outliers)
     K1, K2, R, t = scene.K1[0], scene.K2[0], scene.R[0].numpy(), scene.t[0].numpy()
-    E = unit(np.cross(np.eye(3), t).T @ R)  # [t]_x R
-    return (scene.points1[0], scene.points2[0]), (K1, K2), E, scene.inliers[0]
+    return (scene.points1[0], scene.points2[0]), (K1, K2), essential(R, t), scene.inliers[0]
 
 
 def plane(num_points: int = 60, off_plane: int = 0, seed: int = 0):
@@ -35,6 +34,15 @@ def plane(num_points: int = 60, off_plane: int = 0, seed: int = 0):
     return (scene.points1[0], torch.from_numpy(x2[:, :2] / x2[:, 2:])), (scene.K1[0], scene.K2[0]), R, t
 
 
+def essential(R, t) -> np.ndarray:
+    """[t]_x R of unit norm."""
+    return unit(np.cross(np.eye(3), t).T @ R)
+
+
+def of_pixels(E_mat, K1, K2) -> torch.Tensor:
+    return (torch.linalg.inv(K2).mT @ torch.as_tensor(E_mat).to(K1) @ torch.linalg.inv(K1))[None]
+
+
 def estimate(points, cameras, weights=None, **options):
     return RANSAC(seed=0, **options).estimate(*points, weights, *cameras)
 
@@ -44,9 +52,8 @@ class TestSmoke:
     def test_shapes(self, refine, device, dtype):
         points, cameras, _, _ = pair()
         found = estimate([p.to(device, dtype) for p in points], [K.to(device) for K in cameras], refine=refine)
-        assert found.E_mat.shape == found.F_mat.shape == (3, 3)
+        assert (found.E_mat.shape, found.F_mat.shape, found.inliers.shape) == ((3, 3), (3, 3), (200,))
         assert found.E_mat.dtype == dtype
-        assert found.inliers.shape == (200,)
         values = torch.linalg.svdvals(found.E_mat.double())
         assert torch.allclose(values, torch.tensor([0.5**0.5, 0.5**0.5, 0.0]).double(), atol=1e-6)
 
@@ -56,15 +63,10 @@ class TestSmoke:
         F_mat, inliers = RANSAC(seed=0)(*points, K1=K1, K2=K2)
         assert torch.equal(found.F_mat, F_mat)
         assert torch.equal(found.inliers, inliers)
-        expected = torch.linalg.inv(K2).mT @ found.E_mat @ torch.linalg.inv(K1)
-        assert up_to_sign(F_mat[None], expected[None]) < 1e-10
+        assert up_to_sign(F_mat[None], of_pixels(found.E_mat, K1, K2)) < 1e-10
         distances = kln.sampson_distance(*(p[None] for p in points), F_mat[None])[0]
         assert torch.equal(inliers, distances <= 1)
         assert found.score == pytest.approx((1 - distances.square()).clamp(min=0).sum().item(), rel=1e-6)
-
-    def test_without_cameras_there_is_no_essential_matrix(self):
-        points, _, _, _ = pair()
-        assert RANSAC(seed=0).estimate(*points).E_mat is None
 
     @pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
     def test_weights(self, sampler):
@@ -82,12 +84,12 @@ class TestExceptions:
     @pytest.mark.parametrize(
         ("K1", "K2", "error", "message"),
         [
-            (torch.eye(3), None, ValueError, "K1 and K2 must be given together, got only K1"),
+            (torch.eye(3), None, ValueError, "got only K1"),
             (None, torch.eye(3), ValueError, "got only K2"),
-            (torch.eye(3), torch.zeros(3, 3), ValueError, "K2 must be finite and invertible"),
-            (torch.full((3, 3), torch.nan), torch.eye(3), ValueError, "K1 must be finite and invertible"),
-            (torch.eye(3)[None], torch.eye(3), ValueError, r"K1 must have shape \[3, 3\], got \[1, 3, 3\]"),
-            (torch.eye(3), CAMERA.T, ValueError, "K2 must have a last row of 0 0 1, up to scale, got 320 240 1; "),
+            (torch.eye(3), torch.zeros(3, 3), ValueError, "K2 must be finite"),
+            (torch.full((3, 3), torch.nan), torch.eye(3), ValueError, "K1 must be finite"),
+            (torch.eye(3)[None], torch.eye(3), ValueError, r"K1 .* got \[1, 3, 3\]"),
+            (torch.eye(3), CAMERA.T, ValueError, "K2 .* got 320 240 1"),
             (np.eye(3), torch.eye(3), TypeError, "K1 must be a floating-point tensor"),
         ],
     )
@@ -121,7 +123,7 @@ class TestAccuracy:
         """Samples of eight are degenerate or need points off the plane; samples of five do not."""
         points, cameras, R, t = plane(off_plane=6)
         found = estimate(points, cameras)
-        assert up_to_sign(found.E_mat[None], unit(np.cross(np.eye(3), t).T @ R)[None]) < 1e-6
+        assert up_to_sign(found.E_mat[None], essential(R, t)[None]) < 1e-6
         assert found.inliers.all()
 
     @pytest.mark.parametrize("seed", range(3))
@@ -134,8 +136,8 @@ class TestAccuracy:
         assert kln.sampson_distance(*(p[None] for p in points), found.F_mat[None]).max() < 1e-6
         H = R + 0.5 * np.outer(t / np.linalg.norm(t), np.array([0.2, -0.1, 1.0]) / 4)
         _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
-        solutions = [np.cross(np.eye(3), t[:, 0]).T @ R for R, t in zip(rotations, translations, strict=True)]
-        assert min(up_to_sign(found.E_mat[None], unit(E)[None]) for E in solutions) < 1e-5
+        solutions = [essential(R, t[:, 0]) for R, t in zip(rotations, translations, strict=True)]
+        assert min(up_to_sign(found.E_mat[None], E[None]) for E in solutions) < 1e-5
 
     def test_is_closer_to_the_truth_than_without_cameras(self):
         errors = {True: [], False: []}
@@ -155,7 +157,7 @@ class TestAccuracy:
     def test_final_fit_is_the_optimum_of_its_loss(self):
         points, cameras, _, _ = pair(outliers=0.2)
         found, points = estimate(points, cameras), [p[None] for p in points]
-        optimum = refine_essential(*points, found.E_mat[None], *cameras, loss=kln.GemanMcClure(0.7))
+        optimum = kln.refine_essential(*points, found.E_mat[None], *cameras, loss=kln.GemanMcClure(0.7))
         assert optimum.cost_before <= 1.001 * optimum.cost
 
 
@@ -171,10 +173,10 @@ def distorted(seed: int, scale: float = 1.0):
     return points, (T @ scene.K1[0], T @ scene.K2[0]), scene.R, scene.t
 
 
-def pose_error(F_mat, points, cameras, R, t):
+def error_of_pose(F_mat, points, cameras, R, t):
     near = kln.sampson_distance(*points, F_mat) <= 1
-    pose = relative_pose(*(v[None] for v in (F_mat, *cameras, *points, near)))
-    return kln.pose_error(*pose, R, t).item()
+    pose = kln.relative_pose(*(v[None] for v in (F_mat, *cameras, *points, near)))
+    return pose_error(*pose, R, t).item()
 
 
 class TestInexactCameras:
@@ -185,8 +187,7 @@ class TestInexactCameras:
         for seed in range(5):
             points, cameras, _, _ = pair(name, noise=0.5, seed=seed)
             found = estimate(points, cameras)
-            K1, K2 = (torch.linalg.inv(K) for K in cameras)
-            assert up_to_sign(found.F_mat[None], (K2.mT @ found.E_mat @ K1)[None]) < 1e-9
+            assert up_to_sign(found.F_mat[None], of_pixels(found.E_mat, *cameras)) < 1e-9
 
     def test_distortion(self):
         """The pose is better than that of the best essential matrix, and the essential matrix is the nearest one."""
@@ -195,9 +196,9 @@ class TestInexactCameras:
             points, cameras, R, t = distorted(seed)
             found = estimate(points, cameras)
             one = [v[None] for v in (*points, found.E_mat, *cameras)]
-            fitted = refine_essential(*one, loss=kln.GemanMcClure(0.7))
-            free.append(pose_error(found.F_mat, points, cameras, R, t))
-            known.append(pose_error(fitted.F_mat[0], points, cameras, R, t))
+            fitted = kln.refine_essential(*one, loss=kln.GemanMcClure(0.7))
+            free.append(error_of_pose(found.F_mat, points, cameras, R, t))
+            known.append(error_of_pose(fitted.F_mat[0], points, cameras, R, t))
             values = torch.linalg.svdvals(found.E_mat)
             assert torch.allclose(values, torch.tensor([0.5**0.5, 0.5**0.5, 0.0]).double(), atol=1e-12)
             U, _, Vh = torch.linalg.svd(cameras[1].mT @ found.F_mat @ cameras[0])
@@ -214,8 +215,7 @@ class TestInexactCameras:
         """Rounding does not speak against cameras."""
         points, cameras, _, _ = pair(noise=0.0, outliers=0.3)
         found = estimate(points, cameras)
-        K1, K2 = (torch.linalg.inv(K) for K in cameras)
-        assert up_to_sign(found.F_mat[None], (K2.mT @ found.E_mat @ K1)[None]) < 1e-9
+        assert up_to_sign(found.F_mat[None], of_pixels(found.E_mat, *cameras)) < 1e-9
 
 
 class TestInFront:
@@ -225,8 +225,8 @@ class TestInFront:
         points, cameras, E, _ = pair(noise=0.5, outliers=0.0)
         points1, points2 = (p.clone() for p in points)
         K1, K2 = cameras
-        F = torch.linalg.inv(K2).mT @ torch.from_numpy(E).to(K1) @ torch.linalg.inv(K1)
-        R, t = relative_pose(*(v[None] for v in (F, K1, K2, points1, points2)))
+        F = of_pixels(E, K1, K2)[0]
+        R, t = kln.relative_pose(*(v[None] for v in (F, K1, K2, points1, points2)))
         # Every fifth match moves along its own epipolar line to the other side of the epipole, half a pixel beside it.
         epipole = torch.linalg.svd(F)[0][:, 2]
         epipole = epipole[:2] / epipole[2]
@@ -266,17 +266,14 @@ class TestInvariances:
         assert (found.inliers == scaled.inliers).float().mean() > 0.97
 
 
-@pytest.mark.parametrize("weights", [False, True])
-def test_samplers_of_five(weights, generator):
+def test_samplers_of_five(generator):
     scores = uniform(20)
     scores[10:] = 0
-    samplers = [ProsacSampler(scores, size=5), WeightedSampler(scores, size=5)] if weights else []
-    for sampler in samplers or [UniformSampler(20, torch.device("cpu"), 5)]:
+    uniformly, weighted = UniformSampler(20, torch.device("cpu"), 5), WeightedSampler(scores, size=5)
+    for sampler, total in ((uniformly, 20), (weighted, 10), (ProsacSampler(scores, size=5), 10)):
         drawn = sampler.draw(100, generator)
         assert drawn.shape == (100, 5)
         assert (drawn.sort(-1).values.diff(dim=-1) > 0).all()
-        assert drawn.max() < (10 if weights else 20)
-        inliers = torch.arange(20) < 5
-        share = {ProsacSampler: None, WeightedSampler: float(scores[:5].sum() / scores.sum()), UniformSampler: 0.25}
-        if (expected := share[type(sampler)]) is not None:
-            assert sampler.hit_rate(inliers, slice(None)) == pytest.approx(expected**5, rel=1e-5)
+        assert drawn.max() < total
+    for sampler, share in ((uniformly, 0.25), (weighted, float(scores[:5].sum() / scores.sum()))):
+        assert sampler.hit_rate(torch.arange(20) < 5, slice(None)) == pytest.approx(share**5, rel=1e-5)

@@ -16,13 +16,10 @@ from kornia.geometry import ransac as kornia_ransac
 from two_view import epipolar_distances, scenes, shaken, uniform, up_to_sign
 
 import kornia_learnnorm as kln
-from kornia_learnnorm import RANSAC, sampson_scale, symmetric_scale
+from kornia_learnnorm import RANSAC
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.metrics.pairs import f1_score
 from kornia_learnnorm.ransac import local_optimization as module
-from kornia_learnnorm.ransac.samplers import WeightedSampler
-
-NORMALIZERS = [None, kln.Whitening(), kln.ReweightedWhitening()]
 
 
 def pair(name: str = "handheld", num_points: int = 400, noise: float = 0.3, outliers: float = 0.4, seed: int = 0):
@@ -36,7 +33,7 @@ def failed(result) -> bool:
     return not bool(F_mat.any()) and not bool(inliers.any())
 
 
-class TestSmoke:
+class TestResult:
     def test_shapes(self, device, dtype):
         points1, points2, _, _ = pair(num_points=100)
         F_mat, inliers = RANSAC(seed=0)(points1.to(device, dtype), points2.to(device, dtype))
@@ -45,7 +42,7 @@ class TestSmoke:
         assert F_mat.norm().item() == pytest.approx(1)
         assert torch.linalg.svdvals(F_mat.double())[2] < 1e-7
 
-    @pytest.mark.parametrize("normalizer", NORMALIZERS)
+    @pytest.mark.parametrize("normalizer", [None, kln.Whitening(), kln.ReweightedWhitening()])
     @pytest.mark.parametrize("rank2", [None, "projection", "optimal"])
     def test_any_normalizer(self, normalizer, rank2):
         points1, points2, F_true, _ = pair()
@@ -53,35 +50,23 @@ class TestSmoke:
         inlying = epipolar_distances(points1, points2, F_true.numpy()) < 1
         assert np.median(epipolar_distances(points1, points2, F_mat.numpy())[inlying]) < 1
 
-    def test_learned(self):
+    def test_learned_normalizer_in_a_module(self):
         points1, points2, _, true = pair(num_points=100)
-        _, inliers = RANSAC(shaken(), max_samples=200, seed=0)(points1, points2)
-        assert inliers[true].float().mean() > 0.7
-
-    def test_module(self):
-        ransac = RANSAC(shaken())
+        ransac = RANSAC(shaken(), max_samples=200, seed=0)
+        assert ransac(points1, points2)[1][true].float().mean() > 0.7
         assert set(ransac.state_dict()) == {f"normalizer.{name}" for name in ransac.normalizer.state_dict()}
         assert isinstance(copy.deepcopy(ransac).eval(), RANSAC)
 
-
-class TestResult:
     def test_estimate(self):
         points1, points2 = pair()[:2]
         ransac = RANSAC(seed=0)
         result = ransac.estimate(points1, points2)
-        F_mat, inliers = ransac(points1, points2)
-        assert torch.equal(result.F_mat, F_mat)
-        assert torch.equal(result.inliers, inliers)
-        distances = kln.sampson_distance(points1[None], points2[None], F_mat[None])[0]
+        torch.testing.assert_close(ransac(points1, points2), (result.F_mat, result.inliers), rtol=0, atol=0)
+        distances = kln.sampson_distance(points1[None], points2[None], result.F_mat[None])[0]
         expected = (1 - distances.square()).clamp(min=0).sum()
         assert result.score == pytest.approx(expected.item(), rel=1e-6)
         assert result.num_samples >= 64
-
-    def test_names_of_distances(self):
-        points = pair()[:2]
-        for name, scale in (("sampson", sampson_scale), ("symmetric", symmetric_scale)):
-            by_name, by_function = (RANSAC(seed=0, distance=distance)(*points)[0] for distance in (name, scale))
-            assert torch.equal(by_name, by_function)
+        assert result.E_mat is None  # without cameras
 
     def test_rank2_means_what_it_says(self):
         """The default depends on whether there is a normaliser; what is given never changes."""
@@ -109,18 +94,17 @@ class TestExceptions:
             ({"inl_th": NAN}, ValueError, "inl_th"),
             ({"inl_th": 1e300}, ValueError, "inl_th .* to 1e12, got 1e[+]300"),
             ({"max_samples": 0}, ValueError, "max_samples must be .* at least 1, got 0"),
-            ({"max_samples": 1.5}, ValueError, "whole number of samples"),
-            ({"rank2": "foo"}, ValueError, "rank2 must be 'projection' or 'optimal', got 'foo'"),
-            ({"distance": "foo"}, ValueError, "distance must be 'sampson', 'symmetric' or a function, got 'foo'"),
-            ({"distance": 1}, TypeError, "distance must be 'sampson', 'symmetric' or a function, got 1"),
+            ({"max_samples": 1.5}, ValueError, "max_samples .* got 1.5"),
+            ({"rank2": "foo"}, ValueError, "'projection' or 'optimal', got 'foo'"),
+            ({"distance": "foo"}, ValueError, "'sampson', 'symmetric' .*got 'foo'"),
+            ({"distance": 1}, TypeError, "'sampson', 'symmetric' .*got 1"),
             ({"max_seconds": 0.0}, ValueError, "max_seconds"),
-            ({"confidence": 1.5}, ValueError, r"confidence must lie in \(0, 1\], got 1.5"),
+            ({"confidence": 1.5}, ValueError, r"confidence .* \(0, 1\], got 1.5"),
             ({"confidence": 0.0}, ValueError, "confidence"),
-            ({"seed": 2**64}, ValueError, r"seed must lie in \[0, 2\^63\), got 18446744073709551616"),
-            ({"seed": "a"}, TypeError, "seed must be a whole number or None, got 'a'"),
-            ({"seed": True}, TypeError, "seed must be a whole number or None, got True"),
-            ({"sampler": "prosac"}, TypeError, "sampler must be a function or a class, got 'prosac'"),
-            ({"normalizer": "hartley"}, TypeError, "normalizer must be a module or function, got 'hartley'"),
+            ({"seed": 2**64}, ValueError, r"seed .* \[0, 2\^63\), got 18446744073709551616"),
+            *(({"seed": seed}, TypeError, f"seed must be .* got {seed!r}") for seed in ("a", True)),
+            ({"sampler": "prosac"}, TypeError, "sampler must be .* got 'prosac'"),
+            ({"normalizer": "hartley"}, TypeError, "normalizer must be .* got 'hartley'"),
             *(({k: "1"}, TypeError, f"{k} must be a number, got '1'") for k in ("inl_th", "confidence", "max_seconds")),
         ],
     )
@@ -131,14 +115,14 @@ class TestExceptions:
     @pytest.mark.parametrize(
         ("points1", "points2", "weights", "error", "message"),
         [
-            (POINTS.long(), POINTS, None, TypeError, "points1 must be a float32 or float64 tensor, got torch.int64"),
-            (POINTS.numpy(), POINTS, None, TypeError, r"got <class 'numpy.ndarray'>; torch.from_numpy\(points1\)"),
+            (POINTS.long(), POINTS, None, TypeError, "points1 must be .* got torch.int64"),
+            (POINTS.numpy(), POINTS, None, TypeError, r"numpy.ndarray.*torch.from_numpy\(points1\)"),
             (POINTS, POINTS.float(), None, TypeError, "one dtype"),
             (POINTS[None], POINTS[None], None, ShapeError, r"\[1, 20, 2\]"),
-            (POINTS, POINTS[1:], None, ValueError, r"pair up, got shapes \[20, 2\] and \[19, 2\]"),
-            *((POINTS[:n], POINTS[:n], None, ValueError, f"at least 8 .* are needed, got {n}") for n in (0, 1, 7)),
-            (POINTS, POINTS, torch.ones(20).bool(), TypeError, "must be a floating-point tensor, got torch.bool"),
-            (POINTS, POINTS, torch.ones(19), ValueError, r"weights must have shape \[20\], got \[19\]"),
+            (POINTS, POINTS[1:], None, ValueError, r"\[20, 2\] and \[19, 2\]"),
+            *((POINTS[:n], POINTS[:n], None, ValueError, f"at least 8 .* got {n}") for n in (0, 1, 7)),
+            (POINTS, POINTS, torch.ones(20).bool(), TypeError, "got torch.bool"),
+            (POINTS, POINTS, torch.ones(19), ValueError, r"weights .* \[20\], got \[19\]"),
             *(
                 (POINTS, POINTS, torch.full((20,), bad), ValueError, "finite and not negative")
                 for bad in (-1.0, NAN, float("inf"))
@@ -152,10 +136,9 @@ class TestExceptions:
 
 class TestAccuracy:
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
-    @pytest.mark.parametrize("factor_th", [None, 2.0])
-    def test_finds_the_inliers(self, name, factor_th):
+    @pytest.mark.parametrize("options", [{}, {"distance": "symmetric", "inl_th": 2.0}])
+    def test_finds_the_inliers(self, name, options):
         points1, points2, _, true = pair(name)
-        options = {} if factor_th is None else {"distance": "symmetric", "inl_th": factor_th}
         _, inliers = RANSAC(seed=0, **options)(points1, points2)
         assert inliers[true].float().mean() > 0.9
         assert inliers[~true].float().mean() < 0.15  # outliers can lie on their lines
@@ -168,11 +151,8 @@ class TestAccuracy:
 
     def test_refining_helps(self):
         points1, points2, _, true = pair(noise=1.0)
-        truth = [points1[true], points2[true]]
-        errors = [
-            epipolar_distances(*truth, RANSAC(seed=0, inl_th=3.0, refine=refine)(points1, points2)[0]).mean()
-            for refine in (True, False)
-        ]
+        refined, plain = (RANSAC(seed=0, inl_th=3.0, refine=refine)(points1, points2)[0] for refine in (True, False))
+        errors = [epipolar_distances(points1[true], points2[true], F_mat).mean() for F_mat in (refined, plain)]
         assert errors[0] < errors[1]
 
     @pytest.mark.parametrize("name", ["kitti_06", "tum_fr3_office"])
@@ -221,9 +201,7 @@ class TestContexts:
         points = [p.to(dtype) for p in pair(num_points=100)[:2]]
         plain = RANSAC(normalizer, seed=0)(*points)
         with torch.autocast("cpu", torch.bfloat16):
-            mixed = RANSAC(normalizer, seed=0)(*points)
-        assert torch.equal(plain[0], mixed[0])
-        assert torch.equal(plain[1], mixed[1])
+            torch.testing.assert_close(RANSAC(normalizer, seed=0)(*points), plain, rtol=0, atol=0)
 
     def test_result_serves_in_training(self):
         points1, points2, _, _ = pair(num_points=100)
@@ -238,11 +216,10 @@ class TestBudget:
     def count(self, points, weights=None, **options) -> int:
         return RANSAC(seed=0, **options).estimate(*points, weights).num_samples
 
-    def test_stops_early(self):
-        assert self.count(pair(outliers=0.05)[:2]) <= 128
-
-    def test_confidence_of_one_draws_all(self):
-        assert self.count(pair(outliers=0.05)[:2], confidence=1.0, max_samples=3000) == 3000
+    def test_confidence(self):
+        points = pair(outliers=0.05)[:2]
+        assert self.count(points) <= 128
+        assert self.count(points, confidence=1.0, max_samples=3000) == 3000
 
     def test_time(self, monkeypatch):
         """By a clock that is a second later whenever it is read."""
@@ -261,7 +238,7 @@ class TestBudget:
         good = true + 0.5 * uniform(400)
         plain = self.count((points1, points2))
         assert self.count((points1, points2), good) < plain
-        assert self.count((points1, points2), 0.01 + good, sampler=WeightedSampler) < plain
+        assert self.count((points1, points2), 0.01 + good, sampler=kln.WeightedSampler) < plain
 
 
 LINE = torch.linspace(0, 300, 60, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0])
@@ -335,7 +312,7 @@ class TestHardInput:
         _, inliers = RANSAC(seed=0)(points1[order], points2[order])
         assert inliers[true[order]].float().mean() > 0.95
 
-    @pytest.mark.parametrize("size", [(256, 256), (320, 240)])
+    @pytest.mark.parametrize(("size", "dtype"), [((256, 256), torch.float32), ((320, 240), torch.float64)])
     def test_dense_matches_in_the_order_of_the_rows(self, size, dtype):
         rows, columns = torch.meshgrid(*map(torch.arange, size), indexing="ij")
         points1 = torch.stack([columns, rows], -1).flatten(0, 1).double() + 1e-6 * uniform(size[0] * size[1], 2)
@@ -344,14 +321,14 @@ class TestHardInput:
         _, inliers = RANSAC(seed=0)(points1.to(dtype), points2.to(dtype))
         assert inliers.float().mean() > 0.99
 
-    @pytest.mark.parametrize("factor", [sampson_scale, symmetric_scale])
+    @pytest.mark.parametrize("distance", ["sampson", "symmetric"])
     @pytest.mark.parametrize("number", [100, 1000])
-    def test_match_on_the_epipole(self, number, factor):
+    def test_match_on_the_epipole(self, number, distance):
         epipole = torch.full((2,), 300.0, dtype=torch.float64)
         points1 = uniform(number, 2, high=600)
         points2 = epipole + (points1 - epipole) * uniform(number, 1, low=1.1, high=1.4, seed=1)
         points1[0] = points2[0] = epipole
-        _, inliers = RANSAC(distance=factor, seed=0)(points1, points2)
+        _, inliers = RANSAC(distance=distance, seed=0)(points1, points2)
         assert inliers[1:].all()
 
     def test_a_refinement_that_went_wrong_is_dropped(self, monkeypatch):

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from kornia_learnnorm.ransac.samplers import ProsacSampler, UniformSampler, WeightedSampler, draw_distinct
 
 GROWTH = ProsacSampler.MAX_SAMPLES
-
 CPU = torch.device("cpu")
 
 
