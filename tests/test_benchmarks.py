@@ -1,4 +1,4 @@
-"""The scores of benchmarks/pairs.py on cases whose outcome is known, and its tables."""
+"""The scores of benchmarks/pairs.py on cases whose outcome is known, its tables, and what the other benchmarks time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import importlib
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,19 +20,18 @@ from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2")
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
-
-def import_benchmark(name: str):
-    """Import a benchmark as when it is run."""
+@pytest.fixture(scope="module")
+def benchmark():
+    """A function that imports a benchmark by name, as when it is run."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(BENCHMARKS)
-        return importlib.import_module(name)
+        patch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+        yield importlib.import_module
 
 
 @pytest.fixture(scope="module")
-def pairs():
-    return import_benchmark("pairs")
+def pairs(benchmark):
+    return benchmark("pairs")
 
 
 @pytest.fixture(scope="module")
@@ -40,19 +40,11 @@ def case(pairs):
     return pairs.rendered("room", 0, (160, 120), None)
 
 
-class Warned:
-    """A warning of an estimate, as far as the benchmark reads it."""
-
-    code = "planar"
-
-
-class Answer:
+def answer(case, F_mat: Tensor, *codes: str) -> SimpleNamespace:
     """An estimate, as far as the benchmark reads it."""
-
-    def __init__(self, case, F_mat: Tensor, warnings: tuple = (), predicted_error: float = 1.0) -> None:
-        self.F_mat, self.warnings, self.predicted_error = F_mat, warnings, predicted_error
-        self.points1, self.points2 = case.points1, case.points2
-        self.inliers = torch.ones(len(case.points1), dtype=torch.bool)
+    warnings, inliers = [SimpleNamespace(code=code) for code in codes], torch.ones(len(case.points1), dtype=torch.bool)
+    points = {"points1": case.points1, "points2": case.points2}
+    return SimpleNamespace(F_mat=F_mat, warnings=warnings, predicted_error=1.0, inliers=inliers, **points)
 
 
 def true_matrix(case) -> Tensor:
@@ -67,147 +59,117 @@ def sideways(case) -> Tensor:
     return true_matrix(case._replace(R=torch.eye(3).double(), t=torch.tensor([0.0, 1.0, 0.0]).double()))
 
 
-def test_the_truth_is_right(pairs, case):
-    record = pairs.score(case, lambda case: Answer(case, true_matrix(case)))
-    assert record["determined"]
-    assert record["pose_error"] < 1e-6
-    assert record["true_error"] < 1e-6
-    assert record["inliers"] == record["matches"] == len(case.points1)
-    assert pairs.outcome(record) == "right"
-    flagged = pairs.score(case, lambda case: Answer(case, true_matrix(case), warnings=(Warned(),)))
-    assert flagged["warnings"] == ["planar"]
-    assert pairs.outcome(flagged) == "right, flagged"
+def table_rows(text: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
 
 
-def test_another_motion_is_wrong(pairs, case):
-    record = pairs.score(case, lambda case: Answer(case, sideways(case)))
-    assert record["pose_error"] > 45
-    assert record["true_error"] > 1
-    assert pairs.outcome(record) == "wrong"
-    assert pairs.outcome(record | {"warnings": ["planar"]}) == "wrong, flagged"
+class TestPairs:
+    def test_right_and_wrong_answers(self, pairs, case):
+        record = pairs.score(case, lambda case: answer(case, true_matrix(case)))
+        assert record["determined"]
+        assert max(record["pose_error"], record["true_error"]) < 1e-6
+        assert record["inliers"] == record["matches"] == len(case.points1)
+        assert pairs.outcome(record) == "right"
+        flagged = pairs.score(case, lambda case: answer(case, true_matrix(case), "planar"))
+        assert flagged["warnings"] == ["planar"]
+        assert pairs.outcome(flagged) == "right, flagged"
+        record = pairs.score(case, lambda case: answer(case, sideways(case)))
+        assert record["pose_error"] > 45
+        assert record["true_error"] > 1
+        assert pairs.outcome(record) == "wrong"
+        assert pairs.outcome(record | {"warnings": ["planar"]}) == "wrong, flagged"
 
+    def test_a_fault_of_the_estimator_is_no_refusal(self, pairs, case, capsys):
+        def fail(error):
+            def solve(case):
+                raise error
 
-def test_a_refusal(pairs, case):
-    def refuse(case):
-        raise NoReliableMatrixError("blank", "image 1 is blank")
+            return pairs.score(case, solve)
 
-    record = pairs.score(case, refuse)
-    assert record["refused"] == "blank"
-    assert pairs.outcome(record) == "refused"
-    assert pairs.described(record) == "refused (blank)"
+        refused = fail(NoReliableMatrixError("blank", "image 1 is blank"))
+        assert (refused["refused"], pairs.described(refused)) == ("blank", "refused (blank)")
+        crashed = fail(ZeroDivisionError("oops"))
+        assert pairs.outcome(crashed) == "crashed"
+        assert "oops" in crashed["crashed"]
+        assert "room 0: ZeroDivisionError('oops')" in capsys.readouterr().err
 
+    @pytest.mark.parametrize("kind", ["plane", "rotation"])
+    def test_undetermined_pairs(self, pairs, kind):
+        record = pairs.score(pairs.rendered(kind, 0, (160, 120), None), lambda case: answer(case, sideways(case)))
+        assert not record["determined"]
+        assert pairs.outcome(record) == "wrong"
+        assert kind == "plane" or record["pose_error"] == math.inf
 
-def test_a_fault_of_the_estimator_is_no_refusal(pairs, case, capsys):
-    def fail(case):
-        raise ZeroDivisionError("oops")
+    @pytest.mark.parametrize(("seed", "share"), [(0, 0.1), (4, 0.5), (8, 0.9), (9, 0.1)])
+    def test_contaminated_matches(self, pairs, seed, share):
+        case, again = pairs.contaminated(seed), pairs.contaminated(seed)
+        assert all(map(torch.equal, case.read, again.read))
+        distance = kln.symmetric_epipolar_distance(*case.read, true_matrix(case))
+        # The distance, a sum of one in each image, has a standard deviation of about 1.4 px for noise of 0.5 px, and a
+        # random match comes within 6 px in about 1 % of the cases.
+        assert (distance > 6).double().mean().item() == pytest.approx(share, abs=0.03)
+        assert kln.symmetric_epipolar_distance(case.points1, case.points2, true_matrix(case)).max() < 1e-6
+        assert pairs.is_determined(case.points1, case.points2)
 
-    record = pairs.score(case, fail)
-    assert pairs.outcome(record) == "crashed"
-    assert "oops" in record["crashed"]
-    assert "room 0: ZeroDivisionError('oops')" in capsys.readouterr().err
+    def test_a_cached_pair_is_the_rendered_one(self, pairs, case, tmp_path):
+        for _ in range(2):
+            cached = pairs.rendered("room", 0, (160, 120), tmp_path)
+            for field in ("points1", "points2", "K", "R", "t"):
+                assert torch.equal(getattr(cached, field), getattr(case, field))
+            assert all((a == b).all() for a, b in zip(cached.read, case.read, strict=True))
+        assert [path.name for path in tmp_path.iterdir()] == ["room_0_160x120.npz"]
 
-
-@pytest.mark.parametrize("kind", ["plane", "rotation"])
-def test_undetermined_pairs(pairs, kind):
-    case = pairs.rendered(kind, 0, (160, 120), None)
-    record = pairs.score(case, lambda case: Answer(case, sideways(case)))
-    assert not record["determined"]
-    assert pairs.outcome(record) == "wrong"
-    if kind == "rotation":
-        assert record["pose_error"] == math.inf
-
-
-@pytest.mark.parametrize("seed", [0, 4, 8, 9])
-def test_contaminated_matches(pairs, seed):
-    case = pairs.contaminated(seed)
-    again = pairs.contaminated(seed)
-    assert all(torch.equal(a, b) for a, b in zip(case.read, again.read, strict=True))
-    distance = kln.symmetric_epipolar_distance(*case.read, true_matrix(case))
-    share = (10, 50, 90, 10)[(0, 4, 8, 9).index(seed)] / 100
-    # The distance, a sum of one in each image, has a standard deviation of about 1.4 px for noise of 0.5 px, and a
-    # random match comes within 6 px in about 1 % of the cases.
-    assert (distance > 6).double().mean().item() == pytest.approx(share, abs=0.03)
-    assert kln.symmetric_epipolar_distance(case.points1, case.points2, true_matrix(case)).max() < 1e-6
-    assert pairs.is_determined(case.points1, case.points2)
-
-
-def test_a_cached_pair_is_the_rendered_one(pairs, case, tmp_path):
-    for _ in range(2):
-        cached = pairs.rendered("room", 0, (160, 120), tmp_path)
-        for field in ("points1", "points2", "K", "R", "t"):
-            assert torch.equal(getattr(cached, field), getattr(case, field))
-        assert all((a == b).all() for a, b in zip(cached.read, case.read, strict=True))
-    assert [path.name for path in tmp_path.iterdir()] == ["room_0_160x120.npz"]
-
-
-def test_tables(pairs):
-    def record(kind, determined, pose=0.0, warnings=(), refused=None, predicted=1.0, true=1.0):
-        return {
-            "kind": kind,
-            "seed": 3,
-            "determined": determined,
-            "refused": refused,
-            "crashed": None,
-            "warnings": list(warnings),
-            "pose_error": pose,
-            "predicted_error": predicted,
-            "true_error": true,
-            "matches": 20,
-            "inliers": 9,
+    def test_tables(self, pairs):
+        base = {"seed": 3, "refused": None, "crashed": None, "warnings": [], "matches": 20, "inliers": 9}
+        base |= {"pose_error": 0.0, "predicted_error": 1.0, "true_error": 1.0}
+        room, plane = base | {"kind": "room", "determined": True}, base | {"kind": "plane", "determined": False}
+        records = [
+            room | {"predicted_error": 3.0, "true_error": 1.5},
+            room | {"warnings": ["planar"]},
+            room | {"refused": "blank"},
+            room | {"pose_error": 11.0},
+            plane | {"pose_error": math.inf, "warnings": ["planar"]},
+            plane | {"pose_error": 2.0, "warnings": ["planar"]},
+            plane | {"refused": "no_motion"},
+        ]
+        _, _, *rows = table_rows(pairs.count_table(records))
+        # Pairs, determined, right, wrong, refused, crashed, warned, silently wrong; right but flagged; refused wrongly.
+        assert {kind: [*map(int, cells)] for kind, *cells in rows} == {
+            "room": [4, 4, 2, 1, 1, 0, 1, 1, 1, 1],
+            "plane": [3, 0, 1, 1, 1, 0, 2, 0, 1, 0],
+            "all": [7, 4, 3, 2, 2, 0, 3, 1, 2, 1],
         }
+        _, _, first, second, _ = table_rows(pairs.calibration_table(records))
+        assert first == ["room", "2", "1.25", "2", "1.1", "1.5", "1.9"]  # ratios 2 and 1
+        assert second == ["plane", "0", *["-"] * 5]
+        (line,) = pairs.failures(records)
+        assert line.startswith("room 3: pose error 11.0 degrees")
 
-    records = [
-        record("room", True, predicted=3.0, true=1.5),
-        record("room", True, warnings=["planar"]),
-        record("room", True, refused="blank"),
-        record("room", True, pose=11.0),
-        record("plane", False, pose=math.inf, warnings=["planar"]),
-        record("plane", False, pose=2.0, warnings=["planar"]),
-        record("plane", False, refused="no_motion"),
-    ]
-    _, _, *lines = pairs.count_table(records).splitlines()
-    numbers = {line.split()[1]: [int(cell) for cell in line.strip("|").split("|")[1:]] for line in lines}
-    # Pairs, determined, right, wrong, refused, crashed, warned, silently wrong; right, flagged; determined: refused.
-    assert numbers == {
-        "room": [4, 4, 2, 1, 1, 0, 1, 1, 1, 1],
-        "plane": [3, 0, 1, 1, 1, 0, 2, 0, 1, 0],
-        "all": [7, 4, 3, 2, 2, 0, 3, 1, 2, 1],
-    }
-    _, _, *lines = pairs.calibration_table(records).splitlines()
-    room, plane, _ = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
-    assert room == ["room", "2", "1.25", "2", "1.1", "1.5", "1.9"]  # ratios 2 and 1
-    assert plane == ["plane", "0", *["-"] * 5]
-    (line,) = pairs.failures(records)
-    assert line.startswith("room 3: pose error 11.0 degrees")
-
-
-def test_the_benchmark_runs(pairs, tmp_path, capsys):
-    arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
-    pairs.main([*arguments, "--json", str(tmp_path / "pairs.json")])
-    printed = capsys.readouterr()
-    assert "| rotation |" in printed.out
-    assert "3/3 outliers 0" in printed.err
-    records = json.loads((tmp_path / "pairs.json").read_text())
-    assert [record["kind"] for record in records] == ["plane", "rotation", "outliers"]
-    assert [record["determined"] for record in records] == [False, False, True]
-
-
-@pytest.fixture(scope="module")
-def real_pairs():
-    return import_benchmark("real_pairs")
-
-
-@pytest.fixture(scope="module")
-def real_pair(real_pairs, case):
-    """The rendered room as a pair of frames."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = case.R.mT, -case.R.mT @ case.t  # camera 2 to camera 1, which is the world
-    first = Frame(Path("1.png"), "1.png", "room", (160, 120), case.K.numpy(), np.eye(4))
-    second = Frame(Path("2.png"), "2.png", "room", (160, 120), case.K.numpy(), pose)
-    return real_pairs.Pair("tum", 3, FramePair(first, second), calibrated=True)
+    def test_runs(self, pairs, tmp_path, capsys):
+        arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
+        pairs.main([*arguments, "--json", str(tmp_path / "pairs.json")])
+        printed = capsys.readouterr()
+        assert "| rotation |" in printed.out
+        assert "3/3 outliers 0" in printed.err
+        records = json.loads((tmp_path / "pairs.json").read_text())
+        assert [record["kind"] for record in records] == ["plane", "rotation", "outliers"]
+        assert [record["determined"] for record in records] == [False, False, True]
 
 
 class TestRealPairs:
+    @pytest.fixture(scope="class")
+    def real_pairs(self, benchmark):
+        return benchmark("real_pairs")
+
+    @pytest.fixture(scope="class")
+    def real_pair(self, real_pairs, case):
+        """The rendered room as a pair of frames."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = case.R.mT, -case.R.mT @ case.t  # camera 2 to camera 1, which is the world
+        first = Frame(Path("1.png"), "1.png", "room", (160, 120), case.K.numpy(), np.eye(4))
+        second = Frame(Path("2.png"), "2.png", "room", (160, 120), case.K.numpy(), pose)
+        return real_pairs.Pair("tum", 3, FramePair(first, second), calibrated=True)
+
     def test_errors_of_poses(self, real_pairs, real_pair, case):
         points = case.points1, case.points2
         assert real_pairs.error_of_pose(real_pair, true_matrix(case), *points) < 1e-5
@@ -246,7 +208,7 @@ class TestRealPairs:
             {**base, "pair": 0, "size": 8, "estimate_pair": refused, "RANSAC": 20.0, "poselib": 30.0},
         ]
         real_pairs.print_tables(records, ["poselib"])
-        rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines()]
+        rows = table_rows(capsys.readouterr().out)
         assert ["0", "12.00", "11.00", "50 of 70", "0.50", "none"] in rows
         assert ["1", "inf", "inf", "-", "-", "few_matches"] in rows
         assert ["tum", "without", "estimate_pair", "2", "inf", "inf", "1", "1", "1"] in rows
@@ -255,12 +217,11 @@ class TestRealPairs:
         assert ["tum", "without", "PoseLib", "30.00 (1)", "-", "-", "-", "1.00 (0)"] in rows
 
 
-@pytest.fixture(scope="module")
-def speed():
-    return import_benchmark("speed")
-
-
 class TestSpeed:
+    @pytest.fixture(scope="class")
+    def speed(self, benchmark):
+        return benchmark("speed")
+
     @pytest.mark.parametrize("backward", [False, True])
     def test_every_method_is_timed(self, speed, backward, monkeypatch):
         monkeypatch.setattr(speed, "SECONDS", 1e-3)
@@ -291,28 +252,19 @@ class TestSpeed:
         assert (points2 == scenes.points2).all(-1).sum(-1).tolist() == [30, 30, 30]
 
 
-@pytest.fixture(scope="module")
-def profile_time():
-    return import_benchmark("profile_time")
-
-
 class TestProfile:
-    @pytest.mark.parametrize(
-        ("operation", "group"),
-        [
-            ("aten::linalg_lu_factor_ex", "factorisations"),
-            ("aten::bmm", "products"),
-            ("aten::addmm", "layers"),
-            ("aten::copy_", "memory"),
-            ("aten::mul", "arithmetic"),
-        ],
-    )
-    def test_groups(self, profile_time, operation, group):
-        assert profile_time.group_of(operation) == group
+    @pytest.fixture(scope="class")
+    def profile_time(self, benchmark):
+        return benchmark("profile_time")
+
+    def test_groups(self, profile_time):
+        groups = {"linalg_lu_factor_ex": "factorisations", "bmm": "products", "addmm": "layers"}
+        groups |= {"copy_": "memory", "mul": "arithmetic"}
+        assert {name: profile_time.group_of(f"aten::{name}") for name in groups} == groups
 
     @pytest.mark.parametrize("backward", [False, True])
-    def test_shares_of_a_solver(self, profile_time, speed, backward):
-        found = profile_time.solver_shares("paper", speed.Case(2, 8), backward)
+    def test_shares_of_a_solver(self, profile_time, benchmark, backward):
+        found = profile_time.solver_shares("paper", benchmark("speed").Case(2, 8), backward)
         assert tuple(found) == profile_time.COLUMNS
         assert sum(found.values()) == pytest.approx(100)
         assert min(found["layers"], found["factorisations"], found["arithmetic"]) > 0
@@ -324,15 +276,10 @@ class TestProfile:
         assert found["layers"] > 0
 
 
-@pytest.fixture(scope="module")
-def sizes():
-    return import_benchmark("sizes")
-
-
-class TestSizes:
-    @pytest.mark.parametrize("suffix", ["", "+scores", "+bfloat16", "+bfloat16+scores"])
-    def test_learned_estimators_by_name(self, sizes, case, suffix):
-        points = [p[:64].repeat(2, 1, 1) for p in (case.points1, case.points2)]
-        F_mat = sizes.find_method("learned:robust-tiny" + suffix)(*points, torch.ones(2, 64).double())
-        assert sizes.shown("learned:robust-tiny" + suffix) == "learned:robust-tiny" + suffix
-        assert kln.symmetric_epipolar_distance(*points, F_mat).median() < 0.5
+@pytest.mark.parametrize("suffix", ["", "+scores", "+bfloat16", "+bfloat16+scores"])
+def test_learned_estimators_by_name(benchmark, case, suffix):
+    sizes, name = benchmark("sizes"), "learned:robust-tiny" + suffix
+    points = [p[:64].repeat(2, 1, 1) for p in (case.points1, case.points2)]
+    F_mat = sizes.find_method(name)(*points, torch.ones(2, 64).double())
+    assert sizes.shown(name) == name
+    assert kln.symmetric_epipolar_distance(*points, F_mat).median() < 0.5

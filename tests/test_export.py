@@ -167,9 +167,8 @@ class TestNetworks:
         assert [*programs] == ["stage1", "stage2"]
         for network, program, features in zip(layer.networks, programs.values(), (9, 14), strict=True):
             for size in [(1, 8), (5, 300)]:
-                self.check(
-                    program, network, {"features": torch.randn(*size, features), "absent": torch.rand(size) < 0.2}
-                )
+                example = {"features": torch.randn(*size, features), "absent": torch.rand(size) < 0.2}
+                self.check(program, network, example)
 
     @pytest.mark.parametrize("name", ["crossview", "paper"])
     def test_network_of_a_normaliser(self, name):

@@ -37,13 +37,12 @@ def test_a_layer_returns_from_a_folder(layer_class, name, tmp_path):
 
 
 def test_the_card_names_the_class_and_the_training_data(folder):
-    card = (folder / "README.md").read_text(encoding="utf-8")
-    assert "library_name: kornia_learnnorm" in card
-    assert "`LearnedEightPoint`" in card
-    assert "trained on: kitti_00@0:160, " in card
-    (folder / "README.md").write_text("my own", encoding="utf-8")
+    card = folder / "README.md"
+    for part in ("library_name: kornia_learnnorm", "`LearnedEightPoint`", "kitti_00@0:160, "):
+        assert part in card.read_text(encoding="utf-8")
+    card.write_text("my own", encoding="utf-8")
     hub.HubModel.from_pretrained(folder).save_pretrained(folder)
-    assert (folder / "README.md").read_text(encoding="utf-8") == "my own"
+    assert card.read_text(encoding="utf-8") == "my own"
 
 
 def test_a_layer_returns_from_a_downloaded_repository(folder, tmp_path):
@@ -59,8 +58,8 @@ def test_a_layer_returns_from_a_downloaded_repository(folder, tmp_path):
 
 def test_an_upload_has_the_files_of_the_folder(folder, tmp_path, monkeypatch):
     class Api:
-        def __init__(self, token=None, **kwargs):
-            self.token = token
+        def __init__(self, **kwargs):
+            self.token = None
 
         def create_repo(self, repo_id, **kwargs):
             self.repo_id = repo_id
@@ -72,10 +71,8 @@ def test_an_upload_has_the_files_of_the_folder(folder, tmp_path, monkeypatch):
 
     monkeypatch.setattr("huggingface_hub.hub_mixin.HfApi", Api)
     assert hub.HubModel.from_pretrained(folder).push_to_hub("someone/tiny") == "someone/tiny uploaded"
-    loaded = hub.HubModel.from_pretrained(tmp_path / "someone" / "tiny")
-    torch.testing.assert_close(
-        loaded.layer.state_dict(), kln.LearnedEightPoint.from_pretrained("robust-tiny").state_dict()
-    )
+    uploaded, expected = hub.HubModel.from_pretrained(tmp_path / "someone/tiny"), hub.HubModel.from_pretrained(folder)
+    torch.testing.assert_close(uploaded.state_dict(), expected.state_dict(), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("config", [None, {}, {"class_name": "Linear"}])
@@ -83,13 +80,13 @@ def test_a_folder_without_a_layer_of_this_package_is_refused(config, folder):
     (folder / "config.json").unlink()
     if config is not None:
         (folder / "config.json").write_text(json.dumps(config))
-    with pytest.raises(ValueError, match=r"config\.json of .*tiny must have class_name LearnedEightPoint or"):
+    with pytest.raises(ValueError, match=r"config\.json of .*tiny .* LearnedEightPoint"):
         hub.HubModel.from_pretrained(folder)
 
 
 def test_weights_of_another_class_or_none_are_refused(folder):
     (folder / "config.json").write_text(json.dumps({"class_name": "LearnedNormalizer"}))
-    with pytest.raises(ValueError, match="of a LearnedEightPoint, expected those of a LearnedNormalizer"):
+    with pytest.raises(ValueError, match=r"LearnedEightPoint.* LearnedNormalizer"):
         hub.HubModel.from_pretrained(folder)
     (folder / "model.safetensors").unlink()
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors"):
@@ -98,5 +95,5 @@ def test_weights_of_another_class_or_none_are_refused(folder):
 
 @pytest.mark.parametrize("layer", [torch.nn.Linear(2, 2), kln.EightPoint(), None])
 def test_other_modules_are_refused(layer):
-    with pytest.raises(TypeError, match="must be one of LearnedEightPoint, LearnedNormalizer, got "):
+    with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedNormalizer, got "):
         hub.HubModel(layer)
