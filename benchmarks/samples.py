@@ -18,12 +18,12 @@ from pathlib import Path
 
 import torch
 
-from kornia_learnnorm import CrossViewNetwork, EpipolarLoss, LearnedNormalizer, Whitening
+from kornia_learnnorm import CrossViewNetwork, EightPoint, EpipolarLoss, LearnedNormalizer, Whitening
 from kornia_learnnorm.data.sources import StoreSamples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.writer import join_stores
-from lightning_modules.datamodule import SampleLoader
-from lightning_modules.task import NormalizerTask
+from lightning_modules.datamodule import BatchLoader
+from lightning_modules.task import EstimatorTask
 
 BATCH = 1024
 STEPS = 30
@@ -43,7 +43,7 @@ def main() -> None:
         del store
         start = time.perf_counter()
         source = StoreSamples([str(large)], [0.8, None], num_heldout=16)
-        loader = SampleLoader(source, BATCH, seed=0, shuffle=True, workers=args.workers)
+        loader = BatchLoader(source, BATCH, seed=0, shuffle=True, workers=args.workers)
         print(f"opened and counted in {time.perf_counter() - start:.1f} s: {len(loader)} batches an epoch")
         start, drawn = time.perf_counter(), 0
         for batch in itertools.islice(loader, len(loader) // 8):
@@ -51,7 +51,8 @@ def main() -> None:
         stream = drawn / (time.perf_counter() - start)
         print(f"streamed {stream:.0f} samples/s")
         network = CrossViewNetwork(width=64, depth=4)
-        task = NormalizerTask(LearnedNormalizer(Whitening(), network), loss=EpipolarLoss(heldout_weight=0.5))
+        layer = EightPoint(LearnedNormalizer(Whitening(), network))
+        task = EstimatorTask(layer, loss=EpipolarLoss(heldout_weight=0.5))
         start = time.perf_counter()
         for _ in range(STEPS):
             torch.autograd.grad(task.compute_loss(batch), [*network.parameters()])

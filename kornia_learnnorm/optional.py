@@ -1,11 +1,15 @@
-"""Optional packages, which come with the extras of this package."""
+"""Optional packages, which come with the extras of this package, and modules of the user."""
 
 from __future__ import annotations
 
 import importlib
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-__all__ = ["import_extra"]
+__all__ = ["import_extra", "working_folder_importable"]
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
@@ -34,3 +38,14 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
         raise ImportError(
             f"{purpose} needs {module}: run pip install '.[{extra}]' in a checkout of kornia_learnnorm"
         ) from error
+
+
+@contextmanager
+def working_folder_importable() -> Iterator[None]:
+    """Look for modules in the working folder too, last, while the block runs."""
+    before = [*sys.path]
+    try:
+        sys.path.append(str(Path.cwd()))
+        yield
+    finally:
+        sys.path[:] = before

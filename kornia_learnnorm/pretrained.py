@@ -1,9 +1,15 @@
-"""Files of trained weights: tensors, architecture and training data in one safetensors file."""
+"""Files of trained weights: tensors, architecture and training data in one safetensors file.
+
+A file names the parts to build. Those of this package are found by their names; a part of your own is named by its
+import path, and only a module that the caller names is imported.
+"""
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,8 +20,19 @@ from safetensors.torch import save_file
 from torch import nn
 
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.optional import working_folder_importable
 
-__all__ = ["check_architecture", "load_module", "save_module", "shipped_weights", "weights_digest", "weights_format"]
+__all__ = [
+    "check_architecture",
+    "describe_part",
+    "find_part",
+    "load_module",
+    "name_part",
+    "save_module",
+    "shipped_weights",
+    "weights_digest",
+    "weights_format",
+]
 
 WEIGHTS = Path(__file__).parent / "weights"
 CLASSES = {  # of the modules that files hold, by the format
@@ -27,13 +44,13 @@ MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that
 Module = TypeVar("Module", bound=nn.Module)
 
 
-def save_module(path: str | Path, module: nn.Module, form: str, architecture: Mapping[str, Any]) -> None:
+def save_module(path: str | Path, module: nn.Module, file_format: str, architecture: Mapping[str, Any]) -> None:
     """Write weights, architecture and ``trained_on`` of a module to one file, beside the target and then renamed.
 
     Args:
         path: the file to write.
         module: the module, with the attribute ``trained_on``.
-        form: name of the format.
+        file_format: name of the format.
         architecture: what builds the module again, for JSON.
 
     Raises:
@@ -45,7 +62,7 @@ def save_module(path: str | Path, module: nn.Module, form: str, architecture: Ma
         raise ValueError(f"weights are written to a .safetensors file, got {str(path)!r}")
     state = {key: value.detach().cpu().contiguous() for key, value in module.state_dict().items()}
     metadata = {
-        "format": form,
+        "format": file_format,
         "architecture": json.dumps(architecture),
         "trained_on": json.dumps(module.trained_on),
     }
@@ -56,12 +73,12 @@ def save_module(path: str | Path, module: nn.Module, form: str, architecture: Ma
             raise OSError(f"{path} could not be written: {error}") from error
 
 
-def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module]) -> Module:
+def load_module(name: str | Path, file_format: str, build: Callable[[Path, str], Module]) -> Module:
     """Load a module that :func:`save_module` wrote: one that ships with the package, by name, or a file.
 
     Args:
         name: name of shipped weights, or the path of a ``.safetensors`` file.
-        form: name of the format that is expected.
+        file_format: name of the format that is expected.
         build: makes the module of the path, for messages, and the architecture as JSON text; called on the device
             ``meta``, where weights take no memory before their shapes are known to be those in the file.
 
@@ -76,25 +93,19 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
     path = weights_path(name)
     if not path.is_file() and Path(name).is_file():
         raise ValueError(f"{name} is not a .safetensors file by its name")
+    fitting = ", ".join(shipped_weights(file_format))
     if not path.is_file():
-        raise FileNotFoundError(
-            f"no weights {str(name)!r}: expected a .safetensors file or one of {', '.join(shipped_weights(form))}"
-        )
+        raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {fitting}")
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             state = {key: file.get_tensor(key).clone() for key in file.keys()}  # noqa: SIM118 (not a dict)
     except SafetensorError as error:
         raise ValueError(f"{path} is not a safetensors file: {error}") from error
-    if metadata.get("format") != form:
-        got, fitting = metadata.get("format"), ", ".join(shipped_weights(form))
-        if got in CLASSES:
-            raise ValueError(
-                f"{name} holds the weights of a {CLASSES[got]}, expected those of a {CLASSES[form]}, such as {fitting}"
-            )
-        raise ValueError(
-            f"{path} has another format: expected format {form!r}, got {got!r}; the package's of that format: {fitting}"
-        )
+    if (got := metadata.get("format")) != file_format:
+        held = f"{got!r} of a {CLASSES[got]}" if got in CLASSES else repr(got)
+        expected = f"{file_format!r} of a {CLASSES[file_format]}, such as {fitting}"
+        raise ValueError(f"{name}: expected format {expected}, got {held}")
     with torch.device("meta"):
         module = build(path, metadata.get("architecture", ""))
     try:
@@ -106,16 +117,18 @@ def load_module(name: str | Path, form: str, build: Callable[[Path, str], Module
     broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
     if broken:
         raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
+    if any(value.is_meta for value in (*module.parameters(), *module.buffers())):
+        raise ValueError(f"{path}: a constructor makes a tensor that state_dict does not hold: register it as a buffer")
     module.trained_on = _read_names(path, metadata.get("trained_on", "[]"))  # type: ignore[assignment]
     return module.eval()
 
 
-def shipped_weights(form: str | None = None) -> list[str]:
+def shipped_weights(file_format: str | None = None) -> list[str]:
     """Return the names of the weights that ship with the package, of one format or of all."""
     names = []
     for path in WEIGHTS.glob("*.safetensors"):
         with safe_open(path, "pt") as file:
-            if form is None or file.metadata()["format"] == form:
+            if file_format is None or file.metadata()["format"] == file_format:
                 names.append(path.stem)
     return sorted(names)
 
@@ -150,6 +163,77 @@ def check_architecture(*parts: Mapping[str, Any]) -> None:
     large = [v for part in parts for v in part.values() if isinstance(v, int) and v > MAX_ARCHITECTURE_INT]
     if large:
         raise ValueError(f"numbers can be at most {MAX_ARCHITECTURE_INT}, got {large[0]}")
+
+
+def name_part(part: Any, *modules: Any) -> str:
+    """Return the name of a class or function: its own in one of this package's modules, elsewhere its import path.
+
+    Raises:
+        TypeError: if it cannot be imported by its name.
+
+    """
+    module, name = getattr(part, "__module__", ""), getattr(part, "__name__", "")
+    if any(getattr(known, name, None) is part for known in modules):
+        return str(name)
+    with working_folder_importable():
+        try:
+            if module != "__main__" and getattr(importlib.import_module(module), name) is part:
+                return f"{module}.{name}"
+        except (ImportError, AttributeError, ValueError):
+            pass
+    raise TypeError(f"{part!r} cannot be imported by its name: define it at the top level of a module, not in a script")
+
+
+def describe_part(part: object, *modules: Any) -> dict[str, Any]:
+    """Return the name of a module and its constructor's arguments, kept as attributes of their names.
+
+    Raises:
+        TypeError: if it cannot be imported, or an argument is no attribute, or neither a number nor a text.
+
+    """
+    name, arguments = name_part(type(part), *modules), inspect.signature(type(part)).parameters.values()
+    # A part without its own constructor shows the `*args, **kwargs` of `nn.Module`.
+    keys = [argument.name for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD]
+    if missing := [key for key in keys if not hasattr(part, key)]:
+        raise TypeError(f"{name} cannot be saved: its constructor must keep {missing[0]!r} as an attribute")
+    values = {key: getattr(part, key) for key in keys}
+    for key, value in values.items():
+        if not isinstance(value, bool | int | float | str | None):
+            raise TypeError(f"{name} cannot be saved with its architecture: {key} is {value!r}, not a number or a text")
+    return {**values, "name": name}
+
+
+def find_part(name: str, own_modules: Collection[str], *modules: Any) -> Any:
+    """Return the class or function that a file names: a public one of this package, or one of an own module.
+
+    Args:
+        name: its name, or its import path.
+        own_modules: the modules that may be imported, from the Python path or the working folder.
+        modules: the modules of this package where it can be.
+
+    Raises:
+        ValueError: if there is none, or it is of another module.
+
+    """
+    for known in modules:
+        if name in known.__all__:
+            return getattr(known, name)
+    module, _, attribute = name.rpartition(".")
+    if not module:
+        raise ValueError(f"unknown part {name!r}")
+    if module not in own_modules:
+        raise ValueError(
+            f"{name} is not of this package; if you trust the module, import it by own_modules=[{module!r}], on the"
+            f" command line by {module}:FILE"
+        )
+    with working_folder_importable():
+        try:
+            found = getattr(importlib.import_module(module), attribute)
+        except Exception as error:  # of code that is not ours
+            raise ValueError(f"{name} cannot be imported: {type(error).__name__}: {error}") from error
+    if not callable(found) or getattr(found, "__module__", None) != module:
+        raise ValueError(f"{name} is not a class or function that {module} defines")
+    return found
 
 
 def _read_names(path: Path, text: str) -> tuple[str, ...]:

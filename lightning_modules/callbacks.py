@@ -1,20 +1,17 @@
-"""Callbacks: checkpoints, progress and expected time, export of the trained weights, and predictions to a file."""
+"""Callbacks: checkpoints, expected time, export of the trained weights, and predictions to a file."""
 
 from __future__ import annotations
 
-import math
 import signal
-import sys
 import threading
 import time
 from pathlib import Path
-from types import FrameType
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from pytorch_lightning.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
-from pytorch_lightning.callbacks.progress.tqdm_progress import Tqdm
+from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 from pytorch_lightning.trainer.states import TrainerFn
 from pytorch_lightning.utilities import rank_zero_info
 from pytorch_lightning.utilities.exceptions import SIGTERMException
@@ -22,13 +19,14 @@ from safetensors.torch import save_file
 from torch import Tensor, distributed
 from tqdm import tqdm
 
-from kornia_learnnorm.data.sets import StoreSets, SyntheticSets
+from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.files import atomic_write, short_name
-from lightning_modules.estimator_task import EstimatorTask
-from lightning_modules.task import NormalizerTask
+from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from lightning_modules.task import EstimatorTask
 
-__all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "StepProgress", "WritePredictions"]
+__all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "WritePredictions"]
 
 
 class Checkpoints(ModelCheckpoint):
@@ -70,14 +68,13 @@ class Checkpoints(ModelCheckpoint):
             raise SIGTERMException if terminated else KeyboardInterrupt
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
-        """Say how an interrupted run can be resumed."""
+        """Print how an interrupted run can be resumed."""
         super().on_exception(trainer, pl_module, exception)
         self._restore_handler()
-        if trainer.state.fn != TrainerFn.FITTING or not self._started:
-            return
-        last = self.last_model_path
-        how = f"to go on, repeat the command with --ckpt_path {last}" if last else "no checkpoint was written"
-        _print_above_bar(f"stopped at step {trainer.global_step}; {how}")
+        if trainer.state.fn == TrainerFn.FITTING and self._started:
+            last = self.last_model_path
+            how = f"to go on, repeat the command with --ckpt_path {last}" if last else "no checkpoint was written"
+            _print_above_bar(f"stopped at step {trainer.global_step}; {how}")
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the last step, where no checkpoint was due, and give interrupts back."""
@@ -90,7 +87,7 @@ class Checkpoints(ModelCheckpoint):
         self.last_model_path = str(Path(str(self.dirpath)) / "last.ckpt")
         trainer.save_checkpoint(self.last_model_path)
 
-    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+    def _interrupt(self, *signal_and_frame: Any) -> None:
         """Ask for the end of the training; the second time, end it."""
         if self._interrupted:
             raise KeyboardInterrupt
@@ -106,10 +103,10 @@ class Checkpoints(ModelCheckpoint):
 class ExpectedTime(Callback):
     """Print the device, steps and folder of a training, soon how long it will take, and in the end how long it took.
 
-    The command line adds it to every training.
+    The command line adds it to every training. Lightning's bar counts the batches of one epoch.
 
     Args:
-        measured_steps: steps whose mean time is multiplied, after one that is left out.
+        measured_steps: steps whose mean time is multiplied, after one that does not count.
     """
 
     def __init__(self, measured_steps: int = 10) -> None:
@@ -120,18 +117,18 @@ class ExpectedTime(Callback):
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Print where and how far the training will go."""
         self._first, self._begin = trainer.global_step + 1, time.monotonic()
-        steps = _remaining_steps(trainer)
-        count = "steps until it is stopped" if steps is None else f"{steps} steps"
+        steps = trainer.estimated_stepping_batches - trainer.global_step
+        count = "steps until it is stopped" if steps == float("inf") else f"{steps:.0f} steps"
         _print_above_bar(f"device {pl_module.device}, {count}; results in {trainer.default_root_dir}")
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
         """Print the expected time after the first steps."""
-        done = trainer.global_step - self._first
+        done, steps = trainer.global_step - self._first, trainer.estimated_stepping_batches - trainer.global_step
         if done == 0:
             self._start = time.monotonic()
-        elif done == self.measured_steps and (steps := _remaining_steps(trainer)):
+        elif done == self.measured_steps and 0 < steps < float("inf"):
             seconds = (time.monotonic() - self._start) / done * steps
-            _print_above_bar(f"about {_duration(seconds)} for the remaining {steps} steps, without validation")
+            _print_above_bar(f"about {_duration(seconds)} for the remaining {steps:.0f} steps, without validation")
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Print the time of the steps since the start, validation included."""
@@ -145,58 +142,6 @@ def _print_above_bar(text: str) -> None:
         rank_zero_info(text)
 
 
-class StepProgress(TQDMProgressBar):
-    """Show the steps that a training has done out of all, in one bar over all epochs.
-
-    Lightning's own bars count the batches of one epoch. The command line adds this bar where no other is configured.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(refresh_rate=1 if sys.stdout.isatty() else 100)
-
-    def on_train_start(self, *args: Any) -> None:
-        """Open the bar at the step that the training begins with."""
-        super().on_train_start(*args)
-        bar, done = self.train_progress_bar, self.trainer.global_step
-        bar.total, bar.initial, bar.n = _total_steps(self.trainer), done, done
-        bar.set_description("Step")
-
-    def init_sanity_tqdm(self) -> Tqdm:
-        """Return no bar for the two batches of validation before the training."""
-        return Tqdm(disable=True)
-
-    def get_metrics(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> dict[str, Any]:
-        """Return the logged values, without the number of the logger's version."""
-        return {name: value for name, value in super().get_metrics(trainer, pl_module).items() if name != "v_num"}
-
-    def on_train_epoch_start(self, *args: Any) -> None:
-        """Leave the bar as it is."""
-
-    def on_exception(self, *args: Any) -> None:
-        """Close the bar of a training that ends early, so that messages begin on a new line."""
-        if self._train_progress_bar is not None:
-            self.train_progress_bar.close()
-
-    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
-        """Show the steps and the logged values."""
-        bar, done = self.train_progress_bar, trainer.global_step
-        bar.n = done
-        if self.is_enabled and (done % self.refresh_rate == 0 or done == bar.total):
-            bar.set_postfix(self.get_metrics(trainer, pl_module))
-
-
-def _total_steps(trainer: pl.Trainer) -> int | None:
-    """Return the number of steps of a training; None where it has no end."""
-    total = trainer.max_steps if trainer.max_steps > 0 else trainer.estimated_stepping_batches
-    return int(total) if math.isfinite(total) else None
-
-
-def _remaining_steps(trainer: pl.Trainer) -> int | None:
-    """Return the number of steps that a training has before it; None where it has no end."""
-    total = _total_steps(trainer)
-    return None if total is None else total - trainer.global_step
-
-
 def _duration(seconds: float) -> str:
     """Return a time to one or two digits."""
     if seconds < 90:
@@ -207,8 +152,8 @@ def _duration(seconds: float) -> str:
 class ExportWeights(Callback):
     """Write the trained module as safetensors when training ends, for its ``from_pretrained``.
 
-    The file names the training data: the stores, or ``synthetic scenes``; nothing for a source of another class. A
-    training that ended before its first step raises a ValueError in the place of writing untrained weights.
+    What cannot be saved and loaded again is refused before the training. The file names the training data: the stores,
+    or ``synthetic scenes``; nothing for a source of another class.
 
     Args:
         filename: name of the file in the trainer's default root directory.
@@ -217,31 +162,52 @@ class ExportWeights(Callback):
     def __init__(self, filename: str = "weights.safetensors") -> None:
         self.filename = filename
 
+    def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Save the module to a temporary folder and load it again.
+
+        Raises:
+            TypeError: if the task is none that this callback knows.
+            ValueError: if the module cannot be saved and loaded.
+
+        """
+        if not isinstance(pl_module, EstimatorTask):
+            raise TypeError(f"expected an EstimatorTask, got {type(pl_module).__name__}")
+        if stage == "fit":
+            try:
+                _check_saving(pl_module.trained)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"the trained weights could not be saved: {error}") from error
+
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Save the module."""
+        """Save the module; a ValueError in the place of untrained weights."""
         if trainer.global_step == 0:
             raise ValueError("the training ended before its first step: no weights were written")
-        if trainer.is_global_zero:
+        if trainer.is_global_zero and isinstance(pl_module, EstimatorTask):
             path = Path(trainer.default_root_dir) / self.filename
             path.parent.mkdir(parents=True, exist_ok=True)
-            if not isinstance(pl_module, NormalizerTask | EstimatorTask):
-                raise TypeError(f"expected a NormalizerTask or an EstimatorTask, got {type(pl_module).__name__}")
-            trained = pl_module.normalizer if isinstance(pl_module, NormalizerTask) else pl_module.trained
-            trained.trained_on = _names_of_sources(getattr(trainer, "datamodule", None))
-            trained.save_pretrained(path)
+            source = getattr(getattr(trainer, "datamodule", None), "train", None)
+            pl_module.trained.trained_on = tuple(dict.fromkeys(_names_of(source)))
+            pl_module.trained.save_pretrained(path)
             print(f"wrote {path}")
 
 
-def _names_of_sources(datamodule: Any) -> tuple[str, ...]:
-    """Return the names of the data that a datamodule trains on; nothing where they are not known."""
-    sources = getattr(datamodule, "train", None)
-    names: list[str] = []
-    for source in sources if isinstance(sources, list) else [sources]:
-        if isinstance(source, StoreSamples | StoreSets):
-            names += [short_name(path) for path in source.paths]
-        elif isinstance(source, SyntheticSamples | SyntheticSets):
-            names.append("synthetic scenes")
-    return tuple(dict.fromkeys(names))
+def _check_saving(trained: LearnedNormalizer | LearnedEightPoint) -> None:
+    """Raise TypeError or ValueError if a module cannot be saved, or its file would not give it back."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "weights.safetensors"
+        trained.save_pretrained(path)
+        if isinstance(trained, LearnedNormalizer):
+            parts = [trained.transform, *map(type, trained.modules())]
+            LearnedNormalizer.from_pretrained(path, {part.__module__ for part in parts})
+
+
+def _names_of(source: Any) -> list[str]:
+    """Return the names of the data of a source; nothing where they are not known."""
+    if isinstance(source, RandomSets):
+        return [name for part in source.sources for name in _names_of(part)]
+    if isinstance(source, StoreSamples | StoreSets):
+        return [short_name(path) for path in source.paths]
+    return ["synthetic scenes"] if isinstance(source, SyntheticSamples | SyntheticSets) else []
 
 
 class WritePredictions(Callback):
@@ -276,7 +242,7 @@ class WritePredictions(Callback):
 
 
 def _gathered(batches: list[dict[str, Tensor]]) -> list[dict[str, Tensor]]:
-    """Return the batches of all processes, samples in order: of each batch, process r has every n-th from r on."""
+    """Return the batches of all processes, sets in order: of each batch, process r has every n-th from r on."""
     shares: list[Any] = [None] * distributed.get_world_size()
     distributed.all_gather_object(shares, batches)
     whole = []

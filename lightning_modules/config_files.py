@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-__all__ = ["config_names", "find_config", "read_config", "with_config_paths"]
+__all__ = ["config_names", "find_config", "with_config_paths"]
 
 OPTIONS = ("-c", "--config")
-SECTIONS = ("trainer", "model", "data")  # of a configuration, each of which can be the name of a file
 PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
 REPOSITORY = Path(__file__).parents[1] / "configs"  # where a checkout has them
 
@@ -36,30 +34,6 @@ def find_config(name: str) -> Path:
         known = ", ".join(known for known in names if "/" not in known)
         raise FileNotFoundError(f"no configuration {name}: expected a file, or one of {known}, ablations/*, table1/*")
     return _folder() / f"{stem}.yaml"
-
-
-def read_config(path: str | Path) -> dict[str, Any]:
-    """Return the content of a configuration.
-
-    Raises:
-        ValueError: if the file is not YAML, or it or one of its sections holds something else than options by name.
-
-    """
-    import yaml  # of the extra train, which listing the names does not need
-
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"configuration {path} is not YAML: {error}") from error
-    if content is None:
-        raise ValueError(f"configuration {path} is empty: options by name expected, such as 'seed_everything: 0'")
-    sections = {"": content} if not isinstance(content, dict) else {key: content.get(key, {}) for key in SECTIONS}
-    for key, section in sections.items():
-        file = key and isinstance(section, str) and (Path(path).parent / section).is_file()
-        if not isinstance(section, dict) and not file:
-            got = f"{type(section).__name__} {str(section)[:40]!r}"
-            raise ValueError(f"configuration {path}{key and ', '}{key}: options by name expected, got {got}")
-    return dict(content)
 
 
 def with_config_paths(args: Sequence[str]) -> list[str]:

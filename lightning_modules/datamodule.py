@@ -1,11 +1,11 @@
-"""Sources of samples and the datamodule that feeds them to the trainer."""
+"""The datamodule and its loader: batches of sets of correspondences from any sources, in an order that can resume."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pytorch_lightning as pl
@@ -13,28 +13,18 @@ import torch
 from pytorch_lightning.utilities import rank_zero_info
 from torch.utils.data import DataLoader
 
-from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.data.sources import Block, block_generator
+from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.data.sources import SEEDS_PER_RUN, BlockSource, block_generator
+
+__all__ = ["BatchLoader", "CorrespondenceDataModule"]
 
 # Far from the seeds of training epochs, since the synthetic source gives the same scenes for the same seed. A generator
 # on the CPU reads 32 bits of it.
 EVALUATION_SEED = 4_000_000_007
 
-__all__ = ["CorrespondenceDataModule", "SampleLoader", "SampleSource"]
 
-
-class SampleSource(Protocol):
-    """Anything that draws samples block by block: stores of correspondences, the synthetic generator."""
-
-    def blocks(self, seed: int) -> list[Block]:
-        """Return what each block of a draw holds before any filter; the sums are the same for all seeds."""
-
-    def draw(self, seed: int, block: int) -> Samples:
-        """Return the samples of a block, which depend on nothing but ``seed`` and ``block``."""
-
-
-class SampleLoader:
-    """Batches of samples, drawn anew each epoch; the state is the epoch and the batch, so training resumes exactly.
+class BatchLoader:
+    """Batches of sets, drawn anew each epoch; the state is the epoch and the batch, so training resumes exactly.
 
     A block is cut into batches of nearly equal size, so none of its samples is lost or comes twice. The number of
     batches is the same in every epoch: how many samples the filter keeps is told from the first block of the first
@@ -43,13 +33,14 @@ class SampleLoader:
     can be empty.
 
     ``batch_size`` counts the samples of all processes together, or image pairs, each with all its samples, ``by_pair``.
-    Without ``shuffle`` one draw is kept in order, for evaluation. ``workers`` processes draw the next blocks meanwhile.
+    With None, each block is a batch as it is. Without ``shuffle`` one draw is kept in order, for evaluation.
+    ``workers`` processes draw the next blocks meanwhile.
     """
 
     def __init__(
         self,
-        source: SampleSource,
-        batch_size: int,
+        source: BlockSource,
+        batch_size: int | None,
         seed: int,
         shuffle: bool,
         by_pair: bool = False,
@@ -57,27 +48,30 @@ class SampleLoader:
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        unit = "image pair" if by_pair else "sample"
-        if batch_size < world_size:
-            raise ValueError(f"a batch must hold at least one {unit} for each process, got {batch_size}")
         self.source = source
         self.batch_size, self.by_pair = batch_size, by_pair
         self.seed, self.shuffle = seed, shuffle
         self.workers, self.rank, self.world_size = workers, rank, world_size
         self.epoch, self.batch = 0, 0
-        self._drawn: tuple[int, int, Samples] | None = None
+        self._drawn: tuple[int, int, MatchSets] | None = None
+        self._length = len(source.blocks(seed)) if batch_size is None else self._count(batch_size)
+
+    def _count(self, batch_size: int) -> int:
+        """Return the number of batches in an epoch."""
+        unit = "image pair" if self.by_pair else "sample"
+        if batch_size < self.world_size:
+            raise ValueError(f"a batch must hold at least one {unit} for each process, got {batch_size}")
         sizes = self._sizes(0)
-        kept = len(self._units(self._draw(0, 0))) / max(sizes[0], 1)
-        number = round(kept * sum(sizes))
-        if number < (batch_size if shuffle else 1):
+        number = round(len(self._units(self._draw(0, 0))) / max(sizes[0], 1) * sum(sizes))
+        if number < (batch_size if self.shuffle else 1):
             raise ValueError(f"a batch takes {batch_size} {unit}s, the source gives {number}")
-        self._length = -(-number // batch_size)
+        return -(-number // batch_size)
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
         return self._length
 
-    def __iter__(self) -> Iterator[Samples]:
+    def __iter__(self) -> Iterator[MatchSets]:
         """Yield the batches of the current epoch from the current batch on."""
         epoch, start = self.epoch, self.batch
         # Batch number i of the epoch belongs to the block whose share of all samples it falls into.
@@ -101,11 +95,11 @@ class SampleLoader:
         """Go to a saved position."""
         self.epoch, self.batch = state["epoch"], state["batch"]
 
-    def _cut(self, samples: Samples, number: int, epoch: int, block: int) -> Iterator[Samples]:
+    def _cut(self, samples: MatchSets, number: int, epoch: int, block: int) -> Iterator[MatchSets]:
         """Yield this process's shares of ``number`` batches, or of fewer where the samples are too few."""
         units = self._units(samples)
         order = torch.arange(len(units))
-        if self.shuffle:
+        if self.shuffle and self.batch_size is not None:
             order = torch.randperm(len(units), generator=block_generator(self._seed(epoch), block, 1))
         number = min(number, len(units))
         for i in range(number):
@@ -113,7 +107,7 @@ class SampleLoader:
             chosen = order[first + self.rank : stop : self.world_size]
             yield samples.select(torch.cat([order[:0], *(units[i] for i in chosen)]) if self.by_pair else chosen)
 
-    def _units(self, samples: Samples) -> Sequence[Any]:
+    def _units(self, samples: MatchSets) -> Sequence[Any]:
         """Rows of ``samples`` that stay together: those of a pair, or each alone."""
         if not self.by_pair:
             return range(len(samples.pair))
@@ -124,7 +118,7 @@ class SampleLoader:
         blocks = self.source.blocks(self._seed(epoch))
         return [block.pairs if self.by_pair else block.samples for block in blocks]
 
-    def _blocks(self, epoch: int, first: int) -> Iterator[Samples]:
+    def _blocks(self, epoch: int, first: int) -> Iterator[MatchSets]:
         """Yield the blocks of an epoch from ``first`` on."""
         number = len(self.source.blocks(self._seed(epoch)))
         if self.workers and number > first + 1:
@@ -139,7 +133,7 @@ class SampleLoader:
             for block in range(first, number):
                 yield self._draw(epoch, block)
 
-    def _draw(self, epoch: int, block: int) -> Samples:
+    def _draw(self, epoch: int, block: int) -> MatchSets:
         seed = self._seed(epoch)
         if self._drawn is None or self._drawn[:2] != (seed, block):
             self._drawn = seed, block, self.source.draw(seed, block)
@@ -155,56 +149,54 @@ def _ignore_interrupts(_: int) -> None:
 
 
 class CorrespondenceDataModule(pl.LightningDataModule):
-    """Training, validation and test samples from any sources.
+    """Training, validation and test sets from any sources.
 
     Args:
-        train: source of the training samples.
-        val: source of the validation samples.
-        test: source of the samples for test and predict.
-        batch_size: samples in a batch.
+        train: source of the training sets.
+        val: source of the validation sets.
+        test: source of the sets for test and predict.
+        batch_size: sets in a batch; None for sources that draw whole batches, such as
+            :class:`~kornia_learnnorm.data.random_sets.RandomSets`.
         batch_pairs: image pairs in a training batch, each with all its samples; replaces ``batch_size`` there.
         seed: seed of the training draws; validation and test are drawn once, from a seed of their own.
-        workers: processes that draw the next blocks of training samples meanwhile.
+        workers: processes that draw the next blocks of training sets meanwhile.
     """
 
     def __init__(
         self,
-        train: SampleSource | None = None,
-        val: SampleSource | None = None,
-        test: SampleSource | None = None,
-        batch_size: int = 1024,
+        train: BlockSource | None = None,
+        val: BlockSource | None = None,
+        test: BlockSource | None = None,
+        batch_size: int | None = 1024,
         batch_pairs: int | None = None,
         seed: int = 0,
         workers: int = 0,
     ) -> None:
         super().__init__()
         self.train, self.val, self.test = train, val, test
-        self.batch_size = batch_size
-        self.batch_pairs = batch_pairs
-        self.seed = seed
-        self.workers = workers
+        self.batch_size, self.batch_pairs = batch_size, batch_pairs
+        self.seed, self.workers = seed, workers
 
-    def train_dataloader(self) -> SampleLoader:
-        """Return the shuffled loader of the training samples."""
-        return self._loader("train", self.train, self.seed * 1_000_003, shuffle=True)
+    def train_dataloader(self) -> BatchLoader:
+        """Return the shuffled loader of the training sets."""
+        return self._loader("train", self.train, self.seed * SEEDS_PER_RUN, shuffle=True)
 
     def val_dataloader(self) -> Any:
-        """Return the loader of the validation samples; an empty list where there are none."""
+        """Return the loader of the validation sets; an empty list where there are none."""
         return [] if self.val is None else self._loader("val", self.val, EVALUATION_SEED, shuffle=False)
 
-    def test_dataloader(self) -> SampleLoader:
-        """Return the loader of the test samples, which ``predict`` uses too."""
+    def test_dataloader(self) -> BatchLoader:
+        """Return the loader of the test sets, which ``predict`` uses too."""
         return self._loader("test", self.test, EVALUATION_SEED, shuffle=False)
 
     predict_dataloader = test_dataloader
 
-    def _loader(self, stage: str, source: SampleSource | None, seed: int, shuffle: bool) -> SampleLoader:
+    def _loader(self, stage: str, source: BlockSource | None, seed: int, shuffle: bool) -> BatchLoader:
         if source is None:
-            raise ValueError(f"data.{stage} is not set: give it a source of samples")
+            raise ValueError(f"data.{stage} is not set: give it a source of sets")
         by_pair = shuffle and self.batch_pairs is not None
-        batch = self.batch_pairs if by_pair and self.batch_pairs is not None else self.batch_size
+        size, unit = (self.batch_pairs, "image pairs") if by_pair else (self.batch_size, "sets")
         rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        workers = self.workers if shuffle else 0
-        loader = SampleLoader(source, batch, seed, shuffle, by_pair, workers, rank, world_size)
-        rank_zero_info(f"{stage}: {len(loader)} batches of about {batch} {'image pairs' if by_pair else 'samples'}")
+        loader = BatchLoader(source, size, seed, shuffle, by_pair, self.workers if shuffle else 0, rank, world_size)
+        rank_zero_info(f"{stage}: {len(loader)} batches{f' of about {size} {unit}' if size else ''}")
         return loader

@@ -5,33 +5,31 @@ from __future__ import annotations
 from typing import Any
 
 import pytorch_lightning as pl
+from torch.optim import Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
-__all__ = ["OneCycle", "steps_of"]
+__all__ = ["one_cycle"]
 
 
-def steps_of(trainer: pl.Trainer) -> int:
-    """Return the number of steps of a training, which a cycle needs: at least two.
+def one_cycle(optimizer: Optimizer, trainer: pl.Trainer, warm_up: float) -> OneCycleLR:
+    """Return the cycle over the steps of a training, up to the optimiser's learning rate.
 
     Raises:
         ValueError: if the training has no end.
 
     """
-    steps = trainer.estimated_stepping_batches
-    if steps == float("inf"):
+    if trainer.estimated_stepping_batches == float("inf"):
         raise ValueError(
             "the learning rate follows one cycle over all steps: give trainer.max_steps or trainer.max_epochs;"
             " trainer.max_time may end the training before"
         )
-    return max(2, int(steps))
+    steps = max(2, int(trainer.estimated_stepping_batches))
+    # The schedule divides by the warm-up's steps less one.
+    return OneCycle(optimizer, optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=max(warm_up, 1.5 / steps))
 
 
 class OneCycle(OneCycleLR):
-    """PyTorch's ``OneCycleLR``, which goes on only in a training of as many steps.
-
-    ``OneCycleLR`` takes the number of steps from the checkpoint. A longer training would fail at its end, and a shorter
-    one would stop at a large learning rate.
-    """
+    """PyTorch's schedule, which goes on only in a training of as many steps: elsewhere it fails, or ends too early."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Load the state of a checkpoint.

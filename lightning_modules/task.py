@@ -1,10 +1,10 @@
-"""The training task: correspondences in, loss of the fundamental matrix out, no labels."""
+"""The training task: sets of correspondences in, losses of the estimated matrices out, with labels or without."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import pytorch_lightning as pl
 import torch
@@ -12,125 +12,197 @@ from pytorch_lightning.utilities import rank_zero_warn
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
+from torchmetrics import CatMetric, MeanMetric, Metric, SumMetric
 
-from kornia_learnnorm.data.samples import Samples
-from kornia_learnnorm.estimators.fundamental import find_fundamental, solve_fundamental, solve_in_coordinates
+from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.estimators.eight_point import EightPoint
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.losses import EpipolarLoss
-from kornia_learnnorm.metrics.modules import BetterRateMetric
-from kornia_learnnorm.normalizers.contract import Normalizer
+from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss
+from kornia_learnnorm.metrics.better_rate import comparable
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.learned import LearnedNormalizer
 from kornia_learnnorm.normalizers.whitening import Whitening
-from lightning_modules.schedule import OneCycle, steps_of
+from lightning_modules.schedule import one_cycle
 
-__all__ = ["NormalizerTask"]
+__all__ = ["EstimatorTask", "SetLoss"]
+
+EARLY_STAGE = 0.3  # weight of the losses of all stages but the last
+RESIDUAL_FLOOR = 1e-3  # pixels, added to the residuals under the logarithm of the validation
+BASELINES = {"hartley": EightPoint(Hartley()), "whitening": EightPoint(Whitening())}
+SIZES = {32: "32", 256: "256", 10**9: "1000"}  # largest number of matches in a set, and the name of its median
 
 
 def _adamw(params: Iterable[nn.Parameter]) -> Optimizer:
-    return torch.optim.AdamW(params, lr=3e-3)
+    return torch.optim.AdamW(params, lr=2e-3)
 
 
-class NormalizerTask(pl.LightningModule):
-    """Train a learned normaliser by back-propagating a residual through the whole eight-point algorithm.
+class SetLoss(nn.Module):
+    """Loss of sets of matches with outliers, of each kind of supervision its own.
 
-    Validation and test log the mean log residual and the better rates against Hartley and whitening on the samples'
-    own points; prediction returns the transforms, the fundamental matrix and the residual of each sample.
-
-    Of several processes, all samples count the same, however they are distributed. In training, validation and test,
-    samples with a NaN or infinite coordinate are left out and counted: ``train/left_out``. A step without any other
-    sample, or with a gradient that is not finite, leaves the weights and the optimiser as they are, with a warning, and
-    is counted: ``train/skipped``.
+    Sets whose ground truth is known have the logarithmic loss of true inliers and the cross-entropy of the logits, the
+    others the bounded loss of all matches: sources with ``labels=False`` train without labels.
 
     Args:
-        normalizer: the normaliser to train.
-        loss: residual and reduction.
-        optimizer: builds the optimiser from the parameters; AdamW with a learning rate of 3e-3 when not given.
-        lr_scheduler: builds a schedule that steps once an epoch; when not given, one cycle over all steps of the run
-            up to the optimiser's learning rate.
-        sample_gradient: largest norm of one sample's gradient with respect to its predicted parameters, before the
-            batch's average. Near-degenerate samples have gradients a thousand times the typical one, and a clip of the
-            whole batch would leave only their direction. None leaves all as they are.
+        label_free: loss of the sets without ground truth, times ``label_free_weight``.
+        labelled: loss of the sets with ground truth.
+        inlier_weight: weight of the cross-entropy.
+        label_free_weight: weight of the label-free loss.
     """
 
     def __init__(
         self,
-        normalizer: LearnedNormalizer,
-        loss: EpipolarLoss | None = None,
+        label_free: BoundedEpipolarLoss | None = None,
+        labelled: LogEpipolarLoss | None = None,
+        inlier_weight: float = 0.3,
+        label_free_weight: float = 4.0,
+    ) -> None:
+        super().__init__()
+        self.label_free = label_free or BoundedEpipolarLoss()
+        self.labelled = labelled or LogEpipolarLoss()
+        self.inlier = InlierLoss()
+        self.inlier_weight, self.label_free_weight = inlier_weight, label_free_weight
+
+    def forward(self, sets: MatchSets, F_mat: Tensor, logits: Tensor | None) -> Tensor:
+        """Return the loss of each set, (B,), of its matrix (B, 3, 3) and the logits of its matches (B, N), if any."""
+        heldout1, heldout2 = sets.heldout1.double(), sets.heldout2.double()
+        unknown: Tensor = self.label_free_weight * self.label_free(heldout1, heldout2, F_mat)
+        if sets.labelled is None:
+            return unknown
+        known = self.labelled(heldout1, heldout2, F_mat)
+        if logits is not None and sets.inliers is not None:
+            known = known + self.inlier_weight * self.inlier(logits, sets.inliers)
+        return torch.where(sets.labelled, known, unknown)
+
+
+class EstimatorTask(pl.LightningModule):
+    """Train an estimator, or the normaliser within it, by back-propagating a loss of its matrices.
+
+    With the default loss, of sets of matches with outliers, validation and test log the median distance of the held-out
+    matches by the size of the sets. With another one, of samples, they log the mean log residual of the samples' own
+    points and the better rates against Hartley and whitening. Prediction returns the matrix and the residual of each
+    set, and the transforms of a normaliser.
+
+    Of several processes, all sets count the same, however they are distributed. Sets with a NaN or infinite coordinate
+    are left out and counted: ``train/left_out``. A step without any other set, or with a gradient that is not finite,
+    leaves the weights and the optimiser as they are, with a warning, and is counted: ``train/skipped``.
+
+    Args:
+        estimator: the estimator to train: a :class:`~kornia_learnnorm.LearnedEightPoint`, or an
+            :class:`~kornia_learnnorm.EightPoint` with a :class:`~kornia_learnnorm.LearnedNormalizer`.
+        loss: module of ``(points1, points2, F_mat, heldout1, heldout2)`` that returns a scalar or a loss for each set,
+            such as :class:`~kornia_learnnorm.EpipolarLoss` or your own; :class:`SetLoss` when not given.
+        optimizer: builds the optimiser from the parameters; AdamW with a learning rate of 2e-3 when not given.
+        lr_scheduler: builds a schedule that steps once an epoch; when not given, one cycle over all steps of the run
+            up to the optimiser's learning rate.
+        warm_up: share of the cycle in which the learning rate rises.
+        sample_gradient: largest norm of one set's gradient with respect to the outputs of a network, before the batch's
+            average. Near-degenerate sets have gradients a thousand times the typical one, and a clip of the whole batch
+            would leave only their direction. None leaves all as they are.
+    """
+
+    def __init__(
+        self,
+        estimator: nn.Module,
+        loss: nn.Module | None = None,
         optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = _adamw,
         lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        warm_up: float = 0.05,
         sample_gradient: float | None = 1.0,
     ) -> None:
         super().__init__()
-        self.normalizer = normalizer.train()  # shipped weights come in evaluation mode
-        self.loss = loss or EpipolarLoss()
-        self.optimizer = optimizer
-        self.lr_scheduler = lr_scheduler
-        self.sample_gradient = sample_gradient
-        self.baselines: dict[str, Normalizer] = {"hartley": Hartley(), "whitening": Whitening()}
-        self.better_than_hartley, self.better_than_whitening = BetterRateMetric(), BetterRateMetric()
-        self._log_residuals: list[Tensor] = []  # since the last validation or test
-        self._left_out = 0  # since the last validation or test
-        self._samples = 0  # of all processes since the last step
+        if not isinstance(estimator, LearnedEightPoint | EightPoint):
+            raise TypeError(f"expected a LearnedEightPoint or an EightPoint, got {type(estimator).__name__}")
+        if isinstance(estimator, EightPoint) and not isinstance(estimator.normalizer, LearnedNormalizer):
+            raise TypeError(f"expected a LearnedNormalizer in EightPoint, got {type(estimator.normalizer).__name__}")
+        self.estimator: LearnedEightPoint | EightPoint = estimator.train()  # shipped weights come in evaluation mode
+        self.loss = loss or SetLoss()
+        self.optimizer, self.lr_scheduler = optimizer, lr_scheduler
+        self.warm_up, self.sample_gradient = warm_up, sample_gradient
+        metrics: dict[str, Metric] = {
+            name: MeanMetric() for name in ("log_sed", *map("better_than_{}".format, BASELINES))
+        }
+        metrics |= {f"median_{name}": Median() for name in SIZES.values()}
+        self.metrics = nn.ModuleDict({"left_out": SumMetric(), **metrics})
+        for metric in self.metrics.values():
+            cast(Metric, metric).set_dtype(torch.float64)
+        self._sets = 0  # of all processes since the last step
+
+    @property
+    def trained(self) -> LearnedEightPoint | LearnedNormalizer:
+        """The module that learns, whose weights ``from_pretrained`` reads."""
+        if isinstance(self.estimator, LearnedEightPoint):
+            return self.estimator
+        return cast(LearnedNormalizer, self.estimator.normalizer)
 
     def configure_optimizers(self) -> Any:
         """Build the optimiser and its schedule."""
         optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
         if self.lr_scheduler is not None:
             return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self.lr_scheduler(optimizer)}}
-        schedule = OneCycle(optimizer, max_lr=optimizer.param_groups[0]["lr"], total_steps=steps_of(self.trainer))
+        schedule = one_cycle(optimizer, self.trainer, self.warm_up)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Return the fundamental matrices of correspondences; see :func:`kornia_learnnorm.find_fundamental`."""
-        return find_fundamental(points1, points2, weights, self.normalizer)
-
-    def training_step(self, batch: Samples, batch_idx: int) -> Tensor:
-        """Log the loss of the batch of all processes and return the part of it that this one's samples make."""
+    def training_step(self, batch: MatchSets, batch_idx: int) -> Tensor:
+        """Log the loss of the batch of all processes and return the part of it that this one's sets make."""
         batch, left_out = _finite(batch)
-        samples = len(batch.pair)
-        # Without samples, all weights still take part: the other processes wait for their gradients.
-        loss = self.compute_loss(batch) if samples else 0 * torch.stack([p.sum() for p in self.parameters()]).sum()
-        total, all_left_out, all_samples = self._sum(samples * loss.detach(), left_out, samples)
-        of_all = int(all_samples)
-        self._samples += of_all
+        number = len(batch.points1)
+        # Without sets, all weights still take part: the other processes wait for their gradients.
+        loss = self.compute_loss(batch) if number else 0 * torch.stack([p.sum() for p in self.parameters()]).sum()
+        own = torch.stack([number * loss.detach(), loss.new_tensor(left_out), loss.new_tensor(number)])
+        own = own.to(solve_dtype(self.device))
+        total, all_left_out, all_sets = self.trainer.strategy.reduce(own, reduce_op="sum")
+        of_all = int(all_sets)
+        self._sets += of_all
         self.log("train/loss", total / max(of_all, 1), prog_bar=True)
         self.log("train/left_out", all_left_out)
-        return loss * (samples * self.trainer.world_size / max(of_all, 1))  # gradients are averaged over processes
+        return loss * (number * self.trainer.world_size / max(of_all, 1))  # gradients are averaged over processes
 
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
-        """Skip a step that has no samples, or whose gradient is not finite: the same one in all processes."""
+        """Skip a step that has no sets, or whose gradient is not finite: the same one in all processes."""
         finite = all(bool(p.grad.isfinite().all()) for p in self.parameters() if p.grad is not None)
-        skipped = self._samples == 0 or not finite
+        skipped = self._sets == 0 or not finite
         if skipped:
-            rank_zero_warn(f"a step was skipped: {'non-finite gradient' if self._samples else 'no samples'}")
+            rank_zero_warn(f"a step was skipped: {'non-finite gradient' if self._sets else 'no samples'}")
             for p in self.parameters():
                 p.grad = None  # an optimiser leaves these alone
         self.log("train/skipped", float(skipped))
-        self._samples = 0
+        self._sets = 0
 
-    def _sum(self, *numbers: Tensor | float) -> list[Tensor]:
-        """Sum numbers over all processes."""
-        dtype = solve_dtype(self.device)
-        own = torch.stack([torch.as_tensor(number, dtype=dtype, device=self.device) for number in numbers])
-        return list(self.trainer.strategy.reduce(own, reduce_op="sum"))
-
-    def compute_loss(self, batch: Samples) -> Tensor:
-        """Return the loss of a batch of samples, each sample's gradient limited where it enters the network."""
-        x1, x2 = batch.points1.double(), batch.points2.double()
+    def compute_loss(self, batch: MatchSets) -> Tensor:
+        """Return the loss of a batch, of all stages, each set's gradient limited where it enters the networks."""
+        points = batch.points1.double(), batch.points2.double()
+        heldout = batch.heldout1.double(), batch.heldout2.double()
         arrived: list[Tensor] = []
         with self._limited_gradients(arrived):
-            F_mat = self(x1, x2)
-        loss: Tensor = self.loss(x1, x2, F_mat, batch.heldout1.double(), batch.heldout2.double())
-        if loss.requires_grad:
-            loss.register_hook(arrived.append)  # type: ignore[no-untyped-call]
-        return loss
+            stages = self._stages(*points, batch.scores)
+        total = points[0].new_zeros(())
+        for number, (F_mat, logits) in enumerate(stages, 1):
+            of_sets = isinstance(self.loss, SetLoss)
+            loss = self.loss(batch, F_mat, logits) if of_sets else self.loss(*points, F_mat, *heldout)
+            total = total + (1.0 if number == len(stages) else EARLY_STAGE) * loss.mean()
+        if total.requires_grad:
+            total.register_hook(arrived.append)  # type: ignore[no-untyped-call]
+        return total
+
+    def _stages(self, points1: Tensor, points2: Tensor, scores: Tensor | None) -> list[tuple[Tensor, Tensor | None]]:
+        """Return the matrices of each stage, and the logits of the matches where there are some.
+
+        Each stage of a learned estimator is trained by its own losses.
+        """
+        layer = self.estimator
+        if not isinstance(layer, LearnedEightPoint):
+            return [(layer(points1, points2), None)]
+        before, layer.detach_stages = layer.detach_stages, True
+        try:
+            return [*layer.estimate(points1, points2, scores=scores).stages]
+        finally:
+            layer.detach_stages = before
 
     @contextmanager
     def _limited_gradients(self, arrived: list[Tensor]) -> Iterator[None]:
-        """Attach the limit to the network's outputs while the block runs.
+        """Attach the limit to the networks' outputs while the block runs.
 
         Processes, accumulated batches and the scaler of half precision multiply the loss after it is computed. What
         they make of its gradient arrives in a list, and the limit is multiplied alike.
@@ -141,67 +213,66 @@ class NormalizerTask(pl.LightningModule):
             norm: Tensor = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
             return gradient * torch.where(norm > most, most / norm, 1.0)
 
-        def attach(module: nn.Module, args: Any, params: tuple[Tensor, Tensor]) -> None:
-            for p in params:
-                if p.requires_grad and self.sample_gradient is not None:
-                    p.register_hook(limit)  # type: ignore[no-untyped-call]
+        def attach(module: nn.Module, args: Any, outputs: tuple[Tensor, Tensor]) -> None:
+            for output in outputs:
+                if output.requires_grad and self.sample_gradient is not None:
+                    output.register_hook(limit)  # type: ignore[no-untyped-call]
 
-        handle = self.normalizer.network.register_forward_hook(attach)
+        trained = self.trained
+        networks = [trained.network] if isinstance(trained, LearnedNormalizer) else trained.networks
+        handles = [network.register_forward_hook(attach) for network in networks]
         try:
             yield
         finally:
-            handle.remove()
+            for handle in handles:
+                handle.remove()
 
-    def validation_step(self, batch: Samples, batch_idx: int) -> None:
-        """Collect the residuals of a batch, in the test too."""
+    def validation_step(self, batch: MatchSets, batch_idx: int) -> None:
+        """Log the metrics of a batch, in the test too; Lightning gathers them over batches and processes."""
         batch, left_out = _finite(batch)
-        self._left_out += left_out
-        problem = LinearProblem.from_points(batch.points1, batch.points2)
-        learned = self._residuals(problem, self.normalizer)
-        self._log_residuals.append((learned + self.loss.floor).log())
-        for name, normalizer in self.baselines.items():
-            getattr(self, f"better_than_{name}").update(learned, self._residuals(problem, normalizer))
+        points = batch.points1.double(), batch.points2.double()
+        F_mat = self.estimator(*points)
+        if isinstance(self.loss, SetLoss):
+            size = next(name for largest, name in SIZES.items() if batch.points1.shape[1] <= largest)
+            error = symmetric_epipolar_distance(batch.heldout1.double(), batch.heldout2.double(), F_mat)
+            self._log(f"median_{size}", error.median(-1).values)
+        else:
+            residual = symmetric_epipolar_distance(*points, F_mat).mean(-1)
+            self._log("log_sed", (residual + RESIDUAL_FLOOR).log())
+            for name, baseline in BASELINES.items():
+                other = symmetric_epipolar_distance(*points, baseline(*points)).mean(-1)
+                self._log(f"better_than_{name}", (residual < other)[comparable(residual, other)].double())
+        self._log("left_out", torch.tensor(float(left_out)), shown=False)
 
     test_step = validation_step
 
-    def predict_step(self, batch: Samples, batch_idx: int) -> dict[str, Tensor]:
-        """Return transforms, fundamental matrices and mean residuals of a batch."""
-        x1, x2 = batch.points1.double(), batch.points2.double()  # in float32, F itself loses digits of the residual
-        problem = LinearProblem.from_points(x1, x2)
-        T1, T2 = self.normalizer.transforms(problem)
-        F_mat = solve_in_coordinates(problem, T1, T2)
-        residual = symmetric_epipolar_distance(x1, x2, F_mat).mean(-1)
-        return {"T1": T1, "T2": T2, "F_mat": F_mat, "residual": residual, "pair": batch.pair}
+    def _log(self, name: str, value: Tensor, shown: bool = True) -> None:
+        metric = cast(Metric, self.metrics[name])
+        metric.update(value)
+        stage = "test" if self.trainer.testing else "val"
+        self.log(f"{stage}/{name}", metric, prog_bar=shown, on_epoch=True, on_step=False)
 
-    def on_validation_epoch_end(self) -> None:
-        """Log the metrics of the collected residuals."""
-        self._log_metrics("val")
-
-    def on_test_epoch_end(self) -> None:
-        """Log the metrics of the collected residuals."""
-        self._log_metrics("test")
-
-    def _residuals(self, problem: LinearProblem, normalizer: Normalizer) -> Tensor:
-        """Return the mean symmetric epipolar distance of each sample under a normaliser, (B,)."""
-        F_mat = solve_fundamental(problem, normalizer)
-        return symmetric_epipolar_distance(problem.points1, problem.points2, F_mat).mean(-1)
-
-    def _log_metrics(self, stage: str) -> None:
-        """Log the metrics of the samples of all processes; NaN where there are none."""
-        own = torch.cat([torch.zeros(0, device=self.device), *self._log_residuals])
-        total, samples, left_out = self._sum(own.sum(), len(own), self._left_out)
-        self._log_residuals, self._left_out = [], 0
-        self.log(f"{stage}/log_sed", total / samples, prog_bar=True, sync_dist=True)
-        for name in self.baselines:
-            metric: BetterRateMetric = getattr(self, f"better_than_{name}")
-            rate = metric.compute()["better_rate"]
-            self.log(f"{stage}/better_than_{name}", rate, prog_bar=True, sync_dist=True)
-            metric.reset()
-        self.log(f"{stage}/left_out", left_out, sync_dist=True)
+    def predict_step(self, batch: MatchSets, batch_idx: int) -> dict[str, Tensor]:
+        """Return matrices, mean residuals and, of a normaliser, transforms of a batch."""
+        points = batch.points1.double(), batch.points2.double()  # in float32, F itself loses digits of the residual
+        F_mat = self.estimator(*points)
+        residual = symmetric_epipolar_distance(*points, F_mat).mean(-1)
+        found = {"F_mat": F_mat, "residual": residual, "pair": batch.pair}
+        if isinstance(self.trained, LearnedNormalizer):
+            found["T1"], found["T2"] = self.trained(*points)
+        return found
 
 
-def _finite(batch: Samples) -> tuple[Samples, int]:
-    """Return the samples whose coordinates are all finite, and how many others there are."""
+class Median(CatMetric):
+    """The median of all values."""
+
+    def compute(self) -> Tensor:
+        """Return the median."""
+        return super().compute().median()
+
+
+def _finite(batch: MatchSets) -> tuple[MatchSets, int]:
+    """Return the sets whose coordinates are all finite, and how many others there are."""
     finite = torch.stack([points.isfinite().flatten(1).all(1) for points in batch[:4]]).all(0)
     left_out = len(finite) - int(finite.sum())
     return (batch.select(finite) if left_out else batch), left_out

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-import re
 import signal
+import sys
 import warnings
 import zipfile
-from collections.abc import Sequence
 from contextlib import ExitStack
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +15,22 @@ import pytorch_lightning as pl
 import torch
 from jsonargparse import ArgumentError
 from lightning_fabric.utilities.exceptions import MisconfigurationException
-from pytorch_lightning.callbacks import Callback, ModelCheckpoint, ProgressBar, Timer
-from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
+from pytorch_lightning.callbacks import ModelCheckpoint, ProgressBar, Timer, TQDMProgressBar
+from pytorch_lightning.cli import LightningCLI
 from pytorch_lightning.utilities import rank_zero_only
 from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 from kornia_learnnorm.files import exclusive
-from lightning_modules.callbacks import Checkpoints, ExpectedTime, ExportWeights, StepProgress
-from lightning_modules.config_files import config_names, read_config, with_config_paths
+from kornia_learnnorm.optional import working_folder_importable
+from lightning_modules.callbacks import Checkpoints, ExpectedTime, ExportWeights, WritePredictions
+from lightning_modules.config_files import config_names, with_config_paths
 from lightning_modules.datamodule import CorrespondenceDataModule
-from lightning_modules.estimator_task import EstimatorTask
-from lightning_modules.task import NormalizerTask
+from lightning_modules.task import EstimatorTask
 
 __all__ = ["TrainingCLI", "is_first_process", "run"]
 
-# What Lightning prints of devices, of which a line of ours names the one that is used, its advertisements, the seed,
-# which the configuration has, and how it saves a checkpoint.
-UNWANTED_MESSAGE = re.compile(
-    r"(GPU|TPU|HPU) available: |LOCAL_RANK: |\W*Tip: For seamless|(\[rank: \d+\] )?Seed set to |`weights_only` was not"
-)
+# Of what Lightning prints about devices, seeds and checkpoints, only warnings concern who trains.
 LOGGERS = (
     "lightning_fabric.utilities.seed",
     "pytorch_lightning.trainer.connectors.checkpoint_connector",
@@ -65,24 +59,27 @@ class TrainingCLI(LightningCLI):
         """Return the command, and the arguments of the trainer's method that are no options."""
         return {self.command: LightningCLI.subcommands()[self.command]}
 
-    def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
-        """Parse the arguments; a configuration that ships with the package can be given by its name."""
-        if isinstance(args, list):
-            self.config = parser.parse_args(with_config_paths(args))
-        else:
-            super().parse_arguments(parser, args)
+    def instantiate_classes(self) -> None:
+        """Make task, data and trainer; what refuses its arguments is a ValueError."""
+        try:
+            super().instantiate_classes()
+        except TypeError as error:
+            raise ValueError(str(error)) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
-        """Make the trainer, with what the configuration lacks: checkpoints, the export of the weights, progress."""
+        """Make the trainer, with what the configuration lacks: checkpoints, weights, predictions, progress."""
         config = self.config_init[self.subcommand]["trainer"]
-        callbacks = config["callbacks"] or []
-        callbacks = [*callbacks] if isinstance(callbacks, list) else [callbacks]
-        if config["enable_checkpointing"] is not False and not _has(callbacks, ModelCheckpoint):
-            callbacks.append(Checkpoints())
-        if isinstance(self.model, NormalizerTask | EstimatorTask) and not _has(callbacks, ExportWeights):
-            callbacks.append(ExportWeights())
-        if config["enable_progress_bar"] is not False and not _has(callbacks, ProgressBar):
-            callbacks.append(StepProgress())
+        given = config["callbacks"] or []
+        callbacks = [*given] if isinstance(given, list) else [given]
+        bar = TQDMProgressBar(refresh_rate=1 if sys.stdout.isatty() else 100)
+        for default, kind, wanted in (
+            (Checkpoints(), ModelCheckpoint, config["enable_checkpointing"] is not False),
+            (ExportWeights(), ExportWeights, True),
+            (WritePredictions(), WritePredictions, True),
+            (bar, ProgressBar, config["enable_progress_bar"] is not False),
+        ):
+            if wanted and not any(isinstance(callback, kind) for callback in callbacks):
+                callbacks.append(default)
         trainer = super().instantiate_trainer(callbacks=callbacks, **kwargs)
         if self.subcommand == "fit":
             _check_has_steps(trainer)
@@ -118,20 +115,14 @@ class TrainingCLI(LightningCLI):
             return
         if not Path(path).is_file():
             raise FileNotFoundError(f"no checkpoint at {path}")
-        state = _state_dict(path)
         expected = {key: value.shape for key, value in self.model.state_dict().items()}
-        if {key: value.shape for key, value in state.items()} != expected:
+        if {key: value.shape for key, value in _state_dict(path).items()} != expected:
             raise ValueError(
                 f"{path} holds another network than the one configured: repeat the options of its run, or use the"
                 " config.yaml that the run left in lightning_logs"
             )
 
     before_validate = before_test = before_predict = before_fit
-
-
-def _has(callbacks: list[Callback], kind: type[Callback]) -> bool:
-    """Return whether there is a callback of a class."""
-    return any(isinstance(callback, kind) for callback in callbacks)
 
 
 def _check_has_steps(trainer: pl.Trainer) -> None:
@@ -164,70 +155,22 @@ def is_first_process() -> bool:
     return bool(rank_zero_only.rank == 0)  # type: ignore[attr-defined]
 
 
-def _leave_out_messages() -> None:
-    """Leave out the messages and warnings of Lightning that concern nobody who trains."""
-    for message in UNWANTED_WARNINGS:
-        warnings.filterwarnings("ignore", message=message)
-    for name in LOGGERS:
-        logging.getLogger(name).addFilter(_is_wanted)
-
-
 def _is_wanted(record: logging.LogRecord) -> bool:
-    """Return whether a message of Lightning concerns who trains."""
-    return not UNWANTED_MESSAGE.match(record.getMessage())
+    """Return whether a message is a warning, or comes from this package instead of Lightning."""
+    return record.levelno > logging.INFO or Path(record.pathname).parent == Path(__file__).parent
 
 
-def _config_files(args: Sequence[str]) -> list[str]:
-    """Return the paths of the configurations among the arguments."""
-    files = [value for key, value in pairwise(args) if key in ("-c", "--config")]
-    return files + [arg.partition("=")[2] for arg in args if arg.startswith("--config=")]
+def _short_message(error: BaseException) -> str:
+    """Return the options that an error of jsonargparse concerns, and the first message of one line in its causes.
 
-
-def _names_its_classes(config: dict[str, Any]) -> bool:
-    """Return whether a configuration names the classes of its task and datamodule."""
-    model = config.get("model")
-    return isinstance(model, dict) and "class_path" in model
-
-
-def _which_configurations(command: str, message: str, files: Sequence[str]) -> str:
-    """Return what to give to a training command without a configuration, or with a part of one."""
-    if files:
-        missing = message.rpartition(": ")[2].replace(f"{command}.", "")
-        return (
-            f"{', '.join(files)} has no {missing}: give a whole configuration before it, for example learnnorm"
-            f" {command} --config crossview --config {files[0]}"
-        )
-    names = ", ".join(name for name in config_names() if "/" not in name)
-    checkpoint = "" if command == "fit" else " --ckpt_path runs/crossview-synthetic/checkpoints/last.ckpt"
-    return (
-        f"no configuration: give one by --config, a file or one of {names} (learnnorm config lists all); for example"
-        f" learnnorm {command} --config crossview-synthetic{checkpoint}, which needs no data"
-    )
-
-
-def _short_message(message: str) -> str:
-    """Return what is wrong with the arguments, of all that jsonargparse says about it, on one line."""
-    unknown = re.search(r"(?:Option|does not accept option|unrecognized arguments:) '?([\w.-]+)", message)
-    if unknown:
-        classes = re.findall(r"Problem with given class_path '([\w.]+)'", message[: unknown.end()])
-        of = f" of {classes[-1]}" if classes else ""
-        return f"unknown option {unknown[1]}{of}"
-    return _with_option(_first_error(message), message)
-
-
-def _first_error(message: str) -> str:
-    """Return, on one line, the error of the first type that jsonargparse tried: it is the one that was meant."""
-    while tried := re.search(r"Does not validate against.*?Errors:\n( *)- (.*?)\n(?:\1-|(?!\1))", message, re.DOTALL):
-        message = tried[2]
-    return " ".join(message.split())
-
-
-def _with_option(text: str, message: str) -> str:
-    """Return an error of a type after the option that has it, and before the value that was given."""
-    given = re.search(r"Given value: (.*?)(?:\. Got value: .*)?$", message, re.MULTILINE)
-    if not given or not text.startswith("Expected a "):
-        return text
-    return ": ".join([*re.findall(r'Parser key "([\w.]+)"', message), f"{text}, got {given[1]}"])
+    That is the error of the type that was meant; the messages of many lines list those of all types.
+    """
+    options: dict[str, None] = {}
+    while "\n" in str(error).strip() and error.__cause__ is not None:
+        if isinstance(error, ArgumentError):
+            options[str(error).splitlines()[0]] = None
+        error = error.__cause__
+    return " ".join([*options, str(error)])
 
 
 def run(args: list[str]) -> dict[str, float]:
@@ -239,35 +182,36 @@ def run(args: list[str]) -> dict[str, float]:
         SystemExit: with the code 143, as of a program that the signal SIGTERM ends, if that signal ended the run.
 
     """
-    words = with_config_paths(args)
-    command = words[0]
-    _leave_out_messages()
-    if words[1:] and not words[1].startswith("-"):
-        raise ValueError(f"an option expected, got {words[1]!r}; a configuration is given by --config {words[1]}")
-    configs = [read_config(path) for path in _config_files(words)]
-    named = any(map(_names_its_classes, configs))
+    command, *options = with_config_paths(args)
+    for message in UNWANTED_WARNINGS:
+        warnings.filterwarnings("ignore", message=message)
+    for name in LOGGERS:
+        logging.getLogger(name).addFilter(_is_wanted)
+    if options and not options[0].startswith("-"):
+        raise ValueError(f"an option expected, got {options[0]!r}; a configuration is given by --config {options[0]}")
+    if not any(option.startswith(("--config", "-c", "--model", "--help")) for option in options):
+        names = ", ".join(name for name in config_names() if "/" not in name)
+        raise ValueError(
+            f"no configuration: give one by --config, a file or one of {names} (learnnorm config lists all); for"
+            f" example learnnorm {command} --config crossview-synthetic{' --ckpt_path FILE' * (command != 'fit')}"
+        )
     raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines
     try:
-        cli = TrainingCLI(
-            command,
-            model_class=pl.LightningModule if named else NormalizerTask,
-            datamodule_class=pl.LightningDataModule if named else CorrespondenceDataModule,
-            subclass_mode_model=named,
-            subclass_mode_data=named,
-            args=args,
-            auto_configure_optimizers=False,
-            trainer_defaults={"callbacks": [ExpectedTime()]},
-            parser_kwargs={"prog": "learnnorm", **raises, command: raises},
-            save_config_kwargs={"overwrite": True},
-        )
+        with working_folder_importable():
+            cli = TrainingCLI(
+                command,
+                model_class=EstimatorTask,
+                datamodule_class=CorrespondenceDataModule,
+                args=[command, *options],
+                auto_configure_optimizers=False,
+                trainer_defaults={"callbacks": [ExpectedTime()]},
+                parser_kwargs={"prog": "learnnorm", **raises, command: raises},
+                save_config_kwargs={"overwrite": True},
+            )
     except ArgumentError as error:
-        if "are required" in str(error):
-            raise ValueError(_which_configurations(command, str(error), _config_files(words))) from error
-        raise ValueError(f"{_short_message(str(error))}; learnnorm {command} --help-all lists the options") from error
-    except ValueError as error:  # of a class that was configured: its data, for example
-        raise ValueError(_first_error(str(error))) from error
-    except MisconfigurationException as error:  # such as a test of an estimator, whose task has none
-        raise ValueError(str(error)) from error
+        raise ValueError(f"{_short_message(error)}; learnnorm {command} --help-all lists the options") from error
+    except (MisconfigurationException, ValueError) as error:  # of a class that was configured: its data, for example
+        raise ValueError(_short_message(error)) from error
     except SIGTERMException as error:  # a SystemExit without a code, which would end the program with 0
         raise SystemExit(128 + signal.SIGTERM) from error
     except SystemExit as error:  # Lightning exits so when it was interrupted

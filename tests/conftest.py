@@ -101,7 +101,7 @@ def program():
 def trained(program, tmp_path_factory):
     """The folder of a run of a few steps, and the options that it was made with."""
     folder = tmp_path_factory.mktemp("run")
-    network = "--model.normalizer.init_args.network.init_args"
+    network = "--model.estimator.init_args.normalizer.init_args.network.init_args"
     options = [
         *("--config", str(TESTS.parent / "configs/crossview-synthetic.yaml"), "--data.batch_size=16"),
         *(f"--data.{stage}.init_args.number=100" for stage in ("train", "val", "test")),

@@ -21,11 +21,11 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.sources import Block, SyntheticSamples
 from lightning_modules.callbacks import Checkpoints, WritePredictions
 from lightning_modules.datamodule import CorrespondenceDataModule
-from lightning_modules.task import NormalizerTask
+from lightning_modules.task import EstimatorTask
 
 
 class Pairs(SyntheticSamples):
-    """Ten image pairs, of pair k the samples of k + 1 scenes: processes that share a batch hold unequal numbers."""
+    """Ten image pairs, of pair k the samples of k + 1 scenes, mixed: processes share a batch unequally."""
 
     def __init__(self):
         super().__init__(number=55, num_heldout=4, max_residual=None)
@@ -34,20 +34,22 @@ class Pairs(SyntheticSamples):
         return [Block(55, 10)]
 
     def draw(self, seed, block):
-        return super().draw(seed, block)._replace(pair=torch.repeat_interleave(torch.arange(10), torch.arange(1, 11)))
+        pair = torch.repeat_interleave(torch.arange(10), torch.arange(1, 11))
+        return super().draw(seed, block)._replace(pair=pair[torch.arange(55) * 8 % 55])
 
 
-class Filtered(SyntheticSamples):
-    """Three blocks of forty samples, of which the filter keeps 40, none and one."""
+class Blocks(SyntheticSamples):
+    """Three blocks of so many samples, of which the filter keeps some."""
 
-    def __init__(self):
-        super().__init__(number=40, num_heldout=4, max_residual=None)
+    def __init__(self, number, kept):
+        super().__init__(number=number, num_heldout=4, max_residual=None)
+        self.kept = kept
 
     def blocks(self, seed):
-        return [Block(40, 40)] * 3
+        return [Block(self.number, self.number)] * 3
 
     def draw(self, seed, block):
-        return super().draw(3 * seed + block, 0).select(torch.arange((40, 0, 1)[block]))
+        return super().draw(3 * seed + block, 0).select(torch.arange(self.kept[block]))
 
 
 class Spoil(pl.Callback):
@@ -73,7 +75,7 @@ class BlowUp(pl.Callback):
 
 
 class Watch(pl.Callback):
-    """Keep the figures of each step, and how many samples this process had."""
+    """Keep the results of each step, and how many samples this process had."""
 
     def __init__(self):
         self.seen = {"train/loss": [], "train/left_out": [], "train/skipped": []}
@@ -110,47 +112,54 @@ class Interrupt(pl.Callback):
                 os.kill(os.getpid(), self.number)
 
 
-def task_and_data(case):
+def normaliser_task(double=False, **arguments):
+    """A task that trains a small normaliser on samples, the same weights in each call."""
     torch.manual_seed(0)
-    task = NormalizerTask(
-        # in float64, so that rounding is small
-        kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=8, depth=1)).double(),
-        loss=kln.EpipolarLoss(heldout_weight=0.5),
-        sample_gradient=0.1,
-    )
+    normalizer = kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=8, depth=1))
+    estimator = kln.EightPoint(normalizer.double() if double else normalizer)
+    return EstimatorTask(estimator, **{"loss": kln.EpipolarLoss(), **arguments})
+
+
+def make_trainer(folder, callbacks=(), **arguments):
+    """A trainer that prints nothing."""
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
+    options = {"default_root_dir": folder, "max_epochs": -1, **quiet, **arguments}
+    return pl.Trainer(callbacks=list(callbacks), **options)
+
+
+def task_and_data(case):
+    # in float64, so that rounding is small
+    task = normaliser_task(double=True, loss=kln.EpipolarLoss(heldout_weight=0.5), sample_gradient=0.1)
     source = SyntheticSamples(number=75, num_heldout=4, max_residual=None)
-    train, batch = {"pairs": (Pairs(), 32), "filtered": (Filtered(), 20)}.get(case, (source, 15))
+    train, batch = {"pairs": (Pairs(), 32), "filtered": (Blocks(40, (40, 0, 1)), 20)}.get(case, (source, 15))
     pairs = 3 if case == "pairs" else None
     return task, CorrespondenceDataModule(train, source, source, batch_size=batch, batch_pairs=pairs)
 
 
 def run(case, processes, folder):
-    """Train for six steps, validate, predict, and write weights, figures and predictions to ``folder/case``."""
+    """Train for six steps, validate, predict, and write weights, results and predictions to ``folder/case``."""
     folder = Path(folder) / case
     folder.mkdir(parents=True, exist_ok=True)
-    options = {
-        "max_steps": 6, "max_epochs": -1, "accelerator": "cpu", "devices": processes, "default_root_dir": folder,
-        "strategy": "ddp" if processes > 1 else "auto", "gradient_clip_val": 1.0, "logger": False,
-        "enable_progress_bar": False, "enable_model_summary": False, "num_sanity_val_steps": 0,
-    }  # fmt: skip
+    options = {"max_steps": 6, "devices": processes, "gradient_clip_val": 1.0, "num_sanity_val_steps": 0}
+    options["strategy"] = "ddp" if processes > 1 else "auto"
     last = folder / "checkpoints" / "last.ckpt"
     if case in ("resumed", "killed") and not last.exists():
         callbacks = [Checkpoints(every_n_train_steps=1), Stop(3, kill=case == "killed")]
         with contextlib.suppress(InterruptedError):
-            pl.Trainer(**options, callbacks=callbacks).fit(*task_and_data(case))
+            make_trainer(folder, callbacks, **options).fit(*task_and_data(case))
     watch, more = Watch(), {"spoiled": [Spoil()], "infinite": [BlowUp()]}.get(case, [])
     resume = last.exists()
     more += [Checkpoints(every_n_train_steps=1)] if resume else []
-    trainer = pl.Trainer(**options, callbacks=[watch, *more, WritePredictions()], enable_checkpointing=resume)
+    trainer = make_trainer(folder, [watch, *more, WritePredictions()], enable_checkpointing=resume, **options)
     task, data = task_and_data(case)
     trainer.fit(task, data, ckpt_path=last if resume else None)
-    figures = {name: value.item() for name, value in trainer.callback_metrics.items()}
+    results = {name: value.item() for name, value in trainer.callback_metrics.items()}
     trainer.validate(task, data, verbose=False)
-    figures |= {name: value.item() for name, value in trainer.callback_metrics.items()}
+    results |= {name: value.item() for name, value in trainer.callback_metrics.items()}
     trainer.predict(task, data)
     rank = trainer.global_rank
-    (folder / f"figures-{rank}.json").write_text(json.dumps(figures | watch.seen | {"samples": watch.samples}))
-    save_file(task.normalizer.state_dict(), folder / f"weights-{rank}.safetensors")
+    (folder / f"results-{rank}.json").write_text(json.dumps(results | watch.seen | {"samples": watch.samples}))
+    save_file(task.trained.state_dict(), folder / f"weights-{rank}.safetensors")
 
 
 if __name__ == "__main__":

@@ -37,11 +37,11 @@ def augment(sets: MatchSets, generator: Generator) -> MatchSets:
     points1, points2 = torch.where(swap, points2, points1), torch.where(swap, points1, points2)
     heldout1, heldout2 = torch.where(swap, heldout2, heldout1), torch.where(swap, heldout1, heldout2)
     share = (uniform((batch_size, 1), -0.4, 0.4, generator)).clamp(min=0.0)
-    replaced = uniform(tuple(sets.inliers.shape), 0.0, 1.0, generator) < share
+    replaced = uniform(tuple(points1.shape[:2]), 0.0, 1.0, generator) < share
     points2 = torch.where(replaced[..., None], _wrong_partners(points2, generator), points2)
-    inliers = torch.where(replaced, 0.0, sets.inliers)
+    inliers = None if sets.inliers is None else torch.where(replaced, 0.0, sets.inliers)
     scores = None if sets.scores is None else torch.where(replaced, 0.2 * sets.scores, sets.scores)
-    return MatchSets(points1, points2, scores, inliers, heldout1, heldout2, sets.labelled)
+    return MatchSets(points1, points2, heldout1, heldout2, sets.pair, scores, inliers, sets.labelled)
 
 
 def _maps(batch_size: int, generator: Generator) -> tuple[Tensor, Tensor]:

@@ -1,178 +1,124 @@
-r"""Sets of matches with outliers, as many as wanted from each image pair, and what supervises an estimator on them."""
+r"""Sets of correspondences of image pairs: samples of eight, or matches with outliers, and what supervises them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
-from kornia_learnnorm.data.sources import check_draws, expand_path
-from kornia_learnnorm.data.store import StoreReader
-from kornia_learnnorm.data.synthetic.random_matches import SyntheticMatches, random_matches
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+from kornia_learnnorm.data.residual_filter import plain_residual
+from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["MatchSets", "SetSource", "StoreSets", "SyntheticSets"]
-
-MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
-LABEL_THRESHOLD = 2.0  # pixels from the true epipolar lines up to which a match counts as an inlier
+__all__ = ["MatchSets", "draw_samples"]
 
 
 class MatchSets(NamedTuple):
-    """Sets of matches of image pairs.
+    """Sets of N correspondences each, and further correspondences of the same image pairs.
 
     Attributes:
         points1: pixels in the first view, (B, N, 2).
         points2: pixels in the second view, (B, N, 2).
+        heldout1: pixels in the first view of correspondences held out of the set, (B, M, 2); M may be 0. They are true
+            inliers where the ground truth is known.
+        heldout2: pixels in the second view of correspondences held out of the set, (B, M, 2).
+        pair: index of the image pair in its source, (B,) int64.
         scores: a score for each match, 1 minus Lowe's ratio, (B, N), or None.
-        inliers: one for inliers, zero for outliers, NaN where that is not known, (B, N).
-        heldout1: pixels in the first view of further matches, (B, M, 2): true inliers where those are known, else any.
-        heldout2: pixels in the second view of the further matches, (B, M, 2).
-        labelled: whether the ground truth is known, (B,) bool.
+        inliers: one for inliers, zero for outliers, NaN where that is not known, (B, N), or None.
+        labelled: whether the ground truth is known, (B,) bool, or None where it is known of no set.
     """
 
     points1: Tensor
     points2: Tensor
-    scores: Tensor | None
-    inliers: Tensor
     heldout1: Tensor
     heldout2: Tensor
-    labelled: Tensor
+    pair: Tensor
+    scores: Tensor | None = None
+    inliers: Tensor | None = None
+    labelled: Tensor | None = None
+
+    def select(self, rows: Tensor) -> MatchSets:
+        """Return the sets of the given rows (indices or mask)."""
+        return MatchSets(*(None if field is None else field[rows] for field in self))  # type: ignore[arg-type]
+
+    def with_residual_below(self, max_residual: float | None) -> MatchSets:
+        """Return the sets whose :func:`plain_residual` is below a limit in pixels; None keeps all."""
+        return self if max_residual is None else self.select(plain_residual(self.points1, self.points2) < max_residual)
 
 
-class SetSource(Protocol):
-    """Anything that draws sets of matches."""
+def draw_samples(
+    store: CorrespondenceStore,
+    generator: torch.Generator,
+    size: int = 8,
+    max_ratio: float | None = RATIO,
+    num_heldout: int = 0,
+    max_residual: float | None = None,
+    require_heldout: bool = True,
+) -> MatchSets:
+    """Draw samples: shuffle the correspondences of each pair and split them into sets of ``size``, without the rest.
 
-    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
-        """Return sets of one size, which depend on nothing but the arguments and the generator's state."""
-
-
-class StoreSets:
-    """Random sets of matches of the image pairs of stores; half of the draws with the ratio test.
-
-    Pairs without ground truth are supervised by their own matches, see :class:`~kornia_learnnorm.BoundedEpipolarLoss`.
+    Held-out correspondences come from the same pair, are not in the sample and pass the ratio test of 0.8, whatever
+    ``max_ratio`` is.
 
     Args:
-        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
-            ``$LEARNNORM_DATA`` are filled in.
-        num_heldout: further matches of the pair.
-        max_ratios: limits of Lowe's ratio, of which each draw takes one; None for no limit.
-        labels: use the ground truth where there is one; without, all pairs are supervised by their own matches.
+        store: correspondences of image pairs.
+        generator: source of all randomness; equal states give equal samples.
+        size: correspondences per sample, at least 8.
+        max_ratio: keep correspondences with Lowe's ratio below this; None keeps all.
+        num_heldout: held-out correspondences per sample, drawn with replacement.
+        max_residual: drop samples whose :func:`~kornia_learnnorm.data.residual_filter.plain_residual` is at least this
+            many pixels; None keeps all.
+        require_heldout: refuse a store in which a pair has no correspondence to hold out; if False, the held-out points
+            of such a pair's samples are NaN.
+
+    Returns:
+        samples in the order of the pairs, float32.
 
     Raises:
-        ValueError: if no path is given, an environment variable is not set, or no pair can be used.
-        FileNotFoundError: if there is no such store.
+        ValueError: if ``size`` is below 8, no pair fills a sample, or a pair has no correspondence to hold out.
+
     """
-
-    def __init__(
-        self,
-        paths: Sequence[str],
-        num_heldout: int = 48,
-        max_ratios: Sequence[float | None] = (RATIO, None),
-        labels: bool = True,
-    ) -> None:
-        if not paths or not max_ratios:
-            raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
-        check_draws(num_heldout, max_ratios)
-        self.paths, self.num_heldout, self.max_ratios = tuple(paths), num_heldout, tuple(max_ratios)
-        self._pairs = [pair for path in paths for pair in _read_pairs(path, labels)]
-        if not self._pairs:
-            raise ValueError(f"no pair of {', '.join(paths)} has {MIN_HELDOUT} matches to hold out")
-        self._sizes = [torch.tensor([len(pair.passing(ratio)) for pair in self._pairs]) for ratio in self.max_ratios]
-
-    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
-        """Return sets of random matches of random pairs; the pairs with most matches where too few have enough."""
-        choice = int(torch.randint(len(self.max_ratios), (), generator=generator))
-        ratio, sizes = self.max_ratios[choice], self._sizes[choice]
-        able = (sizes >= min(num_points, int(sizes.max()))).nonzero()[:, 0]
-        chosen = able[torch.randint(len(able), (num_sets,), generator=generator)].tolist()
-        parts = [self._pairs[i].draw(num_points, self.num_heldout, ratio, generator) for i in chosen]
-        return MatchSets(*(torch.stack(values) for values in zip(*parts, strict=True)))
-
-
-class _Pair(NamedTuple):
-    """The matches of one image pair: points (M, 4), ratios (M,), distances from the true lines (M,), NaN if unknown."""
-
-    points: Tensor
-    ratio: Tensor
-    distance: Tensor
-
-    def passing(self, max_ratio: float | None) -> Tensor:
-        """Return the indices of the matches that pass the ratio test."""
-        return torch.arange(len(self.ratio)) if max_ratio is None else (self.ratio < max_ratio).nonzero()[:, 0]
-
-    @property
-    def heldout(self) -> Tensor:
-        """The indices of the matches that supervise."""
-        if self.distance.isnan().any():
-            return torch.arange(len(self.ratio))
-        return ((self.distance < INLIER_THRESHOLD) & (self.ratio < RATIO)).nonzero()[:, 0]
-
-    def draw(
-        self, num_points: int, num_heldout: int, max_ratio: float | None, generator: Generator
-    ) -> Sequence[Tensor]:
-        """Return the fields of a :class:`MatchSets` of one set."""
-        passing, heldout = self.passing(max_ratio), self.heldout
-        rows = passing[torch.randperm(len(passing), generator=generator)]
-        rows = rows[torch.arange(num_points) % len(rows)]
-        held = self.points[heldout[torch.randint(len(heldout), (num_heldout,), generator=generator)]]
-        points, distance = self.points[rows], self.distance[rows]
-        inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
-        labelled = ~distance.isnan().any()
-        return points[:, :2], points[:, 2:], 1 - self.ratio[rows], inliers, held[:, :2], held[:, 2:], labelled
+    if size < 8:
+        raise ValueError(f"a sample needs at least 8 correspondences, got size={size}")
+    points = torch.cat([torch.from_numpy(store.points1), torch.from_numpy(store.points2)], -1)
+    pair = torch.repeat_interleave(torch.arange(len(store)), torch.from_numpy(store.offsets).diff())
+    ratio = torch.from_numpy(store.ratio)
+    rows = torch.arange(len(points)) if max_ratio is None else torch.nonzero(ratio < max_ratio)[:, 0]
+    rows = rows[torch.randperm(len(rows), generator=generator)]
+    rows = rows[torch.argsort(pair[rows], stable=True)]
+    count = torch.bincount(pair[rows], minlength=len(store))
+    place = torch.arange(len(rows)) - (count.cumsum(0) - count)[pair[rows]]
+    rows = rows[place < (count // size * size)[pair[rows]]].reshape(-1, size)
+    if len(rows) == 0:
+        limit = "" if max_ratio is None else f" with ratio below {max_ratio}"
+        raise ValueError(f"no pair of the store has {size} correspondences{limit}, which a sample needs")
+    sample_pair, passes = pair[rows[:, 0]], ratio < RATIO
+    passing = torch.bincount(pair[passes], minlength=len(store))[sample_pair]
+    if num_heldout and require_heldout and int(passing.min()) <= size:
+        few = int(passing.min())
+        expected = f"expected more than the {size} of a sample"
+        raise ValueError(f"held-out correspondences: a pair has only {few} with ratio below {RATIO}, {expected}")
+    cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
+    drawable = passing > size
+    rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]
+    samples = MatchSets(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)
+    return samples.with_residual_below(max_residual)
 
 
-def _read_pairs(path: str, labels: bool) -> list[_Pair]:
-    """Return the pairs of a store that have enough matches that supervise."""
-    reader = StoreReader(expand_path(path))
-    store = reader.read(range(len(reader)))
-    pairs = []
-    for i in range(len(reader)):
-        rows = slice(int(store.offsets[i]), int(store.offsets[i + 1]))
-        points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
-        F_mat = torch.from_numpy(store.F[i]) if labels else torch.full((3, 3), torch.nan, dtype=torch.float64)
-        distance = symmetric_epipolar_distance(points1, points2, F_mat)
-        points = torch.cat([points1, points2], -1).float()
-        pair = _Pair(points, torch.from_numpy(store.ratio[rows]), distance.float())
-        if len(pair.heldout) >= MIN_HELDOUT:
-            pairs.append(pair)
-    return pairs
+def _draw_heldout(
+    rows: Tensor, sample_pair: Tensor, pair: Tensor, passes: Tensor, number: int, generator: torch.Generator
+) -> Tensor:
+    """Draw ``number`` rows for each sample from its pair that pass the ratio test and are not in the sample."""
+    pool = torch.nonzero(passes)[:, 0]
+    count = torch.bincount(pair[pool], minlength=int(pair.max()) + 1)
+    start = count.cumsum(0) - count
 
+    def draw() -> Tensor:
+        u = torch.rand(len(rows), number, generator=generator, dtype=torch.float64)
+        return pool[(u * count[sample_pair, None]).long() + start[sample_pair, None]]
 
-class SyntheticSets:
-    """Sets of matches of synthetic scenes, supervised by exact correspondences, or by further matches.
-
-    Args:
-        num_heldout: exact correspondences of each scene, or further matches.
-        matches: function of the number of scenes, the points per scene, further exact ones and a generator.
-        labels: use exact correspondences and the true inliers; without, scenes are supervised by their own matches.
-    """
-
-    def __init__(
-        self,
-        num_heldout: int = 48,
-        matches: Callable[[int, int, int, Generator], SyntheticMatches] = random_matches,
-        labels: bool = True,
-    ) -> None:
-        self.num_heldout = num_heldout
-        self.matches = matches
-        self.labels = labels
-
-    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
-        """Return the matches of new scenes."""
-        labelled = torch.full((num_sets,), self.labels)
-        if self.labels:
-            found = self.matches(num_sets, num_points, self.num_heldout, generator)
-            points1, points2, scores, inliers, exact1, exact2 = (value.float() for value in found)
-            return MatchSets(points1, points2, scores, inliers, exact1, exact2, labelled)
-        total = num_points + self.num_heldout
-        found = self.matches(num_sets, total, 1, generator)
-        order = torch.randperm(total, generator=generator)
-        points1, points2, scores = (value[:, order].float() for value in found[:3])
-        own, rest = slice(num_points), slice(num_points, None)
-        inliers = torch.full_like(scores[:, own], torch.nan)
-        return MatchSets(
-            points1[:, own], points2[:, own], scores[:, own], inliers, points1[:, rest], points2[:, rest], labelled
-        )
+    drawn = draw()
+    while bool((own := (drawn[..., None] == rows[:, None, :]).any(-1)).any()):
+        drawn = torch.where(own, draw(), drawn)
+    return drawn

@@ -6,28 +6,35 @@ the draw and its own number, so blocks can be drawn in any order, by any process
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Callable, Sequence
-from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from kornia_learnnorm.data.samples import Samples, draw_samples, plain_residual
+from kornia_learnnorm.data.residual_filter import cached_mask
+from kornia_learnnorm.data.sets import MatchSets, draw_samples
 from kornia_learnnorm.data.store import StoreReader
 from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
-from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.protocol import MAX_RESIDUAL, RATIO
 
-__all__ = ["Block", "StoreSamples", "SyntheticSamples", "block_generator", "check_draws", "expand_path"]
+__all__ = [
+    "SEEDS_PER_RUN",
+    "Block",
+    "BlockSource",
+    "StoreSamples",
+    "SyntheticSamples",
+    "block_generator",
+    "check_draws",
+    "expand_path",
+]
 
 SCENES_PER_BLOCK = 8192
+SEEDS_PER_RUN = 1_000_003  # of draws; the epochs of a training take one after the other
 
 
 class Block(NamedTuple):
@@ -35,6 +42,16 @@ class Block(NamedTuple):
 
     samples: int
     pairs: int
+
+
+class BlockSource(Protocol):
+    """Anything that draws sets block by block, as training takes them."""
+
+    def blocks(self, seed: int) -> list[Block]:
+        """Return what each block of a draw holds before any filter; the sums are the same for all seeds."""
+
+    def draw(self, seed: int, block: int) -> MatchSets:
+        """Return the sets of a block, which depend on nothing but ``seed`` and ``block``."""
 
 
 def block_generator(*key: int) -> torch.Generator:
@@ -54,8 +71,8 @@ class StoreSamples:
         max_ratios: limits of Lowe's ratio; 0.8 gives filtered samples, None unfiltered ones, both a mix.
         size: correspondences per sample; with a range ``(low, high)`` each block draws one size, ends included.
         num_heldout: held-out correspondences per sample.
-        max_residual: drop samples whose :func:`~kornia_learnnorm.data.samples.plain_residual` is at least this many
-            pixels; None keeps all.
+        max_residual: drop samples whose :func:`~kornia_learnnorm.data.residual_filter.plain_residual` is at least this
+            many pixels; None keeps all.
         block_pairs: largest number of image pairs in a block.
         cache: folder for the results of the residual filter, so that a draw is filtered once; None for no cache.
 
@@ -104,13 +121,13 @@ class StoreSamples:
             found.append(Block(int(np.sum(samples)), int(np.count_nonzero(samples))))
         return found
 
-    def draw(self, seed: int, block: int) -> Samples:
+    def draw(self, seed: int, block: int) -> MatchSets:
         """Return the samples of a block; ``pair`` counts the pairs of all stores in their order."""
         generator = block_generator(seed, block)
         size = self._size(generator)
         pairs = self._pairs(seed)[block]
         points, heldout = torch.zeros(0, size, 2), torch.zeros(0, self.num_heldout, 2)
-        parts = [Samples(points, points, heldout, heldout, torch.zeros(0, dtype=torch.int64))]
+        parts = [MatchSets(points, points, heldout, heldout, torch.zeros(0, dtype=torch.int64))]
         for store, first, stop in zip(self.stores, self._first, self._first[1:], strict=False):
             own = pairs[(pairs >= first) & (pairs < stop)]
             held = store.read((own - first).tolist()) if len(own) else None
@@ -118,10 +135,17 @@ class StoreSamples:
                 if held is not None and passing[own].max() >= size:
                     part = draw_samples(held, generator, size, ratio, self.num_heldout)
                     parts.append(part._replace(pair=torch.from_numpy(own)[part.pair]))
-        samples = Samples(*map(torch.cat, zip(*parts, strict=True)))
-        if self.cache is None or self.max_residual is None:
-            return samples.with_residual_below(self.max_residual)
-        return samples.select(self._kept(self.cache, samples, self.max_residual, seed, block))
+        samples = MatchSets(*(torch.cat([part[field] for part in parts]) for field in range(5)))  # type: ignore[misc]
+        if self.max_residual is None:
+            return samples
+        about = [*self._about, seed, block]
+        return samples.select(cached_mask(self.cache, about, samples.points1, samples.points2, self.max_residual))
+
+    @property
+    def _about(self) -> list[object]:
+        """What a draw depends on but its seed."""
+        files = [(str(s.path.resolve()), s.path.stat().st_mtime_ns, s.offsets[[0, -1]].tolist()) for s in self.stores]
+        return [files, self.max_ratios, self.sizes, self.num_heldout, self.max_residual, self.block_pairs]
 
     def _pairs(self, seed: int) -> list[NDArray[np.int64]]:
         """Return the sorted indices of the image pairs of each block."""
@@ -134,19 +158,6 @@ class StoreSamples:
         low, high = self.sizes
         return low if low == high else int(torch.randint(low, high + 1, (), generator=generator))
 
-    def _kept(self, cache: Path, samples: Samples, max_residual: float, seed: int, block: int) -> Tensor:
-        """Return the mask (S,) of the samples that the residual filter keeps, from the cache or computed and cached."""
-        files = [(str(s.path.resolve()), s.path.stat().st_mtime_ns, s.offsets[[0, -1]].tolist()) for s in self.stores]
-        about = [files, self.max_ratios, self.sizes, self.num_heldout, max_residual, self.block_pairs, seed, block]
-        path = cache / f"{sha256(json.dumps(about).encode()).hexdigest()[:32]}.npy"
-        if path.is_file():
-            return torch.from_numpy(np.load(path))
-        kept = plain_residual(samples.points1, samples.points2) < max_residual
-        cache.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as temporary:
-            np.save(temporary, kept.numpy())
-        return kept
-
 
 class SyntheticSamples:
     """Samples from synthetic scenes, one sample per scene.
@@ -155,8 +166,8 @@ class SyntheticSamples:
         number: scenes per draw, before the residual filter.
         size: correspondences per sample.
         num_heldout: held-out correspondences per sample, inliers and outliers.
-        max_residual: drop samples whose :func:`~kornia_learnnorm.data.samples.plain_residual` is at least this many
-            pixels; None keeps all.
+        max_residual: drop samples whose :func:`~kornia_learnnorm.data.residual_filter.plain_residual` is at least this
+            many pixels; None keeps all.
         scenes: function of the number of scenes, the points per scene and a generator, for example one of
             :mod:`kornia_learnnorm.data.synthetic`.
 
@@ -185,7 +196,7 @@ class SyntheticSamples:
         sizes = [min(SCENES_PER_BLOCK, self.number - first) for first in range(0, self.number, SCENES_PER_BLOCK)]
         return [Block(size, size) for size in sizes]
 
-    def draw(self, seed: int, block: int) -> Samples:
+    def draw(self, seed: int, block: int) -> MatchSets:
         """Return the samples of a block; each is a pair of its own."""
         number = self.blocks(seed)[block].samples
         scenes = self.scenes(number, self.size + self.num_heldout, block_generator(seed, block))
@@ -193,7 +204,7 @@ class SyntheticSamples:
         points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
         points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
         pair = block * SCENES_PER_BLOCK + torch.arange(number)
-        return Samples(points1, points2, heldout1, heldout2, pair).with_residual_below(self.max_residual)
+        return MatchSets(points1, points2, heldout1, heldout2, pair).with_residual_below(self.max_residual)
 
 
 def check_draws(num_heldout: int, max_ratios: Sequence[float | None]) -> None:

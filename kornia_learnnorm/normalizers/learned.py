@@ -2,9 +2,8 @@ r"""The learned normaliser: a base normaliser, a network, and a builder that tur
 
 from __future__ import annotations
 
-import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,14 @@ from kornia_learnnorm.normalizers.contract import Normalizer, ProblemNormalizer,
 from kornia_learnnorm.normalizers.networks import crossview, paper
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
-from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
+from kornia_learnnorm.pretrained import (
+    check_architecture,
+    describe_part,
+    find_part,
+    load_module,
+    name_part,
+    save_module,
+)
 
 __all__ = ["LearnedNormalizer"]
 
@@ -112,70 +118,47 @@ class LearnedNormalizer(ProblemNormalizer):
             path: the file to write.
 
         Raises:
-            TypeError: if the base, the network or the builder is not one of this package, so that the file could not
-                say how to build it; use ``state_dict`` for those.
+            TypeError: if the base, the network or the builder cannot be imported by its name, or its constructor does
+                not keep its arguments, numbers and texts, as attributes: the file could not say how to build it.
             ValueError: if ``path`` does not end in ``.safetensors``.
             OSError: if it cannot be written.
 
         """
         architecture = {
-            "base": _describe(self.base, *BASES),
-            "network": _describe(self.network, crossview, paper),
-            "transform": _name(self.transform, transforms),
+            "base": describe_part(self.base, *BASES),
+            "network": describe_part(self.network, crossview, paper),
+            "transform": name_part(self.transform, transforms),
             "max_points": self.max_points,
         }
         save_module(path, self, FORMAT, architecture)
 
     @classmethod
-    def from_pretrained(cls, name: str | Path = "crossview") -> LearnedNormalizer:
+    def from_pretrained(cls, name: str | Path = "crossview", own_modules: Collection[str] = ()) -> LearnedNormalizer:
         """Load a trained normaliser: one that ships with the package, by name, or a safetensors file.
 
         Args:
             name: ``"crossview"`` or ``"crossview-synthetic"``, for up to twelve correspondences; ``"crossview-sets"``,
                 for more; ``"paper"``; or the path of a ``.safetensors`` file.
+            own_modules: names of modules of your own that the file may name and that are then imported, from the Python
+                path or the working folder. Without, no code but this package's runs.
 
         Returns:
             the normaliser, in evaluation mode.
 
         Raises:
             FileNotFoundError: if there are no such weights; the message lists those that ship.
-            ValueError: if the file is not a normaliser of this package or its tensors do not fit.
+            ValueError: if the file is not a normaliser of this package, names a part of another module, or its tensors
+                do not fit.
 
         Example:
             >>> normalizer = LearnedNormalizer.from_pretrained("crossview-synthetic")
 
         """
-        return load_module(name, FORMAT, lambda path, architecture: cls(**_build(path, architecture)))
+        return load_module(name, FORMAT, lambda path, text: cls(**_build(path, text, own_modules)))
 
 
-def _name(part: Any, *modules: Any) -> str:
-    name = getattr(part, "__name__", "")
-    if not any(getattr(module, name, None) is part for module in modules):
-        raise TypeError(f"only this package's parts can be saved with their architecture, got {part!r}")
-    return str(name)
-
-
-def _describe(part: object, *modules: Any) -> dict[str, Any]:
-    """Return the name of a part of this package and its constructor's arguments, kept as attributes of their names."""
-    name, arguments = _name(type(part), *modules), inspect.signature(type(part)).parameters.values()
-    # A part without its own constructor shows the `*args, **kwargs` of `nn.Module`.
-    keys = [argument.name for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD]
-    values = {key: getattr(part, key) for key in keys}
-    for key, value in values.items():
-        if not isinstance(value, bool | int | float | str | None):
-            raise TypeError(f"{name} cannot be saved with its architecture: {key} is {value!r}, not a number or a text")
-    return {"name": name, **values}
-
-
-def _build(path: Path, architecture: str) -> dict[str, Any]:
-    """Build the parts that a file names; only public classes and builders of this package can be named."""
-
-    def find(name: str, *modules: Any) -> Any:
-        for module in modules:
-            if name in module.__all__:
-                return getattr(module, name)
-        raise ValueError(f"unknown part {name!r}")
-
+def _build(path: Path, architecture: str, own_modules: Collection[str]) -> dict[str, Any]:
+    """Build the parts that a file names: public ones of this package, and those of the user's modules."""
     try:
         parts = json.loads(architecture)
         base, network = dict(parts["base"]), dict(parts["network"])
@@ -184,9 +167,9 @@ def _build(path: Path, architecture: str) -> dict[str, Any]:
         if not isinstance(max_points, int | None):
             raise ValueError(f"max_points must be a whole number or null, got {max_points!r}")
         return {
-            "base": find(base.pop("name"), *BASES)(**base),
-            "network": find(network.pop("name"), crossview, paper)(**network),
-            "transform": find(parts["transform"], transforms),
+            "base": find_part(base.pop("name"), own_modules, *BASES)(**base),
+            "network": find_part(network.pop("name"), own_modules, crossview, paper)(**network),
+            "transform": find_part(parts["transform"], own_modules, transforms),
             "max_points": max_points,
         }
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:

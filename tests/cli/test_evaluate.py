@@ -13,7 +13,7 @@ from two_view import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.samples import draw_samples
+from kornia_learnnorm.data.sets import draw_samples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store

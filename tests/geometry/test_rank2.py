@@ -22,7 +22,7 @@ from two_view import (
 )
 
 from kornia_learnnorm import Hartley, Whitening, find_fundamental, rank2_projection
-from kornia_learnnorm.data.samples import draw_samples
+from kornia_learnnorm.data.sets import draw_samples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.geometry.rank2 import optimal_rank2
 

@@ -36,8 +36,8 @@ def start(folder, processes, *cases):
     return [(process.returncode, error.decode()) for process, error in zip(started, errors, strict=True)]
 
 
-def figures(folder, rank=0):
-    return json.loads((folder / f"figures-{rank}.json").read_text())
+def results(folder, rank=0):
+    return json.loads((folder / f"results-{rank}.json").read_text())
 
 
 def weights(folder, rank=0):
@@ -45,9 +45,9 @@ def weights(folder, rank=0):
 
 
 def same(folder, other, rank=0):
-    """The weights and figures of two runs are the same up to rounding."""
+    """The weights and results of two runs are the same up to rounding."""
     torch.testing.assert_close(weights(folder, rank), weights(other), rtol=0, atol=1e-9)
-    expected, got = figures(other), figures(folder, rank)
+    expected, got = results(other), results(folder, rank)
     assert len(got) == len(expected) == 8
     for name in got.keys() - {"samples"}:
         assert got[name] == pytest.approx(expected[name], rel=1e-6, nan_ok=True), name
@@ -71,9 +71,9 @@ def test_two_processes_give_what_one_gives(alone, tmp_path):
     ended = start(tmp_path, 2, *CASES)
     assert [code for code, _ in ended] == [0, 0], ended
     for case in CASES[:-1]:
-        samples = [figures(tmp_path / case, rank)["samples"] for rank in (0, 1)]
+        samples = [results(tmp_path / case, rank)["samples"] for rank in (0, 1)]
         assert samples[0] != samples[1]
-        assert [a + b for a, b in zip(*samples, strict=True)] == figures(alone / case)["samples"]
+        assert [a + b for a, b in zip(*samples, strict=True)] == results(alone / case)["samples"]
         for rank in (0, 1):
             same(tmp_path / case, alone / case, rank)
         expected, got = (load_file(folder / case / "predictions.safetensors") for folder in (alone, tmp_path))
@@ -81,17 +81,17 @@ def test_two_processes_give_what_one_gives(alone, tmp_path):
         torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-7)
     # cut at the third of six steps, after the second checkpoint
     torch.testing.assert_close(weights(tmp_path / "resumed", 1), weights(tmp_path / "plain"), rtol=0, atol=0)
-    assert figures(tmp_path / "resumed")["train/loss"] == figures(tmp_path / "plain")["train/loss"][2:]
+    assert results(tmp_path / "resumed")["train/loss"] == results(tmp_path / "plain")["train/loss"][2:]
 
 
 def test_what_is_left_out_is_counted(alone):
-    got = figures(alone / "spoiled")
+    got = results(alone / "spoiled")
     assert got["train/left_out"] == [0, 7, 1, 15, 0, 0]  # of fifteen
     assert got["train/skipped"] == [0, 0, 0, 1, 0, 0]
     assert got["train/loss"][3] == 0
     assert got["val/left_out"] == 7 + 1 + 15
-    assert figures(alone / "infinite")["train/skipped"] == [0, 1, 0, 0, 0, 0]
-    assert figures(alone / "filtered")["samples"] == [20, 20, 1, 20, 20, 1]
+    assert results(alone / "infinite")["train/skipped"] == [0, 1, 0, 0, 0, 0]
+    assert results(alone / "filtered")["samples"] == [20, 20, 1, 20, 20, 1]
     for folder in alone.iterdir():
         assert all(tensor.isfinite().all() for tensor in weights(folder).values())
 
@@ -103,4 +103,4 @@ def test_killed_and_resumed(alone, tmp_path):
     assert code == -signal.SIGKILL
     run("killed", 1, tmp_path)
     torch.testing.assert_close(weights(tmp_path / "killed"), weights(alone / "plain"), rtol=0, atol=0)
-    assert figures(tmp_path / "killed")["train/loss"] == figures(alone / "plain")["train/loss"][2:]
+    assert results(tmp_path / "killed")["train/loss"] == results(alone / "plain")["train/loss"][2:]

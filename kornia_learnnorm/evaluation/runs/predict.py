@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.data.samples import Samples, draw_samples
+from kornia_learnnorm.data.sets import MatchSets, draw_samples
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method
@@ -45,7 +45,7 @@ class SampleOptions:
         if self.max_samples is not None and self.max_samples < 1:
             raise ValueError(f"max_samples must be 1 or more, or None for all, got {self.max_samples}")
 
-    def draw(self, store: CorrespondenceStore, max_ratio: float | None) -> Samples:
+    def draw(self, store: CorrespondenceStore, max_ratio: float | None) -> MatchSets:
         """Return samples of a store, before the filter on the residual.
 
         The held-out points are NaN for the samples of pairs that have no match to hold out.
@@ -60,7 +60,7 @@ class SampleOptions:
 
 @torch.no_grad()
 def predict(
-    method: Method, samples: Samples, store: CorrespondenceStore, max_ratio: float | None, agreement: bool = True
+    method: Method, samples: MatchSets, store: CorrespondenceStore, max_ratio: float | None, agreement: bool = True
 ) -> Arrays:
     """Return a method's matrices of the samples of a store, their errors and diagnostics, arrays (S, ...).
 
@@ -78,7 +78,7 @@ def predict(
     return {key: value.numpy() for key, value in found.items()}
 
 
-def _predict_batch(method: Method, samples: Samples, store: CorrespondenceStore, truth: Tensor) -> dict[str, Tensor]:
+def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStore, truth: Tensor) -> dict[str, Tensor]:
     problem = LinearProblem.from_points(samples.points1, samples.points2)
     x1, x2 = problem.points1, problem.points2
     T1, T2 = normalizing_transforms(method.normalizer, problem)

@@ -17,7 +17,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from kornia_learnnorm.data.samples import Samples, plain_residual
+from kornia_learnnorm.data.residual_filter import plain_residual
+from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, base_name, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs.example import random_pair, sweep
@@ -155,7 +156,7 @@ class _Recorder:
                         self._attempt(label, path, compute, keys, len(samples.pair))
                         bar.update()
 
-    def _samples(self, store: str, protocol: str) -> Samples:
+    def _samples(self, store: str, protocol: str) -> MatchSets:
         """Return the samples within the limit on the residual; write all that were drawn."""
         drawn, limit = self.options.draw(self.stores[store], PROTOCOLS[protocol]), self.options.max_residual
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.samples import Samples
+from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.evaluation.runs.pairs import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import consensus, predict
@@ -25,7 +25,7 @@ def test_predictions_agree_with_the_expectation_under_known_noise():
     """
     store = synthetic_store(pairs=40, points=64, seed=3, noise=0.5, outliers=0.0, scenes=["orbit"])
     points1, points2 = (torch.from_numpy(p).reshape(40, 64, 2) for p in (store.points1, store.points2))
-    samples = Samples(points1, points2, points1[:, :1], points2[:, :1], torch.arange(40))
+    samples = MatchSets(points1, points2, points1[:, :1], points2[:, :1], torch.arange(40))
     F_mat = torch.from_numpy(store.F)
     found = predict(SimpleNamespace(normalizer=kln.Hartley(), solve=lambda *_: F_mat), samples, store, None)
     x1, x2 = (np.concatenate([p.double().numpy(), np.ones((40, 64, 1))], -1) for p in (points1, points2))

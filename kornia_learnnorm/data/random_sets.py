@@ -1,0 +1,220 @@
+"""Random sets of matches with outliers, as many as wanted from each image pair, and their mix for training."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Generator, Tensor
+
+from kornia_learnnorm.data.augmentation import augment
+from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.data.sources import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
+from kornia_learnnorm.data.store import StoreReader
+from kornia_learnnorm.data.synthetic.random_matches import SyntheticMatches, random_matches
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+
+__all__ = ["RandomSets", "SetSource", "StoreSets", "SyntheticSets"]
+
+MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
+LABEL_THRESHOLD = 2.0  # pixels from the true epipolar lines up to which a match counts as an inlier
+
+
+class SetSource(Protocol):
+    """Anything that draws sets of matches."""
+
+    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
+        """Return sets of one size, which depend on nothing but the arguments and the generator's state."""
+
+
+class StoreSets:
+    """Random sets of matches of the image pairs of stores; half of the draws with the ratio test.
+
+    Pairs without ground truth are supervised by their own matches, see :class:`~kornia_learnnorm.BoundedEpipolarLoss`.
+
+    Args:
+        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
+            ``$LEARNNORM_DATA`` are filled in.
+        num_heldout: further matches of the pair.
+        max_ratios: limits of Lowe's ratio, of which each draw takes one; None for no limit.
+        labels: use the ground truth where there is one; without, all pairs are supervised by their own matches.
+
+    Raises:
+        ValueError: if no path is given, an environment variable is not set, or no pair can be used.
+        FileNotFoundError: if there is no such store.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[str],
+        num_heldout: int = 48,
+        max_ratios: Sequence[float | None] = (RATIO, None),
+        labels: bool = True,
+    ) -> None:
+        if not paths or not max_ratios:
+            raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
+        check_draws(num_heldout, max_ratios)
+        self.paths, self.num_heldout, self.max_ratios = tuple(paths), num_heldout, tuple(max_ratios)
+        self._pairs = [pair for path in paths for pair in _read_pairs(path, labels)]
+        if not self._pairs:
+            raise ValueError(f"no pair of {', '.join(paths)} has {MIN_HELDOUT} matches to hold out")
+        self._sizes = [torch.tensor([len(pair.passing(ratio)) for pair in self._pairs]) for ratio in self.max_ratios]
+
+    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
+        """Return sets of random matches of random pairs; the pairs with most matches where too few have enough."""
+        choice = int(torch.randint(len(self.max_ratios), (), generator=generator))
+        ratio, sizes = self.max_ratios[choice], self._sizes[choice]
+        able = (sizes >= min(num_points, int(sizes.max()))).nonzero()[:, 0]
+        chosen = able[torch.randint(len(able), (num_sets,), generator=generator)].tolist()
+        parts = [self._pairs[i].draw(num_points, self.num_heldout, ratio, generator) for i in chosen]
+        points1, points2, heldout1, heldout2, *rest = (torch.stack(values) for values in zip(*parts, strict=True))
+        return MatchSets(points1, points2, heldout1, heldout2, torch.tensor(chosen), *rest)
+
+
+class _Pair(NamedTuple):
+    """The matches of one image pair: points (M, 4), ratios (M,), distances from the true lines (M,), NaN if unknown."""
+
+    points: Tensor
+    ratio: Tensor
+    distance: Tensor
+
+    def passing(self, max_ratio: float | None) -> Tensor:
+        """Return the indices of the matches that pass the ratio test."""
+        return torch.arange(len(self.ratio)) if max_ratio is None else (self.ratio < max_ratio).nonzero()[:, 0]
+
+    @property
+    def heldout(self) -> Tensor:
+        """The indices of the matches that supervise."""
+        if self.distance.isnan().any():
+            return torch.arange(len(self.ratio))
+        return ((self.distance < INLIER_THRESHOLD) & (self.ratio < RATIO)).nonzero()[:, 0]
+
+    def draw(
+        self, num_points: int, num_heldout: int, max_ratio: float | None, generator: Generator
+    ) -> Sequence[Tensor]:
+        """Return the fields of a :class:`MatchSets` of one set, without the index of the pair."""
+        passing, heldout = self.passing(max_ratio), self.heldout
+        rows = passing[torch.randperm(len(passing), generator=generator)]
+        rows = rows[torch.arange(num_points) % len(rows)]
+        held = self.points[heldout[torch.randint(len(heldout), (num_heldout,), generator=generator)]]
+        points, distance = self.points[rows], self.distance[rows]
+        inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
+        labelled = ~distance.isnan().any()
+        return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], 1 - self.ratio[rows], inliers, labelled
+
+
+def _read_pairs(path: str, labels: bool) -> list[_Pair]:
+    """Return the pairs of a store that have enough matches that supervise."""
+    reader = StoreReader(expand_path(path))
+    store = reader.read(range(len(reader)))
+    pairs = []
+    for i in range(len(reader)):
+        rows = slice(int(store.offsets[i]), int(store.offsets[i + 1]))
+        points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
+        F_mat = torch.from_numpy(store.F[i]) if labels else torch.full((3, 3), torch.nan, dtype=torch.float64)
+        distance = symmetric_epipolar_distance(points1, points2, F_mat)
+        points = torch.cat([points1, points2], -1).float()
+        pair = _Pair(points, torch.from_numpy(store.ratio[rows]), distance.float())
+        if len(pair.heldout) >= MIN_HELDOUT:
+            pairs.append(pair)
+    return pairs
+
+
+class SyntheticSets:
+    """Sets of matches of synthetic scenes, supervised by exact correspondences, or by further matches.
+
+    Args:
+        num_heldout: exact correspondences of each scene, or further matches.
+        matches: function of the number of scenes, the points per scene, further exact ones and a generator.
+        labels: use exact correspondences and the true inliers; without, scenes are supervised by their own matches.
+    """
+
+    def __init__(
+        self,
+        num_heldout: int = 48,
+        matches: Callable[[int, int, int, Generator], SyntheticMatches] = random_matches,
+        labels: bool = True,
+    ) -> None:
+        self.num_heldout = num_heldout
+        self.matches = matches
+        self.labels = labels
+
+    def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
+        """Return the matches of new scenes."""
+        pair, labelled = torch.arange(num_sets), torch.full((num_sets,), self.labels)
+        if self.labels:
+            found = self.matches(num_sets, num_points, self.num_heldout, generator)
+            points1, points2, scores, inliers, exact1, exact2 = (value.float() for value in found)
+            return MatchSets(points1, points2, exact1, exact2, pair, scores, inliers, labelled)
+        total = num_points + self.num_heldout
+        found = self.matches(num_sets, total, 1, generator)
+        order = torch.randperm(total, generator=generator)
+        points1, points2, scores = (value[:, order].float() for value in found[:3])
+        own, rest = slice(num_points), slice(num_points, None)
+        inliers = torch.full_like(scores[:, own], torch.nan)
+        points = points1[:, own], points2[:, own], points1[:, rest], points2[:, rest]
+        return MatchSets(*points, pair, scores[:, own], inliers, labelled)
+
+
+class RandomSets:
+    """Batches of random sets, each of one source and one size, for training on matches with outliers.
+
+    Each block is a batch, so ``data.batch_size`` is null. It depends on the seed and its number alone.
+
+    Args:
+        sources: sources of sets.
+        shares: how often each source is taken, up to a factor; equally often when not given.
+        sizes: smallest and largest number of matches in a set; log-uniform between them.
+        correspondences: matches in a batch, of all its sets.
+        max_sets: largest number of sets in a batch.
+        augmented: share of the batches that are augmented.
+        scored: share of the batches that have scores.
+        batches: batches in an epoch.
+
+    Raises:
+        ValueError: if there is no source, the shares do not fit the sources, or a number is out of range.
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[SetSource],
+        shares: Sequence[float] | None = None,
+        sizes: tuple[int, int] = (8, 1000),
+        correspondences: int = 4096,
+        max_sets: int = 256,
+        augmented: float = 0.4,
+        scored: float = 0.5,
+        batches: int = 500,
+    ) -> None:
+        if not sources:
+            raise ValueError("sources is empty: give at least one source of sets")
+        if shares is not None and (len(shares) != len(sources) or min(shares) < 0 or not sum(shares) > 0):
+            raise ValueError(f"shares must be one non-negative number for each of {len(sources)} sources, got {shares}")
+        if not 8 <= sizes[0] <= sizes[1]:
+            raise ValueError(f"sizes must be a range of at least 8 matches, got {sizes}")
+        if batches < 1:
+            raise ValueError(f"batches must be at least 1, got {batches}")
+        self.sources, self.shares = list(sources), [1.0] * len(sources) if shares is None else list(shares)
+        self.sizes, self.correspondences, self.max_sets = tuple(sizes), correspondences, max_sets
+        self.augmented, self.scored, self.batches = augmented, scored, batches
+
+    def blocks(self, seed: int) -> list[Block]:
+        """Return the largest size of each block."""
+        return [Block(self.max_sets, self.max_sets)] * self.batches
+
+    def draw(self, seed: int, block: int) -> MatchSets:
+        """Return the sets of a block."""
+        generator = block_generator(*divmod(seed, SEEDS_PER_RUN), block, 0)
+        chance, size, augmented, scored = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
+        shares = torch.tensor(self.shares).cumsum(0)
+        source = self.sources[int((shares < chance * shares[-1]).sum())]
+        low, high = self.sizes
+        num_points = round(low * math.exp(size * math.log(high / low)))
+        num_sets = max(1, min(self.max_sets, self.correspondences // num_points))
+        sets = source.draw(num_sets, num_points, generator)
+        if augmented < self.augmented:
+            sets = augment(sets, generator)
+        return sets if scored < self.scored else sets._replace(scores=None)

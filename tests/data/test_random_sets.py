@@ -1,0 +1,163 @@
+"""Sets of matches and their augmentation."""
+
+from __future__ import annotations
+
+import h5py
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from two_view import correspondences, scenes, seeded
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.augmentation import augment
+from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
+from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.data.synthetic.random_matches import random_matches, wide_baseline
+
+
+def assert_equal(first: MatchSets, second: MatchSets) -> None:
+    for one, other in zip(first, second, strict=True):
+        assert torch.equal(one.nan_to_num(9.0), other.nan_to_num(9.0))
+
+
+class TestRandomMatches:
+    @pytest.mark.parametrize("seed", range(12))
+    def test_inliers_lie_near_the_lines_of_the_exact_correspondences(self, seed):
+        matches = random_matches(20, 60, 40, seeded(seed))
+        exact = matches.exact1, matches.exact2
+        F_mat = kln.find_fundamental(*exact, normalizer=kln.Whitening(), rank2="optimal")
+        inliers = matches.inliers
+        assert 0.3 < inliers.double().mean() < 0.95
+        distance = kln.symmetric_epipolar_distance(matches.points1, matches.points2, F_mat)
+        medians = torch.stack([d[i].median() for d, i in zip(distance, inliers, strict=True) if i.any()])
+        assert medians.median() < 3
+        assert distance[~inliers].median() > 10
+        assert matches.scores[inliers].mean() > matches.scores[~inliers].mean() + 0.1
+
+    def test_depends_on_the_generator_alone(self):
+        for first, second in zip(*(random_matches(3, 20, 5, seeded(4)) for _ in range(2)), strict=True):
+            assert torch.equal(first, second)
+
+    def test_wide_baseline_is_exact(self):
+        scene = wide_baseline(50, 30, seeded())
+        distance = kln.symmetric_epipolar_distance(scene.points1, scene.points2, scene.F_mat)
+        assert distance[scene.inliers].max() < 1e-6
+        assert scene.inliers.double().mean() > 0.99
+        cosine = (scene.R.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2
+        assert torch.rad2deg(cosine.clamp(-1, 1).acos()).median() > 8
+
+
+class TestStoreSets:
+    @pytest.fixture
+    def store(self, tmp_path):
+        """Two pairs: one with ground truth and 60 matches, one without and 80; a quarter of the ratios are 0.9."""
+        path = tmp_path / "pairs.h5"
+        found = [scenes("handheld", 1, number, seed=number, noise=0.1, outliers=0.1) for number in (60, 80)]
+        offsets = [0, 60, 140]
+        F = torch.cat([found[0].F_mat, torch.full((1, 3, 3), torch.nan)])
+        with h5py.File(path, "w") as file:
+            file.attrs.update(format="correspondences", version=1, dataset="test", pairs="two", detector="none")
+            for name in ("points1", "points2"):
+                file[name] = torch.cat([getattr(scene, name)[0] for scene in found]).float().numpy()
+            file["ratio"] = torch.where(torch.arange(140) % 4 == 0, 0.9, 0.5).float().numpy()
+            file["offsets"] = offsets
+            file["image_size"] = torch.tensor([[[640, 480]] * 2] * 2).int().numpy()
+            file["names"] = [["a", "b"]] * 2
+            file["F"], file["K"] = F.numpy(), torch.eye(3).double().expand(2, 2, 3, 3).numpy()
+            file["R"], file["t"] = torch.eye(3).double().expand(2, 3, 3).numpy(), torch.ones(2, 3).double().numpy()
+        return path
+
+    def test_labelled(self, store):
+        sets = StoreSets([f"{store}@0:1"], 16, [None]).draw(5, 60, seeded())
+        assert sets.labelled.all()
+        assert sets.inliers.sum(1).tolist() == [sets.inliers[0].sum()] * 5
+        assert 0.7 < sets.inliers.mean() <= 0.95
+        reader = h5py.File(store)
+        F_mat = torch.from_numpy(reader["F"][:1]).expand(5, 3, 3)
+        points = sets.heldout1.double(), sets.heldout2.double()
+        assert kln.symmetric_epipolar_distance(*points, F_mat).max() < 1
+
+    def test_unlabelled(self, store):
+        sets = StoreSets([f"{store}@1:2"], 16, [0.8]).draw(5, 40, seeded())
+        assert not sets.labelled.any()
+        assert sets.inliers.isnan().all()
+        assert torch.allclose(sets.scores, torch.tensor(0.5))
+
+    def test_without_labels_the_ground_truth_has_no_effect(self, store, tmp_path):
+        wrong = tmp_path / "wrong.h5"
+        wrong.write_bytes(store.read_bytes())
+        with h5py.File(wrong, "a") as file:
+            file["F"][0] = torch.rand(3, 3).numpy()
+        hidden, other = (StoreSets([str(path)], 16, labels=False).draw(6, 40, seeded()) for path in (store, wrong))
+        assert_equal(hidden, other)
+        assert not hidden.labelled.any()
+        assert hidden.inliers.isnan().all()
+
+    def test_ratio_test_and_sizes(self, store):
+        source = StoreSets([str(store)], 8, [0.8])
+        assert source.draw(20, 60, seeded()).labelled.any().item() is False  # 45 of 60 matches pass, 60 of 80
+        assert source.draw(2, 500, seeded()).points1.shape == (2, 500, 2)  # repeated where no pair has enough
+        assert_equal(source.draw(4, 20, seeded(1)), source.draw(4, 20, seeded(1)))
+
+    @pytest.mark.parametrize(
+        ("arguments", "error", "message"),
+        [
+            (([],), ValueError, "at least one store"),
+            ((["$NO_SUCH_FOLDER/store.h5"],), ValueError, "NO_SUCH_FOLDER"),
+            ((["no_such.h5"],), FileNotFoundError, "no store at no_such.h5"),
+        ],
+    )
+    def test_exceptions(self, arguments, error, message):
+        with pytest.raises(error, match=message):
+            StoreSets(*arguments)
+
+
+class TestSyntheticSets:
+    def test_without_labels_further_matches_supervise(self):
+        sets = SyntheticSets(200, labels=False).draw(8, 100, seeded(3))
+        assert sets.points1.shape == (8, 100, 2)
+        assert sets.heldout2.shape == (8, 200, 2)
+        assert not sets.labelled.any()
+        assert sets.inliers.isnan().all()
+        exact = SyntheticSets(200).draw(8, 100, seeded(3))
+        F_mat = kln.find_fundamental(exact.heldout1.double(), exact.heldout2.double(), rank2="optimal")
+        found, exact = (
+            kln.symmetric_epipolar_distance(s.heldout1.double(), s.heldout2.double(), F_mat) for s in (sets, exact)
+        )
+        assert exact.median() < 0.1
+        assert (found > 5).double().mean() > 0.1  # outliers are among them
+
+
+class TestRandomSets:
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ({"sources": []}, "sources is empty"),
+            ({"shares": [1.0, 2.0]}, "one non-negative number for each of 1 sources"),
+            ({"shares": [0.0]}, "one non-negative number for each"),
+            ({"sizes": (4, 9)}, "at least 8 matches"),
+            ({"batches": 0}, "at least 1, got 0"),
+        ],
+    )
+    def test_wrong_options(self, arguments, message):
+        with pytest.raises(ValueError, match=message):
+            RandomSets(**{"sources": [SyntheticSets()]} | arguments)
+
+
+class TestAugment:
+    @given(seed=st.integers(0, 2**20))
+    def test_keeps_the_epipolar_geometry(self, seed):
+        """Exact correspondences stay exact: eight of them predict all others."""
+        points, nothing = correspondences("handheld", 4, 40, noise=0.0), torch.zeros(4, 40)
+        sets = MatchSets(*points, *points, torch.arange(4), nothing, nothing + 1, nothing[:, 0] > 0)
+        moved = augment(sets, seeded(seed))
+        F_mat = kln.find_fundamental(moved.heldout1, moved.heldout2)
+        assert kln.symmetric_epipolar_distance(moved.heldout1, moved.heldout2, F_mat).max() < 1e-3
+        kept = moved.inliers > 0
+        assert kln.symmetric_epipolar_distance(moved.points1, moved.points2, F_mat)[kept].max() < 1e-3
+        assert kept.double().mean() > 0.55
+
+    def test_without_scores(self):
+        sets = SyntheticSets(8).draw(3, 20, seeded())._replace(scores=None)
+        assert augment(sets, seeded()).scores is None

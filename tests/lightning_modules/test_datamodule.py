@@ -1,0 +1,150 @@
+"""The loader and the datamodule: every sample once, the same batches wherever and however often they are drawn."""
+
+import pytest
+import torch
+from train_processes import Pairs
+
+from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
+from kornia_learnnorm.data.sources import SyntheticSamples
+from lightning_modules.datamodule import BatchLoader, CorrespondenceDataModule
+
+
+def same(batches, expected):
+    return all(torch.equal(a.points1, b.points1) for a, b in zip(batches, expected, strict=True))
+
+
+def random_sets(**arguments):
+    return RandomSets([SyntheticSets(16)], **{"sizes": (16, 64), "correspondences": 512, "batches": 20, **arguments})
+
+
+@pytest.mark.parametrize(("source", "size"), [(SyntheticSamples(300, max_residual=None), 64), (random_sets(), None)])
+def test_batches_depend_on_seed_and_position_alone(source, size):
+    loader = BatchLoader(source, size, seed=0, shuffle=True)
+    first, second = list(loader), list(loader)
+    assert len(first) == len(second) == len(loader) == (5 if size else 20)
+    assert not torch.equal(first[0].points1[0, :8], second[0].points1[0, :8])
+    again = BatchLoader(source, size, seed=0, shuffle=True)
+    again.load_state_dict({"epoch": 1, "batch": 2})
+    assert same(again, second[2:])
+    ordered = BatchLoader(source, size, seed=0, shuffle=False)
+    assert same(ordered, list(ordered))
+
+
+def test_samples_make_batches_of_one_size_and_keep_their_order_without_a_shuffle():
+    source = SyntheticSamples(300, max_residual=None)
+    assert [len(batch.pair) for batch in BatchLoader(source, 64, seed=0, shuffle=True)] == [60] * 5
+    ordered = [batch.pair for batch in BatchLoader(source, 64, seed=0, shuffle=False)]
+    assert torch.equal(torch.cat(ordered), torch.arange(300))
+
+
+def test_batches_of_random_sets_are_the_source_s():
+    source = random_sets()
+    batches = list(BatchLoader(source, None, seed=0, shuffle=True))
+    assert same(batches, [source.draw(0, block) for block in range(20)])
+    assert {batch.points1.shape[1] for batch in batches} != {batches[0].points1.shape[1]}
+    assert {batch.scores is None for batch in batches} == {True, False}
+
+
+@pytest.mark.parametrize(
+    ("size", "options", "message"),
+    [
+        (64, {}, "a batch takes 64 samples, the source gives 10"),
+        (11, {"by_pair": True}, "a batch takes 11 image pairs, the source gives 10"),
+        (0, {}, "a batch must hold at least one sample for each process, got 0"),
+        (1, {"rank": 0, "world_size": 2}, "at least one sample for each process, got 1"),
+    ],
+)
+def test_wrong_sizes_of_batches(size, options, message):
+    with pytest.raises(ValueError, match=message):
+        BatchLoader(SyntheticSamples(number=10, max_residual=None), size, seed=0, shuffle=True, **options)
+
+
+def test_validation_shares_no_sample_with_training_and_can_be_missing():
+    source = SyntheticSamples(number=64, max_residual=None)
+    data = CorrespondenceDataModule(source, source, batch_size=64)
+    (validated,) = (batch.points1 for batch in data.val_dataloader())
+    (trained,) = (batch.points1 for batch in data.train_dataloader())
+    assert not (validated[:, None] == trained[None]).flatten(2).all(-1).any()
+    assert CorrespondenceDataModule().val_dataloader() == []
+    with pytest.raises(ValueError, match=r"data\.train is not set"):
+        CorrespondenceDataModule().train_dataloader()
+
+
+@pytest.mark.parametrize("batch_pairs", [1, 3, 4, 10])
+def test_batches_of_whole_pairs(batch_pairs):
+    source = Pairs()
+    loader = BatchLoader(source, batch_pairs, seed=5, shuffle=True, by_pair=True)
+    assert len(loader) == -(-10 // batch_pairs)
+    orders = []
+    for epoch in range(3):
+        batches = list(loader)
+        assert len(batches) == len(loader)
+        drawn, order = source.draw(5 + epoch, 0), []
+        for batch in batches:
+            pairs = batch.pair.unique()
+            assert 0 <= batch_pairs - len(pairs) <= 1
+            rows = torch.isin(drawn.pair, pairs)
+            for got, expected in zip(batch[:5], drawn.select(rows)[:5], strict=True):  # all of these pairs, once
+                assert sorted(got.tolist()) == sorted(expected.tolist())
+            order += batch.pair.unique_consecutive().tolist()
+        assert sorted(order) == list(range(10))
+        orders.append(order)
+    assert orders[0] != orders[1] != orders[2] != orders[0]
+
+
+def test_one_sample_a_pair_is_counting_samples():
+    source = SyntheticSamples(number=100)
+    by_sample, by_pair = (BatchLoader(source, 16, 0, shuffle=True, by_pair=flag) for flag in (False, True))
+    for _ in range(3):  # the filter leaves another number each epoch
+        assert same(list(by_pair), list(by_sample))
+
+
+def test_batch_pairs_are_for_training_alone():
+    plain, paired = (CorrespondenceDataModule(*3 * [Pairs()], 32, pairs) for pairs in (None, 3))
+    for stage in ("val", "test", "predict"):
+        batches, expected = (list(getattr(data, f"{stage}_dataloader")()) for data in (paired, plain))
+        assert [len(batch.pair) for batch in batches] == [27, 28]
+        assert same(batches, expected)
+    assert [len(batch.pair.unique()) for batch in paired.train_dataloader()] == [2, 3, 2, 3]
+    assert [len(batch.pair) for batch in plain.train_dataloader()] == [27, 28]
+
+
+@pytest.mark.parametrize(
+    ("source", "size", "by_pair"),
+    [(SyntheticSamples(number=9000), 512, False), (Pairs(), 4, True), (random_sets(batches=4), None, False)],
+)
+@pytest.mark.parametrize("world_size", [2, 3])
+def test_processes_share_an_epoch(source, size, by_pair, world_size):
+    """Every sample once in an epoch, in as many batches for each process."""
+    loaders = [BatchLoader(source, size, 0, True, by_pair, 0, rank, world_size) for rank in range(world_size)]
+    whole = BatchLoader(source, size, 0, True, by_pair)
+    for epoch in range(2):
+        shares = [list(loader) for loader in loaders]
+        assert {len(batches) for batches in shares} == {len(whole)}
+        held = 0
+        for *parts, batch in zip(*shares, whole, strict=True):
+            counts = [len(part.pair.unique() if by_pair else part.pair) for part in parts]
+            assert max(counts) - min(counts) <= 1
+            got = torch.cat([part.points1 for part in parts]).flatten(1).tolist()
+            assert sorted(got) == sorted(batch.points1.flatten(1).tolist())
+            held += len(got)
+        assert held == sum(len(source.draw(epoch, block).pair) for block in range(len(source.blocks(epoch))))
+
+
+@pytest.mark.parametrize(
+    ("source", "size"), [(SyntheticSamples(20_000, max_residual=None), 3000), (random_sets(), None)]
+)
+def test_workers_change_nothing(source, size):
+    plain, helped = (BatchLoader(source, size, 0, shuffle=True, workers=workers) for workers in (0, 2))
+    assert same(list(helped), list(plain))
+    for loader in (plain, helped):
+        loader.load_state_dict({"epoch": 1, "batch": 3})
+    assert same(list(helped), list(plain))
+
+
+def test_no_sample_is_lost_to_more_processes_than_samples():
+    source = SyntheticSamples(number=1, max_residual=None)
+    loaders = [BatchLoader(source, 4, 0, shuffle=False, rank=rank, world_size=3) for rank in range(3)]
+    assert [[len(batch.pair) for batch in loader] for loader in loaders] == [[1], [0], [0]]
+    pairs = [BatchLoader(Pairs(), 3, 0, True, by_pair=True, rank=rank, world_size=3) for rank in range(3)]
+    assert [len(list(loader)) for loader in pairs] == [4, 4, 4]
