@@ -25,6 +25,7 @@ from kornia_learnnorm.normalizers.identity import Identity
 from kornia_learnnorm.normalizers.learned import FORMAT, LearnedNormalizer
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.normalizers.whitening import Whitening
+from kornia_learnnorm.optional import working_folder_importable
 from kornia_learnnorm.pretrained import WEIGHTS, shipped_weights, weights_format
 
 __all__ = [
@@ -94,8 +95,9 @@ def find_method(name: str) -> Method:
 
     Args:
         name: ``none``, ``Hartley``, ``whitening``, ``reweighted`` or ``searched``; weights that ship or the path of a
-            ``.safetensors`` file; or the import path of a normaliser class or function, ``package.module:Name``, which
-            is looked for in the current folder last. With ``+LM``, the result is refined by Levenberg-Marquardt on the
+            ``.safetensors`` file, ``module:FILE.safetensors`` where it names parts of that module of your own; or the
+            import path of a normaliser class or function, ``package.module:Name``. Modules are looked for in the
+            current folder last. With ``+LM``, the result is refined by Levenberg-Marquardt on the
             Sampson distance; with ``+optimal``, the covariance-weighted correction takes the place of the projection to
             rank 2.
 
@@ -119,6 +121,9 @@ def base_name(name: str) -> str:
 def _find_normalizer(name: str) -> Normalizer:
     if name in CLOSED_FORMS:
         return CLOSED_FORMS[name]()
+    module, path = _own_weights(name)
+    if module:
+        return LearnedNormalizer.from_pretrained(path, [module])
     if ":" in name:
         return _own_normalizer(name)
     shipped = shipped_weights(FORMAT)
@@ -135,6 +140,12 @@ def _find_normalizer(name: str) -> Normalizer:
             f" .safetensors file or module:Name, each without suffix or with {REFINED} or {OPTIMAL}"
         )
     return LearnedNormalizer.from_pretrained(name)
+
+
+def _own_weights(name: str) -> tuple[str, str]:
+    """Return the module and the file of ``MODULE:FILE.safetensors``, weights of own parts; no module elsewhere."""
+    module, _, path = name.rpartition(":")
+    return (module, path) if Path(path).suffix == ".safetensors" else ("", name)
 
 
 def _own_normalizer(name: str) -> Normalizer:
@@ -163,15 +174,12 @@ def _import(name: str) -> Any:
     module, _, attribute = name.partition(":")
     if not module or not attribute:
         raise ValueError(f"no normaliser at {name!r}: expected module:Name")
-    here, before = str(Path.cwd()), [*sys.path]
     try:
-        sys.path.append(here)
-        return getattr(importlib.import_module(module), attribute)
+        with working_folder_importable():
+            return getattr(importlib.import_module(module), attribute)
     except Exception as error:  # importing runs code that is not ours
         text = f"{type(error).__name__}: {error}"
-        raise ValueError(f"no normaliser at {name!r}, looked for in {here} too: {text}") from error
-    finally:
-        sys.path[:] = before
+        raise ValueError(f"no normaliser at {name!r}, looked for in {Path.cwd()} too: {text}") from error
 
 
 def identify_method(name: str) -> str:
@@ -179,7 +187,10 @@ def identify_method(name: str) -> str:
     base = base_name(name)
     if base in CLOSED_FORMS:
         return name
-    if ":" in base:
+    module, path = _own_weights(base)
+    if module:
+        files = [Path(path), Path(_import(f"{module}:__file__"))]
+    elif ":" in base:
         files = _source_files(base)
     else:
         files = [Path(base) if Path(base).is_file() else WEIGHTS / f"{base}.safetensors"]
@@ -197,7 +208,7 @@ def _source_files(name: str) -> list[Path]:
 def short_name_of(name: str) -> str:
     """Return a method's name for tables and files: for a path, that of the run's folder or of the file."""
     base = base_name(name)
-    return short_name(base) + name[len(base) :] if Path(base).suffix == ".safetensors" else name
+    return short_name(_own_weights(base)[1]) + name[len(base) :] if Path(base).suffix == ".safetensors" else name
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("program")
 
 FOLDER = Path(__file__).parents[2] / "configs"
 OF_SETS = ("crossview-sets", "robust", "robust-synthetic")
-CONFIGS = sorted(path for path in FOLDER.glob("*.yaml") if path.stem not in OF_SETS)
+CONFIGS = sorted(path for path in FOLDER.glob("*.yaml") if path.stem not in (*OF_SETS, "own"))
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 NETWORK = "model.estimator.init_args.normalizer.init_args.network.init_args"
 SMALL_PAPER_NETWORK = [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
