@@ -43,17 +43,16 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
         return exif_camera(image)
     expected = "expected fx,fy,cx,cy, a file of four or nine numbers, KITTI's calib.txt, or exif"
     content = text
-    if "," not in text or Path(text).exists():
-        if not Path(text).is_file():
-            raise FileNotFoundError(f"camera {text}: no such file; {expected}")
-        try:
-            content = Path(text).read_text(encoding="utf-8")
-        except UnicodeDecodeError as error:
-            raise ValueError(f"camera {text}: not a text file; {expected}") from error
-        if any(line.startswith(f"{KITTI_CAMERA}:") for line in content.splitlines()):
-            return read_calibration(Path(text), KITTI_CAMERA)[0]
     try:
+        if "," not in text or Path(text).exists():
+            content = Path(text).read_text(encoding="utf-8")
+            if any(line.startswith(f"{KITTI_CAMERA}:") for line in content.splitlines()):
+                return read_calibration(Path(text), KITTI_CAMERA)[0]
         numbers = np.array(content.replace(",", " ").split(), float)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"camera {text}: no such file; {expected}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"camera {text}: not a text file; {expected}") from error
     except ValueError as error:
         raise ValueError(f"camera {text}: {expected}: {error}") from error
     if numbers.size == 4:
@@ -68,15 +67,10 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
 
 
 def exif_camera(path: str | Path) -> NDArray[np.float64]:
-    """Return the camera matrix (3, 3) that the EXIF data of a photograph suggest, pixels.
+    """Return the camera matrix (3, 3), pixels, that the EXIF data of a photograph suggest; wrong for cropped ones.
 
     The focal length is EXIF's equivalent on 35 mm film, by the images' diagonals; the principal point is the centre.
-    It is wrong for photographs that were cropped.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file holds no such focal length.
-
+    A file without such a focal length is a ValueError.
     """
     size = image_size(path)
     if size == (0, 0):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, open_hdf5, own_dataset
 
@@ -18,63 +18,45 @@ def read_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
 
     A group of the features is an image with ``keypoints`` (N, 2), pixels, and ``image_size``. A group of the matches is
     a pair, ``NAME0/NAME1`` with ``-`` for the slashes in names, with ``matches0`` (N,), an index or -1 for each
-    keypoint of image 0, and ``matching_scores0`` (N,). hloc rounds keypoints to float16 by default: at 1000 px that is
-    half a pixel.
-
-    Returns:
-        the store, in the order of the file; ``ratio`` is 1 - score; K, R, t and F are NaN.
+    keypoint of image 0, and ``matching_scores0`` (N,). The ratio is 1 - score; K, R, t and F are NaN.
 
     Raises:
         FileNotFoundError: if a file is missing.
         ValueError: if a file is not HDF5, holds no pair, or lacks the image or a dataset of a pair.
 
     """
-    pairs: list[dict[str, Any]] = []
+
+    def values(group: Any, name: str) -> Any:
+        data = own_dataset(group, name)
+        if data is None:
+            raise ValueError(f"{group.file.filename}, {group.name} has no dataset {name}")
+        return data[()]
+
     for path in map(Path, (features, matches)):
         if not path.is_file():
             raise FileNotFoundError(f"no file of hloc at {path}")
+    arrays, names = defaultdict(list), []
     with open_hdf5(Path(features)) as images, open_hdf5(Path(matches)) as file:
         found: list[str] = []
         images.visit(found.append)
-        names = {name.replace("/", "-"): name for name in (item.rpartition("/")[0] for item in found) if name}
-        for dashed1, group in file.items():
-            for dashed2, pair in group.items():
-                missing = {dashed1, dashed2} - names.keys()
-                if missing:
-                    raise ValueError(f"{matches} has the pair {dashed1}/{dashed2}, {features} no image {missing.pop()}")
-                (keys1, size1), (keys2, size2) = (
-                    [_values(images[names[dashed]], name) for name in ("keypoints", "image_size")]
-                    for dashed in (dashed1, dashed2)
-                )
-                target, scores = (_values(pair, name) for name in ("matches0", "matching_scores0"))
-                if len(target) != len(keys1) or not ((target >= -1) & (target < len(keys2))).all():
-                    expected = f"{len(keys1)} integers from -1 to {len(keys2) - 1}"
-                    raise ValueError(f"{matches}, {dashed1}/{dashed2}: matches0 must be {expected}, got {target}")
-                index = np.flatnonzero(target >= 0)
-                points = {"points1": keys1[index], "points2": keys2[target[index]]}
-                ratio, pair_names = 1 - scores[index].astype(np.float64), (names[dashed1], names[dashed2])
-                pairs.append({**points, "ratio": ratio, "image_size": [[size1, size2]], "names": pair_names})
-    if not pairs:
+        dashed = {name.replace("/", "-"): name for name in (item.rpartition("/")[0] for item in found)}
+        for key1, key2 in [(one, two) for one in file for two in file[one]]:
+            if missing := {key1, key2} - dashed.keys():
+                raise ValueError(f"{matches} has the pair {key1}/{key2}, {features} no image {missing.pop()}")
+            names.append((dashed[key1], dashed[key2]))
+            keypoints1, keypoints2 = (values(images[name], "keypoints") for name in names[-1])
+            target, scores = (values(file[key1][key2], name) for name in ("matches0", "matching_scores0"))
+            if len(target) != len(keypoints1) or not ((target >= -1) & (target < len(keypoints2))).all():
+                expected = f"{len(keypoints1)} integers from -1 to {len(keypoints2) - 1}"
+                raise ValueError(f"{matches}, {key1}/{key2}: matches0 must be {expected}, got {target}")
+            arrays["points1"].append(keypoints1[target >= 0])
+            arrays["points2"].append(keypoints2[target[target >= 0]])
+            arrays["ratio"].append(1 - scores[target >= 0].astype(np.float64))
+            arrays["image_size"].append([[values(images[name], "image_size") for name in names[-1]]])
+    if not names:
         raise ValueError(f"{matches} holds no pair of images, expected a group for each pair")
-    known: dict[str, Any] = {
-        name: np.concatenate([pair[name] for pair in pairs]).astype(LAYOUT[name][1])
-        for name in ("points1", "points2", "ratio", "image_size")
-    }
-    unknown: dict[str, Any] = {name: np.full((len(pairs), *LAYOUT[name][0]), np.nan) for name in "FKRt"}
-    return CorrespondenceStore(
-        **known,
-        **unknown,
-        offsets=np.cumsum([0, *(len(pair["ratio"]) for pair in pairs)], dtype=np.int64),
-        names=[pair["names"] for pair in pairs],
-        dataset=f"hloc's {Path(features).name} and {Path(matches).name}",
-        pairs="not known",
-        detector="not known",
-    )
-
-
-def _values(group: Any, name: str) -> NDArray[Any]:
-    """Return the values of a dataset that the file itself holds; ValueError for none."""
-    data = own_dataset(group, name)
-    if data is None:
-        raise ValueError(f"{group.file.filename}, {group.name} has no dataset {name}")
-    return np.asarray(data[()])
+    known: dict[str, Any] = {name: np.concatenate(parts).astype(LAYOUT[name][1]) for name, parts in arrays.items()}
+    unknown: dict[str, Any] = {name: np.full((len(names), *LAYOUT[name][0]), np.nan) for name in "FKRt"}
+    offsets = np.cumsum([0, *map(len, arrays["ratio"])], dtype=np.int64)
+    about = {"dataset": f"hloc's {Path(features).name} and {Path(matches).name}", "pairs": "not known"}
+    return CorrespondenceStore(**known, **unknown, **about, offsets=offsets, names=names, detector="not known")

@@ -23,16 +23,8 @@ from kornia_learnnorm.optional import import_extra
 if TYPE_CHECKING:
     import h5py
 
-__all__ = [
-    "FORMAT",
-    "LAYOUT",
-    "VERSION",
-    "CorrespondenceStore",
-    "StoreReader",
-    "open_hdf5",
-    "own_dataset",
-    "read_store",
-]
+__all__ = ["FORMAT", "LAYOUT", "VERSION", "CorrespondenceStore", "StoreReader"]
+__all__ += ["open_hdf5", "own_dataset", "read_store"]
 
 FORMAT = "correspondences"  # attribute of the file
 VERSION = 1  # attribute of the file
@@ -103,23 +95,14 @@ class CorrespondenceStore:
         return replace(self, offsets=offsets, names=self.names[first:stop], **cut)
 
     def rows(self, pair: int, max_ratio: float | None = None) -> NDArray[np.int64]:
-        """Return the rows (N,) of a pair, in increasing order; arguments as for :meth:`matches`."""
+        """Return the rows (N,) of the correspondences of :meth:`matches`, in increasing order."""
         rows = np.arange(self.offsets[pair], self.offsets[pair + 1])
         return rows if max_ratio is None else rows[self.ratio[rows] < max_ratio]
 
     def matches(
         self, pair: int, max_ratio: float | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return the correspondences of a pair.
-
-        Args:
-            pair: index of the pair.
-            max_ratio: keep correspondences with Lowe's ratio below this; None keeps all.
-
-        Returns:
-            points1 (N, 2), points2 (N, 2) and ratio (N,).
-
-        """
+        """Return points1 (N, 2), points2 (N, 2) and ratio (N,) of a pair: those with a ratio below a limit, or all."""
         rows = self.rows(pair, max_ratio)
         return self.points1[rows], self.points2[rows], self.ratio[rows]
 
@@ -134,9 +117,6 @@ def read_store(path: str | Path) -> CorrespondenceStore:
 
     Args:
         path: an HDF5 file in the format that this module describes; ``file.h5@3:10`` for its pairs 3 to 9.
-
-    Returns:
-        the store, in memory.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -175,7 +155,7 @@ class StoreReader:
                 hint = "; it is a folder, and learnnorm match folder makes a store of a folder of images"
             raise FileNotFoundError(f"no store at {self.path}{hint}")
         with open_hdf5(self.path) as file:
-            offsets = _check(self.path, file)
+            offsets = _read_offsets(self.path, file)
         first, stop = (int(part[2]), int(part[3])) if part else (0, len(offsets) - 1)
         _check_range(first, stop, len(offsets) - 1, f"{self.path}: ")
         self._first = first
@@ -188,14 +168,12 @@ class StoreReader:
     def read(self, pairs: Sequence[int]) -> CorrespondenceStore:
         """Return a store of some pairs, in the order given; a range is read fastest, then increasing indices.
 
-        Raises:
-            IndexError: if an index is negative or too large.
-            ValueError: if the file is no longer readable, or points or ratios are not finite.
-
+        An index that is negative or too large is an IndexError, a number that is not finite a ValueError.
         """
         if len(pairs) and not 0 <= min(pairs) <= max(pairs) < len(self):
             raise IndexError(f"pairs {min(pairs)} to {max(pairs)} were asked for, the store has 0 to {len(self) - 1}")
-        runs = _runs(pairs)
+        cuts = [0, *(np.flatnonzero(np.diff(pairs) != 1) + 1).tolist(), len(pairs)]
+        runs = [(int(pairs[a]), int(pairs[b - 1]) + 1) for a, b in pairwise(cuts) if a < b]
         rows = {
             "M": [slice(int(self.offsets[a]), int(self.offsets[b])) for a, b in runs],
             "P": [slice(a + self._first, b + self._first) for a, b in runs],
@@ -249,15 +227,7 @@ def own_dataset(group: h5py.Group, name: str) -> h5py.Dataset | None:
     return None if not hasattr(data, "shape") or data.external or data.is_virtual else data
 
 
-def _runs(pairs: Sequence[int]) -> list[tuple[int, int]]:
-    """Split indices into runs of consecutive ones; return (first, stop) of each run."""
-    if not len(pairs):
-        return []
-    cuts = [0, *(np.flatnonzero(np.diff(pairs) != 1) + 1).tolist(), len(pairs)]
-    return [(int(pairs[a]), int(pairs[b - 1]) + 1) for a, b in pairwise(cuts)]
-
-
-def _check(path: Path, file: h5py.File) -> NDArray[np.int64]:
+def _read_offsets(path: Path, file: h5py.File) -> NDArray[np.int64]:
     """Return the offsets of a store, after checking its version and the shapes and types of its arrays."""
     if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
         got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')}"

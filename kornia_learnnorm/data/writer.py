@@ -29,15 +29,9 @@ PAIRS_PER_CHUNK = 16  # pairs in a chunk of HDF5; few, since each part of an unf
 
 
 def write_store(path: str | Path, store: CorrespondenceStore) -> None:
-    """Write a store to an HDF5 file, completely or not at all.
+    """Write a store to an HDF5 file, completely or not at all; an existing file is replaced.
 
-    Args:
-        path: the file to write; an existing one is replaced.
-        store: the correspondences.
-
-    Raises:
-        OSError: if the folder does not exist or cannot be written, or the disk is full.
-
+    The error is an OSError if the folder does not exist or cannot be written, or the disk is full.
     """
     join_stores(path, [store], store.provenance)
 
@@ -122,15 +116,12 @@ class StoreWriter:
                 had = json.loads((self.folder / OPTIONS).read_text(encoding="utf-8"))
             _refuse(self.folder, had, self.options)
         else:
-            self._begin()
-
-    def _begin(self) -> None:
-        try:
-            self.folder.mkdir(exist_ok=True)
-            write_text(self.folder / OPTIONS, json.dumps(self.options, indent=1))
-        except OSError as error:
-            self.close()
-            raise type(error)(f"cannot write {self.path}: {error.strerror or error}") from error
+            try:
+                self.folder.mkdir(exist_ok=True)
+                write_text(self.folder / OPTIONS, json.dumps(self.options, indent=1))
+            except OSError as error:
+                self.close()
+                raise type(error)(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def done(self) -> set[int]:
         """Return the places of the pairs that were added, after removing unreadable parts (as a power cut leaves)."""

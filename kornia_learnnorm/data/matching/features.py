@@ -18,16 +18,8 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import check_grey, import_cv2
 
-__all__ = [
-    "DETECTORS",
-    "Features",
-    "detect_disk",
-    "detect_keynet",
-    "detect_rootsift",
-    "detect_sift",
-    "keep_features",
-    "pretrained",
-]
+__all__ = ["DETECTORS", "Features", "detect_disk", "detect_keynet", "detect_rootsift", "detect_sift", "keep_features"]
+__all__ += ["pretrained"]
 
 MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is of the mask's edge
 
@@ -48,16 +40,14 @@ class Features(NamedTuple):
 
 
 def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Find the strongest SIFT features.
-
-    A keypoint with several orientations gives several features at the same pixel.
+    """Return the strongest SIFT features; several at a pixel where a keypoint has several orientations.
 
     Args:
         image: grey values with shape :math:`(H, W)`, uint8.
-        num_features: largest number of features to keep.
+        num_features: largest number of features to keep; ties with the weakest of them are kept too.
 
     Returns:
-        up to ``num_features`` features, and ties with the weakest of them; descriptors uint8 with 128 columns.
+        the features; descriptors uint8 with 128 columns.
 
     Raises:
         TypeError: if the image is not an array of uint8.
@@ -77,10 +67,7 @@ def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
 
 
 def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Find SIFT features with square roots of descriptors of unit sum (RootSIFT), float32.
-
-    Their Euclidean distance is the Hellinger distance of SIFT's histograms. Arguments, results and errors are otherwise
-    those of :func:`detect_sift`.
+    """Return the features of :func:`detect_sift` with square roots of descriptors of unit sum (RootSIFT), float32.
 
     References:
         R. Arandjelovic and A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012.
@@ -92,7 +79,7 @@ def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Featu
 
 
 def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Find up to ``num_features`` features with Kornia's DISK, trained with depth; descriptors float32, 128 columns.
+    """Return the features of Kornia's DISK, trained with depth; descriptors float32 with 128 columns.
 
     Arguments and errors are those of :func:`detect_sift`, and OSError if the weights cannot be loaded.
 
@@ -108,7 +95,7 @@ def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
 
 
 def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Find up to ``num_features`` features with Kornia's KeyNet, AffNet and HardNet; results as :func:`detect_disk`.
+    """Return the features of Kornia's KeyNet, AffNet and HardNet; otherwise as :func:`detect_disk`.
 
     References:
         A. Barroso-Laguna et al., Key.Net, ICCV 2019; D. Mishkin et al., AffNet, ECCV 2018; A. Mishchuk et al.,
@@ -127,20 +114,8 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
 def keep_features(features: Features, mask: NDArray[np.bool_]) -> Features:
     """Return the features whose pixels count and are more than 8 rows or columns away from those that do not.
 
-    The border of the image itself drops nothing.
-
-    Args:
-        features: features of one image.
-        mask: true for the pixels that count, (H, W) bool; see :mod:`kornia_learnnorm.data.masks`.
-
-    Returns:
-        some of the features, in their order.
-
-    Raises:
-        TypeError: if the mask is not an array of bool.
-        ValueError: if its shape is not that of the image.
-        ImportError: if OpenCV is not installed.
-
+    ``mask`` is true for the pixels that count, (H, W) bool, see :mod:`kornia_learnnorm.data.masks`; a TypeError or
+    ValueError for other arrays. The border of the image itself drops nothing.
     """
     if not isinstance(mask, np.ndarray) or mask.dtype != bool:
         raise TypeError(f"a mask must be an array of bool, got {getattr(mask, 'dtype', type(mask))}")

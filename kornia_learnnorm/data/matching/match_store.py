@@ -40,25 +40,14 @@ LOG_INTERVAL = 30.0  # seconds between lines of progress where stderr is not a t
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """How images are matched.
+    """How images are matched; ValueError for an unknown name, or a number out of range."""
 
-    Attributes:
-        detector: a key of ``kornia_learnnorm.data.matching.features.DETECTORS``.
-        num_features: largest number of features kept of an image, the strongest ones.
-        matcher: a key of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
-        max_matches: largest number of matches kept of a pair, drawn at random: so many that pass Lowe's ratio test of
-            0.8, and so many that fail it; None keeps all.
-        seed: seed of this draw and of the order of a pair's matches.
-
-    Raises:
-        ValueError: if the detector or matcher is unknown, they do not fit together, or a number is out of range.
-    """
-
-    detector: str = "sift"
-    num_features: int = 4000
-    matcher: str = "nearest"
+    detector: str = "sift"  # a key of features.DETECTORS
+    num_features: int = 4000  # kept of an image, the strongest ones
+    matcher: str = "nearest"  # a key of matchers.MATCHERS
+    #: Matches kept of a pair, drawn at random: so many that pass Lowe's ratio test, so many that fail it; None for all.
     max_matches: int | None = MAX_FILTERED
-    seed: int = 0
+    seed: int = 0  # of this draw and of the order of a pair's matches
 
     def __post_init__(self) -> None:
         for kind, given, known in (("detector", self.detector, DETECTORS), ("matcher", self.matcher, MATCHERS)):

@@ -70,10 +70,7 @@ def _nearest(features1: Features, features2: Features) -> tuple[NDArray[np.int64
 
 
 def match_lightglue(features1: Features, features2: Features) -> Matches:
-    """Match DISK features with Kornia's LightGlue.
-
-    LightGlue gives each match a score instead of a ratio. Here ``ratio`` is 1 - score, so a small one is a confident
-    match and the usual limit of 0.8 keeps scores above 0.2.
+    """Match DISK features with Kornia's LightGlue; ``ratio`` is 1 - score, so the limit of 0.8 keeps scores above 0.2.
 
     Raises:
         ValueError: if an image has fewer than two features, or the descriptors are not of 128 columns of float32.
@@ -103,28 +100,16 @@ MATCHERS: dict[str, Callable[[Features, Features], Matches]] = {"nearest": match
 def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_features: int = 4000) -> Matches:
     """Match the SIFT features of image 1 to their nearest neighbours in image 2.
 
-    Args:
-        image1: grey values with shape :math:`(H_1, W_1)`, uint8.
-        image2: grey values with shape :math:`(H_2, W_2)`, uint8.
-        num_features: how many of the strongest features to keep in each image.
-
-    Returns:
-        as many matches as image 1 has features; see :func:`match_nearest`.
-
-    Raises:
-        TypeError: if an image is not an array of uint8.
-        ValueError: if an image does not have two dimensions or has no features, as a blank one, or ``num_features``
-            is below 2.
-        ImportError: if OpenCV is not installed.
-
+    Arguments and errors are those of :func:`~kornia_learnnorm.data.matching.features.detect_sift` and
+    :func:`match_nearest`: there are as many matches as image 1 has features.
     """
     return match_nearest(detect_sift(image1, num_features), detect_sift(image2, num_features))
 
 
 def one_to_one(points1: Tensor, points2: Tensor, ratio: Tensor) -> Tensor:
-    """Return the indices of matches that share no point, sorted by ratio.
+    """Return the indices, int64, of matches that share no point, sorted by ratio.
 
-    A match is left out if it shares a pixel, in image 1 or in image 2, with a kept match of a smaller ratio.
+    A match is dropped if it shares a pixel, in image 1 or in image 2, with a kept match of a smaller ratio.
     Coordinates decide between equal ratios, so the order of the matches has no effect on which are kept, and a limit on
     the ratio can be applied before or after.
 
@@ -132,9 +117,6 @@ def one_to_one(points1: Tensor, points2: Tensor, ratio: Tensor) -> Tensor:
         points1: pixels in image 1 with shape :math:`(N, 2)`.
         points2: pixels in image 2 with shape :math:`(N, 2)`.
         ratio: nearest over second-nearest descriptor distance, or another cost, with shape :math:`(N,)`.
-
-    Returns:
-        up to N indices, int64.
 
     Example:
         >>> points = torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
