@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from kornia_learnnorm.data.datasets.frames import resize_frames
-from kornia_learnnorm.data.datasets.pairs import choose_pairs
+from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.datasets.reading import DATASETS, missing_ground_truth, read_dataset
 from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
@@ -40,40 +40,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames.add_argument("--sequences", metavar="NAME", nargs="+", help="kitti, tum: these sequences")
     frames.add_argument("--split", metavar="NAME", help="kitti, cambridge: train, test; tum: train, val")
     frames.add_argument("--camera", help="kitti: image_0 to image_3 (default: image_0)")
-    frames.add_argument(
-        "--model", metavar="FOLDER", type=Path, help="colmap: cameras, images and points; ROOT has images"
-    )
-    frames.add_argument(
-        "--max-difference",
-        metavar="S",
-        type=float,
-        help="tum: seconds between an image and its pose, at most (default: 0.02)",
-    )
+    frames.add_argument("--model", metavar="FOLDER", type=Path, help="colmap: cameras, images, points; ROOT has images")
+    text = "tum: seconds between an image and its pose, at most (default: 0.02)"
+    frames.add_argument("--max-difference", metavar="S", type=float, help=text)
     frames.add_argument("--resize", metavar=("WIDTH", "HEIGHT"), nargs=2, type=int, help="resize images and cameras")
     pairs = parser.add_argument_group("pairs").add_mutually_exclusive_group()
     pairs.add_argument("--gap", type=int, default=1, help="frames apart (default: %(default)s)")
     pairs.add_argument("--pairs", metavar="FILE", type=Path, help="two names a line, as hloc lists them")
     pairs.add_argument("--min-points", metavar="N", type=int, help="colmap: pairs that share at least N points")
     match = parser.add_argument_group("matching")
-    for option, names, default in (
-        ("--detector", DETECTORS, options.detector),
-        ("--matcher", MATCHERS, options.matcher),
-    ):
+    for option, names in (("detector", DETECTORS), ("matcher", MATCHERS)):
         text = f"{', '.join(names)} (default: %(default)s)"
-        match.add_argument(option, metavar="NAME", choices=names, default=default, help=text)
-    match.add_argument(
-        "--num-features", metavar="N", type=int, default=options.num_features, help="of an image (default: %(default)s)"
-    )
-    match.add_argument(
-        "--max-matches",
-        metavar="N",
-        type=int,
-        default=options.max_matches,
-        help="per pair, of those that pass the ratio test and of those that fail; 0 keeps all (default: %(default)s)",
-    )
-    match.add_argument(
-        "--seed", type=int, default=options.seed, help="seed of the order of matches (default: %(default)s)"
-    )
+        match.add_argument(f"--{option}", metavar="NAME", choices=names, default=getattr(options, option), help=text)
+    for option, text in (
+        ("num_features", "of an image"),
+        ("max_matches", "per pair, of those that pass the ratio test and of those that fail; 0 keeps all"),
+        ("seed", "seed of the order of matches"),
+    ):
+        default, name = getattr(options, option), f"--{option.replace('_', '-')}"
+        match.add_argument(name, metavar="N", type=int, default=default, help=f"{text} (default: %(default)s)")
     where = match.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=int, default=-1, help="processes here; -1 for all cores (default: %(default)s)")
     where.add_argument("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")

@@ -12,8 +12,7 @@ from kornia_learnnorm.data.datasets.textfiles import (
     camera_matrix,
     listed_image,
     parse_numbers,
-    rigid_motion,
-    rotation,
+    quaternion_pose,
     text_lines,
 )
 from kornia_learnnorm.data.images import image_size
@@ -33,8 +32,7 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
         split: ``train`` or ``test``; None for both.
 
     Returns:
-        the frames by name, each folder a sequence; cameras are NaN if the image cannot be read, or there is no
-        reconstruction or the image is not in it.
+        the frames by name, each folder a sequence; cameras are NaN where image or reconstruction do not give them.
 
     Raises:
         FileNotFoundError: if a list is missing, or an image that it lists.
@@ -61,7 +59,7 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
             K = np.full((3, 3), np.nan)
             if focal > 0:
                 K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
-            pose = rigid_motion(rotation(path, number, row[3:]).T, row[:3])
+            pose = quaternion_pose(path, number, row[3:] * [1, -1, -1, -1], row[:3])
             frames[name] = Frame(root / name, name, name.rpartition("/")[0], size, K, pose)
         if len(frames) == before:
             raise ValueError(f"{path} lists no images after the three lines of its header")

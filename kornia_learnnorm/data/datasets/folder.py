@@ -13,18 +13,10 @@ SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", "
 
 
 def read_folder(root: str | Path) -> list[Frame]:
-    """Return the images of a folder and its subfolders as frames; hidden files and folders are left out.
+    """Return the images of a folder and its subfolders as frames by folder and name, each folder a sequence.
 
-    Args:
-        root: a folder with images; png, jpg, jpeg, bmp, tif, tiff, webp, pgm or ppm, whatever the case.
-
-    Returns:
-        the frames by folder and name, each folder a sequence; cameras and poses are NaN. The size of an image that
-        cannot be read is (0, 0).
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or no image in it.
-
+    Images have the suffix png, jpg, jpeg, bmp, tif, tiff, webp, pgm or ppm, whatever the case; hidden files and folders
+    are skipped. A folder without images is a FileNotFoundError.
     """
     root = Path(root)
     if not root.is_dir():

@@ -27,8 +27,7 @@ def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera:
         camera: ``image_0`` and ``image_1`` are grey, ``image_2`` and ``image_3`` colour, left and right.
 
     Returns:
-        the frames, sequence after sequence; poses are NaN for a sequence without a file of poses (11 to 21). The
-        size of an image that cannot be read is (0, 0).
+        the frames, sequence after sequence; poses are NaN for a sequence without a file of poses (11 to 21).
 
     Raises:
         FileNotFoundError: if a folder, an image of a sequence or a ``calib.txt`` is missing.
@@ -54,16 +53,9 @@ def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera:
 
 
 def read_calibration(path: Path, key: str) -> tuple[Array, Array]:
-    """Return a camera's matrix (3, 3) and its pose in camera 0 (4, 4) from its projection K (I | b).
+    """Return a camera's matrix (3, 3) and its pose in camera 0 (4, 4) from its projection K (I | b) in ``calib.txt``.
 
-    Args:
-        path: a file ``calib.txt``.
-        key: the projection's name, ``P0`` to ``P3`` for ``image_0`` to ``image_3``.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it has no such projection, or the projection is malformed.
-
+    ``key`` is the projection's name, ``P0`` to ``P3`` for ``image_0`` to ``image_3``; ValueError without it.
     """
     for number, line in text_lines(path, "calibration"):
         name, _, rest = line.partition(":")

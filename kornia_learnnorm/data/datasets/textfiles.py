@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from numpy.typing import NDArray
 
-__all__ = ["camera_matrix", "listed_image", "parse_numbers", "rigid_motion", "rotation", "text_lines"]
+__all__ = ["camera_matrix", "listed_image", "parse_numbers", "quaternion_pose", "rigid_motion", "text_lines"]
 
 Array = NDArray[np.float64]
 
@@ -46,12 +46,12 @@ def listed_image(path: Path, number: int, name: str) -> str:
     return name
 
 
-def rotation(path: Path, number: int, wxyz: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z) of any norm but zero."""
+def quaternion_pose(path: Path, number: int, wxyz: Array, centre: Array) -> Array:
+    """Return the pose (4, 4) of a rotation, a quaternion (w, x, y, z) of any norm but zero, and a translation."""
     norm = np.linalg.norm(wxyz)
     if norm == 0:
         raise ValueError(f"{path}, line {number}: a quaternion other than zero expected, got {wxyz}")
-    return np.asarray(quaternion_to_rotation_matrix(torch.from_numpy(wxyz / norm)))
+    return rigid_motion(np.asarray(quaternion_to_rotation_matrix(torch.from_numpy(wxyz / norm))), centre)
 
 
 def rigid_motion(R: Array, t: Array) -> Array:

@@ -15,8 +15,7 @@ from kornia_learnnorm.data.datasets.textfiles import (
     camera_matrix,
     listed_image,
     parse_numbers,
-    rigid_motion,
-    rotation,
+    quaternion_pose,
     text_lines,
 )
 from kornia_learnnorm.data.images import image_size
@@ -46,7 +45,7 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
     Returns:
         the frames, sequence after sequence, by time. Cameras are NaN unless the folder's name has ``freiburg1`` to
         ``freiburg3`` or ``fr1`` to ``fr3`` in it; poses are NaN without ``groundtruth.txt`` or beyond
-        ``max_difference``. The size of an image that cannot be read is (0, 0).
+        ``max_difference``.
 
     Raises:
         FileNotFoundError: if there is no sequence, or an image that ``rgb.txt`` lists is missing.
@@ -98,7 +97,7 @@ def _trajectory(path: Path) -> tuple[Array, Array]:
     rows = []
     for number, line in text_lines(path, "poses"):
         row = parse_numbers(path, number, line.split(), 8, "timestamp tx ty tz qx qy qz qw")
-        rows.append((row[0], rigid_motion(rotation(path, number, row[[7, 4, 5, 6]]), row[1:4])))
+        rows.append((row[0], quaternion_pose(path, number, row[[7, 4, 5, 6]], row[1:4])))
     if not rows:
         raise ValueError(f"{path} has no poses")
     rows.sort(key=lambda row: row[0])

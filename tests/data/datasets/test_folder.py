@@ -7,7 +7,7 @@ import pytest
 from make_sequences import SIZE, names
 
 from kornia_learnnorm.data.datasets.folder import read_folder
-from kornia_learnnorm.data.datasets.pairs import pair_frames
+from kornia_learnnorm.data.datasets.pairing import pair_frames
 
 
 def test_frames(written):

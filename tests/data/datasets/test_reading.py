@@ -7,7 +7,7 @@ import pytest
 from make_sequences import FR1, FR3, STEP
 
 from kornia_learnnorm.data.datasets.frames import FramePair
-from kornia_learnnorm.data.datasets.pairs import pair_frames
+from kornia_learnnorm.data.datasets.pairing import pair_frames
 from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.data.datasets.splits import SPLITS
 

@@ -27,7 +27,7 @@ from PIL import Image
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.frames import FramePair, read_frame
-from kornia_learnnorm.data.datasets.pairs import pair_frames
+from kornia_learnnorm.data.datasets.pairing import pair_frames
 from kornia_learnnorm.data.matching import match_store
 from kornia_learnnorm.data.matching.feature_cache import FeatureCache
 from kornia_learnnorm.data.matching.features import Features, detect_sift

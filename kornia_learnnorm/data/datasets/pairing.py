@@ -20,11 +20,7 @@ def choose_pairs(
     model: Path | None = None,
     min_points: int | None = None,
 ) -> tuple[list[FramePair], str]:
-    """Return pairs of frames and, in words, how they were chosen: listed, by common points, or by their order.
-
-    ``gap``, of :func:`pair_frames`, decides if there is neither a file with a list of pairs nor a number of points that
-    the frames of a pair share in a COLMAP model.
-    """
+    """Return pairs of frames and, in words, how they were chosen: listed, by common points, or ``gap`` apart."""
     found: Iterable[FramePair]
     if listed is not None:
         found, text = listed_pairs(frames, listed), f"listed in {listed.name}"
@@ -60,14 +56,11 @@ def listed_pairs(frames: Sequence[Frame], path: str | Path) -> Iterator[FramePai
     first: dict[tuple[str, ...], int] = {}
     for number, line in text_lines(path, "list of pairs"):
         names = tuple(line.split())
-        if len(names) != 2:
-            raise ValueError(f"{path}, line {number}: two names expected, got {line!r}")
-        if names[0] == names[1]:
-            raise ValueError(f"{path}, line {number}: two images expected, got {names[0]!r} with itself")
+        if len(names) != 2 or names[0] == names[1]:
+            raise ValueError(f"{path}, line {number}: two names of two images expected, got {line!r}")
         if first.setdefault(names, number) != number:
             raise ValueError(f"{path}, line {number}: {line!r} is in line {first[names]} already")
-        for name in names:
-            if name not in named:
-                some = next(iter(named), "none")
-                raise ValueError(f"{path}, line {number}: no frame {name!r} among {len(named)}, such as {some!r}")
+        if unknown := [name for name in names if name not in named]:
+            some = next(iter(named), "none")
+            raise ValueError(f"{path}, line {number}: no frame {unknown[0]!r} among {len(named)}, such as {some!r}")
         yield FramePair(named[names[0]], named[names[1]])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from make_sequences import names
 
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.datasets.pairs import listed_pairs, pair_frames
+from kornia_learnnorm.data.datasets.pairing import listed_pairs, pair_frames
 
 
 def numbered(*sequences: str) -> list[Frame]:
@@ -41,9 +41,9 @@ class TestListedPairs:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("x/0.png x/1.png\nx/0.png\n", r"pairs\.txt, line 2: two names expected, got 'x/0\.png'"),
-            ("x/0.png x/1.png x/2.png", r"line 1: two names expected"),
-            ("x/0.png x/0.png", r"line 1: two images expected, got 'x/0\.png' with itself"),
+            ("x/0.png x/1.png\nx/0.png\n", r"pairs\.txt, line 2: two names of two images expected, got 'x/0\.png'"),
+            ("x/0.png x/1.png x/2.png", r"line 1: two names of two images expected"),
+            ("x/0.png x/0.png", r"line 1: two names of two images expected"),
             ("x/0.png x/1.png\nx/1.png x/0.png\n\nx/0.png  x/1.png", r"line 4: .* is in line 1 already"),
             ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
         ],
