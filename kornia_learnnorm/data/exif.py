@@ -10,15 +10,8 @@ ORIENTATION = 0x0112  # tag, section 4.6.4
 EXIF_IFD = 0x8769  # tag, section 4.6.3
 FOCAL_LENGTH_35MM = 0xA405  # tag, section 4.6.5; zero for unknown
 QUARTER_TURNS = (5, 6, 7, 8)  # orientations that swap width and height
-TURNS = {  # orientation -> name in PIL.Image.Transpose of the turn that undoes it
-    2: "FLIP_LEFT_RIGHT",
-    3: "ROTATE_180",
-    4: "FLIP_TOP_BOTTOM",
-    5: "TRANSPOSE",
-    6: "ROTATE_270",
-    7: "TRANSVERSE",
-    8: "ROTATE_90",
-}
+# Names in PIL.Image.Transpose of the turns that undo the orientations from 2 on.
+TURNS = ("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90")
 
 
 def orientation(image: Any) -> int:
@@ -32,7 +25,7 @@ def turn_upright(image: Any, orientation: int) -> Any:
     """Return an image of Pillow, turned so that an EXIF orientation becomes 1."""
     from PIL.Image import Transpose
 
-    return image.transpose(Transpose[TURNS[orientation]]) if orientation in TURNS else image
+    return image.transpose(Transpose[TURNS[orientation - 2]]) if 2 <= orientation <= 8 else image
 
 
 def focal_length_35mm(image: Any) -> float:

@@ -19,15 +19,9 @@ MIN_USED = 128  # smallest grey value of a mask's pixel that counts
 def read_mask(path: str | Path, size: Size, max_size: int | None = None) -> NDArray[np.bool_]:
     """Return which pixels of an image count by a mask file, (H, W) bool: those above 127.
 
-    Args:
-        path: an image file, read by :func:`~kornia_learnnorm.data.images.read_image`, whose errors are raised too;
-            transparent pixels do not count.
-        size: (width, height) of the image file that the mask is for, turned by EXIF.
-        max_size: limit that the image was read with, so that the mask has the shape of the reduced image.
-
-    Raises:
-        ValueError: if its size is not that of the image, or no pixel counts.
-
+    :func:`~kornia_learnnorm.data.images.read_image` reads the file, so transparent pixels do not count; ``max_size`` is
+    the limit that the image was read with. A mask without a pixel that counts is a ValueError, and one that does not
+    have the (width, height) of the image file, turned by EXIF.
     """
     mask = read_image(path, max_size) >= MIN_USED
     got = image_size(path)
@@ -44,15 +38,8 @@ def content_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
     The frame is made of the outermost rows and columns with grey values of at most 2, of which 95 % or more are equal.
     The rows and columns of a dark photograph have noise and are kept. An image that is black all over has no frame.
 
-    Args:
-        image: grey values with shape :math:`(H, W)`, uint8.
-
-    Returns:
-        a mask with shape :math:`(H, W)`, bool: true in a rectangle, false in the frame around it.
-
-    Raises:
-        TypeError: if the image is not an array of uint8.
-        ValueError: if the image does not have two dimensions, or no pixel.
+    ``image`` has grey values, uint8 (H, W), as the mask, bool: true in a rectangle, false in the frame around it. Other
+    arrays are a TypeError or a ValueError.
 
     Example:
         >>> image = np.pad(np.full((2, 3), 90, np.uint8), ((1, 1), (0, 1)))

@@ -45,39 +45,22 @@ LAYOUT: dict[str, tuple[tuple[int, ...], str, str]] = {
 
 @dataclass(frozen=True)
 class CorrespondenceStore:
-    """Correspondences of many image pairs, in memory.
+    """Correspondences of many image pairs, in memory."""
 
-    Attributes:
-        points1: pixels (x, y) in the first images, (M, 2) float32.
-        points2: pixels (x, y) in the second images, (M, 2) float32.
-        ratio: nearest over second-nearest descriptor distance (Lowe's ratio), (M,) float32.
-        offsets: pair ``i`` owns rows ``offsets[i]:offsets[i + 1]``, (P + 1,) int64.
-        image_size: (width, height) of both images, (P, 2, 2) int32.
-        names: file names of both images, P pairs.
-        F: ground truth, x2^T F x1 = 0, unit Frobenius norm, NaN where unknown, (P, 3, 3) float64.
-        K: cameras, (P, 2, 3, 3) float64.
-        R: rotations of x2 = R x1 + t, (P, 3, 3) float64.
-        t: translations of x2 = R x1 + t in metres, (P, 3) float64.
-        dataset: name of the data set and its sequences.
-        pairs: how the pairs were chosen.
-        detector: detector and matcher.
-        provenance: options, versions and skipped pairs of the command that made the store; values of JSON's types.
-    """
-
-    points1: NDArray[np.float32]
-    points2: NDArray[np.float32]
-    ratio: NDArray[np.float32]
-    offsets: NDArray[np.int64]
-    image_size: NDArray[np.int32]
-    names: list[tuple[str, str]]
-    F: NDArray[np.float64]
-    K: NDArray[np.float64]
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
-    dataset: str
-    pairs: str
-    detector: str
-    provenance: dict[str, Any] = field(default_factory=dict)
+    points1: NDArray[np.float32]  # pixels (x, y) in the first images, (M, 2)
+    points2: NDArray[np.float32]  # pixels (x, y) in the second images, (M, 2)
+    ratio: NDArray[np.float32]  # nearest over second-nearest descriptor distance (Lowe's ratio), (M,)
+    offsets: NDArray[np.int64]  # pair i owns rows offsets[i]:offsets[i + 1], (P + 1,)
+    image_size: NDArray[np.int32]  # (width, height) of both images, (P, 2, 2)
+    names: list[tuple[str, str]]  # file names of both images, P pairs
+    F: NDArray[np.float64]  # ground truth, x2^T F x1 = 0, unit Frobenius norm, NaN where unknown, (P, 3, 3)
+    K: NDArray[np.float64]  # cameras, (P, 2, 3, 3)
+    R: NDArray[np.float64]  # rotations of x2 = R x1 + t, (P, 3, 3)
+    t: NDArray[np.float64]  # translations of x2 = R x1 + t in metres, (P, 3)
+    dataset: str  # name of the data set and its sequences
+    pairs: str  # how the pairs were chosen
+    detector: str  # detector and matcher
+    provenance: dict[str, Any] = field(default_factory=dict)  # options, versions, skipped pairs; values of JSON's types
 
     def __len__(self) -> int:
         """Return the number of image pairs."""

@@ -26,28 +26,16 @@ def _unknown(*shape: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """An image, its camera and its pose.
+    """An image, its camera and its pose."""
 
-    Attributes:
-        path: the image file.
-        name: its path below the root of the dataset, with slashes; the name in stores.
-        sequence: name of its sequence; frames are paired by their order within a sequence.
-        size: (width, height) of the file, pixels; (0, 0) where it cannot be read.
-        camera: camera matrix of the file's pixels, (3, 3) float64, NaN where unknown.
-        pose: camera to world, metres, (4, 4) float64, NaN where unknown.
-        distortion: OpenCV's ``k1, k2, p1, p2[, k3]`` of the file's pixels, which are undistorted before matching;
-            empty for none.
-        resized: (width, height) to resize to after undistortion; None keeps the file's.
-    """
-
-    path: Path
-    name: str
-    sequence: str
-    size: Size
-    camera: NDArray[np.float64] = field(default_factory=lambda: _unknown(3, 3))
-    pose: NDArray[np.float64] = field(default_factory=lambda: _unknown(4, 4))
-    distortion: tuple[float, ...] = ()
-    resized: Size | None = None
+    path: Path  # of the image file
+    name: str  # the path below the root of the dataset, with slashes; the name in stores
+    sequence: str  # name of the sequence; frames are paired by their order within a sequence
+    size: Size  # (width, height) of the file, pixels; (0, 0) where it cannot be read
+    camera: NDArray[np.float64] = field(default_factory=lambda: _unknown(3, 3))  # of the file's pixels, or NaN
+    pose: NDArray[np.float64] = field(default_factory=lambda: _unknown(4, 4))  # camera to world, metres, or NaN
+    distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2[, k3] of the file's pixels; removed before matching
+    resized: Size | None = None  # (width, height) to resize to after undistortion; None keeps the file's
 
     @property
     def matched_size(self) -> Size:

@@ -45,7 +45,7 @@ class MatchOptions:
     detector: str = "sift"  # a key of features.DETECTORS
     num_features: int = 4000  # kept of an image, the strongest ones
     matcher: str = "nearest"  # a key of matchers.MATCHERS
-    #: Matches kept of a pair, drawn at random: so many that pass Lowe's ratio test, so many that fail it; None for all.
+    # Matches kept of a pair, drawn at random: so many that pass Lowe's ratio test, so many that fail it; None for all.
     max_matches: int | None = MAX_FILTERED
     seed: int = 0  # of this draw and of the order of a pair's matches
 

@@ -25,14 +25,9 @@ class Workers:
     """Worker processes that call a function with many arguments; ``options`` are those of joblib's ``Parallel``."""
 
     def __init__(self, **options: Any) -> None:
-        self.options = options
-
-    @property
-    def number(self) -> int:
-        """Return the number of processes."""
         from joblib import effective_n_jobs
 
-        return int(effective_n_jobs(self.options["n_jobs"]))
+        self.options, self.number = options, int(effective_n_jobs(options["n_jobs"]))
 
     @contextmanager
     def results(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Iterator[Any]]:

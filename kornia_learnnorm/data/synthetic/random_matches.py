@@ -36,23 +36,14 @@ KINDS = 5  # of scenes
 
 
 class SyntheticMatches(NamedTuple):
-    """Matches of synthetic scenes.
+    """Matches of synthetic scenes."""
 
-    Attributes:
-        points1: pixels in the first image, (B, N, 2).
-        points2: pixels in the second image, (B, N, 2).
-        scores: a score for each match, as 1 minus Lowe's ratio, (B, N).
-        inliers: one for inliers, zero for outliers, (B, N).
-        exact1: pixels in the first image of further correspondences, without noise, (B, M, 2).
-        exact2: pixels in the second image of the further correspondences, (B, M, 2).
-    """
-
-    points1: Tensor
-    points2: Tensor
-    scores: Tensor
-    inliers: Tensor
-    exact1: Tensor
-    exact2: Tensor
+    points1: Tensor  # pixels in the first image, (B, N, 2)
+    points2: Tensor  # pixels in the second image, (B, N, 2)
+    scores: Tensor  # a score for each match, as 1 minus Lowe's ratio, (B, N)
+    inliers: Tensor  # one for inliers, zero for outliers, (B, N)
+    exact1: Tensor  # pixels in the first image of further correspondences, without noise, (B, M, 2)
+    exact2: Tensor  # pixels in the second image of the further correspondences, (B, M, 2)
 
 
 def random_matches(batch_size: int, num_points: int, num_exact: int, generator: Generator) -> SyntheticMatches:

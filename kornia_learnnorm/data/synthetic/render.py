@@ -34,30 +34,16 @@ Metres = tuple[float, float]  # width and height
 
 
 class RenderedPair(NamedTuple):
-    r"""Two rendered images and their geometry; :math:`X_2 = R X_1 + t` for points in space.
+    """Two rendered images and their geometry: X2 = R X1 + t for points in space, x2^T F x1 = 0."""
 
-    Args:
-        image1: first image, grey, uint8 with shape :math:`(H, W)`.
-        image2: second image, grey, uint8 with shape :math:`(H, W)`.
-        K: intrinsics of both cameras with shape :math:`(3, 3)`; pixel centres are at whole numbers.
-        R: rotation with shape :math:`(3, 3)`.
-        t: translation in metres with shape :math:`(3,)`.
-        F_mat: fundamental matrix with shape :math:`(3, 3)`, unit Frobenius norm, :math:`x_2^\top F x_1 = 0`;
-            NaN where the camera only turns.
-        points1: exact correspondences on the surfaces that both images show, pixels with shape :math:`(M, 2)`: a grid
-            in the first image.
-        points2: their pixels in the second image with shape :math:`(M, 2)`.
-
-    """
-
-    image1: NDArray[np.uint8]
+    image1: NDArray[np.uint8]  # grey, (H, W)
     image2: NDArray[np.uint8]
-    K: Array
-    R: Array
-    t: Array
-    F_mat: Array
-    points1: Array
-    points2: Array
+    K: Array  # intrinsics of both cameras, pixels, (3, 3); pixel centres are at whole numbers
+    R: Array  # (3, 3)
+    t: Array  # metres, (3,)
+    F_mat: Array  # unit norm, (3, 3); NaN where the camera only turns
+    points1: Array  # exact correspondences on the surfaces that both images show, pixels, (M, 2): a grid in image 1
+    points2: Array  # their pixels in image 2, (M, 2)
 
 
 class Plane(NamedTuple):
@@ -70,19 +56,10 @@ class Plane(NamedTuple):
 
 
 def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedPair:
-    r"""Render two views of a room with pictures on stands; equal seeds give equal images.
+    """Render two views of a room with pictures on stands; equal seeds give equal images.
 
-    The second camera is about half a metre to the side of and ahead of the first one and turned a little. The ground
-    truth is :math:`F = K^{-\top} [t]_\times R K^{-1}`.
-
-    Args:
-        seed: seed of textures, boards and motion, 0 or more.
-        width: width of the images in pixels.
-        height: height of the images in pixels.
-
-    Raises:
-        ImportError: if OpenCV is not installed.
-        ValueError: if the seed is negative, or the height is below 64 pixels or above the width.
+    The second camera is about half a metre to the side of and ahead of the first one and turned a little. A seed below
+    0 and a height below 64 pixels or above the width are a ValueError.
 
     Example:
         >>> pair = render_pair(seed=0, width=320, height=240)

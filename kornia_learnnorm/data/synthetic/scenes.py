@@ -37,30 +37,17 @@ MAX_SCALE_CHANGE = 4.0  # ratio of a point's depths in view 1 and view 2; no des
 
 
 class TwoViewScene(NamedTuple):
-    r"""Correspondences of a batch of image pairs and their ground truth; :math:`X_2 = R X_1 + t` for points in space.
+    """Correspondences of a batch of image pairs and their ground truth: X2 = R X1 + t, x2^T F x1 = 0."""
 
-    Args:
-        points1: pixels in the first image with shape :math:`(B, N, 2)`.
-        points2: pixels in the second image with shape :math:`(B, N, 2)`.
-        F_mat: fundamental matrices with shape :math:`(B, 3, 3)`, unit Frobenius norm, :math:`x_2^\top F x_1 = 0`.
-        inliers: boolean, :math:`(B, N)`; false for gross outliers.
-        K1: intrinsics of the first camera with shape :math:`(B, 3, 3)`.
-        K2: intrinsics of the second camera with shape :math:`(B, 3, 3)`.
-        R: rotations with shape :math:`(B, 3, 3)`.
-        t: translations with shape :math:`(B, 3)`, in the unit of depth.
-        image_size: width and height in pixels with shape :math:`(B, 2)`.
-
-    """
-
-    points1: Tensor
-    points2: Tensor
-    F_mat: Tensor
-    inliers: Tensor
-    K1: Tensor
-    K2: Tensor
-    R: Tensor
-    t: Tensor
-    image_size: Tensor
+    points1: Tensor  # pixels in the first image, (B, N, 2)
+    points2: Tensor  # pixels in the second image, (B, N, 2)
+    F_mat: Tensor  # unit Frobenius norm, (B, 3, 3)
+    inliers: Tensor  # boolean, (B, N); false for gross outliers
+    K1: Tensor  # intrinsics of the first camera, (B, 3, 3)
+    K2: Tensor  # intrinsics of the second camera, (B, 3, 3)
+    R: Tensor  # rotations, (B, 3, 3)
+    t: Tensor  # translations in the unit of depth, (B, 3)
+    image_size: Tensor  # width and height, pixels, (B, 2)
 
 
 def random_scenes(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
