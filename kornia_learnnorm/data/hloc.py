@@ -35,7 +35,8 @@ def read_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
     for path in map(Path, (features, matches)):
         if not path.is_file():
             raise FileNotFoundError(f"no file of hloc at {path}")
-    arrays, names = defaultdict(list), []
+    arrays: defaultdict[str, list[Any]] = defaultdict(list)
+    names: list[tuple[str, str]] = []
     with open_hdf5(Path(features)) as images, open_hdf5(Path(matches)) as file:
         found: list[str] = []
         images.visit(found.append)
@@ -58,5 +59,5 @@ def read_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
     known: dict[str, Any] = {name: np.concatenate(parts).astype(LAYOUT[name][1]) for name, parts in arrays.items()}
     unknown: dict[str, Any] = {name: np.full((len(names), *LAYOUT[name][0]), np.nan) for name in "FKRt"}
     offsets = np.cumsum([0, *map(len, arrays["ratio"])], dtype=np.int64)
-    about = {"dataset": f"hloc's {Path(features).name} and {Path(matches).name}", "pairs": "not known"}
+    about: dict[str, Any] = {"dataset": f"hloc's {Path(features).name} and {Path(matches).name}", "pairs": "not known"}
     return CorrespondenceStore(**known, **unknown, **about, offsets=offsets, names=names, detector="not known")
