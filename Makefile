@@ -124,14 +124,17 @@ LAYER_RUNS := $(patsubst configs/%.yaml,runs/%/weights.safetensors,$(wildcard co
 .PRECIOUS: $(ABLATION_RUNS) $(TABLE1_RUNS) $(LAYER_RUNS)
 
 ablations: layer-ablations $(VENV)/.ready $(ABLATION_RUNS)
-	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
-		--methods $(CLOSED_FORMS) $(ABLATION_RUNS) paper crossview searched
+	OMP_NUM_THREADS=1 $(BIN)/learnnorm evaluate $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
+		--methods $(CLOSED_FORMS) $(ABLATION_RUNS) paper crossview searched --out runs/ablations/run
+	$(BIN)/learnnorm report runs/ablations/run
 
 table1: $(VENV)/.ready $(TABLE1_RUNS)
 	$(BIN)/learnnorm synthesize runs/table1 --scenes hand-held --pairs 60
-	OMP_NUM_THREADS=1 $(BIN)/learnnorm compare $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5@10:19 \
+	OMP_NUM_THREADS=1 $(BIN)/learnnorm evaluate $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5@10:19 \
 		$(STORES)/tum_fr3_office_kitti_size.h5@10:19 runs/table1/synthetic.h5 \
-		--methods $(CLOSED_FORMS) paper $(wildcard runs/paper-150/weights.safetensors) crossview $(TABLE1_RUNS) searched
+		--methods $(CLOSED_FORMS) paper $(wildcard runs/paper-150/weights.safetensors) crossview $(TABLE1_RUNS) searched \
+		--out runs/table1/run
+	$(BIN)/learnnorm report runs/table1/run
 
 layer-ablations: $(VENV)/.ready $(LAYER_RUNS)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/sizes.py $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \

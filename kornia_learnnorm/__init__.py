@@ -31,7 +31,7 @@ from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
 from kornia_learnnorm.losses import BoundedEpipolarLoss, EpipolarLoss, InlierLoss, LogEpipolarLoss
 from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate
 from kornia_learnnorm.metrics.bootstrap import PairedDifference, bootstrap_interval, paired_bootstrap
-from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
+from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
 from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc, pose_error
 from kornia_learnnorm.normalizers.contract import PerView
 from kornia_learnnorm.normalizers.hartley import Hartley

@@ -79,7 +79,7 @@ def test_commands_refuse_a_folder_that_another_run_writes(tmp_path, refused):
     out.mkdir()
     with exclusive(out):
         refused(["evaluate", store, "--methods", "Hartley", "--out", out], "run is in use by process ")
-        refused(["robust", store, "--estimators", "--solvers", "Hartley", "--out", out], "run is in use by process ")
+        refused(["robust", store, "--estimators", "RANSAC", "--out", out], "run is in use by process ")
         refused(["estimate", "--pairs", tmp_path / "pairs.txt", "--out", out], "run is in use by process ")
         options = ["--trainer.max_steps=1", f"--trainer.default_root_dir={out}"]
         refused(["fit", "--config", "crossview-synthetic", *options], "run is in use by process ")

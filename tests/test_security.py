@@ -24,7 +24,7 @@ from kornia_learnnorm.data.sources import StoreSamples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
-from kornia_learnnorm.evaluation.runs.store import read_arrays
+from kornia_learnnorm.evaluation.runs.results_store import read_arrays
 
 ROOT = Path(__file__).parent.parent
 

@@ -10,32 +10,15 @@ from pathlib import Path
 
 import torch
 
-from kornia_learnnorm.evaluation.methods import (
-    KEPT_METHODS,
-    SHIPPED,
-    default_methods,
-    short_name_of,
-    short_names,
-)
-from kornia_learnnorm.evaluation.report.formatting import known_parts
-from kornia_learnnorm.evaluation.report.rates import was_trained_on
+from kornia_learnnorm.evaluation.methods import KEPT_METHODS, SHIPPED, default_methods, short_name_of, short_names
+from kornia_learnnorm.evaluation.report.rates import HEADER, method_rows, was_trained_on
 from kornia_learnnorm.evaluation.runs.predict import SampleOptions
-from kornia_learnnorm.evaluation.runs.record import record_run, temporary_run
-from kornia_learnnorm.evaluation.runs.run import Run, read_run
-from kornia_learnnorm.evaluation.tables import HEADER, Table, format_table, method_rows, names_of, tables_as_json
+from kornia_learnnorm.evaluation.runs.prediction_run import Run, read_run, record_run, temporary_run
+from kornia_learnnorm.evaluation.tables import Table, format_table, names_of, tables_as_json
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = [
-    "EXAMPLES",
-    "add_arguments",
-    "add_json_argument",
-    "add_run_arguments",
-    "json_tables",
-    "print_table",
-    "run",
-    "run_arguments",
-]
+__all__ = ["EXAMPLES", "add_arguments", "add_json_argument", "json_tables", "run"]
 
 EXAMPLES = """\
 learnnorm evaluate store.h5 --methods Hartley crossview Hartley+LM --size 16
@@ -45,8 +28,8 @@ LEGEND = "mean, median: symmetric epipolar distance of a sample's own points, th
 TRUTH = "truth: of the ground-truth inliers of its pair, the accuracy; a better fit need not be more accurate"
 
 
-def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that ``evaluate``, ``compare`` and ``diagnose`` share."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``learnnorm evaluate`` to a parser."""
     parser.add_argument(
         "stores", metavar="STORE", nargs="+", help="stores of correspondences (.h5); FILE.h5@3:10 for some pairs"
     )
@@ -78,6 +61,15 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=SampleOptions.max_samples,
         help="at most so many samples of each store and protocol, at random (default: %(default)s; 0: all)",
+    )
+    parser.add_argument(
+        "--size", metavar="N", type=int, default=8, help="correspondences in a sample (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="RUN",
+        help="folder to keep the predictions in, with everything that learnnorm report shows; the default methods are"
+        f" then also {', '.join(KEPT_METHODS)}",
     )
     add_json_argument(parser)
 
@@ -117,50 +109,20 @@ def json_tables(args: argparse.Namespace, inputs: Sequence[str] = ()) -> Iterato
         print(f"\nwrote {args.json}")
 
 
-def print_table(args: argparse.Namespace, heading: str, table: Table) -> None:
-    """Print a table under a heading, unless standard output is for JSON."""
-    if args.json != "-":
-        print(f"\n{heading}\n\n{format_table(table.header, table.rows)}", flush=True)
-
-
-def run_arguments(
-    args: argparse.Namespace, size: int, *, kept: bool = False
-) -> tuple[dict[str, str], tuple[str, ...], SampleOptions]:
-    """Return the stores by name, the names of the methods and how samples of ``size`` correspondences are drawn.
-
-    A run that is ``kept`` has more default methods.
-    """
+def run(args: argparse.Namespace) -> int:
+    """Make a run of predictions and print two tables per store, filtered and unfiltered."""
     if args.max_samples < 0:
         raise ValueError(f"--max-samples must be 0, for all, or more, got {args.max_samples}")
     if not args.max_residual >= 0:
         raise ValueError(f"--max-residual must be 0 or more, inf for all, got {args.max_residual:g}")
     stores = {name: path for path, name in names_of(args.stores).items()}
     weights = args.weights or ()
-    methods = (*args.methods, *weights) if args.methods else default_methods(weights, kept=kept)
+    methods = (*args.methods, *weights) if args.methods else default_methods(weights, kept=args.out is not None)
     for path in weights:
         if (name := short_name_of(path)) in SHIPPED and path != name:
             print(f"{name} is {path} here, not the weights of this name that ship", file=sys.stderr)
-    return stores, methods, SampleOptions(size, args.seed, args.max_samples or None, args.max_residual)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``learnnorm evaluate`` to a parser."""
-    add_run_arguments(parser)
-    parser.add_argument(
-        "--size", metavar="N", type=int, default=8, help="correspondences in a sample (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--out",
-        metavar="RUN",
-        help="folder to keep the predictions in, with everything that learnnorm report shows; the default methods are"
-        f" then also {', '.join(KEPT_METHODS)}",
-    )
-
-
-def run(args: argparse.Namespace) -> int:
-    """Make a run of predictions and print two tables per store, filtered and unfiltered."""
-    stores, methods, options = run_arguments(args, args.size, kept=args.out is not None)
-    with json_tables(args, [*args.stores, *(args.weights or ())]) as tables:
+    options = SampleOptions(args.size, args.seed, args.max_samples or None, args.max_residual)
+    with json_tables(args, [*args.stores, *weights]) as tables:
         if args.out is None:
             _print_tables(args, temporary_run(stores, methods, options), tables)
             return 0
@@ -195,10 +157,11 @@ def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> No
             own = torch.stack([errors["own"] for errors in cell.predictions.values()])
             if infinite := int(own.isinf().any(0).sum()):
                 text += f"; {infinite} with a point on an epipole, not in the means"
-            table = known_parts(Table(cell.title, text, [*HEADER], method_rows(cell.predictions)))
+            table = Table(cell.title, text, [*HEADER], method_rows(cell.predictions)).known_parts()
             if table is not None:
                 tables.append(table)
-                print_table(args, text, table)
+                if args.json != "-":
+                    print(f"\n{text}\n\n{format_table(table.header, table.rows)}", flush=True)
     if args.json != "-":
         print(f"\n{LEGEND}")
         if any(_has_truth(run, store) for store in run.about["stores"]):

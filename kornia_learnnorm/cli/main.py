@@ -52,9 +52,7 @@ TOOLS = {
     "estimate": ("kornia_learnnorm.cli.estimate", "the fundamental matrix of two images"),
     "demo": ("kornia_learnnorm.cli.demo", "a page in the browser to try two images on"),
     "evaluate": ("kornia_learnnorm.cli.evaluate", "better rates and errors on stores of correspondences"),
-    "diagnose": ("kornia_learnnorm.cli.diagnose", "condition number, rank-2 error and other diagnostics"),
-    "compare": ("kornia_learnnorm.cli.compare", "methods side by side over several stores, with confidence intervals"),
-    "robust": ("kornia_learnnorm.cli.robust", "robust estimators and minimal solvers on stores"),
+    "robust": ("kornia_learnnorm.cli.robust", "robust estimators on stores"),
     "report": ("kornia_learnnorm.cli.report", "tables and figures of what evaluate --out and robust wrote"),
     "match": ("kornia_learnnorm.cli.match", "a store of correspondences from folders of images"),
     "synthesize": ("kornia_learnnorm.cli.synthesize", "a synthetic store and a rendered image pair"),
@@ -221,7 +219,7 @@ def _run_training(words: list[str]) -> int:
         training.run(words)
         return 0
     from kornia_learnnorm.cli.evaluate import add_json_argument, json_tables
-    from kornia_learnnorm.evaluation.tables import Table
+    from kornia_learnnorm.evaluation.tables import Number, Table
 
     usage = f"learnnorm {words[0]} --config NAME_OR_FILE --ckpt_path FILE [options]"
     parser = argparse.ArgumentParser(f"learnnorm {words[0]}", usage, add_help=False, allow_abbrev=False)
@@ -233,7 +231,7 @@ def _run_training(words: list[str]) -> int:
     with json_tables(args, [word.rpartition("=")[2] for word in options]) as tables:
         with redirect_stdout(sys.stderr if args.json == "-" else sys.stdout):
             metrics = training.run(options)
-        rows = [[name, "" if math.isnan(value) else str(value)] for name, value in metrics.items()]
+        rows = [[name, "" if math.isnan(value) else Number(value, "")] for name, value in metrics.items()]
         tables.append(Table(words[0], f"metrics on {MEASURED[words[0]]}", ["metric", "value"], rows))
     return 0
 

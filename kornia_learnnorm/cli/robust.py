@@ -1,4 +1,4 @@
-"""The command ``learnnorm robust``: robust estimators and the hypotheses of minimal solvers on stores."""
+"""The command ``learnnorm robust``: robust estimators on stores."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import argparse
 import sys
 from pathlib import Path
 
-from kornia_learnnorm.evaluation.robust.estimators import DEFAULT_ESTIMATORS, DEFAULT_SOLVERS
-from kornia_learnnorm.evaluation.robust.record import DEFAULT_OPTIONS, record_robust
+from kornia_learnnorm.evaluation.robust.robust_estimators import DEFAULT_ESTIMATORS
+from kornia_learnnorm.evaluation.robust.robust_run import DEFAULT_OPTIONS, record_robust
 from kornia_learnnorm.evaluation.tables import names_of
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
 
 EXAMPLES = """\
 learnnorm robust store.h5 --out run && learnnorm report run
-learnnorm robust store.h5 --out run --estimators RANSAC poselib --solvers"""
+learnnorm robust store.h5 --out run --estimators RANSAC poselib"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,39 +26,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--estimators",
         metavar="NAME",
-        nargs="*",
+        nargs="+",
         default=list(DEFAULT_ESTIMATORS),
-        help="robust estimators; learned:WEIGHTS, guided:WEIGHTS, count:METHOD, time:METHOD and RANSAC:METHOD for your"
-        " own; RANSAC-calibrated, poselib-calibrated and opencv-usac-magsac-calibrated use the cameras of the store"
+        help="robust estimators; learned:WEIGHTS, guided:WEIGHTS and RANSAC:METHOD for your own; RANSAC-calibrated,"
+        " poselib-calibrated and opencv-usac-magsac-calibrated use the cameras of the store"
         f" (default: {' '.join(DEFAULT_ESTIMATORS)})",
-    )
-    parser.add_argument(
-        "--solvers",
-        metavar="NAME",
-        nargs="*",
-        default=list(DEFAULT_SOLVERS),
-        help=f"minimal solvers whose hypotheses are measured (default: {' '.join(DEFAULT_SOLVERS)})",
     )
     counts = {
         "pairs": "of each store, evenly spaced; 0: all",
-        "hypotheses": "pairs of each store for the minimal solvers, evenly spaced; 0: all",
         "seeds": "runs on each pair",
-        "slow_seeds": "runs of the estimators that can take a second: all except opencv-*, count:* and time:*",
+        "slow_seeds": "runs of the estimators that can take a second: all except opencv-* and learned:*",
         "seed": "the first seed",
     }
     for name, text in counts.items():
         option, default = f"--{name.replace('_', '-')}", DEFAULT_OPTIONS[name]
         parser.add_argument(option, metavar="N", type=int, default=default, help=f"{text} (default: %(default)s)")
-    parser.add_argument(
-        "--redo", metavar="NAME", nargs="+", default=[], help="estimators or solvers to run again, after a change"
-    )
+    parser.add_argument("--redo", metavar="NAME", nargs="+", default=[], help="estimators to run again, after a change")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record a run of robust estimators and minimal solvers."""
+    """Record a run of robust estimators."""
     stores = {name: path for path, name in names_of(args.stores).items()}
     options = {name: getattr(args, name) for name in DEFAULT_OPTIONS}
-    missing = record_robust(args.out, stores, args.estimators, args.solvers, options, args.redo, args.command_line)
+    missing = record_robust(args.out, stores, args.estimators, options, args.redo, args.command_line)
     if missing:
         print(f"left out, since not installed: {', '.join(missing)}", file=sys.stderr)
     print(f"wrote {args.out}; learnnorm report {args.out} makes its tables and pictures")

@@ -1,49 +1,61 @@
-"""Tables: their form as Markdown and as JSON, and those of methods from the errors of their samples."""
+"""Tables of numbers, which are rounded where they are shown: in Markdown, in the terminal and in JSON."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
-import re
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
-
 from kornia_learnnorm.files import short_name
-from kornia_learnnorm.metrics.better_rate import better_rate, comparable
-from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.optional import import_extra
 
-__all__ = [
-    "DIAGNOSTICS",
-    "HEADER",
-    "Table",
-    "diagnostic_rows",
-    "format_table",
-    "method_rows",
-    "names_of",
-    "tables_as_json",
-]
+__all__ = ["MIN_P_VALUE", "Cell", "Number", "Table", "format_table", "names_of", "tables_as_json"]
 
-HEADER = (
-    "method",
-    "better than Hartley %",
-    "than whitening %",
-    "mean px",
-    "median px",
-    "truth: median px",
-    "truth: better than Hartley %",
-)
-DIAGNOSTICS = ("method", "condition number", "rho", "distance 1", "distance 2", "error due to rank 2 %")
+MIN_P_VALUE = 1e-3  # the smallest p-value that the resamples of a report can resolve
 
-_NUMBER = r"([+-]?\d+(?:\.\d*)?(?:e[+-]?\d+)?)"
-# A number; its interval and p-value, or the standard deviation of a run's mean; * for a
-# store that was trained on.
-CELL = re.compile(rf"{_NUMBER}(?: \[{_NUMBER}, {_NUMBER}\](?:, (?:< )?{_NUMBER})?)?(?: ± {_NUMBER})?( \*)?")
-PARTS = ("value", "low", "high", "p", "std", "trained_on")
 
-Predictions = Mapping[str, Mapping[str, Tensor]]
+class Number(NamedTuple):
+    """A number and what stands beside it.
+
+    Example:
+        >>> str(Number(1.52, ".1f", (1.2, 2.0), 0.0004)), str(Number(99.9, ".1f", trained_on=True))
+        ('1.5 [1.2, 2.0], < 0.001', '99.9 *')
+
+    """
+
+    value: float
+    spec: str = ".3f"  # format of the value, the interval and the standard deviation
+    interval: tuple[float, float] | None = None
+    p_value: float | None = None
+    std: float | None = None  # of the mean of a run
+    trained_on: bool = False  # whether the method was trained on the store
+
+    def __str__(self) -> str:
+        """Return the number as tables show it."""
+        text = format(self.value, self.spec)
+        if self.interval is not None:
+            text += " [{:{spec}}, {:{spec}}]".format(*self.interval, spec=self.spec)
+        if self.p_value is not None:
+            text += f", < {MIN_P_VALUE:g}" if self.p_value < MIN_P_VALUE else f", {self.p_value:.3f}"
+        text += "" if self.std is None else f" ± {self.std:{self.spec}}"
+        return f"{text} *" if self.trained_on else text
+
+    def as_json(self) -> Any:
+        """Return the rounded number, or an object with the numbers beside it; a number that is not finite as text."""
+        if not math.isfinite(self.value):
+            return str(self)
+        low, high = self.interval or (None, None)
+        parts = {"value": self.value, "low": low, "high": high, "std": self.std}
+        known = {name: float(format(part, self.spec)) for name, part in parts.items() if part is not None}
+        if self.p_value is not None:
+            known["p"] = max(MIN_P_VALUE, round(self.p_value, 3))
+        found: dict[str, Any] = known | {"trained_on": True} if self.trained_on else known
+        return found if len(found) > 1 else found["value"]
+
+
+Cell = str | int | Number
 
 
 class Table(NamedTuple):
@@ -52,7 +64,26 @@ class Table(NamedTuple):
     title: str
     text: str  # what the table shows and how to read it, Markdown
     header: list[str]
-    rows: list[list[str]]  # cells as text
+    rows: list[list[Cell]]
+
+    def known_parts(self) -> Table | None:
+        """Return the table without the columns and rows that have no number; None if there is none at all.
+
+        The first column has names.
+
+        Example:
+            >>> Table("", "", ["method", "own", "truth"], [["a", 1, ""], ["b", "", "-"]]).known_parts().rows
+            [['a', 1]]
+
+        """
+        known = [row for row in self.rows if any(map(_is_known, row[1:]))]
+        places = [0, *(i for i in range(1, len(self.header)) if any(_is_known(row[i]) for row in known))]
+        rows = [[row[i] for i in places] for row in known]
+        return self._replace(header=[self.header[i] for i in places], rows=rows) if rows else None
+
+
+def _is_known(cell: Cell) -> bool:
+    return cell not in ("", "-")
 
 
 def tables_as_json(command: str, tables: Sequence[Table]) -> str:
@@ -63,88 +94,49 @@ def tables_as_json(command: str, tables: Sequence[Table]) -> str:
     null where the table is empty or has ``-``; otherwise its text. Numbers are rounded as in the printed table.
 
     Example:
-        >>> print(tables_as_json("learnnorm ...", [Table("A", "", ["method", "px"], [["mine", "1.5 [1.2, 2]"]])]))
-        {"command": "learnnorm ...",... "rows": [{"method": "mine", "px": {"value": 1.5, "low": 1.2, "high": 2}}]}]}
+        >>> rows = [["mine", Number(1.52, ".1f", (1.2, 2.0))]]
+        >>> print(tables_as_json("learnnorm ...", [Table("A", "", ["method", "px"], rows)]))
+        {"command": "learnnorm ...",... "rows": [{"method": "mine", "px": {"value": 1.5, "low": 1.2, "high": 2.0}}]}]}
 
     """
+
+    def value(cell: Cell) -> Any:
+        return cell.as_json() if isinstance(cell, Number) else cell if _is_known(cell) else None
+
     content = {
         "command": command,
         "version": importlib.metadata.version("kornia_learnnorm"),
-        "tables": [{"title": t.title, "text": t.text, "rows": [_row(t.header, row) for row in t.rows]} for t in tables],
+        "tables": [
+            {
+                "title": table.title,
+                "text": table.text,
+                "rows": [dict(zip(table.header, map(value, row), strict=True)) for row in table.rows],
+            }
+            for table in tables
+        ],
     }
     return json.dumps(content, allow_nan=False)
 
 
-def _row(header: Sequence[str], row: Sequence[str]) -> dict[str, Any]:
-    name, *cells = row
-    return {header[0]: name, **{column: _value(cell) for column, cell in zip(header[1:], cells, strict=True)}}
+def format_table(header: Sequence[str], rows: Sequence[Sequence[Cell]], form: str = "pipe", **options: Any) -> str:
+    """Format a table with padded columns, the first aligned left and the others right.
 
-
-def _value(cell: str) -> Any:
-    """Return what a cell says, for JSON."""
-    if cell in ("", "-"):
-        return None
-    if not (found := CELL.fullmatch(cell)):
-        return cell
-    *numbers, star = found.groups()
-    parts = [*(None if number is None else json.loads(number.lstrip("+")) for number in numbers), bool(star) or None]
-    known = {name: part for name, part in zip(PARTS, parts, strict=True) if part is not None}
-    return known if len(known) > 1 else known["value"]
-
-
-def method_rows(predictions: Predictions) -> list[list[str]]:
-    """Return a row per method in the order of :data:`HEADER`, from the errors of each sample, pixels, (S,).
-
-    ``own`` is the mean symmetric epipolar distance of a sample's points, ``truth`` the median one of its pair's
-    ground-truth inliers, NaN where there are none. The mean leaves out samples whose residual is infinite for any
-    method (a point on an epipole). Without Hartley or whitening among the methods, their rates are empty.
-    """
-    finite = torch.stack([errors["own"] for errors in predictions.values()]).isfinite().all(0)
-    rows = []
-    for name, errors in predictions.items():
-        own, truth = errors["own"], errors["truth"]
-        rates = [_rate(predictions, name, baseline, "own") for baseline in ("Hartley", "whitening")]
-        numbers = [f"{own[finite].mean().item():.3f}", f"{median(own).item():.3f}"]
-        accuracy = "-" if truth.isnan().all() else f"{median(truth).item():.3f}"
-        rows.append([name, *rates, *numbers, accuracy, _rate(predictions, name, "Hartley", "truth")])
-    return rows
-
-
-def _rate(predictions: Predictions, name: str, baseline: str, quantity: str) -> str:
-    if name == baseline or baseline not in predictions:
-        return "-"
-    errors, other = predictions[name][quantity], predictions[baseline][quantity]
-    return f"{100 * better_rate(errors, other).rate:.1f}" if comparable(errors, other).any() else "-"
-
-
-def diagnostic_rows(predictions: Predictions) -> list[list[str]]:
-    """Return a row per method in the order of :data:`DIAGNOSTICS`: the medians of the diagnostics of a run."""
-    rows = []
-    for name, found in predictions.items():
-        numbers = [median(found[key]).item() for key in ("condition_number", "rho", "distance1", "distance2")]
-        rank2 = 100 * median(found["rank2_share"]).item()
-        rows.append([name, *(f"{number:.4g}" for number in numbers), f"{rank2:z.0f}"])
-    return rows
-
-
-def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format a Markdown table with padded columns, the first aligned left and the others right.
+    Args:
+        header: names of the columns.
+        rows: cells.
+        form: form of the table for ``tabulate``; the default is Markdown.
+        options: further options of ``tabulate``.
 
     Example:
         >>> print(format_table(["method", "px"], [["Hartley", "1.5"]]))
-        | method  |  px |
-        |:--------|----:|
-        | Hartley | 1.5 |
+        | method   |   px |
+        |:---------|-----:|
+        | Hartley  |  1.5 |
 
     """
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = [c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(cells, widths, strict=True))]
-        return "| " + " | ".join(padded) + " |"
-
-    rule = "|" + "|".join(":" + "-" * (w + 1) if i == 0 else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
-    return "\n".join([line(header), rule, *map(line, rows)])
+    tabulate = import_extra("tabulate", "images", "printing tables").tabulate
+    options |= {"colalign": ("left", *["right"] * (len(header) - 1)), "disable_numparse": True}
+    return str(tabulate([[*map(str, row)] for row in rows], [*header], tablefmt=form, **options))
 
 
 def names_of(paths: Sequence[str], shorten: Callable[[str], str] = short_name, what: str = "files") -> dict[str, str]:

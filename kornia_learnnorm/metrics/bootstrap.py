@@ -92,12 +92,12 @@ def paired_bootstrap(
         values: one number per sample with shape (S,), or per image pair.
         baseline: numbers of the other method for the samples with shape (S,).
         groups: index of each sample's image pair with shape (S,), integers.
-        level: share of the draws within the interval.
+        level: as for :func:`bootstrap_interval`, as are ``draws`` and ``seed``.
         draws: number of draws.
         seed: seed of the draws.
 
     Returns:
-        the mean difference, its interval of :func:`~kornia_learnnorm.bootstrap_interval`, and the p-value.
+        the mean difference, its interval of :func:`bootstrap_interval`, and the p-value.
 
     Raises:
         ValueError: if the shapes differ, a difference is not finite (drop such samples of both methods and count them),

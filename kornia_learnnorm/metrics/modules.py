@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from kornia_learnnorm.metrics.better_rate import comparable
+from kornia_learnnorm.metrics.better_rate import count_better
 
 __all__ = ["BetterRateMetric"]
 
 
 class BetterRateMetric(Metric):
-    """Share of samples with a residual below the baseline's; see :func:`kornia_learnnorm.better_rate`.
+    """Share of samples with a residual below the baseline's; see :mod:`~kornia_learnnorm.metrics.better_rate`.
 
     Args:
         kwargs: options of ``torchmetrics.Metric``.
@@ -47,19 +47,12 @@ class BetterRateMetric(Metric):
             self.add_state(name, torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
 
     def update(self, residual: Tensor, baseline: Tensor) -> None:
-        """Add samples: their residuals and the baseline's, with shape (S,) each.
-
-        Raises:
-            ValueError: if the shapes differ.
-
-        """
-        if residual.shape != baseline.shape or residual.ndim != 1:
-            raise ValueError(f"residuals must be two (S,) tensors, got {[*residual.shape]} and {[*baseline.shape]}")
-        valid = comparable(residual, baseline)
-        self.better += (residual < baseline)[valid].sum()
-        self.ties += (residual == baseline)[valid].sum()
-        self.compared += valid.sum()
-        self.degenerate += (~valid).sum()
+        """Add samples: their residuals and the baseline's, with shape (S,) each."""
+        better, ties, compared = count_better(residual, baseline)
+        self.better += better
+        self.ties += ties
+        self.compared += compared
+        self.degenerate += len(residual) - compared
 
     def compute(self) -> dict[str, Tensor]:
         """Return ``better_rate``, ``ties``, ``degenerate`` and ``compared``."""

@@ -12,7 +12,7 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.manifold import nearest_essential
 from kornia_learnnorm.geometry.pose import in_front, relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size

@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.two_view.warnings import PairWarning
 
 __all__ = ["NoReliableMatrixError", "PairEstimate", "package_versions"]

@@ -1,4 +1,4 @@
-"""The tables that ``evaluate``, ``compare`` and ``diagnose`` print, on files that the tests write."""
+"""The tables that ``evaluate`` prints and ``report`` makes of them, on files that the tests write."""
 
 from __future__ import annotations
 
@@ -17,11 +17,9 @@ from kornia_learnnorm.data.sets import draw_samples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
-from kornia_learnnorm.evaluation.tables import Table, tables_as_json
+from kornia_learnnorm.evaluation.diagnostics import diagnose
+from kornia_learnnorm.evaluation.runs import example
 from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
-
-METHODS = ["none", "Hartley", "whitening", "reweighted", "paper", "crossview-synthetic"]
-METHODS += ["tilted", "crossview", "searched"]
 
 
 @pytest.fixture(scope="module")
@@ -74,68 +72,54 @@ def errors_by_hand(folder, samples):
     return own, {name: np.array(values) for name, values in truth.items()}
 
 
-def test_compare(folder, capsys):
-    stores = [str(folder / store) for store in ("known.h5", "known.h5@1:8", "unknown.h5")]
-    weights = [str(folder / "tilted/weights.safetensors"), "crossview"]
-    assert main(["compare", *stores, "--weights", *weights]) == 0
-    printed = capsys.readouterr().out
-    assert printed.endswith("fewer than 8 pairs have none\n")
-    tables = read_tables(printed)
-    assert list(tables) == ["better than Hartley %", "better than whitening %", "ground truth: better than Hartley %"]
-    drawn = [samples_of(folder, "known.h5"), samples_of(folder, "known.h5@1:8")]
-    counts = [f"{len(kept.pair)} of {number} samples" for kept, number in drawn]
-    columns = [f"known: {counts[0]}, 9 pairs", f"known@1:8: {counts[1]}, 7 pairs", f"unknown: {counts[0]}, 9 pairs"]
-    for title, (header, rows) in tables.items():
-        truth = title.startswith("ground truth")
-        assert header == ["method", *columns[: 2 if truth else 3]]
-        assert list(rows) == [name for name in METHODS if not title.endswith(f"{name} %")]
-        for nine, seven, *unknown in rows.values():
-            rate, low, high = map(float, nine.replace("[", "").replace("]", "").replace(",", "").split())
-            assert 0 <= low <= rate <= high <= 100
-            assert 0 <= float(seven) <= 100  # too few pairs for an interval
-            assert unknown == ([] if truth else [nine])
-    for baseline in ("Hartley", "whitening"):
-        assert tables[f"better than {baseline} %"][1]["searched"][:2] == ["100.0 [100.0, 100.0]", "100.0"]
+def tables_of_report(folder, capsys, *words):
+    """The tables of a report of a run that is kept, by their titles, and their rows by method."""
+    assert main(["evaluate", *words, "--out", str(folder)]) == 0
+    capsys.readouterr()
+    assert main(["report", str(folder), "--json", "-"]) == 0
+    tables = json.loads(capsys.readouterr().out)["tables"]
+    return {table["title"]: {row["method"]: row for row in table["rows"] if "method" in row} for table in tables}
 
 
-def test_compare_leaves_out_what_has_no_number(folder, tmp_path, capsys, refused):
-    command = ["compare", str(folder / "unknown.h5"), "--methods"]
-    assert main([*command, "none", "whitening"]) == 0
-    ((title, (_, rows)),) = read_tables(capsys.readouterr().out).items()
-    assert title == "better than whitening %"
-    assert list(rows) == ["none"]
-    for methods in (["none", "crossview"], ["Hartley"]):
-        expected = f"expected Hartley or whitening and methods to compare with it, got {' '.join(methods)}"
-        refused([*command, *methods, "--json", tmp_path / "tables.json"], expected)
-    assert [*tmp_path.iterdir()] == []
-
-
-def test_the_commands_agree_with_a_computation_by_hand(folder, capsys):
+def test_the_commands_agree_with_a_computation_by_hand(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(example, "TRIALS", 5)
     shared = [str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--weights"]
     shared += [str(folder / "tilted/weights.safetensors")]
     samples, drawn = samples_of(folder, "known.h5")
     own, truth = errors_by_hand(folder, samples)
-    rates = {}
-    assert main(["compare", *shared]) == 0
-    tables = read_tables(capsys.readouterr().out)
-    for title, errors, baseline in [
-        ("better than Hartley %", own, "Hartley"),
-        ("better than whitening %", own, "whitening"),
-        ("ground truth: better than Hartley %", truth, "Hartley"),
+    tables, rates = tables_of_report(tmp_path / "run", capsys, *shared), []
+    for title, column, errors, baseline in [
+        ("Better than Hartley, filtered", f"known: {len(samples.pair)} of {drawn}", own, "Hartley"),
+        ("Better than whitening, filtered", f"known: {len(samples.pair)} of {drawn}", own, "whitening"),
+        ("Fit and accuracy: known, filtered", "truth: better than Hartley %", truth, "Hartley"),
     ]:
         better = errors["tilted"] < errors[baseline]
         assert 0 < better.mean() < 1
-        low, high = bootstrap_interval(torch.from_numpy(better), samples.pair)
-        rates[title] = f"{100 * better.mean():.1f}"
-        assert tables[title][1]["tilted"] == [f"{rates[title]} [{100 * low:.1f}, {100 * high:.1f}]"]
+        interval = bootstrap_interval(torch.from_numpy(better), samples.pair)
+        low, high = (float(f"{100 * end:.1f}") for end in interval)
+        rates.append(f"{100 * better.mean():.1f}")
+        assert tables[title]["tilted"][column] == {"value": float(rates[-1]), "low": low, "high": high}
     assert main(["evaluate", *shared]) == 0
     (title, (_, rows)), _ = read_tables(capsys.readouterr().out).items()
     counts = f"{len(samples.pair)} of {drawn} samples"
     assert title == f"matches with ratio below 0.8: {counts}, un-normalised residual below 60 px"
-    better_hartley, better_whitening, better_truth = rates.values()
+    better_hartley, better_whitening, better_truth = rates
     numbers = (own["tilted"].mean(), np.median(own["tilted"]), np.median(truth["tilted"]))
     assert rows["tilted"] == [better_hartley, better_whitening, *(f"{number:.3f}" for number in numbers), better_truth]
     assert rows["Hartley"][0] == rows["Hartley"][-1] == rows["whitening"][1] == "-"
+
+
+@pytest.mark.parametrize("size", [8, 20])
+def test_diagnostics(folder, tmp_path, capsys, monkeypatch, size):
+    monkeypatch.setattr(example, "TRIALS", 5)
+    words = [str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--size", str(size)]
+    rows = tables_of_report(tmp_path / "run", capsys, *words)["Fit and accuracy: known, filtered"]
+    samples, _ = samples_of(folder, "known.h5", size=size)
+    columns = ["condition number", "rho", "distance 1", "distance 2", "error due to rank 2 %"]
+    for name, normalizer in {"Hartley": kln.Hartley(), "whitening": kln.Whitening()}.items():
+        *expected, share = (np.median(v) for v in diagnose(samples.points1, samples.points2, normalizer))
+        texts = [*(f"{value:.4g}" for value in expected), f"{100 * share:z.0f}"]
+        assert [rows[name][column] for column in columns] == [*map(float, texts)]
 
 
 def test_evaluate_prints_the_same_with_and_without_a_folder(folder, tmp_path, capsys):
@@ -181,21 +165,8 @@ def test_weights_are_added_to_the_default_methods(folder, tmp_path, capsys, kept
         assert "tilted" in after
 
 
-@pytest.mark.parametrize("size", [8, 20])
-def test_diagnose(folder, capsys, size):
-    command = ["diagnose", str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--sizes", str(size)]
-    assert main(command) == 0
-    ((title, (_, rows)),) = read_tables(capsys.readouterr().out).items()
-    samples, drawn = samples_of(folder, "known.h5", size=size)
-    assert title.startswith(f"known: medians over {len(samples.pair)} of {drawn} samples of {size}, ratio below 0.8")
-    for name, normalizer in {"Hartley": kln.Hartley(), "whitening": kln.Whitening()}.items():
-        *expected, share = (np.median(v) for v in kln.diagnose(samples.points1, samples.points2, normalizer))
-        assert rows[name] == [*(f"{value:.4g}" for value in expected), f"{100 * share:z.0f}"]
-
-
-@pytest.mark.parametrize("command", ["evaluate", "compare", "diagnose"])
-def test_json_has_the_numbers_of_the_tables(folder, tmp_path, capsys, command):
-    words = [command, str(folder / "known.h5"), "--methods", "Hartley", "crossview"]
+def test_json_has_the_numbers_of_the_tables(folder, tmp_path, capsys):
+    words = ["evaluate", str(folder / "known.h5"), "--methods", "Hartley", "crossview"]
     path = tmp_path / "tables.json"
     assert main([*words, "--json", str(path)]) == 0
     printed = capsys.readouterr().out
@@ -211,34 +182,15 @@ def test_json_has_the_numbers_of_the_tables(folder, tmp_path, capsys, command):
         for row in table["rows"]:
             assert [*row] == header
             for value, cell in zip([*row.values()][1:], rows[row["method"]], strict=True):
-                if isinstance(value, dict):
-                    low, high = (float(end) for end in cell.partition("[")[2].rstrip("]").split(", "))
-                    assert [value["value"], value["low"], value["high"]] == [float(cell.split()[0]), low, high]
-                else:
-                    assert value == (None if cell == "-" else float(cell))
-
-
-def test_json_of_a_run_and_of_its_report(folder, tmp_path, capsys):
-    out = str(tmp_path / "run")
-    command = ["evaluate", str(folder / "known.h5"), "--methods", "Hartley", "crossview", "--out", out, "--json", "-"]
-    assert main(command) == 0
-    printed = capsys.readouterr()
-    assert len(json.loads(printed.out)["tables"]) == 2
-    assert f"wrote {out}" in printed.err
-    assert main(["report", out, "--json", "-"]) == 0
-    tables = json.loads(capsys.readouterr().out)["tables"]
-    rows = {row["method"]: row for row in tables[0]["rows"]}
-    assert "Hartley" not in rows  # with which it would be compared
-    assert {*next(value for key, value in rows["crossview"].items() if "known" in key)} == {"value", "low", "high"}
+                assert value == (None if cell == "-" else float(cell))
 
 
 def test_json_is_not_written_where_a_command_fails_or_over_its_input(folder, tmp_path, refused):
     store = tmp_path / "known.h5"
     store.write_bytes((folder / "known.h5").read_bytes())
-    for command in ("evaluate", "compare", "diagnose"):
-        refused([command, f"{store}@0:2", "--json", store], "known.h5: expected a new file or -")
-        refused([command, store, "--json", tmp_path / "none/a.json"], "none does not exist")
-        refused([command, store, "--json", tmp_path / "a.json", "--weights", "nothing"], "no weights")
+    refused(["evaluate", f"{store}@0:2", "--json", store], "known.h5: expected a new file or -")
+    refused(["evaluate", store, "--json", tmp_path / "none/a.json"], "none does not exist")
+    refused(["evaluate", store, "--json", tmp_path / "a.json", "--weights", "nothing"], "no weights")
     assert [*tmp_path.iterdir()] == [store]
 
 
@@ -254,19 +206,6 @@ def test_without_ground_truth_there_are_no_columns_of_it(folder, capsys):
     for header, rows in read_tables(unknown).values():
         assert header == ["method", "better than Hartley %", "mean px", "median px"]
         assert rows["Hartley"][0] == "-"
-
-
-def test_cells_as_json():
-    cells = ["", "-", "12", "+1.50", "2.5e+06", "1.5 [1.2, +2.0]", "-3.0 [-4.0, -2.0], < 0.001", "7.00 ± 0.10"]
-    cells += ["99.9 *", "99.9 [99.0, 100.0] *", "2 [1, 3]", "kitti_00, kitti_01", "inf"]
-    (row,) = json.loads(tables_as_json("", [Table("", "", ["name", *map(str, range(13))], [["12", *cells]])]))[
-        "tables"
-    ][0]["rows"]
-    expected = [None, None, 12, 1.5, 2.5e6, {"value": 1.5, "low": 1.2, "high": 2.0}]
-    expected += [{"value": -3.0, "low": -4.0, "high": -2.0, "p": 0.001}, {"value": 7.0, "std": 0.1}]
-    expected += [{"value": 99.9, "trained_on": True}, {"value": 99.9, "low": 99.0, "high": 100.0, "trained_on": True}]
-    expected += [{"value": 2, "low": 1, "high": 3}]
-    assert [*row.values()] == ["12", *expected, "kitti_00, kitti_01", "inf"]
 
 
 @pytest.mark.parametrize(
@@ -285,8 +224,7 @@ def test_cells_as_json():
         (["tilted/weights.safetensors"], ["tilted"], "not a readable HDF5 file"),
     ],
 )
-@pytest.mark.parametrize("command", ["evaluate", "compare", "diagnose"])
-def test_stores_and_weights_are_checked_first(folder, command, stores, weights, message, refused):
+def test_stores_and_weights_are_checked_first(folder, stores, weights, message, refused):
     stores = [folder / store for store in stores]
     weights = [folder / name / "weights.safetensors" if "." not in name else folder / name for name in weights]
-    refused([command, *stores, "--weights", *weights], message)
+    refused(["evaluate", *stores, "--weights", *weights], message)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from dataclasses import replace
 
@@ -11,11 +10,9 @@ import pytest
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
-from kornia_learnnorm.evaluation.robust import estimators, hypotheses
 from kornia_learnnorm.evaluation.runs import example
 
-ESTIMATORS = ["kornia-8pt", "count:Hartley", "count:whitening", "time:Hartley", "time:whitening", "RANSAC"]
-SOLVERS = ["Hartley", "whitening", "seven-point"]
+ESTIMATORS = ["opencv-usac", "RANSAC", "RANSAC:whitening", "ground-truth"]
 
 
 @pytest.fixture(scope="session")
@@ -58,21 +55,6 @@ def reading(copied, command):
 
 
 @pytest.fixture(scope="session")
-def small_budgets():
-    """Return a context manager under which robust estimators and minimal solvers get few samples and little time."""
-
-    @contextlib.contextmanager
-    def small():
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(estimators, "NUM_SAMPLES", 50)
-            patch.setattr(estimators, "MAX_SECONDS", 0.005)
-            patch.setattr(hypotheses, "NUMBERS", (1, 3, 10, 30))
-            yield
-
-    return small
-
-
-@pytest.fixture(scope="session")
 def robust_store(tmp_path_factory):
     """A store that is called what the paper's data are."""
     path = tmp_path_factory.mktemp("store") / "kitti_06.h5"
@@ -83,15 +65,14 @@ def robust_store(tmp_path_factory):
 @pytest.fixture(scope="session")
 def robust_command(robust_store):
     """The command of a run, without its folder."""
-    return ["robust", str(robust_store), "--seeds", "2", "--estimators", *ESTIMATORS, "--solvers", *SOLVERS, "--out"]
+    return ["robust", str(robust_store), "--seeds", "2", "--estimators", *ESTIMATORS, "--out"]
 
 
 @pytest.fixture(scope="session")
-def robust_run(robust_command, small_budgets, tmp_path_factory):
+def robust_run(robust_command, tmp_path_factory):
     """A run of robust estimators, not to be changed."""
     folder = tmp_path_factory.mktemp("runs") / "run"
-    with small_budgets():
-        assert main([*robust_command, str(folder)]) == 0
+    assert main([*robust_command, str(folder)]) == 0
     return folder
 
 

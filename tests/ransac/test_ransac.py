@@ -18,7 +18,7 @@ from two_view import epipolar_distances, scenes, shaken, uniform, up_to_sign
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.metrics.pairs import f1_score
+from kornia_learnnorm.metrics.inliers import f1_score
 from kornia_learnnorm.ransac import local_optimization as module
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from kornia_learnnorm.evaluation.methods import REFINED
-from kornia_learnnorm.evaluation.report.pair import draw_example, example_inliers
+from kornia_learnnorm.evaluation.report.example_picture import draw_example, example_inliers
 from kornia_learnnorm.evaluation.report.rates import papers_data
 from kornia_learnnorm.evaluation.report.style import (
     INK,
-    Picture,
+    ReportPicture,
     is_learned,
     line_style,
     make_figure,
@@ -18,7 +18,7 @@ from kornia_learnnorm.evaluation.report.style import (
     report_style,
 )
 from kornia_learnnorm.evaluation.runs.example import TRIALS
-from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 
 __all__ = ["report_figures"]
@@ -30,7 +30,7 @@ BUILT_IN = {*NORMALISATIONS, "crossview-synthetic"}
 
 
 @report_style()
-def report_figures(run: Run) -> list[Picture]:
+def report_figures(run: Run) -> list[ReportPicture]:
     """Draw all pictures of a run; those of samples use the first store with filtered samples."""
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
     colors = method_colors(run.about["methods"])
@@ -41,14 +41,14 @@ def report_figures(run: Run) -> list[Picture]:
     return [*_numbered(first, run, cell.store), *_numbered(example, run, store), *_numbered(last, run, cell.store)]
 
 
-def _numbered(pictures: list[Picture], run: Run, store: str) -> list[Picture]:
+def _numbered(pictures: list[ReportPicture], run: Run, store: str) -> list[ReportPicture]:
     """Return pictures of a store with the numbers of Fan et al. in their titles, where it has their test data."""
     if not papers_data(run.about["stores"][store]):
         return pictures
     return [p._replace(title=f"{p.title} (Figure {p.name.removeprefix('figure-')})") for p in pictures]
 
 
-def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
+def _per_frame(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     chosen = _present(cell, "Hartley", "paper", "crossview", "Hartley+LM", "crossview+LM")
     figure, (axes,) = make_figure(1, 1)
     pair = cell.pair.numpy()
@@ -69,7 +69,7 @@ def _per_frame(cell: Cell, colors: dict[str, str]) -> Picture:
     return make_picture(figure, "figure-4a", "Error by frame", text)
 
 
-def _distribution(cell: Cell, colors: dict[str, str]) -> Picture:
+def _distribution(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     figure, (axes,) = make_figure(1, 1)
     names = _present(cell, *NORMALISATIONS, "Hartley+optimal")
     for name in names:
@@ -82,7 +82,7 @@ def _distribution(cell: Cell, colors: dict[str, str]) -> Picture:
     return make_picture(figure, "figure-4b", "Distribution of errors", text)
 
 
-def _distances(cell: Cell, colors: dict[str, str]) -> Picture:
+def _distances(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     figure, views = make_figure(1, 2)
     bins = np.geomspace(0.7, 30, 60).tolist()
     for view, axes in enumerate(views, 1):
@@ -98,7 +98,7 @@ def _distances(cell: Cell, colors: dict[str, str]) -> Picture:
     return make_picture(figure, "figure-5", "Normalised distances", text)
 
 
-def _by_size(run: Run, colors: dict[str, str]) -> Picture:
+def _by_size(run: Run, colors: dict[str, str]) -> ReportPicture:
     figure, panels = make_figure(1, 2)
     titles = {"own": "the sample's points", "truth": "ground-truth inliers"}
     for axes, (key, title) in zip(panels, titles.items(), strict=True):
@@ -122,7 +122,7 @@ def _by_size(run: Run, colors: dict[str, str]) -> Picture:
     return make_picture(figure, "figure-11", "Number of correspondences", text)
 
 
-def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
+def _conditions(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     figure, (axes,) = make_figure(1, 1)
     names = _present(cell, *NORMALISATIONS)[::-1]
     for place, name in enumerate(names):
@@ -140,7 +140,7 @@ def _conditions(cell: Cell, colors: dict[str, str]) -> Picture:
     return make_picture(figure, "figure-12", "Condition numbers", text, legend=False)
 
 
-def _rho(cell: Cell, colors: dict[str, str]) -> Picture:
+def _rho(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     figure, (axes,) = make_figure(1, 1)
     names = _present(cell, "Hartley", "whitening", "paper", "crossview")
     for name in names:
@@ -162,7 +162,7 @@ def _dashes(names: list[str]) -> str:
     return " Dashed: learned." if any(map(is_learned, names)) else ""
 
 
-def _present(cell: Cell, *names: str) -> list[str]:
+def _present(cell: RunCell, *names: str) -> list[str]:
     """Return the methods of the run among ``names``, and all methods that are not built in, such as own weights."""
     own = [name for name in cell.predictions if "+" not in name and name not in BUILT_IN]
     return [name for name in names if name in cell.predictions] + own

@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
-from kornia_learnnorm.evaluation.report.formatting import BASELINE, MIN_BOOTSTRAP_PAIRS, rate_text
-from kornia_learnnorm.evaluation.runs.run import Cell, Run
-from kornia_learnnorm.evaluation.tables import Table
-from kornia_learnnorm.metrics.better_rate import better_rate
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.evaluation.report.numbers import BASELINE, MIN_BOOTSTRAP_PAIRS, better_share, median_number
+from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
+from kornia_learnnorm.evaluation.tables import Cell, Number, Table
+from kornia_learnnorm.metrics.better_rate import better_rate, comparable
 from kornia_learnnorm.protocol import PROTOCOLS, RATIO
 
-__all__ = ["papers_data", "rate_tables", "was_trained_on", "with_baseline"]
+__all__ = ["HEADER", "method_rows", "papers_data", "rate_tables", "was_trained_on", "with_baseline"]
+
+# Columns of the table that learnnorm evaluate prints.
+HEADER = (
+    "method",
+    "better than Hartley %",
+    "than whitening %",
+    "mean px",
+    "median px",
+    "truth: median px",
+    "truth: better than Hartley %",
+)
 
 # Fan et al., Table 1: better than Hartley % by training set, on the data of PAPERS_DATA.
-PRINTED = {
-    "KITTI 00-05": {"KITTI": "86.68", "TUM": "90.04"},
-    "TUM": {"KITTI": "84.22", "TUM": "89.73"},
-    "KITTI 00-05 and TUM": {"KITTI": "87.05", "TUM": "91.43"},
+PRINTED: dict[str, dict[str, float]] = {
+    "KITTI 00-05": {"KITTI": 86.68, "TUM": 90.04},
+    "TUM": {"KITTI": 84.22, "TUM": 89.73},
+    "KITTI 00-05 and TUM": {"KITTI": 87.05, "TUM": 91.43},
 }
 # The data that Fan et al. test on: the beginning of what a run notes of a store, KITTI 06-10 or TUM at KITTI's size.
 PAPERS_DATA = {
@@ -65,9 +79,9 @@ def papers_data(description: str) -> str:
     return next((name for name, pattern in PAPERS_DATA.items() if re.match(pattern, description)), "")
 
 
-def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
+def _better_rates(run: Run, cells: list[RunCell], baseline: str) -> Table:
     trained, protocol = run.about["trained_on"], cells[0].protocol
-    rows = [
+    rows: list[list[Cell]] = [
         [name, *rates, ", ".join(trained[name]) or "-"]
         for name in run.about["methods"]
         if name != baseline and any(rates := [_rate(cell, name, baseline, trained[name]) for cell in cells])
@@ -93,7 +107,7 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     papers = [papers_data(run.about["stores"][cell.store]) for cell in cells] if baseline == BASELINE else []
     if protocol == "filtered" and any(papers):
         rows += [
-            ["Fan et al., as printed", *(values.get(name, "") for name in papers), train]
+            ["Fan et al., as printed", *(Number(values[p], ".2f") if p in values else "" for p in papers), train]
             for train, values in PRINTED.items()
         ]
         text += " Fan et al. test on KITTI 06-10 and on TUM freiburg3_long_office at KITTI's size."
@@ -102,10 +116,10 @@ def _better_rates(run: Run, cells: list[Cell], baseline: str) -> Table:
     return Table(title, text, header, rows)
 
 
-def _rate(cell: Cell, name: str, baseline: str, trained_on: Iterable[str]) -> str:
-    """Return a better rate, with an asterisk if the method was trained on the store; empty if it is not known."""
-    rate = rate_text(cell, name, baseline, "own") if name in cell.predictions else ""
-    return f"{rate} *" if rate and was_trained_on(cell.store, trained_on) else rate
+def _rate(cell: RunCell, name: str, baseline: str, trained_on: Iterable[str]) -> Cell:
+    """Return a better rate, marked if the method was trained on the store; unknown without predictions."""
+    rate = better_share(cell, name, baseline, "own") if name in cell.predictions else ""
+    return rate._replace(trained_on=was_trained_on(cell.store, trained_on)) if isinstance(rate, Number) else rate
 
 
 def was_trained_on(store: str, trained_on: Iterable[str]) -> bool:
@@ -117,3 +131,31 @@ def was_trained_on(store: str, trained_on: Iterable[str]) -> bool:
 def _pairs_of(store: str) -> tuple[str, float, float]:
     match = re.fullmatch(r"(.+)@(\d+):(\d+)", store)
     return (match[1], float(match[2]), float(match[3])) if match else (store, 0.0, float("inf"))
+
+
+def method_rows(predictions: Mapping[str, Mapping[str, Tensor]]) -> list[list[Cell]]:
+    """Return a row per method in the order of :data:`HEADER`, from the errors of each sample, pixels, (S,).
+
+    ``own`` is the mean symmetric epipolar distance of a sample's points, ``truth`` the median one of its pair's
+    ground-truth inliers, NaN where there are none. The mean leaves out samples whose residual is infinite for any
+    method (a point on an epipole). Without Hartley or whitening among the methods, their rates are empty.
+    """
+
+    def rate(name: str, baseline: str, quantity: str) -> Cell:
+        if name == baseline or baseline not in predictions:
+            return "-"
+        errors, other = predictions[name][quantity], predictions[baseline][quantity]
+        known = comparable(errors, other).any()
+        return Number(100 * better_rate(errors, other).rate, ".1f") if known else "-"
+
+    finite = torch.stack([errors["own"] for errors in predictions.values()]).isfinite().all(0)
+    return [
+        [
+            name,
+            *(rate(name, baseline, "own") for baseline in (BASELINE, "whitening")),
+            Number(errors["own"][finite].mean().item()),
+            *(median_number(errors[key]) or "-" for key in ("own", "truth")),
+            rate(name, BASELINE, "truth"),
+        ]
+        for name, errors in predictions.items()
+    ]

@@ -12,14 +12,22 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kornia_learnnorm.evaluation.methods import CLOSED_FORMS, base_name
-from kornia_learnnorm.evaluation.robust.estimators import SEVEN_POINT
 from kornia_learnnorm.two_view.drawing import import_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["INK", "Picture", "is_learned", "line_style", "make_figure", "make_picture", "method_colors", "report_style"]
+__all__ = [
+    "INK",
+    "ReportPicture",
+    "is_learned",
+    "line_style",
+    "make_figure",
+    "make_picture",
+    "method_colors",
+    "report_style",
+]
 
 INK = "#010203"  # placeholder that make_picture replaces by the text colour of the page
 # Legible on white and on black; after P. Tol's and Okabe and Ito's palettes for colour blindness.
@@ -33,7 +41,7 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-class Picture(NamedTuple):
+class ReportPicture(NamedTuple):
     """A picture of a report."""
 
     name: str  # of the file, without suffix
@@ -56,8 +64,8 @@ def method_colors(names: Iterable[str]) -> dict[str, str]:
 
 
 def is_learned(name: str) -> bool:
-    """Return whether a method or a minimal solver has weights: it is no closed form and no ``module:Name``."""
-    return base_name(name) not in (*CLOSED_FORMS, SEVEN_POINT) and ":" not in name
+    """Return whether a method has weights: it is no closed form and no ``module:Name``."""
+    return base_name(name) not in CLOSED_FORMS and ":" not in name
 
 
 def line_style(name: str) -> str:
@@ -79,7 +87,7 @@ def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, l
     return figure, axes
 
 
-def make_picture(figure: Figure, name: str, title: str, text: str, legend: bool = True) -> Picture:
+def make_picture(figure: Figure, name: str, title: str, text: str, legend: bool = True) -> ReportPicture:
     """Return a figure as SVG, with one legend of all axes above it; call it inside :func:`report_style`."""
     if legend:
         entries: dict[str, Any] = {}
@@ -95,4 +103,4 @@ def make_picture(figure: Figure, name: str, title: str, text: str, legend: bool 
     # The pictures share a page, so their identifiers must differ.
     svg = re.sub(r'id="([^"]+)"', rf'id="{name}-\1"', svg)
     svg = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)
-    return Picture(name, title, text, svg)
+    return ReportPicture(name, title, text, svg)

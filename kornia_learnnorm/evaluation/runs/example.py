@@ -9,14 +9,17 @@ import torch
 
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.runs.pairs import ground_truth_inliers, median_distance, pair_matches
-from kornia_learnnorm.evaluation.runs.store import Arrays
+from kornia_learnnorm.evaluation.runs.pair_motions import ground_truth_inliers, median_distance, pair_matches
+from kornia_learnnorm.evaluation.runs.results_store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["TRIALS", "random_pair", "sweep"]
+__all__ = ["EXAMPLE", "SWEEP", "TRIALS", "random_pair", "sweep"]
 
+# Arrays in the files; read by name, so that a damaged file is recognised before it is used.
+EXAMPLE = ("store", "pair", "names", "points1", "points2", "truth", "F", "size")
+SWEEP = ("size", "own", "truth")
 SIZES = (8, 9, 10, 12, 16, 24, 32, 64, 128, 256)  # correspondences in a sample
 TRIALS = 1000  # samples of each size
 

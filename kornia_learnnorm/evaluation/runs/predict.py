@@ -11,11 +11,12 @@ from kornia_learnnorm.data.sets import MatchSets, draw_samples
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.runs.pairs import ground_truth_inliers, median_distance, pair_matches
-from kornia_learnnorm.evaluation.runs.store import Arrays
+from kornia_learnnorm.evaluation.runs.pair_motions import ground_truth_inliers, median_distance, pair_matches
+from kornia_learnnorm.evaluation.runs.results_store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.metrics.inliers import f1_from_masks, finite_distance
 from kornia_learnnorm.metrics.poses import rotation_error, translation_error
 from kornia_learnnorm.normalizers.contract import normalizing_transforms
 from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
@@ -99,9 +100,8 @@ def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStor
 def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
     """Return ``inliers``, a share, and ``f1``, (S, thresholds), of matrices (S, 3, 3) on all matches of their pairs.
 
-    The values are those of :func:`~kornia_learnnorm.metrics.pairs.inlier_share` and
-    :func:`~kornia_learnnorm.metrics.pairs.f1_score`, with the distances computed once for both and for all of
-    :data:`~kornia_learnnorm.protocol.THRESHOLDS`. F1 is NaN where the ground truth has no inliers.
+    The distances are computed once for all :data:`~kornia_learnnorm.protocol.THRESHOLDS`. F1 is NaN where the ground
+    truth has no inliers.
     """
     inliers = F_mat.new_full((len(F_mat), len(THRESHOLDS)), torch.nan)
     f1 = inliers.clone()
@@ -111,13 +111,12 @@ def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio
         true = _within(points1[None], points2[None], torch.from_numpy(store.F[index : index + 1]))
         number = len(rows), -1, -1
         found = _within(points1.expand(*number), points2.expand(*number), F_mat[rows])
-        both, either = (found & true).sum(-1), found.sum(-1) + true.sum(-1)
         inliers[rows] = found.double().mean(-1)
-        f1[rows] = torch.where(true.any(-1), (2 * both).double() / either, torch.nan)
+        f1[rows] = f1_from_masks(found, true)
     return {"inliers": inliers, "f1": f1}
 
 
 def _within(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
     """Return which points lie within each threshold, (S, thresholds, N); none do under a matrix of NaN."""
-    distance = symmetric_epipolar_distance(points1, points2, F_mat).nan_to_num(nan=torch.inf)
+    distance = finite_distance(points1, points2, F_mat)
     return distance[:, None] < distance.new_tensor(THRESHOLDS)[:, None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
-from kornia_learnnorm.evaluation.robust.matches import draw_matches
+from kornia_learnnorm.evaluation.robust.robust_run import shuffled_pair
 
 
 @pytest.fixture
@@ -14,6 +14,6 @@ def matches():
 
     def draw(noise=0.2, outliers=0.2, points=300):
         store = synthetic_store(1, points, seed=3, noise=noise, outliers=outliers, scenes=["hand-held"])
-        return draw_matches(store, 0, "unfiltered", 0)
+        return shuffled_pair(store, 0, "unfiltered", 0)
 
     return draw

@@ -11,9 +11,9 @@ import torch
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
-from kornia_learnnorm.evaluation.runs.pairs import pair_motions
+from kornia_learnnorm.evaluation.runs.pair_motions import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import consensus, predict
-from kornia_learnnorm.metrics.pairs import f1_score, inlier_share
+from kornia_learnnorm.metrics.inliers import f1_score, inlier_share
 from kornia_learnnorm.protocol import THRESHOLDS
 
 

@@ -8,14 +8,16 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.evaluation.runs.store import Arrays
+from kornia_learnnorm.evaluation.runs.results_store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.metrics.median import median
+from kornia_learnnorm.metrics.poses import rotation_error
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
-__all__ = ["MOTIONS", "ground_truth_inliers", "median_distance", "pair_matches", "pair_motions"]
+__all__ = ["MOTIONS", "PAIRS", "ground_truth_inliers", "median_distance", "pair_matches", "pair_motions"]
 
 MOTIONS = ("rotation", "forward", "parallax", "inliers")
+PAIRS = (*MOTIONS, "names")  # arrays in the file of a store's pairs
 MIN_INLIERS = 16  # a pair with fewer has no ground-truth inliers to measure with
 MAX_INLIERS = 200  # of a pair, the first in the store's random order
 
@@ -79,9 +81,8 @@ def _motion(store: CorrespondenceStore, pair: int) -> dict[str, float]:
         return known
     rotated = convert_points_to_homogeneous(x1[near]) @ (K[1] @ R @ K[0].inverse()).mT
     parallax = (x2[near] - rotated[:, :2] / rotated[:, 2:]).norm(dim=1)
-    sine, cosine = (R - R.mT).norm() / 2**0.5, R.trace() - 1
     return known | {
-        "rotation": torch.atan2(sine, cosine).rad2deg().item(),
+        "rotation": rotation_error(R, torch.eye(3).to(R)).item(),
         "forward": (t[2].abs() / t.norm()).item(),
         "parallax": median(parallax).item(),
     }

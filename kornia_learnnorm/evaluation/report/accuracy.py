@@ -7,29 +7,27 @@ import math
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.formatting import (
+from kornia_learnnorm.evaluation.report.numbers import (
     BASELINE,
     MIN_BOOTSTRAP_PAIRS,
-    MIN_P_VALUE,
+    MIN_DISTANCE,
     POSE_HEADER,
     RESAMPLES,
-    mean_text,
-    median_text,
-    number_text,
-    paired_text,
-    percent_change,
-    pose_texts,
-    rate_text,
+    better_share,
+    mean_share,
+    median_number,
+    number,
+    paired_change,
+    pose_numbers,
 )
 from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
-from kornia_learnnorm.evaluation.runs.run import Cell, Run
-from kornia_learnnorm.evaluation.tables import Table
-from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
+from kornia_learnnorm.evaluation.tables import MIN_P_VALUE, Cell, Table
+from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import THRESHOLDS
 
 __all__ = ["by_motion", "report_tables"]
 
-MIN_DISTANCE = 1e-6  # pixels; smaller distances are clamped before the logarithm
 MAX_FAILURES = 10  # rows of the table of the worst samples
 MIN_PAIRS = 4  # pairs with a known value; fewer are not split in halves
 MIN_RELATIVE_RANGE = 0.01  # of the median; pairs whose values differ less are not split in halves
@@ -56,29 +54,31 @@ def report_tables(run: Run) -> list[Table]:
     return tables
 
 
-def _accuracy(cell: Cell) -> Table:
+def _accuracy(cell: RunCell) -> Table:
     """Return the table of errors, poses and diagnostics by method."""
     header = ["method", "fit px", "held out px", "truth px", f"truth: better than {BASELINE} %"]
     header += ["rotation deg", "translation deg", *POSE_HEADER, "condition number", "rho", "distance 1", "distance 2"]
-    posed, rows = _posed(cell), []
+    header.append("error due to rank 2 %")
+    posed, rows = _posed(cell), list[list[Cell]]()
     for name, p in cell.predictions.items():
-        rate = "-" if name == BASELINE else rate_text(cell, name, BASELINE, "truth")
+        rate: Cell = "-" if name == BASELINE else better_share(cell, name, BASELINE, "truth")
         angles = [p[key] for key in ("rotation_error", "translation_error")]
         diagnostics = (p[key] for key in ("condition_number", "rho", "distance1", "distance2"))
         rows.append(
             [
                 name,
-                *(median_text(p[key]) for key in ("own", "heldout", "truth")),
+                *(median_number(p[key]) for key in ("own", "heldout", "truth")),
                 rate,
-                *(median_text(angle, ".2f") for angle in angles),
-                *pose_texts(*(angle.nan_to_num(math.inf)[posed] for angle in angles)),
-                *(median_text(values, ".4g") for values in diagnostics),
+                *(median_number(angle, ".2f") for angle in angles),
+                *pose_numbers(*(angle.nan_to_num(math.inf)[posed] for angle in angles)),
+                *(median_number(values, ".4g") for values in diagnostics),
+                median_number(100 * p["rank2_share"], "z.0f"),
             ]
         )
     return Table(f"Fit and accuracy: {cell.title}", _accuracy_text(cell, int(posed.sum())), header, rows)
 
 
-def _accuracy_text(cell: Cell, posed: int) -> str:
+def _accuracy_text(cell: RunCell, posed: int) -> str:
     """Return what the table of errors shows, of which the samples of ``posed`` have a ground-truth pose."""
     truth = int(_with_truth(cell).sum())
     count = f"of which {truth} have ground-truth inliers and {posed} a ground-truth pose"
@@ -94,26 +94,27 @@ def _accuracy_text(cell: Cell, posed: int) -> str:
     )
     return (
         f"Medians over {len(cell.pair)} samples, {count}. `fit` is the error of the sample itself: the mean symmetric "
-        f"epipolar distance of its eight points. {others} of the symmetric epipolar distance."
-        f"{angles if posed else ''} `+LM` is refined on the eight points: no method fits "
+        f"epipolar distance of its own points. {others} of the symmetric epipolar distance."
+        f"{angles if posed else ''} `+LM` is refined on these points: no method fits "
         "them more closely. The condition number of the design matrix is its largest over its eighth singular value. "
         "`rho` is the second over the third singular value of the normalised matrix before the projection to rank 2: "
         "the larger it is, the less the projection changes. Distances 1 and 2 are the mean distances of the normalised "
-        "points from the origin in views 1 and 2. The last four columns have no unit."
+        "points from the origin in views 1 and 2. These four columns have no unit. `error due to rank 2` is the share "
+        "of the fit that the projection adds."
     )
 
 
-def _consensus(cell: Cell, run: Run) -> Table:
+def _consensus(cell: RunCell, run: Run) -> Table:
     """Return the table of inlier shares and F1 of the matrices of samples.
 
     Samples without ground truth are left out, unless no sample has one.
     """
     header = ["method", *(f"{name} @{threshold:g} px" for threshold in THRESHOLDS for name in ("inliers %", "F1 %"))]
     known = next(iter(cell.predictions.values()))["f1"].isfinite()
-    kept, rows = known | ~known.any(0), []
+    kept, rows = known | ~known.any(0), list[list[Cell]]()
     for name, prediction in cell.predictions.items():
         cells = [
-            mean_text(prediction[key][keep, place], cell.pair[keep])
+            mean_share(prediction[key][keep, place], cell.pair[keep])
             for place, keep in enumerate(kept.T)
             for key in ("inliers", "f1")
         ]
@@ -137,26 +138,26 @@ def _consensus(cell: Cell, run: Run) -> Table:
     return Table(f"Inliers{' and F1' * truth}: {cell.title}", text, header, rows)
 
 
-def _with_truth(cell: Cell) -> Tensor:
+def _with_truth(cell: RunCell) -> Tensor:
     """Return a mask of the samples whose pair has ground-truth inliers, (S,)."""
     return ~cell.predictions[BASELINE]["truth"].isnan()
 
 
-def _posed(cell: Cell) -> Tensor:
+def _posed(cell: RunCell) -> Tensor:
     """Return a mask of the samples whose pair has a ground-truth pose, (S,): any method has an error on any of them."""
     errors = torch.stack([p["translation_error"] for p in cell.predictions.values()])
     return torch.isin(cell.pair, cell.pair[errors.isfinite().any(0)])
 
 
-def _tests(cell: Cell) -> Table:
+def _tests(cell: RunCell) -> Table:
     """Return the table of paired tests of each distance against the baseline."""
     quantities = {"own": "fit", "heldout": "held out", "truth": "truth"}
     header = ["method", *(f"{name}: change %, p" for name in quantities.values())]
     logs = {
         name: {key: p[key].clamp(min=MIN_DISTANCE).log() for key in quantities} for name, p in cell.predictions.items()
     }
-    rows = [
-        [name, *(paired_text(log[key], logs[BASELINE][key], cell.pair, show=percent_change) for key in quantities)]
+    rows: list[list[Cell]] = [
+        [name, *(paired_change(log[key], logs[BASELINE][key], cell.pair, logarithms=True) for key in quantities)]
         for name, log in logs.items()
         if name != BASELINE
     ]
@@ -175,9 +176,9 @@ def _count(pair: Tensor) -> str:
     return f"{len(pair)} samples of {len(torch.unique(pair))} pairs"
 
 
-def by_motion(cell: Cell, run: Run, learned: str) -> Table:
+def by_motion(cell: RunCell, run: Run, learned: str) -> Table:
     """Return the better rates of a method in two halves of the image pairs, split at the median of each motion."""
-    rows, left_out = [], []
+    rows, left_out = list[list[Cell]](), list[str]()
     truth = _with_truth(cell)
     for key, name in MOTIONS.items():
         values = torch.from_numpy(run.pairs[cell.store][key])
@@ -188,9 +189,11 @@ def by_motion(cell: Cell, run: Run, learned: str) -> Table:
         text = _distinct(middle, values)
         for half, chosen in ((f"up to {text}", values <= middle), (f"above {text}", values > middle)):
             inside = chosen[cell.pair]
-            rates = [rate_text(cell, learned, BASELINE, quantity, inside) for quantity in ("own", "heldout", "truth")]
+            rates = [
+                better_share(cell, learned, BASELINE, quantity, inside) for quantity in ("own", "heldout", "truth")
+            ]
             counts = [int(chosen.sum()), int(inside.sum()), int((inside & truth).sum())]
-            rows.append([name, half, *map(str, counts), *rates])
+            rows.append([name, half, *counts, *rates])
     header = ["motion", "half", "pairs", "samples", "with truth", "fit: better %", "held out: better %"]
     text = (
         f"Better rate of `{learned}` against {BASELINE} in the halves of the image pairs below and above the median of "
@@ -221,22 +224,22 @@ def _distinct(middle: Tensor, values: Tensor) -> str:
     return next((text for text in texts if float(text) < above), texts[-1])
 
 
-def _worst_failures(cell: Cell, run: Run, learned: str) -> Table:
+def _worst_failures(cell: RunCell, run: Run, learned: str) -> Table:
     """Return the samples with the largest ratio of a method's ground-truth error to the baseline's."""
     mine, other = cell.predictions[learned], cell.predictions[BASELINE]
     ratio = (mine["truth"] / other["truth"]).nan_to_num(nan=-1.0, posinf=torch.inf)
     worst = ratio.argsort(descending=True)[:MAX_FAILURES]
     header = ["pair", "truth px", f"{BASELINE}: truth px", "ratio", "fit px", f"{BASELINE}: fit px"]
-    pairs, rows = run.pairs[cell.store], []
+    pairs, rows = run.pairs[cell.store], list[list[Cell]]()
     for row in worst[ratio[worst] > 0].tolist():
         pair = int(cell.pair[row])
         numbers = (mine["truth"][row], other["truth"][row], ratio[row], mine["own"][row], other["own"][row])
-        cells = [number_text(float(number), ".2f") for number in numbers]
+        cells = [number(float(one), ".2f") for one in numbers]
         condition, parallax = float(mine["condition_number"][row]), float(pairs["parallax"][pair])
-        rows.append([str(pairs["names"][pair]), *cells, number_text(condition, ".3g"), number_text(parallax, ".1f")])
+        rows.append([str(pairs["names"][pair]), *cells, number(condition, ".3g"), number(parallax, ".1f")])
     text = (
         f"The {len(rows)} samples with the largest ratio of `truth`, the median symmetric epipolar distance of the "
         f"ground-truth inliers, under `{learned}` to that under {BASELINE}, of {int((ratio >= 0).sum())} samples with "
-        "ground truth. `fit` is the mean distance of the sample's eight points."
+        "ground truth. `fit` is the mean distance of the sample's own points."
     )
     return Table(f"Worst failures: {cell.title}", text, [*header, "condition number", "parallax px"], rows)

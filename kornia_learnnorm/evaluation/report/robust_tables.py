@@ -2,47 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.formatting import (
+from kornia_learnnorm.evaluation.report.numbers import (
     MIN_BOOTSTRAP_PAIRS,
     POSE_HEADER,
-    median_text,
-    number_text,
-    paired_text,
-    pose_texts,
+    median_number,
+    number,
+    paired_change,
+    pose_numbers,
 )
 from kornia_learnnorm.evaluation.report.rates import papers_data
-from kornia_learnnorm.evaluation.robust.estimators import TRUTH
-from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR
-from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
-from kornia_learnnorm.evaluation.tables import Table
-from kornia_learnnorm.protocol import THRESHOLDS
+from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
+from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
+from kornia_learnnorm.evaluation.tables import Cell, Number, Table
+from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
 
-__all__ = ["pairs_with_truth", "robust_tables"]
+__all__ = ["MAX_ERROR", "PRINTED", "pairs_with_truth", "robust_tables"]
 
+MAX_ERROR = MAX_RESIDUAL  # pixels; larger errors are clamped
 # Fan et al., Tables 2 and 3: share of inliers and F1 at 0.1 px, then at 1 px, %.
-PRINTED: dict[tuple[str, str], dict[str, Sequence[str]]] = {
+PRINTED: dict[tuple[str, str], dict[str, tuple[float | None, ...]]] = {
     ("KITTI", "filtered"): {
-        "Ranftl and Koltun": ("24.61", "14.65", "85.87", "75.77"),
-        "MLESAC": ("18.60", "12.54", "84.48", "75.15"),
-        "LMEDS": ("20.01", "13.34", "84.23", "75.44"),
-        "USAC": ("21.43", "13.90", "85.13", "75.70"),
-        "RANSAC, Hartley": ("21.85", "13.84", "84.96", "75.65"),
-        "RANSAC, learned": ("21.89", "13.86", "84.98", "75.66"),
+        "Ranftl and Koltun": (24.61, 14.65, 85.87, 75.77),
+        "MLESAC": (18.60, 12.54, 84.48, 75.15),
+        "LMEDS": (20.01, 13.34, 84.23, 75.44),
+        "USAC": (21.43, 13.90, 85.13, 75.70),
+        "RANSAC, Hartley": (21.85, 13.84, 84.96, 75.65),
+        "RANSAC, learned": (21.89, 13.86, 84.98, 75.66),
     },
     ("KITTI", "unfiltered"): {
-        "RANSAC, Hartley": ("4.40", "", "30.50", ""),
-        "RANSAC, learned": ("4.38", "", "30.55", ""),
+        "RANSAC, Hartley": (4.40, None, 30.50, None),
+        "RANSAC, learned": (4.38, None, 30.55, None),
     },
     ("TUM", "unfiltered"): {
-        "RANSAC, Hartley": ("7.60", "", "44.13", ""),
-        "RANSAC, learned": ("7.64", "", "44.18", ""),
+        "RANSAC, Hartley": (7.60, None, 44.13, None),
+        "RANSAC, learned": (7.64, None, 44.18, None),
     },
 }
+BASELINE = "RANSAC"  # that RANSAC with other normalisers is compared with
 TABLE_NUMBER = {"filtered": " (Table 2)", "unfiltered": " (Table 3)"}  # in Fan et al.
 SCALES = {"inliers": 100.0, "f1": 100.0, "error": 1.0}  # shares are printed in %
 
@@ -80,16 +80,18 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
     header = ["estimator", *(f"{name} @{t:g} px" for t in THRESHOLDS for name in names), "median error px @1 px"]
     known = {threshold: pairs_with_truth(cell, threshold) for threshold in THRESHOLDS}
     truth = any(bool(found.any()) for found in known.values())
-    rows = []
+    rows: list[list[Cell]] = []
     for name, by_threshold in cell.estimates.items():
-        cells = []
+        cells: list[Cell] = []
         for threshold in THRESHOLDS:
             inliers, f1, error = (by_threshold[threshold][key][_kept(cell, threshold)] for key in SCALES)
             error = error.clamp(max=MAX_ERROR)
-            cells += [_mean_text(100 * inliers, 2), _mean_text(100 * f1, 2), _mean_text(error, 3)]
-        rows.append([name, *cells, median_text(error.flatten())])
+            cells += [_mean(100 * inliers, 2), _mean(100 * f1, 2), _mean(error, 3)]
+        rows.append([name, *cells, median_number(error.flatten())])
     printed = PRINTED.get((papers_data(run.about["stores"][cell.store]), cell.protocol), {})
-    rows += [[f"Fan et al., as printed: {name}", a, b, "", c, d, "", ""] for name, (a, b, c, d) in printed.items()]
+    for name, values in printed.items():
+        a, b, c, d = ("" if value is None else Number(value, ".2f") for value in values)
+        rows.append([f"Fan et al., as printed: {name}", a, b, "", c, d, "", ""])
     dropped = " and ".join(f"{int((~kept).sum())} at {threshold:g} px" for threshold, kept in known.items())
     agreement = (
         "F1: agreement of these inliers with the ground truth's at the threshold. Error: mean distance of the ground "
@@ -100,34 +102,32 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
         "Mean over image pairs and runs, ± standard deviation of the mean of a run if there are several runs. Inliers: "
         "share of the estimator's matches with a symmetric epipolar distance below the threshold. "
         f"{agreement if truth else 'There is no ground truth: more inliers do not prove a more accurate matrix.'} "
-        "`count:` is the best of 1,000 minimal samples, which all methods share, without refinement. "
-        "`time:` is the best of the samples drawn in 50 ms, which depends on the machine. `RANSAC`, `learned:` "
-        "and `guided:` are the package's own, all others come from other packages; all run with their defaults."
+        "`RANSAC`, `learned:` and `guided:` are the package's own, all others come from other packages; all run with "
+        "their defaults."
     )
     number = TABLE_NUMBER[cell.protocol] if printed else ""
     return Table(f"Robust estimation: {cell.title}{number}", text, header, rows)
 
 
-def _mean_text(values: Tensor, digits: int) -> str:
+def _mean(values: Tensor, digits: int) -> Cell:
     """Return the mean of numbers (P, S) and the standard deviation of the mean over the S runs; empty if unknown."""
     runs = values.mean(0)
     if values.numel() == 0 or bool(runs.isnan().any()):
         return ""
-    text = f"{runs.mean().item():.{digits}f}"
-    return text if len(runs) < 2 else f"{text} ± {runs.std().item():.{digits}f}"
+    return Number(runs.mean().item(), f".{digits}f", std=runs.std().item() if len(runs) > 1 else None)
 
 
 def _pose_and_time(cell: RobustCell) -> Table:
     """Return the table of relative poses, time and number of samples."""
     names = (*POSE_HEADER, "ms", "samples")
     header = ["estimator", *(f"{name} @{threshold:g} px" for threshold in THRESHOLDS for name in names)]
-    rows = []
+    rows: list[list[Cell]] = []
     for name, by_threshold in cell.estimates.items():
-        cells = []
+        cells: list[Cell] = []
         for results in by_threshold.values():
-            cells += pose_texts(results["rotation_error"], results["translation_error"])
-            cells.append(median_text(1000 * results["seconds"].flatten(), ".1f"))
-            cells.append(number_text(results["samples"].mean().item(), ".0f"))
+            cells += pose_numbers(results["rotation_error"], results["translation_error"])
+            cells.append(median_number(1000 * results["seconds"].flatten(), ".1f"))
+            cells.append(number(results["samples"].mean().item(), ".0f"))
         rows.append([name, *cells])
     posed = any(row[1] for row in rows)
     poses = (
@@ -141,25 +141,14 @@ def _pose_and_time(cell: RobustCell) -> Table:
     return Table(f"{'Pose and time' if posed else 'Time'}: {cell.title}", text, header, rows)
 
 
-def _baseline(name: str) -> str:
-    """Return the estimator to compare with: Hartley's normalisation on the same budget, or RANSAC with its defaults."""
-    kind, _, method = name.partition(":")
-    if kind == "RANSAC" and method:
-        return kind
-    return "time:Hartley" if kind == "time" else "count:Hartley"
-
-
 def _tests(cell: RobustCell) -> list[Table]:
-    """Return the table of paired tests of the package's own estimators, if there are any to compare."""
+    """Return the table of paired tests of RANSAC with other normalisers, if there are any to compare."""
     names = ("inliers", "F1", "error px")
     header = ["estimator", "against", *(f"{name} @{t:g} px: change, p" for t in THRESHOLDS for name in names)]
-    rows = []
-    for name, by_threshold in cell.estimates.items():
-        baseline = _baseline(name)
-        if name.startswith(("count:", "time:", "RANSAC")) and name != baseline and baseline in cell.estimates:
-            other = cell.estimates[baseline]
-            cells = [_test(by_threshold[t], other[t], key, _kept(cell, t)) for t in THRESHOLDS for key in SCALES]
-            rows.append([name, baseline, *cells])
+    own = [name for name in cell.estimates if name.startswith(f"{BASELINE}:") and BASELINE in cell.estimates]
+    rows: list[list[Cell]] = [
+        [name, BASELINE, *(_test(cell, name, t, key) for t in THRESHOLDS for key in SCALES)] for name in own
+    ]
     text = (
         "Change of the mean against another estimator, in percentage points and in px, with the 95 % interval and "
         "two-sided p-value of a paired bootstrap over image pairs; fewer than "
@@ -169,6 +158,7 @@ def _tests(cell: RobustCell) -> list[Table]:
     return [Table(f"Paired tests of robust estimation: {cell.title}", text, header, rows)] if rows else []
 
 
-def _test(values: dict[str, Tensor], baseline: dict[str, Tensor], key: str, known: Tensor) -> str:
-    runs = min(values[key].shape[1], baseline[key].shape[1])
-    return paired_text(*(r[key][known, :runs].clamp(max=MAX_ERROR).mean(1) * SCALES[key] for r in (values, baseline)))
+def _test(cell: RobustCell, name: str, threshold: float, key: str) -> Cell:
+    both = [cell.estimates[n][threshold][key][_kept(cell, threshold)] for n in (name, BASELINE)]
+    runs = min(values.shape[1] for values in both)
+    return paired_change(*(values[:, :runs].clamp(max=MAX_ERROR).mean(1) * SCALES[key] for values in both))

@@ -20,11 +20,11 @@ from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method
-from kornia_learnnorm.evaluation.robust.run import read_robust
-from kornia_learnnorm.evaluation.runs import record
+from kornia_learnnorm.evaluation.robust.robust_run import read_robust
+from kornia_learnnorm.evaluation.runs import prediction_run
 from kornia_learnnorm.evaluation.runs.predict import ERRORS, SampleOptions
-from kornia_learnnorm.evaluation.runs.run import read_run
-from kornia_learnnorm.evaluation.runs.store import file_name
+from kornia_learnnorm.evaluation.runs.prediction_run import read_run, temporary_run
+from kornia_learnnorm.evaluation.runs.results_store import file_name
 from kornia_learnnorm.pretrained import WEIGHTS
 
 
@@ -54,7 +54,7 @@ def test_predictions_are_those_of_the_functions(run, store):
 
 
 def test_a_temporary_run_of_methods_in_another_order_has_the_same_numbers(run, store, methods):
-    found = record.temporary_run({"scenes": str(store)}, methods[::-1])
+    found = temporary_run({"scenes": str(store)}, methods[::-1])
     assert [*found.about["methods"]] == methods[::-1]
     assert_same(read_run(run), found)
     assert {*found.cells[1].predictions["Hartley+LM"]} == {*ERRORS}
@@ -64,7 +64,7 @@ def test_a_temporary_run_of_methods_in_another_order_has_the_same_numbers(run, s
 def test_another_run_computes_nothing_and_adds_what_is_new(copied, command, methods, monkeypatch, few_trials):
     files = {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")}
     with monkeypatch.context() as patch:
-        patch.setattr(record, "predict", pytest.fail)
+        patch.setattr(prediction_run, "predict", pytest.fail)
         assert main([*command, str(copied)]) == 0
     assert {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")} == files
     assert main([*command[:3], "reweighted", "--out", str(copied)]) == 0
@@ -148,7 +148,7 @@ def test_names_do_not_change_numbers(store, tmp_path):
     for weights in (("crossview", "paper"), ("paper", "crossview")):
         for path, name in zip(paths, weights, strict=True):
             shutil.copy(WEIGHTS / f"{name}.safetensors", path)
-        cell = record.temporary_run({"scenes": str(store)}, [*map(str, paths)], protocols=["filtered"]).cells[0]
+        cell = temporary_run({"scenes": str(store)}, [*map(str, paths)], SampleOptions(max_samples=30)).cells[0]
         found.append([cell.predictions[name]["own"] for name in ("one", "two")])
     assert torch.equal(found[0][0], found[1][1])
     assert torch.equal(found[0][1], found[1][0])
@@ -175,22 +175,30 @@ class TestOwnCode:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("def Mine(a, b, c):\n    raise RuntimeError('boom')", "RuntimeError: boom"),
             ("def Mine(a, b):\n    pass", "Mine() takes 2 positional arguments"),
             ("def Mine(a, b, c):\n    return 1", "must return two transforms of shape"),
             ("def Mine(a, b, c):\n    return 2 * [float('nan') * a.new_ones(len(a), 3, 3)]", "are not finite"),
+            ("class Mine:\n    def __init__(self, size):\n        pass", "cannot be made without arguments"),
+            ("Mine = (", "SyntaxError"),
+            ("1 / 0", "ZeroDivisionError"),
         ],
     )
-    def test_one_that_fails_is_left_out(self, store, capsys, text, message):
+    def test_one_that_is_no_normaliser(self, text, message):
+        Path("own_normaliser.py").write_text(text)
+        sys.modules.pop("own_normaliser", None)
+        importlib.invalidate_caches()
         before = [*sys.path]
-        assert self.evaluate(store, text) == 2
+        with pytest.raises(ValueError, match=re.escape(message)):
+            find_method("own_normaliser:Mine").estimate(*torch.rand(2, 3, 8, 2, dtype=torch.float64))
         assert sys.path == before
+
+    def test_one_that_fails_is_left_out(self, store, capsys):
+        assert self.evaluate(store, "def Mine(a, b, c):\n    raise RuntimeError('boom')") == 2
         error = capsys.readouterr().err
-        assert message in error
+        assert "RuntimeError: boom" in error
         assert "own_normaliser:Mine failed, called with" in error
         assert error.splitlines()[-1].endswith("All others are in run")
         assert [*read_run("run").about["methods"]] == ["Hartley"]
-        assert main(["report", "run"]) == 0
         assert self.evaluate(store, self.GOOD) == 0
         assert len(read_run("run").cells[0].predictions) == 2
 
@@ -206,19 +214,6 @@ class TestOwnCode:
         assert self.evaluate(store, self.GOOD) == 0
         assert self.evaluate(store, self.GOOD + "# edited") == 2
         assert "is a run of other options, remove it or write elsewhere: own_normaliser:Mine" in capsys.readouterr().err
-
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            ("class Mine:\n    def __init__(self, size):\n        pass", "cannot be made without arguments"),
-            ("Mine = (", "SyntaxError"),
-            ("1 / 0", "ZeroDivisionError"),
-        ],
-    )
-    def test_one_that_cannot_be_made(self, store, capsys, text, message):
-        assert self.evaluate(store, text) == 2
-        assert message in capsys.readouterr().err
-        assert not Path("run").exists()
 
 
 def test_pairs_with_few_matches_have_no_example_and_nothing_held_out(tmp_path, capsys):
@@ -283,12 +278,12 @@ def test_names_that_differ_have_files_that_differ():
     assert [file_name(name) for name in plain] == plain
 
 
-def test_a_run_of_some_pairs_of_a_store(store, tmp_path, capsys):
+def test_a_run_of_some_pairs_of_a_store(store, tmp_path, few_trials):
     out = tmp_path / "run"
     assert main(["evaluate", f"{store}@0:2", "--methods", "Hartley", "--max-samples", "20", "--out", str(out)]) == 0
-    solver = ["--estimators", "--solvers", "Hartley", "--hypotheses", "1"]
-    assert main(["robust", f"{store}@0:2", *solver, "--out", str(out)]) == 0
+    options = ["--estimators", "opencv-lmeds", "--pairs", "1", "--seeds", "1"]
+    assert main(["robust", f"{store}@0:2", *options, "--out", str(out)]) == 0
     assert [path for path in out.rglob("*") if re.search(r"[^A-Za-z0-9+_.-]", path.name)] == []
     assert [*read_run(out).about["stores"]] == ["scenes@0:2"]
     assert read_run(out).cells[0].store == "scenes@0:2"
-    assert read_robust(out).cells[0].hypotheses
+    assert read_robust(out).cells[0].estimates

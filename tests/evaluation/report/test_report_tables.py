@@ -1,23 +1,28 @@
-"""Tables of runs: better rates, accuracy, motion, robust estimators, hypotheses."""
+"""Tables of runs: better rates, accuracy, motion, robust estimators."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 
 import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation.report.formatting import known_parts, mean_text, median_text, number_text, paired_text
-from kornia_learnnorm.evaluation.report.hypotheses import hypothesis_figures, hypothesis_tables
+from kornia_learnnorm.evaluation.report.accuracy import by_motion, report_tables
+from kornia_learnnorm.evaluation.report.numbers import mean_share, median_number, number, paired_change
 from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
-from kornia_learnnorm.evaluation.report.robust import PRINTED, robust_tables
+from kornia_learnnorm.evaluation.report.robust_tables import PRINTED, robust_tables
 from kornia_learnnorm.evaluation.report.style import method_colors
-from kornia_learnnorm.evaluation.report.tables import by_motion, report_tables
-from kornia_learnnorm.evaluation.robust.run import read_robust
-from kornia_learnnorm.evaluation.runs.run import Cell, Run, read_run
-from kornia_learnnorm.evaluation.tables import Table
+from kornia_learnnorm.evaluation.robust.robust_run import read_robust
+from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell, read_run
+from kornia_learnnorm.evaluation.tables import Number, Table, tables_as_json
+
+
+def as_text(rows):
+    """The cells of a table as it is printed."""
+    return [[*map(str, row)] for row in rows]
 
 
 def test_rates_are_those_of_the_samples(run):
@@ -25,7 +30,7 @@ def test_rates_are_those_of_the_samples(run):
     cell = found.cells[0]
     own = {name: prediction["own"].numpy() for name, prediction in cell.predictions.items()}
     table = report_tables(found)[0]
-    for row in table.rows:
+    for row in as_text(table.rows):
         if row[0] in own:
             assert row[1].startswith(f"{100 * np.mean(own[row[0]] < own['Hartley']):.1f} [")
     assert [row[0] for row in table.rows] == [name for name in own if name != "Hartley"]
@@ -37,36 +42,37 @@ def test_rates_are_those_of_the_samples(run):
 
 def test_accuracy_and_tests(run):
     tables = {table.title: table for table in report_tables(read_run(run))}
-    rows = {row[0]: row for row in tables["Fit and accuracy: scenes, filtered"].rows}
+    rows = {row[0]: row for row in as_text(tables["Fit and accuracy: scenes, filtered"].rows)}
     assert float(rows["Hartley+LM"][1]) < float(rows["Hartley"][1]) < float(rows["none"][1])
-    tests = {row[0]: row for row in tables["Paired tests: scenes, filtered"].rows}
+    tests = {row[0]: row for row in as_text(tables["Paired tests: scenes, filtered"].rows)}
     assert tests["none"][1].startswith("+")
     assert tests["Hartley+LM"][1].startswith("-")
     assert len(tables["By motion: scenes, filtered"].rows) == 8
     assert 0 < len(tables["Worst failures: scenes, filtered"].rows) <= 10
 
 
-def test_texts_of_cells():
-    assert [number_text(0.5), number_text(float("nan"))] == ["0.500", ""]
-    assert median_text(torch.tensor([1.0, 4.0, torch.nan])) == "2.500"
+def test_numbers():
+    assert [str(number(0.5)), number(float("nan"))] == ["0.500", ""]
+    assert str(median_number(torch.tensor([1.0, 4.0, torch.nan]))) == "2.500"
     values = torch.tensor([1.5, 2.5])
-    assert paired_text(values, values - 0.5) == "+0.500"  # too few pairs for an interval
-    assert paired_text(values, values * torch.nan) == ""
+    assert str(paired_change(values, values - 0.5)) == "+0.500"  # too few pairs for an interval
+    assert paired_change(values, values * torch.nan) == ""
     values = torch.arange(8) + 1.5
-    assert paired_text(values, values - 0.5) == "+0.500 [+0.500, +0.500], < 0.001"
-    assert paired_text(values[1:], values[1:] - 0.5) == "+0.500"
+    assert str(paired_change(values, values - 0.5)) == "+0.500 [+0.500, +0.500], < 0.001"
+    assert str(paired_change(values[1:], values[1:] - 0.5)) == "+0.500"
+    halved = paired_change(values, values + np.log(2), logarithms=True)
+    assert str(halved) == "-50.0 [-50.0, -50.0], < 0.001"
     pair = torch.arange(8).repeat_interleave(2)
-    assert mean_text(torch.zeros(16), pair) == "0.0 [0.0, 0.0]"
-    assert mean_text(torch.zeros(16).masked_fill(pair == 3, torch.nan), pair) == "0.0"  # seven pairs
-    assert mean_text(torch.full((16,), torch.nan), pair) == ""
+    assert str(mean_share(torch.zeros(16), pair)) == "0.0 [0.0, 0.0]"
+    assert str(mean_share(torch.zeros(16).masked_fill(pair == 3, torch.nan), pair)) == "0.0"  # seven pairs
+    assert mean_share(torch.full((16,), torch.nan), pair) == ""
     assert method_colors(["none", "Hartley"]) == {"none": "#8b8b8b", "Hartley": "#e69f00"}
 
 
 def without_truth(run, robust):
     truth = ("truth", "heldout", "f1", "error", "rotation_error", "translation_error")
     robust_results = [r for cell in robust.cells for e in cell.estimates.values() for r in e.values()]
-    hypotheses = [h for cell in robust.cells for h in cell.hypotheses.values()]
-    for results in (*(p for cell in run.cells for p in cell.predictions.values()), *robust_results, *hypotheses):
+    for results in (*(p for cell in run.cells for p in cell.predictions.values()), *robust_results):
         for key in results.keys() & truth:
             results[key][:] = torch.nan
     for values in run.pairs["scenes"].values():
@@ -82,7 +88,7 @@ def of_one_pair(run, robust):
         predictions = {name: {key: v[kept] for key, v in p.items()} for name, p in cell.predictions.items()}
         cells.append(dataclasses.replace(cell, pair=cell.pair[kept], predictions=predictions))
     for cell in robust.cells:
-        for results in (*(r for e in cell.estimates.values() for r in e.values()), *cell.hypotheses.values()):
+        for results in (r for e in cell.estimates.values() for r in e.values()):
             results.update({key: values[:1] for key, values in results.items()})
     return dataclasses.replace(run, cells=cells), robust
 
@@ -90,9 +96,9 @@ def of_one_pair(run, robust):
 @pytest.mark.parametrize("change", [without_truth, of_one_pair])
 def test_unknown_numbers_are_empty_cells(run, robust_run, change):
     found, robust = change(read_run(run), read_robust(robust_run))
-    tables = [*report_tables(found), *robust_tables(robust), *hypothesis_tables(robust)]
-    cells = [cell for table in tables for row in table.rows for cell in row]
-    assert len(tables) >= 14
+    tables = [*report_tables(found), *robust_tables(robust)]
+    cells = [cell for table in tables for row in as_text(table.rows) for cell in row]
+    assert len(tables) >= 12
     assert "" in cells
     assert not [cell for cell in cells if re.search("nan|inf", cell)]
 
@@ -122,11 +128,11 @@ def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_r
     found, _ = without_truth(found, read_robust(robust_run))
     for name, values in heldout.items():
         found.cells[0].predictions[name]["heldout"][:] = values
-    tables = {t.title: t for table in report_tables(found) if (t := known_parts(table))}
+    tables = {t.title: t for table in report_tables(found) if (t := table.known_parts())}
     for title, table in tables.items():
         assert all(any(row[i] for row in table.rows) for i in range(len(table.header))), title
         assert not [name for name in table.header if "truth" in name or "F1" in name], title
-    rows = {row[0]: row for row in tables["Inliers: scenes, filtered"].rows}
+    rows = {row[0]: row for row in as_text(tables["Inliers: scenes, filtered"].rows)}
     assert rows["whitening"][2].startswith(f"{100 * shares[:, 1].mean():.1f} [")
     assert tables["Fit and accuracy: scenes, filtered"].header[:4] == [
         "method",
@@ -141,7 +147,7 @@ def motion_cell(forward, truth):
     """Six pairs of two samples each; the figures other than ``forward`` are not known."""
     error = torch.tensor(truth, dtype=torch.float64).repeat_interleave(2)
     errors = {"own": torch.arange(12) + 1.0, "heldout": torch.arange(12) + 1.0, "truth": error}
-    cell = Cell("a", "filtered", torch.arange(6).repeat_interleave(2), 12, {"Hartley": errors, "mine": errors})
+    cell = RunCell("a", "filtered", torch.arange(6).repeat_interleave(2), 12, {"Hartley": errors, "mine": errors})
     unknown = np.full(6, np.nan)
     pairs = {"rotation": unknown, "forward": np.array(forward), "parallax": unknown, "inliers": unknown}
     return cell, Run({}, [cell], {"a": pairs}, {}, {})
@@ -152,7 +158,7 @@ class TestByMotion:
         """A median of 0.999555 that three digits round to 1, among samples of which some have no truth."""
         nan = float("nan")
         table = by_motion(*motion_cell([0.2, 0.4, 0.9995, 0.99961, 0.99962, 0.9997], [1, nan, 1, 1, nan, nan]), "mine")
-        assert [row[1:5] for row in table.rows] == [["up to 0.9996", "3", "6", "4"], ["above 0.9996", "3", "6", "2"]]
+        assert [row[1:5] for row in table.rows] == [["up to 0.9996", 3, 6, 4], ["above 0.9996", 3, 6, 2]]
         assert "Not shown: rotation, degrees, known of 0 of 6 pairs, at least 4 are needed; parallax" in table.text
 
     @pytest.mark.parametrize(
@@ -173,28 +179,21 @@ def test_the_rate_of_known_distributions():
     rng = np.random.default_rng(0)
     own = {"Hartley": rng.exponential(1.0, 20_000), "crossview": rng.exponential(0.5, 20_000)}
     predictions = {name: {"own": torch.from_numpy(values)} for name, values in own.items()}
-    cell = Cell("kitti_06", "filtered", torch.arange(20_000) // 100, 20_000, predictions)
+    cell = RunCell("kitti_06", "filtered", torch.arange(20_000) // 100, 20_000, predictions)
     trained_on = {"Hartley": [], "crossview": ["kitti_06@0:3"]}
     about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(own, ""), "trained_on": trained_on}
     about["stores"] = {"kitti_06": "KITTI odometry 06, 200 pairs, 20000 matches"}
     (table,) = rate_tables(Run(about, [cell], {}, {}, {}))
-    rate, interval = table.rows[0][1].split(" ", 1)
-    low, high = (float(end) for end in interval.strip("[] *").split(", "))
-    assert table.rows[0][::2] == ["crossview", "kitti_06@0:3"]
-    assert interval.endswith(" *")
+    name, rate, trained_on = table.rows[0]
+    (low, high), rate = rate.interval, rate.value
+    assert (name, trained_on) == ("crossview", "kitti_06@0:3")
+    assert str(table.rows[0][1]).endswith("] *")
     assert low < 200 / 3 < high
     # The half width of independent samples: 1.96 standard deviations of a proportion.
     assert (high - low) / 2 == pytest.approx(196 * np.sqrt(2 / 9 / 20_000), rel=0.2)
-    assert float(rate) == pytest.approx(200 / 3, abs=1)
+    assert rate == pytest.approx(200 / 3, abs=1)
     printed = {"KITTI 00-05": "86.68", "TUM": "84.22", "KITTI 00-05 and TUM": "87.05"}
-    assert {row[2]: row[1] for row in table.rows[1:]} == printed
-
-
-def test_rows_and_columns_without_a_number_are_left_out():
-    rows = [["a", "-", "1.5", ""], ["b", "-", "", ""], ["c", "-", "-", "-"]]
-    known = known_parts(Table("", "", ["method", "own", "truth", "angle"], rows))
-    assert (known.header, known.rows) == (["method", "truth"], [["a", "1.5"]])
-    assert known_parts(Table("", "", ["method", "own"], [["a", "-"], ["b", ""]])) is None
+    assert {row[2]: row[1] for row in as_text(table.rows[1:])} == printed
 
 
 def test_rates_have_no_row_of_the_baseline_or_of_a_method_without_predictions(run):
@@ -210,22 +209,20 @@ def test_rates_have_no_row_of_the_baseline_or_of_a_method_without_predictions(ru
 def test_numbers_of_robust_estimators(robust_run):
     found = read_robust(robust_run)
     tables = {table.title: table for table in robust_tables(found)}
-    figures = found.cells[0].estimates["count:whitening"][1.0]
-    rows = {row[0]: row for row in tables["Robust estimation: kitti_06, filtered (Table 2)"].rows}
+    figures = found.cells[0].estimates["opencv-usac"][1.0]
+    rows = {row[0]: row for row in as_text(tables["Robust estimation: kitti_06, filtered (Table 2)"].rows)}
     means = 100 * figures["inliers"].mean(0)
-    assert rows["count:whitening"][4] == f"{means.mean():.2f} ± {means.std():.2f}"
+    assert rows["opencv-usac"][4] == f"{means.mean():.2f} ± {means.std():.2f}"
     assert "±" not in rows["RANSAC"][1]  # a single run
-    printed = PRINTED["KITTI", "filtered"]
-    assert rows["Fan et al., as printed: LMEDS"][1:3] == list(printed["LMEDS"][:2])
-    pose = {row[0]: row for row in tables["Pose and time: kitti_06, filtered"].rows}
-    assert pose["count:whitening"][6] == "50"
+    assert rows["Fan et al., as printed: LMEDS"][1:3] == ["20.01", "13.34"]
+    assert PRINTED["KITTI", "filtered"]["LMEDS"][:2] == (20.01, 13.34)
+    pose = {row[0]: row for row in as_text(tables["Pose and time: kitti_06, filtered"].rows)}
+    assert pose["opencv-usac"][6] == ""
     assert float(pose["RANSAC"][11]) > 0
-    tests = {row[0]: row for row in tables["Paired tests of robust estimation: kitti_06, filtered"].rows}
-    baselines = {"count:whitening": "count:Hartley", "time:whitening": "time:Hartley", "RANSAC": "count:Hartley"}
-    assert {name: row[1] for name, row in tests.items()} == baselines
-    other = found.cells[0].estimates["count:Hartley"][1.0]
-    change = 100 * (figures["inliers"] - other["inliers"]).mean().item()
-    assert tests["count:whitening"][5] == f"{change:+.3f}"  # too few pairs for an interval
+    ((name, against, *changes),) = as_text(tables["Paired tests of robust estimation: kitti_06, filtered"].rows)
+    assert (name, against) == ("RANSAC:whitening", "RANSAC")
+    mine, other = (found.cells[0].estimates[one][1.0]["inliers"] for one in (name, against))
+    assert changes[3] == f"{100 * (mine - other).mean().item():+.3f}"  # too few pairs for an interval
 
 
 def test_robust_estimators_without_ground_truth(robust_run):
@@ -235,31 +232,34 @@ def test_robust_estimators_without_ground_truth(robust_run):
             for key in ("f1", "error", "rotation_error", "translation_error"):
                 figures[key][:] = torch.nan
     found.about["stores"]["kitti_06"] = "images of a folder, 3 pairs, 990 matches"
-    table, time, tests = map(known_parts, robust_tables(found)[:3])
+    table, time, tests = (table.known_parts() for table in robust_tables(found)[:3])
     assert table.header == ["estimator", "inliers % @0.1 px", "inliers % @1 px"]
     assert time.header == ["estimator", "ms @0.1 px", "samples @0.1 px", "ms @1 px", "samples @1 px"]
     assert tests.header[2:] == ["inliers @0.1 px: change, p", "inliers @1 px: change, p"]
     assert time.title == "Time: kitti_06, filtered"
     assert "ground-truth" not in [row[0] for row in (*table.rows, *time.rows)]
-    shares = found.cells[0].estimates["count:whitening"][1.0]["inliers"]
-    assert next(row for row in table.rows if row[0] == "count:whitening")[2].startswith(f"{100 * shares.mean():.2f} ±")
+    shares = found.cells[0].estimates["opencv-usac"][1.0]["inliers"]
+    assert str(table.rows[0][2]).startswith(f"{100 * shares.mean():.2f} ±")
 
 
-def test_numbers_of_hypotheses(robust_run):
-    found = read_robust(robust_run)
-    best, chosen, tests = hypothesis_tables(found)[:3]
-    error = found.cells[0].hypotheses["whitening"]["error"]
-    assert best.rows[1][1] == chosen.rows[1][1] == f"{error.mean():.3f}"
-    assert best.rows[1][4] == f"{error.min(-1).values.mean():.3f}"
-    names = ["Best of k hypotheses", "Hypothesis that MSAC picks among k"]
-    assert [row[:2] for row in tests.rows[:2]] == [["whitening", name] for name in names]
-    change = (error - found.cells[0].hypotheses["Hartley"]["error"]).mean().item()
-    assert tests.rows[0][2] == f"{change:+.3f}"  # too few pairs for an interval
+def test_parts_of_a_table():
+    rows = [["a", "-", Number(1.5, ".1f"), ""], ["b", "-", "", ""], ["c", "-", "-", "-"]]
+    known = Table("", "", ["method", "own", "truth", "angle"], rows).known_parts()
+    assert (known.header, as_text(known.rows)) == (["method", "truth"], [["a", "1.5"]])
+    assert Table("", "", ["method", "own"], [["a", "-"], ["b", ""]]).known_parts() is None
 
 
-def test_no_figures_and_tables_of_hypotheses_without_ground_truth(robust_run):
-    found = read_robust(robust_run)
-    for hypotheses in [h for cell in found.cells for h in cell.hypotheses.values()]:
-        hypotheses["error"][:] = torch.nan
-    assert hypothesis_figures(found) == []
-    assert [table for table in hypothesis_tables(found) if "kitti_06" in table.title] == []
+def test_cells_as_json():
+    numbers = [Number(1.499, "+.2f"), Number(2.5e6, ".3g"), Number(1.52, ".1f", (1.24, 2.0))]
+    numbers += [Number(-3, ".1f", (-4, -2), 0.0004), Number(-3, ".1f", (-4, -2), 0.0312), Number(7, ".2f", std=0.1)]
+    numbers += [Number(99.9, ".1f", trained_on=True), Number(99.9, ".1f", (99.0, 100.0), trained_on=True)]
+    cells = ["12", "", "-", 12, *numbers, "kitti_00, kitti_01", Number(np.inf)]
+    header = ["name", *map(str, range(len(cells) - 1))]
+    (row,) = json.loads(tables_as_json("", [Table("", "", header, [cells])]))["tables"][0]["rows"]
+    interval = {"value": -3.0, "low": -4.0, "high": -2.0}
+    expected = [None, None, 12, 1.5, 2.5e6, {"value": 1.5, "low": 1.2, "high": 2.0}, interval | {"p": 0.001}]
+    expected += [interval | {"p": 0.031}, {"value": 7.0, "std": 0.1}, {"value": 99.9, "trained_on": True}]
+    expected += [{"value": 99.9, "low": 99.0, "high": 100.0, "trained_on": True}, "kitti_00, kitti_01", "inf"]
+    assert [*row.values()] == ["12", *expected]
+    assert [*map(str, numbers[:4])] == ["+1.50", "2.5e+06", "1.5 [1.2, 2.0]", "-3.0 [-4.0, -2.0], < 0.001"]
+    assert [*map(str, numbers[5:])] == ["7.00 ± 0.10", "99.9 *", "99.9 [99.0, 100.0] *"]

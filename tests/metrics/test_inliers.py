@@ -11,7 +11,7 @@ from kornia.core.exceptions import ShapeError
 from two_view import epipolar_distances, scenes
 
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.metrics.pairs import epipolar_error, f1_score, inlier_share
+from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
 
 INF, NAN = float("inf"), float("nan")
 ROWS = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]], dtype=torch.float64)  # y1 - y2

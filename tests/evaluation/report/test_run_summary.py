@@ -8,9 +8,9 @@ import re
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation.report.summary import robust_summary, run_summary
-from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
-from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.evaluation.report.run_summary import robust_summary, run_summary
+from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
+from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 
 PAIRS, SAMPLES = 12, 60
 PAIR = torch.arange(SAMPLES) // (SAMPLES // PAIRS)
@@ -27,7 +27,7 @@ def errors(scale, key="truth"):
 
 
 def summary_of(predictions, pair=PAIR):
-    (text,) = run_summary(Run({}, [Cell("a", "filtered", pair, SAMPLES, predictions)], {}, {}, {}))
+    (text,) = run_summary(Run({}, [RunCell("a", "filtered", pair, SAMPLES, predictions)], {}, {}, {}))
     return text
 
 
@@ -56,7 +56,7 @@ def test_hartley_may_win():
 def test_weights_of_ones_own_are_named_where_another_method_wins():
     predictions = {"Hartley": errors(1.0), "best": errors(0.5), "own": errors(0.8), "crossview": errors(0.9)}
     about = {"trained_on": {"Hartley": [], "best": [], "own": ["a@0:9"], "crossview": ["kitti_00"]}}
-    (text,) = run_summary(Run(about, [Cell("a", "filtered", PAIR, SAMPLES, predictions)], {}, {}, {}))
+    (text,) = run_summary(Run(about, [RunCell("a", "filtered", PAIR, SAMPLES, predictions)], {}, {}, {}))
     assert text.endswith("`own` has 5.200 px.")
 
 
@@ -118,9 +118,7 @@ def test_robust_estimators(truth, text):
         "greedy": estimates(0.4, 0.9, 0.02, truth),
         "ground-truth": estimates(0.0, 1.0, truth=truth),
     }
-    (line,) = robust_summary(
-        RobustRun({}, [RobustCell("a", "filtered", found, {}), RobustCell("b", "filtered", {}, {})], [])
-    )
+    (line,) = robust_summary(RobustRun({}, [RobustCell("a", "filtered", found), RobustCell("b", "filtered", {})], []))
     assert text in line
     assert "ground-truth" not in line.replace("ground-truth inliers", "")
     assert ("next is `greedy` with 0.400 px" if truth else "next is `exact` with 50.0 %") in line

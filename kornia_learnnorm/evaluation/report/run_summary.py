@@ -10,25 +10,24 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.methods import SHIPPED, base_name
-from kornia_learnnorm.evaluation.report.formatting import (
+from kornia_learnnorm.evaluation.report.numbers import (
     BASELINE,
     MIN_BOOTSTRAP_PAIRS,
+    MIN_DISTANCE,
     RESAMPLES,
-    median_text,
+    median_number,
     percent_change,
 )
-from kornia_learnnorm.evaluation.report.robust import pairs_with_truth
-from kornia_learnnorm.evaluation.robust.estimators import TRUTH
-from kornia_learnnorm.evaluation.robust.hypotheses import MAX_ERROR
-from kornia_learnnorm.evaluation.robust.run import RobustCell, RobustRun
-from kornia_learnnorm.evaluation.runs.run import Cell, Run
+from kornia_learnnorm.evaluation.report.robust_tables import MAX_ERROR, pairs_with_truth
+from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
+from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
+from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.metrics.bootstrap import PairedDifference, paired_bootstrap
-from kornia_learnnorm.metrics.summary import median
+from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, THRESHOLDS
 
 __all__ = ["robust_summary", "run_summary"]
 
-MIN_DISTANCE = 1e-6  # pixels; smaller distances are clamped before the logarithm
 # The errors of methods, the most telling first: what is known of the first that is known decides.
 ERRORS = {
     "truth": "error on the ground-truth inliers",
@@ -82,7 +81,7 @@ def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> 
     return _Ranking(winner, others[0] if others else "", level, ahead, differences, pairs)
 
 
-def _about_methods(cell: Cell, own: list[str]) -> str:
+def _about_methods(cell: RunCell, own: list[str]) -> str:
     """Return which method has the smallest median error, as the table shows it, beside others: the user's own too."""
     key = next((key for key in ERRORS if not cell.predictions[BASELINE][key].isnan().all()), "own")
     logs = {name: p[key].clamp(min=MIN_DISTANCE).log() for name, p in cell.predictions.items()}
@@ -91,11 +90,11 @@ def _about_methods(cell: Cell, own: list[str]) -> str:
     used = cell.pair[torch.stack([*logs.values()]).isfinite().all(0)]
     size = f"{len(used):,} samples of {len(torch.unique(used))} image pairs"
     text = f"**{cell.title}** ({size}): "
-    text += f"`{winner}` has the smallest {ERRORS[key]}, median {median_text(best[key])} px"
+    text += f"`{winner}` has the smallest {ERRORS[key]}, median {median_number(best[key])} px"
     text += f"{_compared(cell, ranking, key)}.{_level(ranking)}"
     for name in own:
         if name in cell.predictions and name != winner:
-            text += f" `{name}` has {median_text(cell.predictions[name][key])} px."
+            text += f" `{name}` has {median_number(cell.predictions[name][key])} px."
     if ranking.ahead:
         text += f" The geometric mean of the errors is smaller for {_names(ranking.ahead)}."
     if key != "truth" and "inliers" in best:
@@ -104,22 +103,22 @@ def _about_methods(cell: Cell, own: list[str]) -> str:
     return text
 
 
-def _compared(cell: Cell, ranking: _Ranking, key: str) -> str:
+def _compared(cell: RunCell, ranking: _Ranking, key: str) -> str:
     """Return the baseline's error, or the second's where the baseline has won, and the change against the baseline."""
     won = ranking.winner == BASELINE
     other = ranking.second if won else BASELINE
-    error = median_text(cell.predictions[other][key]) if other else ""
+    error = median_number(cell.predictions[other][key]) if other else ""
     if not error:
         return ""
     text = f"; next is `{other}` with {error} px" if won else f"; {other} has {error} px"
     if found := ranking.against.get(other):
         logs = (-found.mean, -found.high, -found.low) if won else (found.mean, found.low, found.high)
         mean, low, high = map(percent_change, logs)
-        text += f" (change of the geometric mean {mean} % [{low}, {high}])"
+        text += f" (change of the geometric mean {mean:+.1f} % [{low:+.1f}, {high:+.1f}])"
     return text
 
 
-def _inlier_share(cell: Cell, name: str) -> str:
+def _inlier_share(cell: RunCell, name: str) -> str:
     share = cell.predictions[name]["inliers"][:, THRESHOLDS.index(INLIER_THRESHOLD)]
     return f"`{name}` {100 * share.nanmean().item():.1f} %"
 

@@ -1,4 +1,4 @@
-"""Picture of an image pair: its inliers and outliers, and the epipolar lines of one of its samples."""
+"""ReportPicture of an image pair: its inliers and outliers, and the epipolar lines of one of its samples."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.evaluation.report.style import INK, Picture, make_figure, make_picture
-from kornia_learnnorm.evaluation.runs.run import Run
-from kornia_learnnorm.evaluation.runs.store import Arrays
+from kornia_learnnorm.evaluation.report.style import INK, ReportPicture, make_figure, make_picture
+from kornia_learnnorm.evaluation.runs.prediction_run import Run
+from kornia_learnnorm.evaluation.runs.results_store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.two_view.drawing import INLIER, WIDE, draw_line, draw_matches
@@ -25,7 +25,7 @@ METHODS = ("Hartley", "crossview")
 TRUTH = "ground truth"
 
 
-def draw_example(run: Run, colors: dict[str, str]) -> list[Picture]:
+def draw_example(run: Run, colors: dict[str, str]) -> list[ReportPicture]:
     """Draw the example image pair of a run, without the images; nothing where the run has no sample of it."""
     pair = run.example
     place = (str(pair["store"]), "filtered") if pair else ("", "")

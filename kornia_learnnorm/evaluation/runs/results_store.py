@@ -1,7 +1,8 @@
-"""The files of a run.
+"""The results of a run, kept in a folder, which is the only thing that recording and reporting share.
 
-``run.json`` tells what the run was computed from, in a section for ``evaluate`` and one for ``robust``; NumPy archives
-hold its arrays and are checked when they are read.
+``run.json`` says what the run was computed from, in a section for ``evaluate`` and one for ``robust``; NumPy archives
+hold its arrays. A file that exists is read, to know that it is whole, and not computed again; a run of other options is
+refused. A method that fails is left out of the run, all others go on.
 """
 
 from __future__ import annotations
@@ -11,48 +12,61 @@ import json
 import re
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import atomic_write, exclusive, write_text
+from kornia_learnnorm.optional import import_extra
 
 __all__ = [
     "About",
     "Arrays",
+    "Job",
     "begin_section",
     "file_name",
-    "leave_out",
+    "once",
     "read_arrays",
     "read_section",
+    "record",
+    "result_files",
     "run_folder",
     "write_arrays",
 ]
 
 FORMAT = 4  # of the folder; runs of another format are refused
-# Parts of a section that may grow: what each is, by its name.
-JOINED = {
-    "evaluate": ("stores", "methods", "trained_on", "versions"),
-    "robust": ("stores", "estimators", "solvers", "versions"),
-}
+# Parts of a section that may grow: what each is, by its name. The second are its methods.
+JOINED = {"evaluate": ("stores", "methods", "trained_on", "versions"), "robust": ("stores", "estimators", "versions")}
 # Parts that must stay as they are.
 OPTIONS = {
     "evaluate": ("size", "seed", "max_samples", "max_residual"),
-    "robust": ("pairs", "hypotheses", "seeds", "slow_seeds", "seed", "threads"),
+    "robust": ("pairs", "seeds", "slow_seeds", "seed", "threads"),
 }
+# Where the files of methods are.
+PLACES = {"evaluate": ("*/filtered", "*/unfiltered", "sizes"), "robust": ("robust/*/*/*",)}
 
 MAX_NAME = 80  # letters of a name in that of a file
 RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{device}{i}" for device in ("COM", "LPT") for i in range(10))}  # Windows
 
 About = dict[str, Any]
 Arrays = dict[str, NDArray[Any]]
+
+
+class Job(NamedTuple):
+    """A file of a run that a method makes."""
+
+    method: str
+    path: Path
+    compute: Callable[[], Arrays]
+    keys: Sequence[str] = ()  # arrays that a whole file has
+    rows: int | None = None  # of these arrays
 
 
 @contextmanager
@@ -63,6 +77,54 @@ def run_folder(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     with exclusive(folder):
         yield
+
+
+def record(folder: Path, section: str, jobs: Iterable[Job], total: int, known: Collection[str]) -> str:
+    """Do the jobs whose files are missing, with a progress bar.
+
+    Args:
+        folder: the run.
+        section: ``evaluate`` or ``robust``.
+        jobs: made one after the other.
+        total: number of jobs, for the bar.
+        known: methods that stay in the run even if they fail: those that it had before.
+
+    Returns:
+        why methods have failed; empty if none has.
+
+    """
+    tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
+    failed = dict[str, str]()
+    with tqdm(total=total, unit="file", disable=None) as bar:
+        for job in jobs:
+            bar.set_postfix_str(f"{job.method}: {job.path.parent.relative_to(folder)}")
+            if job.path.is_file():
+                read_arrays(job.path, job.keys, job.rows)
+            elif job.method not in failed:
+                try:
+                    write_arrays(job.path, job.compute())
+                except ValueError as error:
+                    failed[job.method] = str(error)
+            bar.update()
+    _forget(folder, section, failed.keys() - {*known})
+    # A normaliser of the user's own is named in its message already.
+    named = {text if text.startswith(name.partition("+")[0]) else f"{name}: {text}" for name, text in failed.items()}
+    return "; ".join(sorted(named))
+
+
+def _forget(folder: Path, section: str, names: Collection[str]) -> None:
+    """Remove methods from a section, with their files: their code will be another when they come again."""
+    about = read_section(folder, section) or {}
+    for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
+        about[key] = {name: value for name, value in about[key].items() if name not in names}
+    _write(folder, section, about)
+    for path in result_files(folder, section, names):
+        path.unlink()
+
+
+def result_files(folder: Path, section: str, names: Iterable[str]) -> list[Path]:
+    """Return the files of methods or estimators."""
+    return [p for name in names for place in PLACES[section] for p in folder.glob(f"{place}/{file_name(name)}.npz")]
 
 
 def read_section(folder: Path, section: str) -> About | None:
@@ -87,12 +149,21 @@ def begin_section(
     about: About,
     redo: Collection[str] = (),
     command: str = "",
-) -> None:
+) -> About:
     """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
 
-    ``about`` has the options and, by the names in ``JOINED``, what each method, estimator and so on is, None for one
-    whose package is not installed. The descriptions of ``redo`` may change.
-    ``command`` is noted with the date of today.
+    Args:
+        folder: the run.
+        section: ``evaluate`` or ``robust``.
+        stores: by their names.
+        about: the options and, by the names in ``JOINED``, what each method or estimator is, None for one whose package
+            is not installed.
+        redo: methods or estimators whose descriptions may change.
+        command: noted with the date of today.
+
+    Returns:
+        what the section was before; empty for a new one.
+
     """
     about = about | {
         "stores": {
@@ -101,7 +172,8 @@ def begin_section(
         },
         "versions": {name: importlib.metadata.version(name) for name in ("kornia_learnnorm", "torch", "kornia")},
     }
-    joined, had = JOINED[section], read_section(folder, section) or about
+    before = read_section(folder, section) or {}
+    joined, had = JOINED[section], before or about
     differ = [f"{key} {had[key]!r}, now {about[key]!r}" for key in OPTIONS[section] if had[key] != about[key]]
     differ += [text for key in joined for text in _changes(had[key], about[key], redo)]
     if differ:
@@ -109,14 +181,7 @@ def begin_section(
     dates = {command: datetime.now().astimezone().date().isoformat()} if command else {}
     about["commands"] = {**had.get("commands", {}), **dates}
     _write(folder, section, about | {key: _join(had[key], about[key]) for key in joined})
-
-
-def leave_out(folder: Path, section: str, names: Collection[str]) -> None:
-    """Remove methods, estimators or solvers from a section; their files are the caller's."""
-    about = read_section(folder, section) or {}
-    for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
-        about[key] = {name: value for name, value in about[key].items() if name not in names}
-    _write(folder, section, about)
+    return before
 
 
 def _changes(had: About, now: About, redo: Collection[str]) -> list[str]:
@@ -158,7 +223,7 @@ def _write(folder: Path, section: str, about: About) -> None:
 
 
 def file_name(name: str) -> str:
-    """Return the name of the file or folder of a store, a method, an estimator or a solver, without suffix.
+    """Return the name of the file or folder of a store, a method or an estimator, without suffix.
 
     It is the name itself, unless that is not a file's name on Linux, macOS and Windows alike, or longer than
     ``MAX_NAME``: then it has a part of a hash of the name, so that no two names have one file.
@@ -180,6 +245,13 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         np.savez_compressed(temporary, **arrays)
+
+
+def once(path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None) -> Arrays:
+    """Return the arrays of a file, after computing and writing them if it does not exist."""
+    if not path.is_file():
+        write_arrays(path, compute())
+    return read_arrays(path, keys, rows)
 
 
 def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> Arrays:

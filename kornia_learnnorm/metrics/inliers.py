@@ -1,4 +1,4 @@
-r"""Metrics of an estimated fundamental matrix, one number per image pair: share of inliers, F1, epipolar error.
+r"""Metrics of an estimated fundamental matrix, one number per image pair: share of inliers, F1 score, epipolar error.
 
 All distances are symmetric epipolar distances in pixels, the sum :math:`d_1 + d_2` of both points' distances to their
 epipolar lines. Other packages take the larger of the two or their mean, so their thresholds mean something else.
@@ -6,6 +6,10 @@ epipolar lines. Other packages take the larger of the two or their mean, so thei
 A failed estimate (NaN or zero matrix) has no inliers and an infinite error. NaN is not a failure: the pair cannot be
 measured, and callers drop and count such pairs. The evaluation of NG-RANSAC drops a pair from all three
 metrics when the ground truth has no inliers at the threshold or none below 1 px.
+
+Reference:
+    R. Ranftl, V. Koltun, Deep Fundamental Matrix Estimation, ECCV 2018, as evaluated by E. Brachmann, C. Rother,
+    Neural-Guided RANSAC, ICCV 2019.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from torch import Tensor
 from kornia_learnnorm.geometry.checks import check_mask
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
-__all__ = ["epipolar_error", "f1_score", "inlier_share"]
+__all__ = ["epipolar_error", "f1_from_masks", "f1_score", "finite_distance", "inlier_share"]
 
 
 def inlier_share(
@@ -43,10 +47,6 @@ def inlier_share(
         ShapeError: if a shape is wrong.
         ValueError: if the points do not pair up, the mask does not fit them, or the threshold is not positive.
 
-    Reference:
-        R. Ranftl, V. Koltun, Deep Fundamental Matrix Estimation, ECCV 2018, as evaluated by E. Brachmann, C. Rother,
-        Neural-Guided RANSAC, ICCV 2019.
-
     Example:
         >>> F_mat = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # lines are rows
         >>> points1, points2 = torch.tensor([[5.0, 1.0], [5.0, 2.0]]), torch.tensor([[9.0, 1.25], [9.0, 3.0]])
@@ -67,23 +67,15 @@ def f1_score(
     :math:`2 |A \cap B| / (|A| + |B|)` with :math:`A = \{i : d_i(F) < \tau\}` and the same :math:`B` of the true matrix.
 
     Args:
-        points1: pixels in the first images with shape :math:`(*, N, 2)`.
-        points2: pixels in the second images with shape :math:`(*, N, 2)`.
+        points1: as for :func:`inlier_share`, which raises the same errors.
+        points2: as for :func:`inlier_share`.
         F_mat: estimated fundamental matrices with shape :math:`(*, 3, 3)`, any scale.
         F_true: true fundamental matrices with shape :math:`(*, 3, 3)`, any scale; NaN where unknown.
         threshold: symmetric epipolar distance :math:`\tau` that an inlier stays below, pixels.
-        mask: true for the correspondences of a padded batch that count, boolean with shape :math:`(*, N)`.
+        mask: as for :func:`inlier_share`.
 
     Returns:
         scores with shape :math:`(*)`; zero where the sets do not meet, NaN where the ground truth has no inliers.
-
-    Raises:
-        TypeError: if a tensor is not floating-point, dtypes differ, or the mask is not boolean.
-        ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up, the mask does not fit them, or the threshold is not positive.
-
-    Reference:
-        Ranftl and Koltun, as for :func:`inlier_share`.
 
     Example:
         >>> F_true = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # lines are rows
@@ -93,11 +85,14 @@ def f1_score(
         tensor(0.6667)
 
     """
-    inliers = _inliers(points1, points2, F_mat, threshold, mask)
-    true = _inliers(points1, points2, F_true, threshold, mask)
-    both = 2 * (inliers & true).sum(-1).to(points1.dtype)
-    score = both / (inliers.sum(-1) + true.sum(-1))
-    return torch.where(true.any(-1), score, torch.nan)
+    masks = (_inliers(points1, points2, matrix, threshold, mask) for matrix in (F_mat, F_true))
+    return f1_from_masks(*masks).to(points1.dtype)
+
+
+def f1_from_masks(inliers: Tensor, true: Tensor) -> Tensor:
+    """Return the F1 score, float64, of masks (..., N) of inliers against the true ones; NaN where none is true."""
+    both, either = (inliers & true).sum(-1).double(), inliers.sum(-1) + true.sum(-1)
+    return torch.where(true.any(-1), 2 * both / either, torch.nan)
 
 
 def epipolar_error(
@@ -111,27 +106,11 @@ def epipolar_error(
     r"""Return the mean symmetric epipolar distance of the ground truth's inliers under an estimate, in pixels.
 
     :math:`\frac{1}{|B|} \sum_{i \in B} d_i(F)` with :math:`B = \{i : d_i(F_{true}) < \tau\}`, whatever threshold the
-    other metrics are taken at.
-
-    Args:
-        points1: pixels in the first images with shape :math:`(*, N, 2)`.
-        points2: pixels in the second images with shape :math:`(*, N, 2)`.
-        F_mat: estimated fundamental matrices with shape :math:`(*, 3, 3)`, any scale.
-        F_true: true fundamental matrices with shape :math:`(*, 3, 3)`, any scale; NaN where unknown.
-        threshold: symmetric epipolar distance :math:`\tau` that an inlier stays below, pixels.
-        mask: true for the correspondences of a padded batch that count, boolean with shape :math:`(*, N)`.
+    other metrics are taken at. The arguments and errors are those of :func:`f1_score`.
 
     Returns:
         errors in pixels with shape :math:`(*)`; infinite for a failed estimate, NaN where the ground truth has no
         inliers.
-
-    Raises:
-        TypeError: if a tensor is not floating-point, dtypes differ, or the mask is not boolean.
-        ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up, the mask does not fit them, or the threshold is not positive.
-
-    Reference:
-        Ranftl and Koltun, as for :func:`inlier_share`.
 
     Example:
         >>> F_true = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # lines are rows
@@ -142,19 +121,19 @@ def epipolar_error(
 
     """
     true = _inliers(points1, points2, F_true, threshold, mask)
-    distance = _distance(points1, points2, F_mat)
+    distance = finite_distance(points1, points2, F_mat)
     return torch.where(true, distance, 0.0).sum(-1) / true.sum(-1)
 
 
-def _distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    """Return the distances, infinite under a matrix of NaN."""
+def finite_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
+    """Return the symmetric epipolar distances (..., N), pixels, infinite under a matrix of NaN."""
     return symmetric_epipolar_distance(points1, points2, F_mat).nan_to_num(nan=inf, posinf=inf)
 
 
 def _inliers(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, mask: Tensor | None) -> Tensor:
     if not threshold > 0:
         raise ValueError(f"threshold must be positive, got {threshold}")
-    inliers = _distance(points1, points2, F_mat) < threshold
+    inliers = finite_distance(points1, points2, F_mat) < threshold
     if mask is None:
         return inliers
     check_mask(mask, points1, points2)

@@ -1,0 +1,198 @@
+"""Robust estimators by name, as ``learnnorm robust`` takes them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.refinement import refine_fundamental
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, find_method, identify_method, short_name_of
+from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version
+from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.pretrained import weights_digest
+from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
+
+__all__ = [
+    "DEFAULT_ESTIMATORS",
+    "TRUTH",
+    "Estimate",
+    "Estimator",
+    "EvaluatedPair",
+    "estimator_names",
+    "find_estimator",
+    "identify_estimator",
+    "is_slow",
+    "run_estimator",
+]
+
+TRUTH = "ground-truth"
+MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network
+DEFAULTS = "RANSAC"  # RANSAC with its default options
+LEARNED, GUIDED = "learned:", "guided:"  # followed by the name of weights of an estimator
+KINDS = (LEARNED, GUIDED, f"{DEFAULTS}:")
+DEFAULT_ESTIMATORS = (
+    *(name for name in PEERS if not name.endswith(CALIBRATED)),
+    DEFAULTS,
+    f"{DEFAULTS}:crossview",
+    f"{LEARNED}robust",
+    f"{LEARNED}robust-synthetic",
+    f"{GUIDED}robust",
+    f"{GUIDED}robust-synthetic",
+    TRUTH,
+)
+
+
+class EvaluatedPair(NamedTuple):
+    """The correspondences of an image pair, in the order in which estimators get them, and its ground truth."""
+
+    points1: Tensor  # pixels in the first image, (N, 2) float64
+    points2: Tensor  # pixels in the second image, (N, 2) float64
+    F_mat: Tensor  # true fundamental matrix, (3, 3)
+    K: Tensor  # camera matrices, (2, 3, 3)
+    R: Tensor  # true rotation, (3, 3)
+    t: Tensor  # true translation, (3,)
+    size: NDArray[np.int32]  # (width, height) of both images, (2, 2)
+
+
+class Estimate(NamedTuple):
+    """A fundamental matrix, its time and its number of samples."""
+
+    F_mat: Tensor  # (3, 3) float64; NaN for a failure
+    seconds: float  # wall-clock time
+    samples: float  # number of minimal samples solved; NaN if unknown
+
+
+# Pair, seed and threshold in pixels, to a matrix, None for a failure, and a number of minimal samples.
+Estimator = Callable[[EvaluatedPair, int, float], tuple[Tensor | None, float]]
+
+
+@torch.no_grad()
+def run_estimator(estimator: Estimator, pair: EvaluatedPair, seed: int, threshold: float) -> Estimate:
+    """Return the estimate and its time; a failure if there are fewer than eight correspondences."""
+    start = time.perf_counter()
+    F_mat, samples = (None, 0.0) if len(pair.points1) < SAMPLE_SIZE else estimator(pair, seed, threshold)
+    seconds = time.perf_counter() - start
+    failure = torch.full((3, 3), torch.nan, dtype=torch.float64)
+    return Estimate(failure if F_mat is None else F_mat, seconds, samples)
+
+
+def find_estimator(name: str) -> Estimator:
+    """Return a robust estimator by its name.
+
+    Args:
+        name: one of
+
+            - a name in :data:`~kornia_learnnorm.evaluation.robust.peers.PEERS`;
+            - ``learned:WEIGHTS``, a :class:`~kornia_learnnorm.LearnedEightPoint`; ``learned:WEIGHTS+LM``, refined with
+              Geman and McClure's loss at the threshold;
+            - ``guided:WEIGHTS``, RANSAC with the probabilities of the learned estimator as weights of the matches;
+            - ``RANSAC``, :class:`~kornia_learnnorm.RANSAC` with its defaults;
+            - ``RANSAC-calibrated``, RANSAC with the cameras of the store;
+            - ``RANSAC:METHOD``, RANSAC with another normaliser and at most 20,000 samples;
+            - ``ground-truth``, the true matrix, which shows how far the metrics can be trusted.
+
+    Raises:
+        ValueError: if there is no estimator of this name.
+        FileNotFoundError: if there are no weights of this name.
+        ImportError: if the package of the estimator is not installed.
+
+    """
+    kind, method = _split(name)
+    if name in PEERS:
+        return partial(_peer, find_peer(name), name.endswith(CALIBRATED))
+    if name == TRUTH:
+        return lambda pair, *_: (pair.F_mat, math.nan)
+    if name in (DEFAULTS, DEFAULTS + CALIBRATED):
+        return partial(_ransac, {}, name != DEFAULTS)
+    if kind == LEARNED and method:
+        weights = method.removesuffix(REFINED)
+        return partial(_learned, LearnedEightPoint.from_pretrained(weights), weights != method)
+    if kind == GUIDED and method:
+        return partial(_guided, LearnedEightPoint.from_pretrained(method))
+    if kind and method:
+        if method.endswith(REFINED):
+            wanted = f"expected {base_name(method)!r} without {REFINED}, got {method!r}"
+            raise ValueError(f"RANSAC refines by itself: {wanted}")
+        rank2 = {"rank2": "optimal"} if method.endswith(OPTIMAL) else {}
+        options = {"normalizer": find_method(method).normalizer, "max_samples": MAX_SAMPLES, **rank2}
+        return partial(_ransac, options, False)
+    raise ValueError(
+        f"no estimator {name!r}: expected {', '.join(PEERS)}, learned:WEIGHTS, learned:WEIGHTS{REFINED},"
+        f" guided:WEIGHTS, RANSAC, RANSAC{CALIBRATED}, RANSAC:METHOD or {TRUTH}"
+    )
+
+
+def _peer(
+    peer: Peer, calibrated: bool, pair: EvaluatedPair, seed: int, threshold: float
+) -> tuple[Tensor | None, float]:
+    """Run an estimator of another package, with the cameras if it is calibrated."""
+    cameras = [pair.K.numpy()] if calibrated else []
+    F_mat = peer(pair.points1.numpy(), pair.points2.numpy(), pair.size, seed, threshold, *cameras)
+    # OpenCV stacks up to three matrices if there are only seven points.
+    good = F_mat is not None and F_mat.shape == (3, 3)
+    return torch.tensor(np.array(F_mat, float)) if good else None, math.nan
+
+
+def _ransac(
+    options: dict[str, Any], calibrated: bool, pair: EvaluatedPair, seed: int, threshold: float, **more: Any
+) -> tuple[Tensor | None, float]:
+    """Run RANSAC; if it is calibrated, with the cameras, and it fails on pairs of unknown cameras."""
+    if calibrated and not bool(pair.K.isfinite().all()):
+        return None, 0.0
+    cameras = {"K1": pair.K[0], "K2": pair.K[1]} if calibrated else {}
+    found = RANSAC(inl_th=threshold, seed=seed, **options).estimate(pair.points1, pair.points2, **cameras, **more)
+    return found.F_mat if bool(found.F_mat.any()) else None, found.num_samples
+
+
+def _learned(
+    layer: LearnedEightPoint, refined: bool, pair: EvaluatedPair, seed: int, threshold: float
+) -> tuple[Tensor, float]:
+    """Run a learned estimator, which has no threshold, and robust refinement at the threshold if wanted."""
+    points1, points2 = pair.points1[None], pair.points2[None]
+    F_mat = layer(points1, points2)
+    if refined:
+        F_mat = refine_fundamental(points1, points2, F_mat, loss=GemanMcClure(threshold)).F_mat
+    return F_mat[0], math.nan
+
+
+def _guided(layer: LearnedEightPoint, pair: EvaluatedPair, seed: int, threshold: float) -> tuple[Tensor | None, float]:
+    """Run RANSAC whose samples follow the probabilities of a learned estimator."""
+    weights = layer.estimate(pair.points1[None], pair.points2[None]).weights[0]
+    return _ransac({}, False, pair, seed, threshold, weights=weights)
+
+
+def is_slow(name: str) -> bool:
+    """Return whether an estimator can take more than a second on pairs with few inliers."""
+    return not name.startswith(("opencv", TRUTH, LEARNED))
+
+
+def identify_estimator(name: str) -> str:
+    """Return what the results of an estimator depend on: a package's version, or the digest of weights."""
+    if name in PEERS:
+        return peer_version(name)
+    kind, method = _split(name)
+    if kind in (LEARNED, GUIDED):
+        return f"{name} {weights_digest(method.removesuffix(REFINED))}"
+    return f"{kind}{identify_method(method)}" if kind else name
+
+
+def estimator_names(names: Sequence[str]) -> dict[str, str]:
+    """Return short names of estimators for tables and files; raise ValueError if two are equal."""
+    return names_of(names, lambda name: "".join((_split(name)[0], short_name_of(_split(name)[1]))), "estimators")
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return kind, with its colon, and method, which may have a colon of its own."""
+    kind = next((kind for kind in KINDS if name.startswith(kind)), "")
+    return kind, name.removeprefix(kind)

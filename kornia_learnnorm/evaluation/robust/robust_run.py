@@ -1,0 +1,261 @@
+"""Results of robust estimators on stores, computed once and kept in a folder: what ``learnnorm robust`` makes.
+
+Those of an estimator are in ``robust/STORE/PROTOCOL/THRESHOLD/ESTIMATOR.npz``. The folder may also hold a run of
+``learnnorm evaluate``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.robust.peers import PEERS
+from kornia_learnnorm.evaluation.robust.robust_estimators import (
+    DEFAULT_ESTIMATORS,
+    Estimator,
+    EvaluatedPair,
+    estimator_names,
+    find_estimator,
+    identify_estimator,
+    is_slow,
+    run_estimator,
+)
+from kornia_learnnorm.evaluation.runs.results_store import (
+    About,
+    Arrays,
+    Job,
+    begin_section,
+    file_name,
+    read_arrays,
+    read_section,
+    record,
+    result_files,
+    run_folder,
+)
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
+from kornia_learnnorm.metrics.poses import rotation_error, translation_error
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, MAX_FILTERED, PROTOCOLS, THRESHOLDS
+
+__all__ = [
+    "DEFAULT_OPTIONS",
+    "RobustCell",
+    "RobustRun",
+    "estimate_path",
+    "even_pairs",
+    "measure",
+    "read_robust",
+    "record_robust",
+    "shuffled_pair",
+]
+
+DEFAULT_OPTIONS = {
+    "pairs": 48,  # image pairs of each store; 0 for all
+    "seeds": 5,  # runs on each pair
+    "slow_seeds": 1,  # runs of the slow estimators on each pair
+    "seed": 0,  # the first seed
+}
+Results = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class RobustCell:
+    """The results of one store and protocol."""
+
+    store: str  # its name
+    protocol: str  # filtered or unfiltered
+    estimates: dict[str, dict[float, Results]]  # results (pairs, seeds) by estimator, then by threshold
+
+    @property
+    def title(self) -> str:
+        """Store and protocol."""
+        return f"{self.store}, {self.protocol}"
+
+
+@dataclass(frozen=True)
+class RobustRun:
+    """A run of robust estimation."""
+
+    about: About  # what the run was computed from, its section of run.json
+    cells: list[RobustCell]
+    missing: list[str]  # what has not been computed yet
+
+
+def record_robust(
+    folder: str | Path,
+    stores: Mapping[str, str],
+    estimators: Sequence[str] = DEFAULT_ESTIMATORS,
+    options: Mapping[str, int] | None = None,
+    redo: Sequence[str] = (),
+    command: str = "",
+) -> list[str]:
+    """Compute the missing results of a run, with a progress bar.
+
+    An estimator whose package is not installed is left out, and the run records that.
+
+    Args:
+        folder: the run, created if it does not exist.
+        stores: paths of the stores by their names in tables.
+        estimators: names for :func:`~kornia_learnnorm.evaluation.robust.robust_estimators.find_estimator`.
+        options: options that differ from :data:`DEFAULT_OPTIONS`.
+        redo: estimators whose results are computed again.
+        command: the command line that asks for it, for the report.
+
+    Returns:
+        the names of the estimators that were left out, since their packages are not installed.
+
+    Raises:
+        ValueError: if the folder holds a run of other options, an option, a store or an estimator is wrong, an existing
+            file is damaged, or, at the end, if an estimator has failed.
+        OSError: if a file is missing or cannot be written, or another process writes this run.
+
+    """
+    folder, options = Path(folder), {**DEFAULT_OPTIONS, **(options or {})}
+    for name, value in options.items():
+        if value < (least := 1 if name in ("seeds", "slow_seeds") else 0):
+            raise ValueError(f"{name.replace('_', '-')} must be {least} or more, got {value}")
+    if unknown := {*redo} - {*estimators}:
+        raise ValueError(f"--redo {' '.join(sorted(unknown))}: not among the estimators of this command")
+    names = estimator_names(estimators)
+    found = {names[name]: _find(name) for name in estimators}
+    read = {name: read_store(path) for name, path in stores.items()}
+    identities = {names[name]: found[names[name]] and identify_estimator(name) for name in estimators}
+    about: About = {"estimators": identities, **options, "threads": torch.get_num_threads()}
+    redone = [names[name] for name in redo]
+    installed = {name: estimator for name, estimator in found.items() if estimator is not None}
+    with run_folder(folder):
+        before = begin_section(folder, "robust", read, about, redone, command)
+        for path in result_files(folder, "robust", redone):
+            path.unlink()
+        total = len(read) * len(PROTOCOLS) * len(THRESHOLDS) * len(installed)
+        known = before.get("estimators", {}).keys() - {*redone}
+        failed = record(folder, "robust", _jobs(folder, read, installed, options), total, known)
+    if failed:
+        raise ValueError(f"{failed}. All others are in {folder}")
+    return [name for name, estimator in found.items() if estimator is None]
+
+
+def _find(name: str) -> Estimator | None:
+    """Return an estimator; None if it is from another package that is not installed."""
+    try:
+        return find_estimator(name)
+    except ImportError:
+        if name in PEERS:
+            return None
+        raise
+
+
+def _jobs(
+    folder: Path,
+    stores: Mapping[str, CorrespondenceStore],
+    estimators: Mapping[str, Estimator],
+    options: Mapping[str, int],
+) -> Iterator[Job]:
+    """Give the files of the estimators."""
+    for store, protocol, name, threshold in product(stores, PROTOCOLS, estimators, THRESHOLDS):
+        pairs = even_pairs(len(stores[store]), options["pairs"])
+        seeds = min(options["seeds"], options["slow_seeds"]) if is_slow(name) else options["seeds"]
+        draw = partial(shuffled_pair, stores[store], protocol=protocol, seed=options["seed"])
+        compute = partial(_estimates, estimators[name], draw, threshold, pairs, seeds)
+        yield Job(name, estimate_path(folder, store, protocol, threshold, name), compute)
+
+
+def _estimates(
+    estimator: Estimator, draw: Callable[..., EvaluatedPair], threshold: float, pairs: list[int], seeds: int
+) -> Arrays:
+    """Return an estimator's matrices of every pair with every seed and their metrics, arrays (pairs, seeds, ...)."""
+    rows = []
+    for index, seed in product(pairs, range(seeds)):
+        pair = draw(index, order=seed)
+        found = run_estimator(estimator, pair, seed, threshold)
+        rows.append({**measure(pair, found.F_mat, threshold), **found._asdict(), "F_mat": found.F_mat.numpy()})
+    arrays = {key: np.array([row[key] for row in rows], float) for key in rows[0]}
+    return {"pair": np.array(pairs)} | {key: v.reshape(len(pairs), seeds, *v.shape[1:]) for key, v in arrays.items()}
+
+
+def even_pairs(total: int, number: int) -> list[int]:
+    """Return the indices of at most ``number`` evenly spaced image pairs of ``total``; all of them for 0."""
+    return [int(place) for place in np.linspace(0, total - 1, min(number or total, total)).round()]
+
+
+def shuffled_pair(store: CorrespondenceStore, pair: int, protocol: str, seed: int, order: int = 0) -> EvaluatedPair:
+    """Return the correspondences of an image pair; ``order`` is a second seed of their order.
+
+    The protocol ``filtered`` draws at most 1,000 matches that pass the ratio test, ``unfiltered`` takes all.
+    """
+    rows = store.rows(pair, PROTOCOLS[protocol])
+    if protocol == "filtered":
+        rows = np.random.default_rng([seed, pair]).permutation(rows)[:MAX_FILTERED]
+    rows = np.random.default_rng([seed, pair, order]).permutation(rows)
+    points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
+    F_mat, K, R, t = (torch.from_numpy(part[pair]) for part in (store.F, store.K, store.R, store.t))
+    return EvaluatedPair(points1, points2, F_mat, K, R, t, store.image_size[pair])
+
+
+def measure(pair: EvaluatedPair, F_mat: Tensor, threshold: float) -> dict[str, float]:
+    """Return ``inliers``, ``f1``, ``error`` (px), ``rotation_error`` and ``translation_error`` (degrees) of a matrix.
+
+    They are NaN where the pair lacks the ground truth. A failed estimate is zero or NaN. The inliers of the estimate
+    within 1 px decide between the four poses of the matrix.
+    """
+    x1, x2 = pair.points1, pair.points2
+    near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD
+    pose = relative_pose(F_mat[None], pair.K[:1], pair.K[1:], x1[None], x2[None], near[None])
+    known = bool((rotation_error(pair.R, pair.R) + translation_error(pair.t, pair.t)).isfinite())
+    found = rotation_error(pose[0][0], pair.R), translation_error(pose[1][0], pair.t)
+    angles = [angle.nan_to_num(nan=torch.inf) if known else angle * torch.nan for angle in found]
+    results = {
+        "inliers": inlier_share(x1, x2, F_mat, threshold),
+        "f1": f1_score(x1, x2, F_mat, pair.F_mat, threshold),
+        "error": epipolar_error(x1, x2, F_mat, pair.F_mat),
+        "rotation_error": angles[0],
+        "translation_error": angles[1],
+    }
+    return {name: float(value) for name, value in results.items()}
+
+
+def estimate_path(folder: Path, store: str, protocol: str, threshold: float, name: str) -> Path:
+    """Return the file of an estimator's results."""
+    return folder / "robust" / file_name(store) / protocol / f"{threshold:g}px" / f"{file_name(name)}.npz"
+
+
+def read_robust(folder: str | Path) -> RobustRun | None:
+    """Read a run of robust estimation.
+
+    Args:
+        folder: the folder that ``learnnorm robust --out`` wrote.
+
+    Returns:
+        the run; None where the folder has none.
+
+    Raises:
+        ValueError: if another version of the package made it, or a file is damaged.
+
+    """
+    folder = Path(folder)
+    about, missing = read_section(folder, "robust"), list[str]()
+    if about is None:
+        return None
+    cells = []
+    for store, protocol in product(about["stores"], PROTOCOLS):
+        cells.append(RobustCell(store, protocol, {}))
+        for name, identity in about["estimators"].items():
+            paths = {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
+            if all(path.is_file() for path in paths.values()):
+                cells[-1].estimates[name] = {threshold: _results(path) for threshold, path in paths.items()}
+            elif identity is not None:  # its package is installed
+                missing.append(f"{name} ({store}, {protocol})")
+    return RobustRun(about, cells, missing)
+
+
+def _results(path: Path) -> Results:
+    return {key: torch.from_numpy(value).double() for key, value in read_arrays(path).items()}

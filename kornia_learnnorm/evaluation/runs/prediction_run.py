@@ -1,0 +1,257 @@
+"""Predictions of methods on stores, computed once and kept in a folder: what ``learnnorm evaluate`` makes.
+
+Each store has a folder with the motion of its pairs and the protocols, in each of which are the samples and a file per
+method with arrays in the order of the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.data.residual_filter import plain_residual
+from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.runs.example import EXAMPLE, SWEEP, random_pair, sweep
+from kornia_learnnorm.evaluation.runs.pair_motions import PAIRS, pair_motions
+from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS, SampleOptions, predict
+from kornia_learnnorm.evaluation.runs.results_store import (
+    About,
+    Arrays,
+    Job,
+    begin_section,
+    file_name,
+    once,
+    read_arrays,
+    read_section,
+    record,
+    run_folder,
+    write_arrays,
+)
+from kornia_learnnorm.protocol import PROTOCOLS
+
+__all__ = ["Run", "RunCell", "read_run", "record_run", "temporary_run"]
+
+SAMPLES = ("pair", "plain_residual")  # arrays in the file of samples
+
+
+@dataclass(frozen=True)
+class RunCell:
+    """The predictions of all methods on the samples of one store and protocol."""
+
+    store: str  # its name
+    protocol: str  # filtered or unfiltered
+    pair: Tensor  # image pair of each sample, (S,) int64
+    drawn: int  # number of samples before the filter on the un-normalised residual
+    predictions: dict[str, dict[str, Tensor]]  # arrays (S, ...) by method and quantity, float64
+
+    @property
+    def title(self) -> str:
+        """Store and protocol."""
+        return f"{self.store}, {self.protocol}"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of predictions."""
+
+    about: About  # what the run was computed from, its section of run.json
+    cells: list[RunCell]
+    pairs: dict[str, Arrays]  # the motion of each store's pairs, (P,) each
+    sizes: dict[str, Arrays]  # errors by the number of correspondences, by method
+    example: Arrays  # the image pair of these errors, from random_pair; empty where there is none yet
+    missing: list[str] = field(default_factory=list)  # what has not been computed yet
+
+
+def temporary_run(stores: Mapping[str, str], methods: Sequence[str], options: SampleOptions | None = None) -> Run:
+    """Return a run that is not kept, without shares of inliers and errors by the number of correspondences.
+
+    The arguments and errors are those of :func:`record_run`.
+    """
+    with TemporaryDirectory(prefix="learnnorm-") as folder:
+        record_run(folder, stores, methods, options, complete=False)
+        return read_run(folder, complete=False)
+
+
+def record_run(
+    folder: str | Path,
+    stores: Mapping[str, str],
+    methods: Sequence[str],
+    options: SampleOptions | None = None,
+    complete: bool = True,
+    command: str = "",
+) -> str:
+    """Compute what a run does not have yet, with a progress bar.
+
+    Args:
+        folder: the run, made if missing.
+        stores: paths of the stores by the names that tables give them.
+        methods: names for :func:`~kornia_learnnorm.evaluation.methods.find_method`.
+        options: how the samples are drawn.
+        complete: compute everything that a report shows: also the shares of inliers, F1 and, for one pair, the errors
+            by the number of correspondences.
+        command: the command line that asks for it, for the report.
+
+    Returns:
+        why there is no example of a pair; empty where there is one or none was wanted.
+
+    Raises:
+        ValueError: if the folder holds a run of other options, a store or a method is wrong, a file is damaged, or, at
+            the end, if a method has failed.
+        OSError: if a file is missing or cannot be written, or another process writes this run.
+
+    """
+    options = SampleOptions() if options is None else options
+    folder, names = Path(folder), short_names(methods)
+    found = {names[name]: find_method(name) for name in methods}
+    read = {name: read_store(path) for name, path in stores.items()}
+    about = {
+        **vars(options),
+        "methods": {names[name]: identify_method(name) for name in methods},
+        "trained_on": {name: list(method.trained_on) for name, method in found.items()},
+    }
+    with run_folder(folder):
+        before = begin_section(folder, "evaluate", read, about, command=command)
+        no_example = _record_example(folder, read, options.seed) if complete else ""
+        jobs = _jobs(folder, read, found, options, complete)
+        swept = sum(map(_is_swept, found)) if complete and not no_example else 0
+        total = len(read) * len(PROTOCOLS) * len(found) + swept
+        failed = record(folder, "evaluate", jobs, total, before.get("methods", ()))
+    if failed:
+        raise ValueError(failed + (f". All others are in {folder}" if complete else ""))
+    return no_example
+
+
+def _jobs(
+    folder: Path,
+    stores: Mapping[str, CorrespondenceStore],
+    methods: Mapping[str, Method],
+    options: SampleOptions,
+    complete: bool,
+) -> Iterator[Job]:
+    """Make the files of the stores' motions and samples, and give those of the methods to make."""
+    keys = _keys(complete)
+    for name, store in stores.items():
+        once(_path(folder, name, "pairs"), partial(pair_motions, store), PAIRS, len(store))
+        for protocol, max_ratio in PROTOCOLS.items():
+            place = f"{name}, {protocol}"
+            samples = _samples(_path(folder, name, protocol, "samples"), place, options, store, max_ratio)
+            for label, method in methods.items():
+                compute = partial(predict, method, samples, store, max_ratio, complete)
+                yield Job(label, _path(folder, name, protocol, label), compute, keys, len(samples.pair))
+    if complete and (folder / "example.npz").is_file():
+        example = read_arrays(folder / "example.npz", EXAMPLE)
+        for label in filter(_is_swept, methods):
+            compute = partial(sweep, methods[label], example, options.seed)
+            yield Job(label, _path(folder, "sizes", label), compute, SWEEP)
+
+
+def _path(folder: Path, *names: str) -> Path:
+    """Return a file of a run."""
+    *parents, last = map(file_name, names)
+    return folder.joinpath(*parents, f"{last}.npz")
+
+
+def _keys(complete: bool) -> tuple[str, ...]:
+    """Return the names of the arrays in the file of a method's predictions."""
+    return (*ERRORS, *AGREEMENT) if complete else ERRORS
+
+
+def _is_swept(method: str) -> bool:
+    """Return whether a run keeps a method's errors by the number of correspondences: searching takes too long."""
+    return not method.startswith("searched")
+
+
+def _samples(
+    path: Path, place: str, options: SampleOptions, store: CorrespondenceStore, max_ratio: float | None
+) -> MatchSets:
+    """Return the samples within the limit on the residual; write all that were drawn."""
+    drawn, limit = options.draw(store, max_ratio), options.max_residual
+
+    def describe() -> Arrays:
+        residual = plain_residual(drawn.points1, drawn.points2).numpy()
+        if not (residual < limit).any():
+            few = f"none of {len(residual)} samples has an un-normalised residual below {limit:g} px"
+            raise ValueError(f"{place}: {few}")
+        return {"pair": drawn.pair.numpy(), "plain_residual": residual}
+
+    found = once(path, describe, SAMPLES, len(drawn.pair))
+    if not np.array_equal(found["pair"], drawn.pair.numpy()):
+        raise ValueError(f"{path.parent} is of other samples than the run's seed draws of the store, remove it")
+    return drawn.select(torch.from_numpy(found["plain_residual"] < limit))
+
+
+def _record_example(folder: Path, stores: Mapping[str, CorrespondenceStore], seed: int) -> str:
+    """Write the example of a pair, or return why there is none."""
+    path = folder / "example.npz"
+    if not path.is_file():
+        try:
+            write_arrays(path, random_pair(stores, seed))
+        except ValueError as error:
+            return str(error)
+    return ""
+
+
+def read_run(folder: str | Path, complete: bool = True) -> Run:
+    """Read what has been computed of a run.
+
+    Args:
+        folder: the folder that ``learnnorm evaluate --out`` wrote.
+        complete: as for :func:`record_run`.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run, or a file that others depend on is missing.
+        ValueError: if another version of the package made it, or a file is damaged.
+
+    """
+    folder = Path(folder)
+    about, missing = read_section(folder, "evaluate"), list[str]()
+    if about is None:
+        raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
+    cells, pairs = [], {}
+    for store in about["stores"]:
+        for protocol in PROTOCOLS:
+            absent = ["all methods"]
+            if _path(folder, store, protocol, "samples").is_file():
+                cells.append(_read_cell(folder, about, store, protocol, complete))
+                pairs[store] = _read_pairs(_path(folder, store, "pairs"), cells[-1].pair)
+                absent = [name for name in about["methods"] if name not in cells[-1].predictions]
+            missing += [f"{name} on {store}, {protocol}" for name in absent]
+    if not (folder / "example.npz").is_file():
+        known = any(np.isfinite(motions["inliers"]).any() for motions in pairs.values())
+        return Run(about, cells, pairs, {}, {}, [*missing, *["the example of a pair"] * known])
+    example = read_arrays(folder / "example.npz", EXAMPLE)
+    swept = {name: _path(folder, "sizes", name) for name in about["methods"] if _is_swept(name)}
+    missing += [f"{name} by the number of correspondences" for name, path in swept.items() if not path.is_file()]
+    sizes = {name: read_arrays(path, SWEEP) for name, path in swept.items() if path.is_file()}
+    return Run(about, cells, pairs, sizes, example, missing)
+
+
+def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, complete: bool) -> RunCell:
+    samples = read_arrays(_path(folder, store, protocol, "samples"), SAMPLES)
+    kept = torch.from_numpy(samples["plain_residual"] < about["max_residual"])
+    pair = torch.from_numpy(samples["pair"])[kept]
+    paths = {name: _path(folder, store, protocol, name) for name in about["methods"]}
+    predictions = {
+        name: {key: torch.from_numpy(value) for key, value in read_arrays(path, _keys(complete), len(pair)).items()}
+        for name, path in paths.items()
+        if path.is_file()
+    }
+    return RunCell(store, protocol, pair, len(kept), predictions)
+
+
+def _read_pairs(path: Path, pair: Tensor) -> Arrays:
+    pairs = read_arrays(path, PAIRS)
+    number = min(len(pairs[key]) for key in PAIRS)
+    if not 0 <= int(pair.min()) <= int(pair.max()) < number:
+        raise ValueError(f"{path} has {number} image pairs, there are samples of {int(pair.max()) + 1}: remove it")
+    return pairs

@@ -1,0 +1,160 @@
+"""Runs of robust estimators: the correspondences that they get, what is computed, kept, refused and left out."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.evaluation.robust import peers
+from kornia_learnnorm.evaluation.robust.robust_estimators import find_estimator, run_estimator
+from kornia_learnnorm.evaluation.robust.robust_run import estimate_path, even_pairs, measure, read_robust, shuffled_pair
+from kornia_learnnorm.metrics.inliers import f1_score
+
+
+def times(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*.npz")}
+
+
+def test_files_and_numbers(robust_run, robust_store):
+    assert len(times(robust_run / "robust")) == 2 * 2 * 4  # protocols, thresholds, estimators
+    filtered, unfiltered = read_robust(robust_run).cells
+    assert unfiltered.title == "kitti_06, unfiltered"
+    assert unfiltered.estimates["opencv-usac"][0.1]["f1"].shape == (3, 2)
+    assert unfiltered.estimates["RANSAC"][1.0]["F_mat"].shape == (3, 1, 3, 3)
+    drawn = shuffled_pair(read_store(robust_store), 2, "filtered", 0, 1)
+    found = run_estimator(find_estimator("opencv-usac"), drawn, 1, 1.0)
+    figures = filtered.estimates["opencv-usac"][1.0]
+    assert torch.equal(figures["F_mat"][2, 1], found.F_mat)
+    for key, value in measure(drawn, found.F_mat, 1.0).items():
+        assert figures[key][2, 1].item() == value
+
+
+def test_again_computes_nothing_but_what_is_missing(robust_copied, robust_again, robust_run, monkeypatch):
+    path = estimate_path(robust_copied, "kitti_06", "filtered", 1.0, "RANSAC")
+    path.unlink()
+    before = times(robust_copied)
+    assert main(robust_again) == 0
+    new, old = np.load(path), np.load(robust_run / path.relative_to(robust_copied))
+    for key in {*old.files} - {"seconds"}:
+        np.testing.assert_array_equal(new[key], old[key])
+    monkeypatch.setattr("kornia_learnnorm.evaluation.robust.robust_run.run_estimator", pytest.fail)
+    assert main(robust_again) == 0
+    assert {name: time for name, time in times(robust_copied).items() if name != path} == before
+
+
+def test_redo(robust_copied, robust_again, refused):
+    before = times(robust_copied)
+    about = json.loads((robust_copied / "run.json").read_text())
+    about["robust"]["estimators"]["RANSAC"] = "RANSAC of old"
+    (robust_copied / "run.json").write_text(json.dumps(about))
+    refused(robust_again, "is a run of other options, remove it or write elsewhere: RANSAC 'RANSAC of old'")
+    assert main([*robust_again, "--redo", "RANSAC"]) == 0
+    changed = {path.name for path, time in times(robust_copied).items() if time != before[path]}
+    assert changed == {"RANSAC.npz"}
+    refused([*robust_again, "--redo", "poselib"], "--redo poselib: not among the estimators of this command")
+
+
+def test_other_options_are_refused(robust_again, refused):
+    for option in ("--seeds", "--pairs", "--seed", "--slow-seeds"):
+        refused([*robust_again, option, "3"], "is a run of other options")
+    refused([*robust_again, "--seeds", "0"], "seeds must be 1 or more, got 0")
+    refused([*robust_again, "--pairs", "-1"], "pairs must be 0 or more, got -1")
+
+
+def test_estimators_and_stores_join(robust_copied, tmp_path):
+    write_store(tmp_path / "other.h5", synthetic_store(pairs=1, points=40, seed=2, scenes=["orbit"]))
+    before = [*read_robust(robust_copied).about["estimators"]]
+    options = ["--seeds", "2", "--estimators", "opencv-usac", "opencv-lmeds"]
+    assert main(["robust", str(tmp_path / "other.h5"), *options, "--out", str(robust_copied)]) == 0
+    found = read_robust(robust_copied)
+    assert [*found.about["stores"]] == ["kitti_06", "other"]
+    assert [*found.about["estimators"]] == [*before, "opencv-lmeds"]
+    assert [*found.cells[3].estimates] == ["opencv-usac", "opencv-lmeds"]
+
+
+def test_runs_of_before_the_hypotheses_were_dropped_are_read_and_joined(robust_copied, robust_again):
+    about = json.loads((robust_copied / "run.json").read_text())
+    about["robust"] |= {"solvers": {"Hartley": "Hartley"}, "hypotheses": 12}
+    (robust_copied / "run.json").write_text(json.dumps(about))
+    assert main(robust_again) == 0
+    assert [*read_robust(robust_copied).cells[0].estimates] == [*about["robust"]["estimators"]]
+
+
+def test_a_package_that_is_not_installed(robust_copied, robust_store, monkeypatch):
+    monkeypatch.setitem(peers.PEERS, "poselib", peers.PeerPackage(pytest.fail, "no_such_module", "poselib"))
+    command = ["robust", str(robust_store), "--seeds", "2", "--estimators", "poselib", "--out", str(robust_copied)]
+    assert main(command) == 0
+    assert read_robust(robust_copied).about["estimators"]["poselib"] is None
+
+
+def test_damaged(robust_copied, robust_again, refused):
+    path = robust_copied / "robust/kitti_06/filtered/1px/RANSAC.npz"
+    whole = path.read_bytes()
+    for content in (b"", b"bad", whole[:100]):
+        path.write_bytes(content)
+        for again in (["report", robust_copied], robust_again):
+            refused(again, f"{path} is damaged, remove it")
+    (robust_copied / "run.json").write_text('{"format": 4, "robust": {"stores": {}}}')
+    for again in (["report", robust_copied], robust_again):
+        refused(again, "run.json is damaged: estimators, versions, pairs")
+
+
+def test_what_fails_is_left_out_and_others_go_on(robust_store, tmp_path, monkeypatch, capsys):
+    text = "from kornia_learnnorm import Hartley\ndef Bad(points1, points2, weights):\n    raise RuntimeError('boom')\n"
+    (tmp_path / "own.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    out = tmp_path / "run"
+    command = ["robust", str(robust_store), "--pairs", "1", "--seeds", "1", "--out", str(out), "--estimators"]
+    assert main([*command, "RANSAC:own:Bad", "RANSAC"]) == 2
+    error = capsys.readouterr().err
+    assert "boom" in error
+    assert f"All others are in {out}" in error
+    found = read_robust(out)
+    assert found.missing == []
+    assert [*found.cells[0].estimates] == ["RANSAC"]
+    assert found.cells[0].estimates["RANSAC"][1.0]["samples"].min() >= 1
+    assert main(["report", str(out)]) == 0
+
+
+def test_protocols_and_order():
+    store = synthetic_store(2, 1500, seed=1, scenes=["orbit"])
+    rows = slice(1500, 3000)
+    everything = shuffled_pair(store, 1, "unfiltered", 0)
+    assert {*map(tuple, everything.points1.float().tolist())} == {*map(tuple, store.points1[rows].tolist())}
+    first, second, again = (shuffled_pair(store, 1, "filtered", 0, order).points1 for order in (0, 1, 0))
+    assert len(first) == 1000
+    ratio = {tuple(p): r for p, r in zip(store.points1[rows].tolist(), store.ratio[rows], strict=True)}
+    assert max(ratio[tuple(p)] for p in first.float().tolist()) < 0.8
+    assert not torch.equal(first, second)
+    assert torch.equal(*(torch.unique(points, dim=0) for points in (first, second)))
+    assert torch.equal(first, again)
+
+
+def test_measure(matches):
+    drawn = matches()
+    true = measure(drawn, drawn.F_mat, 0.5)
+    assert true["f1"] == 1
+    assert max(true["rotation_error"], true["translation_error"]) < 1e-4
+    F_mat = drawn.F_mat * (1 + 1e-3 * torch.randn(3, 3, dtype=torch.float64))
+    expected = f1_score(drawn.points1, drawn.points2, F_mat, drawn.F_mat, 0.5)
+    assert measure(drawn, F_mat, 0.5)["f1"] == pytest.approx(expected.item())
+    failed = measure(drawn, torch.full((3, 3), torch.nan, dtype=torch.float64), 1.0)
+    assert failed["inliers"] == failed["f1"] == 0
+    assert failed["error"] == failed["rotation_error"] == failed["translation_error"] == math.inf
+    unknown = drawn._replace(F_mat=drawn.F_mat * torch.nan, R=drawn.R * torch.nan, t=drawn.t * torch.nan)
+    found = measure(unknown, drawn.F_mat, 1.0)
+    assert found["inliers"] > 0.5
+    assert all(math.isnan(found[key]) for key in ("f1", "error", "rotation_error", "translation_error"))
+
+
+def test_even_pairs():
+    assert even_pairs(51, 3) == [0, 25, 50]
+    assert even_pairs(2, 0) == even_pairs(2, 5) == [0, 1]
