@@ -2,6 +2,8 @@ r"""The homography of a scene that is mostly a plane, the parallax of the rest, 
 
 With the homography :math:`H` of the plane, two matches off the plane determine the epipole :math:`e_2`, since the line
 through :math:`H x_1` and :math:`x_2` passes through it, and :math:`F = [e_2]_\times H`.
+
+Points are pixels (N, 2) in float64, matrices (3, 3), and thresholds pixels.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ MIN_PARALLAX_INLIERS = 3  # matches off the plane that a matrix must have to be 
 
 
 def find_homography(points1: Tensor, points2: Tensor, threshold: float) -> Tensor | None:
-    """Return the homography (3, 3) that explains most matches within a threshold (pixels), by OpenCV's MAGSAC."""
+    """Return the homography that explains most matches within a threshold, by OpenCV's MAGSAC, or None."""
     cv2 = import_cv2()
     try:
         H = cv2.findHomography(points1.numpy(), points2.numpy(), cv2.USAC_MAGSAC, threshold)[0]
@@ -39,7 +41,7 @@ def find_homography(points1: Tensor, points2: Tensor, threshold: float) -> Tenso
 
 
 def parallax(points1: Tensor, points2: Tensor, H: Tensor) -> Tensor:
-    """Return the distances (N,) of points2 (N, 2) from where a homography (3, 3) moves points1, pixels."""
+    """Return the distances (N,) of points2 from where a homography moves points1, pixels."""
     moved = convert_points_to_homogeneous(points1) @ H.mT
     distance: Tensor = (moved[:, :2] / moved[:, 2:] - points2).norm(dim=-1)
     return distance.nan_to_num(nan=math.inf)
@@ -52,13 +54,12 @@ def parallax_evidence(distance: Tensor, inliers: Tensor, threshold: float) -> fl
     distance :math:`r` from :math:`H x_1` lies within :math:`\tau` of this line with probability
     :math:`\frac{2}{\pi} \arcsin(\tau / r)`. Two matches determine an epipole; the others are evidence for it.
 
+    Small is strong evidence; where fewer than three matches off the plane are inliers, there is none: it is infinite.
+
     Args:
         distance: of the matches from where the homography moves them, see :func:`parallax`, (N,).
         inliers: mask of the inliers of the matrix, (N,).
-        threshold: largest distance :math:`\tau` of an inlier from its epipolar line, pixels.
-
-    Returns:
-        the logarithm, infinite where fewer than three matches off the plane are inliers; small is strong evidence.
+        threshold: largest distance :math:`\tau` of an inlier from its epipolar line.
 
     Reference:
         L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches between two images and estimate
@@ -78,18 +79,10 @@ def parallax_evidence(distance: Tensor, inliers: Tensor, threshold: float) -> fl
 
 
 def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshold: float, seed: int) -> Tensor | None:
-    r"""Return the fundamental matrix of a homography and an epipole that most matches agree with, refined on all.
+    """Return the fundamental matrix of a homography and an epipole that most matches agree with, refined on all.
 
-    Args:
-        points1: pixels in image 1 with shape :math:`(N, 2)`, float64.
-        points2: pixels in image 2 with shape :math:`(N, 2)`.
-        H: homography of the plane with shape :math:`(3, 3)`, from image 1 to image 2.
-        threshold: largest Sampson distance of an inlier, pixels.
-        seed: seed of the pairs of matches off the plane.
-
-    Returns:
-        the matrix :math:`(3, 3)`, of rank 2 and unit Frobenius norm; None where fewer than three matches are off the
-        plane.
+    It has rank 2 and unit Frobenius norm; None where fewer than three matches are off the plane. The threshold is the
+    largest Sampson distance of an inlier; the seed draws the pairs of matches off the plane.
 
     Reference:
         O. Chum, T. Werner, J. Matas, Two-view geometry estimation unaffected by a dominant plane, CVPR 2005.

@@ -32,14 +32,12 @@ def distances_from_plane(
 
     Args:
         points1: pixels in image 1 with shape :math:`(N, 2)`, float64.
-        points2: pixels in image 2 with shape :math:`(N, 2)`.
+        points2: pixels in image 2 with shape :math:`(N, 2)`; the distance is infinite where the homography moves a
+            point to infinity.
         H: homography of the plane with shape :math:`(3, 3)`, from image 1 to image 2.
         size1: width and height of image 1, pixels.
         size2: width and height of image 2, pixels.
         threshold: scale of the loss, pixels.
-
-    Returns:
-        the distances, infinite where the homography moves a point to infinity.
 
     """
     centre1, radius1 = _centre_and_radius(size1)

@@ -3,6 +3,8 @@ r"""False matches of repeated texture, which agree with each other: how they sho
 Equal windows of a wall match each other along its rows, so that the false matches agree on an epipole where these rows
 meet, and on a matrix that more matches fit than the true one. Which matches fit cannot tell these matrices apart; that
 the false matches jump away from their neighbours, and are nearest neighbours in one direction only, does.
+
+Points are pixels (N, 2) in float64, matrices (3, 3), and thresholds pixels.
 """
 
 from __future__ import annotations
@@ -59,8 +61,8 @@ def resolve_ambiguity(
 
     Args:
         first: estimate of all matches.
-        false1: pixels in image 1 of matches that are not nearest neighbours in both directions, (M, 2), float64.
-        false2: pixels in image 2, (M, 2).
+        false1: points in image 1 of matches that are not nearest neighbours in both directions.
+        false2: their points in image 2.
         again: returns the estimate of some matches of the first one, from a mask of them, or raises
             NoReliableMatrixError.
     """
@@ -108,16 +110,7 @@ def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: flo
 
     A false match of repeated texture jumps to a copy, away from its neighbours in one image or in both. Where most
     matches around a true one are false, these count little: in a second round the neighbours of a match are weighted by
-    the share of their own neighbours that agree with them.
-
-    Args:
-        points1: pixels in image 1 with shape (N, 2), float64.
-        points2: pixels in image 2 with shape (N, 2).
-        H: homography that explains most matches, (3, 3); parallax is measured from where it moves points1.
-        threshold: largest distance of an inlier, pixels.
-
-    Returns:
-        a mask (N,).
+    the share of their own neighbours that agree with them. Parallax is measured from where H moves points1.
 
     References:
         J. Bian et al., GMS: grid-based motion statistics for fast, ultra-robust feature correspondence, CVPR 2017;
@@ -149,15 +142,7 @@ def _agreeing_share(weights: Tensor, agrees: Tensor) -> Tensor:
 
 
 def fitting_share(points1: Tensor, points2: Tensor, H: Tensor, F_mat: Tensor, threshold: float) -> float:
-    """Return which share of the matches off a plane fits a matrix; 1 where fewer than 16 lie off it.
-
-    Args:
-        points1: pixels in image 1, (N, 2), float64.
-        points2: pixels in image 2, (N, 2).
-        H: homography of the plane, (3, 3).
-        F_mat: matrix, (3, 3).
-        threshold: largest distance of an inlier, pixels.
-    """
+    """Return which share of the matches off the plane of a homography fits a matrix; 1 where fewer than 16 are off."""
     off = parallax(points1, points2, H) > PARALLAX * threshold
     fits = symmetric_epipolar_distance(points1[off], points2[off], F_mat) < threshold
     return float(fits.double().mean()) if len(fits) >= MIN_MATCHES_OFF_PLANE else 1.0
