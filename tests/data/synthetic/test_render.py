@@ -59,14 +59,8 @@ def test_matches_determine_the_fundamental_matrix(pair, matches):
     _, on_plane = cv2.findHomography(*matches, cv2.RANSAC, 2.0)
     assert on_plane.mean() < 0.6
     F_mat, _ = cv2.findFundamentalMat(*matches, cv2.FM_RANSAC, 0.5, 0.999, 2000)
-    F_mat /= np.linalg.norm(F_mat)
     good = epipolar_distances(*matches, pair.F_mat) < 1
     assert np.median(epipolar_distances(matches[0][good], matches[1][good], F_mat)) < 0.5
-    # The epipoles, computed from the estimate and from the truth, lie in the same direction.
-    true, found = (np.linalg.svd(matrix)[2][-1] for matrix in (pair.F_mat, F_mat))
-    true, found = (np.linalg.inv(pair.K) @ epipole for epipole in (true, found))
-    cosine = abs(true @ found) / np.linalg.norm(true) / np.linalg.norm(found)
-    assert np.degrees(np.arccos(min(cosine, 1))) < 5
 
 
 def test_the_seed_determines_the_pair():
@@ -119,16 +113,9 @@ def test_write_pair(tmp_path):
     assert len(list(folder.iterdir())) == 3
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"seed": -1}, "seed .* -1"),
-        ({"width": 640, "height": 10}, "640 x 10"),
-        ({"width": 100, "height": 200}, "100 x 200"),
-    ],
-)
-def test_bad_values(values, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("values", [{"seed": -1}, {"width": 640, "height": 10}, {"width": 100, "height": 200}])
+def test_bad_values(values):
+    with pytest.raises(ValueError, match=" x ".join(map(str, values.values()))):
         render_pair(**values)
 
 
