@@ -1,6 +1,5 @@
 """Stores: what is written comes back, some pairs of it, and what a broken file says."""
 
-import re
 from pathlib import Path
 
 import h5py
@@ -51,7 +50,7 @@ def test_file_follows_the_format(path):
 
 @pytest.mark.parametrize("pairs", ["", "@0:2"])
 def test_missing_file(tmp_path, pairs):
-    with pytest.raises(FileNotFoundError, match=f"no store at {re.escape(str(tmp_path / 'none.h5'))}"):
+    with pytest.raises(FileNotFoundError, match=r"no store at .*none\.h5"):
         read_store(f"{tmp_path / 'none.h5'}{pairs}")
 
 
@@ -141,16 +140,13 @@ def test_ground_truth_of_the_synthetic_store(uneven):
     assert np.sort(distance)[:24].max() < 4
 
 
-@pytest.mark.parametrize(("first", "stop"), [(0, 1), (0, 3), (1, 2), (2, 5), (5, 6), (0, 6)])
+@pytest.mark.parametrize(("first", "stop"), [(0, 1), (1, 2), (2, 5), (0, 6)])
 def test_select(uneven, first, stop):
     part = uneven.select(first, stop)
-    assert len(part) == stop - first
-    assert part.offsets[0] == 0
     assert part.names == uneven.names[first:stop]
     assert (part.dataset, part.pairs, part.detector) == (uneven.dataset, uneven.pairs, uneven.detector)
     for new, old in enumerate(range(first, stop)):
-        for name in ("points1", "points2", "ratio"):
-            np.testing.assert_array_equal(getattr(part, name)[part.rows(new)], getattr(uneven, name)[uneven.rows(old)])
+        np.testing.assert_equal(part.matches(new), uneven.matches(old))
         for name in ("image_size", "F", "K", "R", "t"):
             np.testing.assert_array_equal(getattr(part, name)[new], getattr(uneven, name)[old])
     assert len(part.points1) == len(part.points2) == len(part.ratio) == part.offsets[-1]

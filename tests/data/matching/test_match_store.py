@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,13 +25,12 @@ from PIL import Image
 
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.datasets.folder import read_folder
-from kornia_learnnorm.data.datasets.frames import FramePair, read_frame
+from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairing import pair_frames
 from kornia_learnnorm.data.matching import match_store
 from kornia_learnnorm.data.matching.feature_cache import FeatureCache
-from kornia_learnnorm.data.matching.features import Features, detect_sift
+from kornia_learnnorm.data.matching.features import Features
 from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches, match_frames
-from kornia_learnnorm.data.matching.matchers import match_nearest
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 
 OPTIONS = MatchOptions(num_features=200, max_matches=30)
@@ -96,8 +94,7 @@ class TestOnce:
 
     def test_cache_gives_back_what_was_put(self, images, tmp_path):
         (pair, *_) = pairs_of(images)
-        rows = np.arange(6, dtype=np.uint8).reshape(2, 3)
-        features = Features(np.ones((2, 2), np.float32), rows, (160, 120))
+        features = Features(np.ones((2, 2), np.float32), np.arange(6, dtype=np.uint8).reshape(2, 3), (160, 120))
         with FeatureCache(tmp_path / "cache", [pair]) as cache:
             cache.put(pair.frame1, features)
             cache.put(pair.frame2, "unreadable")
@@ -106,9 +103,8 @@ class TestOnce:
             cache.release(pair)
             assert list(cache.folder.iterdir()) == []
         assert reason == "unreadable"
-        assert np.array_equal(got.points, features.points)
-        assert np.array_equal(got.descriptors, rows)
-        assert (got.descriptors.dtype, got.size) == (np.uint8, (160, 120))
+        np.testing.assert_equal(got, features)
+        assert got.descriptors.dtype == np.uint8
         assert not cache.folder.exists()
 
 
@@ -146,7 +142,6 @@ class TestProcesses:
         ("where", "message"),
         [
             ({"jobs": 0}, "jobs must be .* got 0"),
-            ({"jobs": -7}, "jobs must be .* got -7"),
             ({"dask": "127.0.0.1:bad"}, "address as tcp://host:8786, got '127.0.0.1:bad'"),
             ({"dask": "http://127.0.0.1:1"}, "address as tcp://host:8786, got 'http://127.0.0.1:1'"),
         ],
@@ -264,38 +259,18 @@ class TestDask:
 
 
 class TestGoingOn:
-    def test_complete_store_is_left_alone_and_lists_what_it_lacks(self, tmp_path, capsys):
-        root = frames_of(tmp_path / "images", 4)
-        (root / "003.png").write_bytes(b"")
-        path = tmp_path / "store.h5"
-        skipped = collect_matches(pairs_of(root), path, OPTIONS)
-        before = path.stat().st_mtime_ns
-        assert collect_matches(pairs_of(root), path, OPTIONS) == skipped
-        assert path.stat().st_mtime_ns == before
-        assert "exists already" in capsys.readouterr().err
-
     def test_other_cameras_are_refused(self, images, expected):
         moved = [FramePair(replace(pair.frame1, camera=np.eye(3)), pair.frame2) for pair in pairs_of(images)]
         with pytest.raises(ValueError, match=r"other data.* the images, their cameras, their poses or the pairs"):
             collect_matches(moved, expected, OPTIONS)
 
-    @pytest.mark.parametrize("complete", [True, False])
-    def test_store_of_an_earlier_version_is_refused(self, images, tmp_path, monkeypatch, complete):
+    def test_store_of_an_earlier_version_is_refused(self, images, tmp_path, monkeypatch):
         """Its options do not say that its matches share no point."""
-        path, add = tmp_path / "store.h5", match_store.StoreWriter.add
-
-        def add_some(writer, place, pair):
-            if place == 5 and not complete:
-                raise KeyboardInterrupt
-            add(writer, place, pair)
-
         monkeypatch.setattr(match_store, "METHOD", {})
-        monkeypatch.setattr(match_store.StoreWriter, "add", add_some)
-        with nullcontext() if complete else pytest.raises(KeyboardInterrupt):
-            collect_matches(pairs_of(images)[:8], path, OPTIONS)
+        collect_matches(pairs_of(images)[:2], tmp_path / "store.h5", OPTIONS)
         monkeypatch.undo()
         with pytest.raises(ValueError, match=r"made with other options, .*: matches was None and is 'one-to-one'"):
-            collect_matches(pairs_of(images)[:8], path, OPTIONS)
+            collect_matches(pairs_of(images)[:2], tmp_path / "store.h5", OPTIONS)
 
     @pytest.mark.parametrize(
         ("place", "error", "jobs"),
@@ -326,7 +301,7 @@ class TestGoingOn:
 
 
 class TestBadInput:
-    def test_unreadable_and_blank_images_are_skipped_and_listed(self, tmp_path):
+    def test_unreadable_and_blank_images_are_skipped_and_listed(self, tmp_path, capsys):
         root = frames_of(tmp_path / "images", 9)
         (root / "002.png").write_bytes(b"")
         data = (root / "004.png").read_bytes()
@@ -336,9 +311,13 @@ class TestBadInput:
         assert list(skipped) == [f"{i:03}.png {i + 1:03}.png" for i in range(1, 7)]
         for name, reason in zip(skipped, ["is empty", "is empty", *["truncated"] * 2, *["is blank"] * 2], strict=True):
             assert reason in skipped[name]
-        store = read_store(tmp_path / "store.h5")
+        path = tmp_path / "store.h5"
+        store, before = read_store(path), path.stat().st_mtime_ns
         assert store.names == [("000.png", "001.png"), ("007.png", "008.png")]
         assert store.provenance["skipped"] == skipped
+        assert collect_matches(pairs_of(root), path, OPTIONS) == skipped  # a complete store is left alone
+        assert path.stat().st_mtime_ns == before
+        assert "exists already" in capsys.readouterr().err
 
     def test_nothing_matched_blocks_no_later_run(self, images, tmp_path):
         (pair, *_) = pairs_of(images)
@@ -367,32 +346,16 @@ def matched(pair: FramePair, seed: int, most: int | None) -> CorrespondenceStore
 
 
 class TestMatchFrames:
-    def test_matches_are_one_to_one(self, images):
-        """Against the nearest neighbours, of which several share a feature, chosen by a loop."""
-        (pair, *_) = pairs_of(images)
-        features = [detect_sift(read_frame(frame)) for frame in pair]
-        store = match_frames(pair, *features, options=MatchOptions(max_matches=None))
-        rows = np.column_stack([part.numpy() for part in match_nearest(*features)]).tolist()
-        kept: list[list] = []
-        seen: tuple[set, set] = (set(), set())
-        for row in sorted(rows, key=lambda row: row[::-1]):
-            if tuple(row[:2]) not in seen[0] and tuple(row[2:4]) not in seen[1]:
-                kept.append(row)
-                seen[0].add(tuple(row[:2]))
-                seen[1].add(tuple(row[2:4]))
-        assert sorted(np.column_stack([store.points1, store.points2, store.ratio]).tolist()) == sorted(kept)
-        assert len(kept) < len(features[0].points)
-
     @given(seed=st.integers(0, 1000), most=st.integers(8, 40))
     def test_cut_is_a_subset_with_at_most_so_many_of_each_class(self, images, seed, most):
         (pair, *_) = pairs_of(images)
         whole, cut = matched(pair, seed, None), matched(pair, seed, most)
         rows, some = (
-            [tuple(row) for row in np.column_stack([store.points1, store.points2, store.ratio])]
-            for store in (whole, cut)
+            list(map(tuple, np.column_stack([store.points1, store.points2, store.ratio]))) for store in (whole, cut)
         )
         assert len(set(some)) == len(some)
         assert set(some) <= set(rows)
+        assert len({row[:2] for row in rows}) == len({row[2:4] for row in rows}) == len(rows)  # one-to-one
         passes = {True: (whole.ratio < 0.8).sum(), False: (whole.ratio >= 0.8).sum()}
         assert (cut.ratio < 0.8).sum() == min(most, passes[True])
         assert (cut.ratio >= 0.8).sum() == min(most, passes[False])
