@@ -47,17 +47,11 @@ class TestContentMask:
         image[8:12], image[:, 5:9] = 0, 0
         assert content_mask(image) is None
 
-    @pytest.mark.parametrize(
-        ("image", "error", "message"),
-        [
-            (np.zeros((4, 5)), TypeError, "array of uint8, got float64"),
-            (np.zeros((4, 5, 3), np.uint8), ValueError, r"must be grey .* got \(4, 5, 3\)"),
-            (np.zeros((0, 5), np.uint8), ValueError, r"got \(0, 5\)"),
-        ],
-    )
-    def test_wrong_arguments(self, image, error, message):
-        with pytest.raises(error, match=message):
-            content_mask(image)
+    def test_wrong_arguments(self):
+        with pytest.raises(TypeError, match="array of uint8, got float64"):
+            content_mask(np.zeros((4, 5)))
+        with pytest.raises(ValueError, match=r"must be grey .* got \(4, 5, 3\)"):
+            content_mask(np.zeros((4, 5, 3), np.uint8))
 
 
 class TestReadMask:

@@ -44,12 +44,6 @@ def test_without_reconstruction(cambridge):
     assert all(np.isnan(frame.K).all() for frame in read_cambridge(cambridge))
 
 
-def test_suffix_of_the_reconstruction(cambridge):
-    path = cambridge / "reconstruction.nvm"
-    path.write_text(path.read_text().replace(".jpg", ".png"))
-    assert np.isfinite(read_cambridge(cambridge)[0].K).all()
-
-
 def test_an_unreadable_image_has_no_camera(cambridge):
     (cambridge / "seq1/frame00001.png").write_bytes(b"")
     frame = read_cambridge(cambridge)[0]

@@ -96,11 +96,9 @@ class TestReadColmap:
         with pytest.raises(ValueError, match=r"1\.png must have its camera's size, 160 x 120 pixels, got 120 x 160"):
             read(colmap)
 
-    def test_unreadable_image(self, colmap):
+    def test_missing_and_unreadable_images(self, colmap):
         (colmap / "images/one/1.png").write_bytes(b"")
         assert [frame.size for frame in read(colmap)] == [SIZE, (0, 0), SIZE, SIZE]
-
-    def test_missing_images(self, colmap):
         shutil.rmtree(colmap / "images/two")
         with pytest.raises(FileNotFoundError, match=r"2 of 4 images are not in .*images, the first is two/2\.png"):
             read(colmap)
@@ -108,17 +106,13 @@ class TestReadColmap:
     @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
     def test_missing_file(self, colmap, name):
         (colmap / "model" / f"{name}.txt").unlink()
-        with pytest.raises(
-            FileNotFoundError, match=rf"no COLMAP model at .*model: it lacks {name}\.bin or {name}\.txt"
-        ):
+        with pytest.raises(FileNotFoundError, match=rf"no COLMAP model at .*model: it lacks {name}\.bin or"):
             read(colmap)
 
     @pytest.mark.parametrize(
         ("name", "text"),
         [
             ("cameras", "hello\n"),
-            ("cameras", "1 UNKNOWN 160 120 1 2 3\n"),
-            ("cameras", "1 PINHOLE 160 120 1\n"),
             ("cameras", "7 PINHOLE 160 120 130 130 80 60\n"),
             ("images", "hello\n\n"),
             ("points3D", "1 0 0 1 0 0 0 0.5 77 0 2 9\n"),
@@ -156,14 +150,10 @@ class TestCovisiblePairs:
         expected = [pair for pair, count in sorted(self.shared(model).items()) if count >= min_points]
         assert names(covisible_pairs(model / "model", read(model), min_points)) == expected
 
-    def test_by_name_whatever_the_order_of_the_frames(self, model):
-        frames = read(model)
-        straight, reverse = (names(covisible_pairs(model / "model", some)) for some in (frames, frames[::-1]))
-        assert straight == reverse
-
-    def test_some_frames(self, model):
+    def test_some_frames_in_any_order(self, model):
         frames = [frame for frame in read(model) if frame.sequence == "two"]
-        assert names(covisible_pairs(str(model / "model"), frames)) == [("two/2.png", "two/3.png")]
+        for some in (frames, frames[::-1]):
+            assert names(covisible_pairs(str(model / "model"), some)) == [("two/2.png", "two/3.png")]
 
     def test_points_without_3d_do_not_count(self, colmap):
         edit(colmap / "model" / "images.txt", 3, " ".join(f"{n} {n} -1" for n in range(50)))

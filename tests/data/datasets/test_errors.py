@@ -20,10 +20,7 @@ WHOLE = 0  # in place of the number of a line
 MALFORMED = [
     ("poses/00.txt", 2, "1 2 3", r"00\.txt, line 2: the 12 numbers of a pose expected, got '1 2 3'"),
     ("poses/00.txt", 2, "1 0 0 nan 0 1 0 0 0 0 1 0", "line 2: the 12 numbers of a pose expected, got '1 0 0 nan"),
-    ("poses/00.txt", 2, "a b", "line 2: the 12 numbers of a pose expected, got 'a b'"),
-    ("poses/00.txt", 2, "1 " * 13, "line 2: the 12 numbers of a pose expected"),
     ("poses/00.txt", 4, None, r"00\.txt has no line 4, the pose of .*000003\.png"),
-    ("poses/00.txt", 4, "", r"00\.txt has no line 4, the pose of .*000003\.png"),
     ("sequences/00/calib.txt", 1, "P0: 1 2 3", r"calib\.txt, line 1: P0: and 12 numbers expected, got 'P0: 1 2 3'"),
     ("sequences/00/calib.txt", 1, "P0: " + "0 " * 12, "line 1: a camera matrix and a fourth column expected"),
     ("sequences/00/calib.txt", 1, None, r"calib\.txt has no line 'P0: 12 numbers'"),
@@ -33,7 +30,6 @@ MALFORMED = [
     (f"{FR1}/rgb.txt", 4, "noon rgb/1.png", r"line 4: a timestamp and a file name expected, got 'noon rgb/1\.png'"),
     (f"{FR1}/rgb.txt", WHOLE, b"# nothing\n", r"rgb\.txt lists no images"),
     (f"{FR1}/groundtruth.txt", 2, "1 2 3", r"groundtruth\.txt, line 2: timestamp tx ty tz qx qy qz qw expected"),
-    (f"{FR1}/groundtruth.txt", 3, "1 2 3 4 0 0 0 inf", "line 3: timestamp tx"),
     (f"{FR1}/groundtruth.txt", 3, "1 2 3 4 0 0 0 0", "line 3: a quaternion other than zero expected"),
     (f"{FR1}/groundtruth.txt", WHOLE, b"# nothing\n", r"groundtruth\.txt has no poses"),
     ("dataset_train.txt", 5, "seq1/frame00002.png 1 2 3", r"train\.txt, line 5: ImageFile X Y Z W P Q R"),
@@ -46,7 +42,6 @@ MALFORMED = [
     ("reconstruction.nvm", 5, "seq1/frame00002.jpg 1 2", "line 5: an image, its focal length"),
     ("reconstruction.nvm", 5, "a.jpg 0 1 0 0 0 0 0 0 0 0", "line 5: a positive focal length expected, got 0"),
     ("reconstruction.nvm", WHOLE, b"NVM_V3\n\n3\n", r"reconstruction\.nvm announces 3 images and has 0"),
-    ("reconstruction.nvm", WHOLE, b"NVM_V3\n", "the number of images expected, got ''"),
 ]
 MISSING = [
     ("sequences/00/calib.txt", WHOLE, None, r"no calibration at .*calib\.txt"),
@@ -82,12 +77,10 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
     [
         ("kitti", "kitti", {"sequences": ["07"]}, ValueError, r"no sequence '07' at .*, there are 00, 06, 11"),
         ("kitti", "kitti", {"sequences": ["00", "00"]}, ValueError, r"each once, got \['00', '00'\]"),
-        ("kitti", "kitti", {"sequences": []}, ValueError, r"one name or more, each once, got \[\]"),
         ("kitti", "kitti", {"sequences": "00"}, TypeError, "a list of names, got the string '00'"),
         ("kitti", "kitti", {"camera": "image_4"}, ValueError, "image_0 to image_3, got 'image_4'"),
         ("tum", "tum", {"sequences": ["desk"]}, ValueError, f"no sequence 'desk' at .*, there are {FR1}, {FR3}"),
         ("tum", "tum", {"max_difference": -0.1}, ValueError, r"zero or more seconds, got -0\.1"),
-        ("tum", "tum", {"max_difference": float("nan")}, ValueError, "zero or more seconds, got nan"),
         ("tum", "kitti", {}, FileNotFoundError, r"no rgb\.txt in .*kitti, nor in a folder in it"),
         ("tum", "none", {}, FileNotFoundError, r"no folder at .*none"),
         ("cambridge", "cambridge", {"split": "val"}, ValueError, "'train', 'test' or None for both, got 'val'"),

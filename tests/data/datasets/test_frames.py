@@ -47,17 +47,6 @@ def projections(pair: FramePair, count: int = 20, seed: int = 0) -> list[np.ndar
 
 
 class TestFrame:
-    def test_unknown_by_default(self):
-        one = frame()
-        for value, shape in ((one.camera, (3, 3)), (one.pose, (4, 4))):
-            assert value.shape == shape
-            assert np.isnan(value).all()
-        assert frame().camera is not one.camera
-        assert (one.distortion, one.resized, one.matched_size) == ((), None, (640, 480))
-
-    def test_camera_is_that_of_the_file_without_resizing(self):
-        assert np.array_equal(frame(camera=CAMERA).K, CAMERA)
-
     def test_halved(self):
         # By hand: pixel edges go from -0.5 .. 639.5 to -0.5 .. 319.5, so x' = (x + 0.5) / 2 - 0.5.
         expected = [[250, 0, 154.75], [0, 255, 124.75], [0, 0, 1]]
@@ -114,13 +103,6 @@ class TestFramePair:
 
 
 class TestResizeFrames:
-    def test_the_last_size_counts(self):
-        once = resize_frames([frame(camera=CAMERA)], (100, 50))
-        twice = resize_frames(resize_frames([frame(camera=CAMERA)], (7, 9)), (100, 50))
-        assert np.array_equal(once[0].K, twice[0].K)
-        assert once[0].matched_size == (100, 50)
-        assert once[0].size == (640, 480)
-
     @pytest.mark.parametrize("size", [(0, 5), (5, -1)])
     def test_wrong_size(self, size):
         with pytest.raises(ValueError, match=f"positive width and height, got {size[0]} x {size[1]}"):

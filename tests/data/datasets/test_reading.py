@@ -9,7 +9,6 @@ from make_sequences import FR1, FR3, STEP
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairing import pair_frames
 from kornia_learnnorm.data.datasets.reading import read_dataset
-from kornia_learnnorm.data.datasets.splits import SPLITS
 
 
 def epipoles_agree(pair: FramePair) -> bool:
@@ -35,12 +34,6 @@ def test_splits_and_ground_truth(written, dataset, options, sequence):
     assert [frame.sequence for frame in frames] == [sequence] * 4
     if dataset != "tum":  # its wall is turned
         assert all(epipoles_agree(pair) for pair in pair_frames(frames))
-
-
-def test_no_sequence_is_in_two_splits():
-    for splits in SPLITS.values():
-        names = [name for split in splits.values() for name in split or ()]
-        assert len(names) == len(set(names))
 
 
 @pytest.mark.parametrize(

@@ -66,10 +66,6 @@ def test_association(tum, stamps, expected):
     assert np.isnan(x) if expected is None else x == expected
 
 
-def test_max_difference(written):
-    assert np.isnan(read_tum(written / "tum", max_difference=0.001)[0].pose).all()
-
-
 @pytest.mark.parametrize("norm", [0.01, 1.0, 100.0])
 def test_quaternion_of_any_norm(tum, norm):
     rng = np.random.default_rng(0)

@@ -114,17 +114,6 @@ class TestOneToOne:
         rows = torch.cat([points1, points2, ratio[:, None]], 1)
         assert torch.equal(rows[before], rows[kept[ratio[kept] < limit / 8]])
 
-    def test_features_with_several_orientations(self):
-        matches = match_images(texture(), texture()[:, 15:].copy())
-        kept = one_to_one(*matches)
-        assert 50 < len(kept) < len(matches.ratio)
-        for points in matches[:2]:
-            assert len(torch.unique(points[kept], dim=0)) == len(kept)
-
-    def test_types(self):
-        points = torch.rand(5, 2, dtype=torch.float64)
-        assert len(one_to_one(points, points.float().requires_grad_(), torch.zeros(5))) == 5
-
     @pytest.mark.parametrize("shapes", [((5, 3), (5, 2), (5,)), ((5, 2), (4, 2), (5,)), ((5, 2), (5, 2), (5, 1))])
     def test_wrong_shapes(self, shapes):
         with pytest.raises(ShapeError):
