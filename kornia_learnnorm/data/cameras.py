@@ -28,7 +28,7 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the text is none of these, the numbers are not finite, or a focal length is not positive.
+        ValueError: if the text is none of these, or the numbers are not those of a camera.
 
     Example:
         >>> read_camera("700,700,320,240")

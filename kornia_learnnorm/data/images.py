@@ -37,7 +37,7 @@ def import_cv2() -> Any:
 
 
 def import_pillow() -> Any:
-    """Return the module ``PIL.Image``; the ImportError names the extra that installs it."""
+    """Return the module ``PIL.Image``; see :func:`import_cv2`."""
     return import_extra("PIL.Image", "images", "reading images")
 
 
@@ -194,13 +194,6 @@ def scaling(size_from: Size, size_to: Size) -> Tensor:
     The outer edges stay in place: :math:`x' = (x + 0.5) s - 0.5` with a factor :math:`s` for each axis. If ``S1`` and
     ``S2`` lead from full images to reduced ones, :math:`S_2^\top F S_1` is the fundamental matrix of the full images
     for the matrix :math:`F` of the reduced ones. A size below 1 is a ValueError.
-
-    Example:
-        >>> scaling((400, 200), (100, 100))
-        tensor([[ 0.2500,  0.0000, -0.3750],
-                [ 0.0000,  0.5000, -0.2500],
-                [ 0.0000,  0.0000,  1.0000]], dtype=torch.float64)
-
     """
     if min(*size_from, *size_to) < 1:
         raise ValueError(f"sizes must be a positive width and height, got {size_from} and {size_to}")

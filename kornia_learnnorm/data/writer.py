@@ -92,11 +92,7 @@ class StoreWriter:
     Each pair becomes a store of its own, a part, in the folder ``<path>.parts``. A later run finds the parts of a run
     that was killed; parts, or a complete store, of other options or of another program are a ValueError.
     :meth:`finish` joins the parts in the order of their places and removes the folder. The options are all that the
-    store depends on, values of JSON's types.
-
-    Attributes:
-        complete: whether the store exists, made with the same options.
-        skipped: the pairs that a complete store leaves out, and why; empty while it is not complete.
+    store depends on, values of JSON's types. ``skipped`` has the pairs that are not in a complete store, and why.
     """
 
     def __init__(self, path: str | Path, options: dict[str, Any]) -> None:
@@ -108,13 +104,13 @@ class StoreWriter:
         self.complete = self.path.exists()
         if self.complete:
             provenance = read_store(self.path).provenance
-            _refuse(self.path, provenance.get("options"), self.options)
+            _check_options(self.path, provenance.get("options"), self.options)
             self.skipped = dict(provenance.get("skipped", {}))
         elif self._parts():
             had = None
             with suppress(FileNotFoundError, ValueError):
                 had = json.loads((self.folder / OPTIONS).read_text(encoding="utf-8"))
-            _refuse(self.folder, had, self.options)
+            _check_options(self.folder, had, self.options)
         else:
             try:
                 self.folder.mkdir(exist_ok=True)
@@ -161,7 +157,7 @@ def _folder(path: Path) -> Path:
     return path.with_name(path.name + ".parts")
 
 
-def _refuse(path: Path, had: Any, options: dict[str, Any]) -> None:
+def _check_options(path: Path, had: Any, options: dict[str, Any]) -> None:
     if not isinstance(had, dict):
         raise ValueError(f"{path} exists, but was not made by this command: remove it or write elsewhere")
     other = [key for key in {**had, **options} if had.get(key) != options.get(key)]

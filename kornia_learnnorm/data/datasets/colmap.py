@@ -41,9 +41,9 @@ def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
 
     Raises:
         FileNotFoundError: if a file of the model is missing, or an image.
-        ValueError: if the model is malformed or empty, a camera's model has distortion other than k1, k2, p1, p2, or an
-            image's size is not its camera's.
-        ImportError: if pycolmap or Pillow is not installed; the message names the extra that brings it.
+        ValueError: if the model is malformed or empty, a camera has distortion other than k1, k2, p1, p2, or an image
+            does not have its camera's size.
+        ImportError: if pycolmap or Pillow is not installed.
 
     """
     images, reconstruction = Path(images), _reconstruction(Path(model))

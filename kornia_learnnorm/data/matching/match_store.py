@@ -112,13 +112,11 @@ def collect_matches(
         dask: address of a Dask scheduler whose workers match instead; they need the images under the same paths.
 
     Returns:
-        the pairs that could not be matched, ``"name1 name2"``, and why; the store leaves them out and lists them.
+        the pairs that could not be matched, ``"name1 name2"``, and why; the store lists them.
 
     Raises:
         ValueError: if there are no pairs, none of them could be matched, or ``path`` holds another store.
-        OSError: if a file cannot be written, another process writes the store, or workers crash repeatedly without
-            progress.
-        ImportError: if OpenCV, h5py, joblib or, for ``dask``, Dask is not installed.
+        OSError: if a file cannot be written, another process writes it, or workers crash repeatedly.
 
     """
     options, about = options or MatchOptions(), about or {}

@@ -65,9 +65,6 @@ def random_scenes(batch_size: int, num_points: int, generator: Generator) -> Two
         num_points: correspondences per scene :math:`N`.
         generator: source of all randomness.
 
-    Returns:
-        the scenes.
-
     Raises:
         TypeError: if ``generator`` is not a ``torch.Generator``.
         ValueError: if ``batch_size`` or ``num_points`` is below one.
@@ -100,7 +97,7 @@ def random_views(batch_size: int, num_points: int, generator: Generator) -> TwoV
 def forward_driving(
     batch_size: int, num_points: int, generator: Generator, noise: float = 0.5, outliers: float = 0.0
 ) -> TwoViewScene:
-    """Draw scenes of a car that drives forward: KITTI's camera, a road, about a metre between the images.
+    """Draw scenes of a car that drives forward: KITTI's camera, a road, about a metre between the images; in metres.
 
     Args:
         batch_size: number of scenes :math:`B`.
@@ -109,13 +106,9 @@ def forward_driving(
         noise: standard deviation of the Gaussian noise, pixels per coordinate, in both views.
         outliers: share of gross outliers, whose second point is uniform in the image.
 
-    Returns:
-        the scenes; the unit of depth is the metre.
-
     Raises:
         TypeError: if ``generator`` is not a ``torch.Generator``.
-        ValueError: if ``batch_size`` or ``num_points`` is below one, ``noise`` negative or not finite, or ``outliers``
-            outside of 0-1.
+        ValueError: if a number is out of its range.
 
     Reference:
         A. Geiger, P. Lenz, R. Urtasun, Are we ready for autonomous driving? The KITTI benchmark suite, CVPR 2012.
