@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar.fundamental import run_7point
 from torch import Tensor
 
@@ -45,10 +46,14 @@ def find_solver(name: str) -> Solver:
 def measure(solver: Solver, x1: Tensor, x2: Tensor, rows: Tensor, inliers: Tensor) -> tuple[Tensor, Tensor]:
     """Return the errors, pixels, and MSAC scores of the hypotheses from minimal samples (K, 8)."""
     F_mat = solver(x1[rows], x2[rows])
-    points = [x.expand(*F_mat.shape[:2], -1, -1) for x in (x1, x2)]
-    sampson = kln.sampson_distance(*points, F_mat).nan_to_num(nan=torch.inf)
-    score = (1 - (sampson / INLIER_THRESHOLD).square()).clamp(min=0).sum(-1)
-    distance = kln.symmetric_epipolar_distance(*(x[..., inliers, :] for x in points), F_mat)
+    h1, h2 = (convert_points_to_homogeneous(x).mT for x in (x1, x2))
+    line2, line1 = F_mat @ h1, F_mat.mT @ h2
+    # As the formulas have it: a point that is almost on an epipole counts like any other.
+    residual = (h2 * line2).sum(-2).abs()
+    normal1, normal2 = (line[..., :2, :].square().sum(-2) for line in (line1, line2))
+    sampson = residual.square() / (normal1 + normal2)
+    score = (1 - sampson / INLIER_THRESHOLD**2).clamp(min=0).nan_to_num(nan=0.0).sum(-1)
+    distance = (residual * (normal1.rsqrt() + normal2.rsqrt()))[..., inliers]
     error = distance.nan_to_num(nan=torch.inf).mean(-1).clamp(max=MAX_RESIDUAL)
     best = score.argmax(-1, keepdim=True)
     return error.gather(-1, best)[:, 0], score.gather(-1, best)[:, 0]

@@ -59,9 +59,8 @@ KEPT_METHODS = ("Hartley+optimal", "Hartley+LM", "crossview+LM")  # further defa
 def default_methods(weights: Sequence[str] = (), *, kept: bool = False) -> tuple[str, ...]:
     """Return the names of the default methods: closed forms, weights, and the search as the limit of them all.
 
-    Args:
-        weights: names or paths of further weights; of two that have one name in tables, these replace the shipped ones.
-        kept: whether the methods are those of a run that is kept, which has :data:`KEPT_METHODS` too.
+    Of two weights that have one name in tables, ``weights`` replace the shipped ones. A run that is ``kept`` has
+    :data:`KEPT_METHODS` too.
     """
     *closed_forms, search = CLOSED_FORMS
     given = {short_name_of(name) for name in weights}

@@ -10,11 +10,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
+from pairwise import pairwise
 from torch.autograd import gradcheck
 from two_view import SCENES, correspondences, epipolar_distances, homogeneous, shaken, uniform
 
-from kornia_learnnorm import Diagnostics, Hartley, Identity, ReweightedWhitening, Whitening, diagnose
-from kornia_learnnorm.evaluation.diagnostics import condition_number, normalized_distance, singularity_ratio
+from kornia_learnnorm import Hartley, Identity, ReweightedWhitening, Whitening
+from kornia_learnnorm.evaluation.diagnostics import (
+    Diagnostics,
+    condition_number,
+    diagnose,
+    normalized_distance,
+    singularity_ratio,
+)
 
 NORMALIZERS = [Identity(), Hartley(), Whitening(), ReweightedWhitening(3)]
 
@@ -88,16 +95,6 @@ def test_of_a_diagonal(function, matrix, expected):
 
 
 class TestConditionNumber:
-    @pytest.mark.parametrize("num_rows", [8, 9, 30])
-    def test_agrees_with_numpy(self, num_rows, device, dtype):
-        A = uniform(20, num_rows, 9, low=-1, dtype=dtype)
-        d = np.linalg.eigvalsh((A.mT.double() @ A.double()).numpy())[:, ::-1]
-        found = condition_number(A.to(device)).cpu()
-        assert found.dtype == dtype
-        np.testing.assert_allclose(
-            found.numpy(), np.sqrt(d[:, 0] / d[:, 7]), rtol=1e-4 if found.itemsize == 4 else 1e-8
-        )
-
     def test_the_null_vector_does_not_count(self):
         """A ninth singular value does not change it, be it zero or nearly the eighth."""
         Q = torch.linalg.qr(uniform(9, 9, low=-1))[0]
@@ -112,15 +109,6 @@ class TestConditionNumber:
     def test_scale_and_rotations_do_not_matter(self, seed, factor):
         A, Q = uniform(10, 9, low=-1, seed=seed), torch.linalg.qr(uniform(9, 9, low=-1, seed=seed + 1))[0]
         assert condition_number(factor * A @ Q).item() == pytest.approx(condition_number(A).item(), rel=1e-9)
-
-
-class TestSingularityRatio:
-    def test_agrees_with_numpy(self, device, dtype):
-        F_mat = uniform(20, 3, 3, low=-1, dtype=dtype)
-        s = np.linalg.svd(F_mat.double().numpy())[1]
-        found = singularity_ratio(F_mat.to(device)).cpu()
-        assert found.dtype == dtype
-        np.testing.assert_allclose(found.numpy(), s[:, 1] / s[:, 2], rtol=1e-3 if found.itemsize == 4 else 1e-9)
 
 
 class TestNormalizedDistance:
@@ -152,9 +140,7 @@ class TestDiagnose:
             assert (values.shape, values.dtype, values.device.type) == ((batch_size,), torch.float64, device.type)
             assert torch.isfinite(values).all()
 
-    @pytest.mark.parametrize("name", SCENES)
-    @pytest.mark.parametrize("num_points", [8, 20])
-    @pytest.mark.parametrize("normalizer", NORMALIZERS)
+    @pairwise(name=SCENES, num_points=[8, 20], normalizer=NORMALIZERS)
     def test_agrees_with_numpy(self, name, num_points, normalizer, device):
         options = {} if name == "random" else {"noise": 0.5}
         points = correspondences(name, 10, num_points, **options)
@@ -176,11 +162,6 @@ class TestDiagnose:
         ]
         means = [share.mean().item() for share in shares]
         assert 0.9 > means[0] > means[1] > means[2]
-
-    def test_hartley_helps(self):
-        points = correspondences("driving", 50)
-        pixels, hartley = (diagnose(*points, normalizer).condition_number for normalizer in (Identity(), Hartley()))
-        assert (hartley < 0.1 * pixels).all()
 
     def test_any_normalizer_of_the_contract(self):
         points, seen = correspondences("driving", 5), []

@@ -9,17 +9,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pairwise import pairwise
 from two_view import SCENES, correspondences, eight_point, epipolar_distances, numpy_hartley, shaken, uniform
 
 from kornia_learnnorm import (
     Hartley,
     ReweightedWhitening,
-    SearchedNormalizer,
     Whitening,
     find_fundamental,
     paper_transform,
     spd_transform,
 )
+from kornia_learnnorm.evaluation.search import SearchedNormalizer
 
 BASES = {"hartley": Hartley(), "whitening": Whitening(), "reweighted": ReweightedWhitening(), "learned": shaken()}
 
@@ -50,33 +51,22 @@ def numpy_spd(params) -> np.ndarray:
     return T
 
 
-class TestSmoke:
-    """See also tests/normalizers/test_contract.py."""
+@pytest.mark.parametrize(("steps", "learning_rate"), [(0, 0.1), (-1, 0.1), (10, 0.0), (10, -1.0)])
+def test_exceptions(steps, learning_rate):
+    with pytest.raises(ValueError, match=f"must be positive, got {steps} and {learning_rate}"):
+        SearchedNormalizer(steps=steps, learning_rate=learning_rate)
 
-    def test_defaults(self):
-        normalizer = SearchedNormalizer()
-        assert isinstance(normalizer.base, ReweightedWhitening)
-        assert normalizer.transform is spd_transform
-        assert (normalizer.num_parameters, normalizer.steps, normalizer.learning_rate) == (5, 100, 0.1)
-        assert list(normalizer.parameters()) == []
 
-    def test_one_step_is_exactly_the_base(self, dtype):
-        """The first transforms tried are the base's own."""
-        points = [p.to(dtype) for p in correspondences("handheld", 5)]
-        expected = Hartley()(*(p.double() for p in points))
-        for T, H in zip(SearchedNormalizer(Hartley(), steps=1)(*points), expected, strict=True):
-            assert torch.equal(T, H.to(dtype))
-
-    @pytest.mark.parametrize(("steps", "learning_rate"), [(0, 0.1), (-1, 0.1), (10, 0.0), (10, -1.0)])
-    def test_exceptions(self, steps, learning_rate):
-        with pytest.raises(ValueError, match=f"must be positive, got {steps} and {learning_rate}"):
-            SearchedNormalizer(steps=steps, learning_rate=learning_rate)
+def test_one_step_is_exactly_the_base(dtype):
+    """The first transforms tried are the base's own."""
+    points = [p.to(dtype) for p in correspondences("handheld", 5)]
+    expected = Hartley()(*(p.double() for p in points))
+    for T, H in zip(SearchedNormalizer(Hartley(), steps=1)(*points), expected, strict=True):
+        assert torch.equal(T, H.to(dtype))
 
 
 class TestSearch:
-    @pytest.mark.parametrize("base", BASES)
-    @pytest.mark.parametrize("scene", SCENES)
-    @pytest.mark.parametrize("num_points", [8, 20])
+    @pairwise(base=BASES, scene=SCENES, num_points=[8, 20])
     def test_never_worse_than_its_base(self, base, scene, num_points):
         *_, found, expected = searched(base, scene, num_points)
         assert (found <= expected * (1 + 1e-6) + 1e-6).all()
@@ -248,8 +238,7 @@ DEGENERATE = {
 }
 
 
-@pytest.mark.parametrize("num_points", [8, 20])
-@pytest.mark.parametrize("sample", DEGENERATE)
+@pairwise(num_points=[8, 20], sample=DEGENERATE, dtype=[torch.float32, torch.float64])
 def test_finite_on_degenerate_samples(sample, num_points, dtype):
     points = [p[:, :num_points].to(dtype) for p in DEGENERATE[sample]]
     for weights in (None, torch.zeros(4, num_points)):

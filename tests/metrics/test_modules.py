@@ -9,7 +9,7 @@ import torch
 
 pytest.importorskip("torchmetrics")
 
-from kornia_learnnorm import better_rate
+from kornia_learnnorm.metrics.better_rate import better_rate
 from kornia_learnnorm.metrics.modules import BetterRateMetric
 
 NAN, INF = float("nan"), float("inf")

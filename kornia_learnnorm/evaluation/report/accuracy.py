@@ -9,7 +9,6 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.report.numbers import (
     BASELINE,
-    MIN_BOOTSTRAP_PAIRS,
     MIN_DISTANCE,
     POSE_HEADER,
     RESAMPLES,
@@ -22,11 +21,9 @@ from kornia_learnnorm.evaluation.report.numbers import (
 )
 from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
-from kornia_learnnorm.evaluation.tables import MIN_P_VALUE, Cell, Table
+from kornia_learnnorm.evaluation.tables import Cell, Table
 from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import THRESHOLDS
-
-__all__ = ["by_motion", "report_tables"]
 
 MAX_FAILURES = 10  # rows of the table of the worst samples
 MIN_PAIRS = 4  # pairs with a known value; fewer are not split in halves
@@ -81,26 +78,16 @@ def _accuracy(cell: RunCell) -> Table:
 def _accuracy_text(cell: RunCell, posed: int) -> str:
     """Return what the table of errors shows, of which the samples of ``posed`` have a ground-truth pose."""
     truth = int(_with_truth(cell).sum())
-    count = f"of which {truth} have ground-truth inliers and {posed} a ground-truth pose"
-    others = "`held out` (16 other matches of the pair) and `truth` (the pair's ground-truth inliers) are errors on"
-    others += " other points: medians"
-    if not truth:
-        count = "without ground truth"
-        others = "`held out` (16 other matches of the pair, some of which may be wrong) is the error on other points:"
-        others += " the median"
-    angles = (
-        " The angles are errors of the relative pose; AUC at 5, 10 and 20 degrees and mAA(10) summarise them, %. A "
-        "pose that cannot be found counts as a failure."
-    )
+    known = f"of which {truth} have ground-truth inliers and {posed} a ground-truth pose" if truth else "without truth"
     return (
-        f"Medians over {len(cell.pair)} samples, {count}. `fit` is the error of the sample itself: the mean symmetric "
-        f"epipolar distance of its own points. {others} of the symmetric epipolar distance."
-        f"{angles if posed else ''} `+LM` is refined on these points: no method fits "
-        "them more closely. The condition number of the design matrix is its largest over its eighth singular value. "
-        "`rho` is the second over the third singular value of the normalised matrix before the projection to rank 2: "
-        "the larger it is, the less the projection changes. Distances 1 and 2 are the mean distances of the normalised "
-        "points from the origin in views 1 and 2. These four columns have no unit. `error due to rank 2` is the share "
-        "of the fit that the projection adds."
+        f"Medians over {len(cell.pair)} samples, {known}, of symmetric epipolar distances: `fit` is the mean of the "
+        "sample's own points, `held out` the median of 16 other matches of the pair, some of which may be wrong, "
+        "`truth` that of the pair's ground-truth inliers. Angles are errors of the relative pose, summarised by AUC "
+        "and mAA(10), %; a pose that cannot be found is a failure. `+LM` is refined on the sample's points: nothing "
+        "fits them more closely. Condition number: largest over eighth singular value of the design matrix. `rho`: "
+        "second over third singular value of the normalised matrix before the projection to rank 2, which changes the "
+        "less the larger it is. Distances: mean ones of the normalised points from the origin. Error due to rank 2: "
+        "share of the fit."
     )
 
 
@@ -120,19 +107,16 @@ def _consensus(cell: RunCell, run: Run) -> Table:
         ]
         rows.append([name, *cells])
     truth = bool(known.any())
-    kind = "that pass the ratio test" if cell.protocol == "filtered" else "with or without the ratio test"
     dropped = " and ".join(f"{int((~keep).sum())} at {t:g} px" for t, keep in zip(THRESHOLDS, known.T, strict=True))
     text = (
-        f"Each sample's matrix on all matches of its pair {kind}: mean over samples with the 95 % bootstrap interval "
-        f"over image pairs; fewer than {MIN_BOOTSTRAP_PAIRS} pairs have no interval. `inliers` is the share of the "
-        "matches with a symmetric epipolar distance below the threshold."
+        "Each sample's matrix on all matches of its pair, by the same ratio test; no RANSAC and no refinement. "
+        "`inliers` is the share of the matches with a symmetric epipolar distance below the threshold."
     )
     if truth:
         text += (
-            " `F1` is the harmonic mean of the precision and recall of these inliers against those of the ground truth "
-            f"at the same threshold. Samples of pairs without ground-truth inliers are left out: {dropped}."
+            " `F1` is the harmonic mean of the precision and recall of these inliers against those of the ground truth."
+            f" Samples of pairs without ground-truth inliers are left out: {dropped}."
         )
-    text += " No RANSAC and no refinement on inliers take place."
     if papers_data(run.about["stores"][cell.store]):
         text += " Fan et al., Tables 2 and 3, measure something else."
     return Table(f"Inliers{' and F1' * truth}: {cell.title}", text, header, rows)
@@ -163,8 +147,7 @@ def _tests(cell: RunCell) -> Table:
     ]
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "
-        f"p-value of a paired bootstrap over image pairs with {RESAMPLES:,} resamples, which cannot resolve p-values "
-        f"below {MIN_P_VALUE:g}; fewer than {MIN_BOOTSTRAP_PAIRS} pairs have neither. Negative is better. `fit` and "
+        f"p-value of a paired bootstrap of {RESAMPLES:,} resamples. Negative is better. `fit` and "
         f"`held out` use {_count(cell.pair)}"
     )
     truth = cell.pair[_with_truth(cell)]
@@ -197,9 +180,8 @@ def by_motion(cell: RunCell, run: Run, learned: str) -> Table:
     header = ["motion", "half", "pairs", "samples", "with truth", "fit: better %", "held out: better %"]
     text = (
         f"Better rate of `{learned}` against {BASELINE} in the halves of the image pairs below and above the median of "
-        "each motion. `with truth` is the number of samples whose pair has ground-truth inliers; the last column is "
-        "the rate on them. In brackets is the 95 % bootstrap interval over image pairs; fewer than "
-        f"{MIN_BOOTSTRAP_PAIRS} pairs have none."
+        "each motion. `with truth` is the number of samples whose pair has ground-truth inliers, which the last column "
+        "is the rate on."
     )
     if left_out:
         text += f" Not shown: {'; '.join(left_out)}."
@@ -238,8 +220,7 @@ def _worst_failures(cell: RunCell, run: Run, learned: str) -> Table:
         condition, parallax = float(mine["condition_number"][row]), float(pairs["parallax"][pair])
         rows.append([str(pairs["names"][pair]), *cells, number(condition, ".3g"), number(parallax, ".1f")])
     text = (
-        f"The {len(rows)} samples with the largest ratio of `truth`, the median symmetric epipolar distance of the "
-        f"ground-truth inliers, under `{learned}` to that under {BASELINE}, of {int((ratio >= 0).sum())} samples with "
-        "ground truth. `fit` is the mean distance of the sample's own points."
+        f"The {len(rows)} samples of {int((ratio >= 0).sum())} with ground truth with the largest ratio of `truth` "
+        f"under `{learned}` to that under {BASELINE}."
     )
     return Table(f"Worst failures: {cell.title}", text, [*header, "condition number", "parallax px"], rows)

@@ -18,8 +18,6 @@ from kornia_learnnorm.two_view.drawing import INLIER, WIDE, draw_line, draw_matc
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_example", "example_inliers"]
-
 NUM_LINES = 5  # epipolar lines of each matrix
 METHODS = ("Hartley", "crossview")
 TRUTH = "ground truth"

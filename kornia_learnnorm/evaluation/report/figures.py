@@ -21,8 +21,6 @@ from kornia_learnnorm.evaluation.runs.example import TRIALS
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 
-__all__ = ["report_figures"]
-
 MAX_FRAMES = 20  # image pairs on the axis of Figure 4a
 RHO_WINDOW = 100  # successive samples in a mean of Figure 13
 NORMALISATIONS = ("none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched")

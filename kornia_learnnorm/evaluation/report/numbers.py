@@ -14,21 +14,6 @@ from kornia_learnnorm.metrics.bootstrap import bootstrap_interval, paired_bootst
 from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
 
-__all__ = [
-    "BASELINE",
-    "MIN_BOOTSTRAP_PAIRS",
-    "MIN_DISTANCE",
-    "POSE_HEADER",
-    "RESAMPLES",
-    "better_share",
-    "mean_share",
-    "median_number",
-    "number",
-    "paired_change",
-    "percent_change",
-    "pose_numbers",
-]
-
 BASELINE = "Hartley"  # the method that all others are compared with
 RESAMPLES = 2000  # bootstrap resamples of a paired test
 MIN_BOOTSTRAP_PAIRS = 8  # image pairs; a bootstrap over fewer is too narrow: no interval, no p-value

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from kornia_learnnorm.evaluation.report.accuracy import report_tables
 from kornia_learnnorm.evaluation.report.figures import report_figures
+from kornia_learnnorm.evaluation.report.numbers import MIN_BOOTSTRAP_PAIRS
 from kornia_learnnorm.evaluation.report.rates import papers_data, with_baseline
 from kornia_learnnorm.evaluation.report.robust_tables import robust_tables
 from kornia_learnnorm.evaluation.report.run_summary import robust_summary, run_summary
@@ -22,14 +23,17 @@ from kornia_learnnorm.evaluation.report.style import ReportPicture
 from kornia_learnnorm.evaluation.robust.robust_run import RobustRun, read_robust
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, read_run
 from kornia_learnnorm.evaluation.runs.results_store import read_section
-from kornia_learnnorm.evaluation.tables import Table, format_table
+from kornia_learnnorm.evaluation.tables import MIN_P_VALUE, Table, format_table
 from kornia_learnnorm.files import write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["Report", "print_summary", "print_tables", "write_report"]
-
 GREY = "#808890"  # lines and letters of a picture in its own file: legible on white and on black
+INTERVALS = (
+    f"Filtered matches: the nearest descriptor is less than {RATIO:g} times as far as the second nearest. In brackets "
+    f"are 95 % bootstrap intervals over image pairs, of 2,000 resamples; fewer than {MIN_BOOTSTRAP_PAIRS} pairs have "
+    f"neither interval nor p-value, and none below {MIN_P_VALUE:g} can be resolved."
+)
 PAGE_STYLE = """
 :root { color-scheme: light dark; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem;
@@ -54,19 +58,9 @@ class Report(NamedTuple):
 
 
 def write_report(folder: str | Path) -> Report:
-    """Write ``report.md``, ``report.html`` and the pictures into the folder of a run.
+    """Write ``report.md``, ``report.html`` and the pictures into the folder of ``evaluate``, ``robust`` or both.
 
-    Args:
-        folder: folder that ``learnnorm evaluate --out``, ``learnnorm robust --out`` or both wrote.
-
-    Returns:
-        the tables, and what is missing.
-
-    Raises:
-        FileNotFoundError: if the run does not exist or is not complete.
-        ValueError: if a file of the run is damaged.
-        ImportError: if Matplotlib is not installed.
-
+    Raise FileNotFoundError if there is no run, ValueError if a file of it is damaged.
     """
     folder = Path(folder)
     summary, about, tables = list[str](), list[str](), list[Table]()
@@ -87,6 +81,7 @@ def write_report(folder: str | Path) -> Report:
     for picture in pictures:
         write_text(folder / f"{picture.name}.svg", picture.svg.replace("currentColor", GREY))
     tables = [known for table in tables if (known := table.known_parts())]
+    about.append(INTERVALS)
     page = _markdown(summary, about, tables, pictures)
     write_text(folder / "report.md", page)
     write_text(folder / "report.html", _html(page, pictures))
@@ -106,8 +101,7 @@ def _about_run(run: Run) -> str:
     papers = any(map(papers_data, about["stores"].values()))
     numbers = " Numbers of tables and figures are those of Fan et al." if papers else ""
     return (
-        f"Stores: {_stores(about)}. Methods: {', '.join(about['methods'])}. {samples} of each store, filtered by the "
-        f"ratio test (the nearest descriptor is less than {RATIO:g} times as far as the second nearest) and "
+        f"Stores: {_stores(about)}. Methods: {', '.join(about['methods'])}. {samples} of each store, filtered and "
         f"unfiltered, seed {about['seed']}. {', '.join(_versions(about))}.{numbers}{_missing(run.missing)}"
     )
 

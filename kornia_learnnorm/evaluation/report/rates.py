@@ -9,13 +9,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.numbers import BASELINE, MIN_BOOTSTRAP_PAIRS, better_share, median_number
+from kornia_learnnorm.evaluation.report.numbers import BASELINE, better_share, median_number
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.evaluation.tables import Cell, Number, Table
 from kornia_learnnorm.metrics.better_rate import better_rate, comparable
-from kornia_learnnorm.protocol import PROTOCOLS, RATIO
-
-__all__ = ["HEADER", "method_rows", "papers_data", "rate_tables", "was_trained_on", "with_baseline"]
+from kornia_learnnorm.protocol import PROTOCOLS
 
 # Columns of the table that learnnorm evaluate prints.
 HEADER = (
@@ -56,13 +54,12 @@ def with_baseline(run: Run) -> Run:
 
 def rate_tables(run: Run) -> list[Table]:
     """Return the tables of rates against Hartley and, where the run has it, whitening."""
-    tables = []
-    for baseline in (BASELINE, "whitening"):
-        for protocol in PROTOCOLS:
-            cells = [cell for cell in run.cells if cell.protocol == protocol and baseline in cell.predictions]
-            if cells:
-                tables.append(_better_rates(run, cells, baseline))
-    return tables
+    parts = [
+        ([cell for cell in run.cells if cell.protocol == protocol and baseline in cell.predictions], baseline)
+        for baseline in (BASELINE, "whitening")
+        for protocol in PROTOCOLS
+    ]
+    return [_better_rates(run, cells, baseline) for cells, baseline in parts if cells]
 
 
 def papers_data(description: str) -> str:
@@ -95,15 +92,11 @@ def _better_rates(run: Run, cells: list[RunCell], baseline: str) -> Table:
     ties, degenerate = sum(rate.ties for rate in found), sum(rate.degenerate for rate in found)
     text = (
         f"Share of samples of {run.about['size']} correspondences with a smaller mean symmetric epipolar distance than "
-        f"under {baseline}, %, with the 95 % bootstrap interval over image pairs; fewer than {MIN_BOOTSTRAP_PAIRS} "
-        "pairs have no interval. An asterisk marks a method that was trained on pairs of the store. The whole table "
-        f"has {ties} ties, which count as not better, and leaves out {degenerate} degenerate comparisons. The header "
-        "gives the number of samples used and drawn; samples with a mean symmetric epipolar distance under the "
-        "eight-point algorithm without normalisation of "
+        f"under {baseline}, %; {ties} ties count as not better, {degenerate} degenerate comparisons are left out. An "
+        "asterisk marks a method that was trained on pairs of the store. The header gives the number of samples used "
+        "and drawn: those with a mean distance without normalisation of "
         f"{run.about['max_residual']:g} px or more are not used."
     )
-    if protocol == "filtered":
-        text += f" Filtered matches: the nearest descriptor is less than {RATIO:g} times as far as the second nearest."
     papers = [papers_data(run.about["stores"][cell.store]) for cell in cells] if baseline == BASELINE else []
     if protocol == "filtered" and any(papers):
         rows += [

@@ -7,7 +7,6 @@ from dataclasses import replace
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.report.numbers import (
-    MIN_BOOTSTRAP_PAIRS,
     POSE_HEADER,
     median_number,
     number,
@@ -19,8 +18,6 @@ from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
 from kornia_learnnorm.evaluation.tables import Cell, Number, Table
 from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
-
-__all__ = ["MAX_ERROR", "PRINTED", "pairs_with_truth", "robust_tables"]
 
 MAX_ERROR = MAX_RESIDUAL  # pixels; larger errors are clamped
 # Fan et al., Tables 2 and 3: share of inliers and F1 at 0.1 px, then at 1 px, %.
@@ -99,11 +96,10 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
         f"are left out: {dropped}. `ground-truth` is the true matrix: where it has few inliers, F1 says little."
     )
     text = (
-        "Mean over image pairs and runs, ± standard deviation of the mean of a run if there are several runs. Inliers: "
-        "share of the estimator's matches with a symmetric epipolar distance below the threshold. "
+        "Mean over image pairs and runs, ± standard deviation of the mean of a run. Inliers: share of the matches with "
+        "a symmetric epipolar distance below the threshold. "
         f"{agreement if truth else 'There is no ground truth: more inliers do not prove a more accurate matrix.'} "
-        "`RANSAC`, `learned:` and `guided:` are the package's own, all others come from other packages; all run with "
-        "their defaults."
+        "`RANSAC`, `learned:` and `guided:` are the package's own; all run with their defaults."
     )
     number = TABLE_NUMBER[cell.protocol] if printed else ""
     return Table(f"Robust estimation: {cell.title}{number}", text, header, rows)
@@ -131,13 +127,10 @@ def _pose_and_time(cell: RobustCell) -> Table:
         rows.append([name, *cells])
     posed = any(row[1] for row in rows)
     poses = (
-        "AUC: area under the recall curve of the pose error, the larger of the rotation and translation angles, up to "
-        "5, 10 and 20 degrees, and mAA(10), %, over all pairs and runs; failures count. "
+        "AUC up to 5, 10 and 20 degrees and mAA(10) of the pose error, the larger of the angles of rotation and "
+        "translation, %, over all pairs and runs; failures count. "
     )
-    text = (
-        f"{poses if posed else ''}`ms` is the median time of a run, `samples` the mean number of minimal samples, "
-        "empty if it is unknown. Estimators of other packages decide by themselves how many samples they draw."
-    )
+    text = f"{poses if posed else ''}`ms` is the median time of a run, `samples` the mean number of minimal samples."
     return Table(f"{'Pose and time' if posed else 'Time'}: {cell.title}", text, header, rows)
 
 
@@ -151,9 +144,8 @@ def _tests(cell: RobustCell) -> list[Table]:
     ]
     text = (
         "Change of the mean against another estimator, in percentage points and in px, with the 95 % interval and "
-        "two-sided p-value of a paired bootstrap over image pairs; fewer than "
-        f"{MIN_BOOTSTRAP_PAIRS} pairs have neither. The mean of a pair is over the runs that both "
-        "estimators have. More inliers, a higher F1 and a smaller error are better."
+        "two-sided p-value of a paired bootstrap, over the runs that both have. More inliers, a higher F1 and a "
+        "smaller error are better."
     )
     return [Table(f"Paired tests of robust estimation: {cell.title}", text, header, rows)] if rows else []
 

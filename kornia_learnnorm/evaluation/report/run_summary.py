@@ -26,8 +26,6 @@ from kornia_learnnorm.metrics.bootstrap import PairedDifference, paired_bootstra
 from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, THRESHOLDS
 
-__all__ = ["robust_summary", "run_summary"]
-
 # The errors of methods, the most telling first: what is known of the first that is known decides.
 ERRORS = {
     "truth": "error on the ground-truth inliers",

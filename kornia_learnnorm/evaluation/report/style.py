@@ -18,25 +18,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "INK",
-    "ReportPicture",
-    "is_learned",
-    "line_style",
-    "make_figure",
-    "make_picture",
-    "method_colors",
-    "report_style",
-]
-
 INK = "#010203"  # placeholder that make_picture replaces by the text colour of the page
 # Legible on white and on black; after P. Tol's and Okabe and Ito's palettes for colour blindness.
 HUES = "8b8b8b e69f00 2b9fd9 18a57a d55e00 cc79a7 a0714f 7a6ff0 b8a400 c2443f 5f8f2f"
 WIDTH = 8.0  # inches
 SETTINGS: dict[str, Any] = {
-    "svg.fonttype": "none",
+    **{f"{key}.color": INK for key in ("text", "xtick", "ytick", "grid")},
+    **{f"axes.{key}color": INK for key in ("label", "edge")},
+    **{f"axes.spines.{side}": False for side in ("top", "right")},
+    **{f"{key}.facecolor": "none" for key in ("figure", "axes")},
+    "axes.grid": True,
+    "grid.alpha": 0.15,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
     "font.size": 10,
     "font.family": "sans-serif",
+    "svg.fonttype": "none",
     "svg.hashsalt": "report",
 }
 
@@ -75,16 +72,8 @@ def line_style(name: str) -> str:
 
 def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, list[Axes]]:
     """Return a figure of eight inches with axes row by row; call it inside :func:`report_style`."""
-    figure = import_matplotlib().figure.Figure(figsize=(WIDTH, height), layout="constrained", facecolor="none")
-    axes = [figure.add_subplot(rows, columns, place + 1, facecolor="none") for place in range(rows * columns)]
-    for one in axes:
-        one.grid(color=INK, alpha=0.15, linewidth=0.6)
-        one.tick_params(colors=INK, which="both")
-        one.xaxis.label.set_color(INK)
-        one.yaxis.label.set_color(INK)
-        one.spines[["top", "right"]].set_visible(False)
-        one.spines[["left", "bottom"]].set_color(INK)
-    return figure, axes
+    figure = import_matplotlib().figure.Figure(figsize=(WIDTH, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False).flatten().tolist()
 
 
 def make_picture(figure: Figure, name: str, title: str, text: str, legend: bool = True) -> ReportPicture:
@@ -94,8 +83,7 @@ def make_picture(figure: Figure, name: str, title: str, text: str, legend: bool 
         for axes in figure.axes:
             handles, labels = axes.get_legend_handles_labels()
             entries |= dict(zip(labels, handles, strict=True))
-        where: dict[str, Any] = {"loc": "outside upper center", "ncols": 5, "frameon": False, "labelcolor": INK}
-        figure.legend([*entries.values()], [*entries], **where)
+        figure.legend([*entries.values()], [*entries], loc="outside upper center", ncols=5)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["CALIBRATED", "PEERS", "Peer", "PeerPackage", "find_peer", "peer_version"]
-
 Array = NDArray[np.float64]
 Sizes = NDArray[np.int32]
 Peer = Callable[..., Any]

@@ -23,19 +23,6 @@ from kornia_learnnorm.pretrained import weights_digest
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 
-__all__ = [
-    "DEFAULT_ESTIMATORS",
-    "TRUTH",
-    "Estimate",
-    "Estimator",
-    "EvaluatedPair",
-    "estimator_names",
-    "find_estimator",
-    "identify_estimator",
-    "is_slow",
-    "run_estimator",
-]
-
 TRUTH = "ground-truth"
 MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network
 DEFAULTS = "RANSAC"  # RANSAC with its default options

@@ -46,18 +46,6 @@ from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_sh
 from kornia_learnnorm.metrics.poses import rotation_error, translation_error
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, MAX_FILTERED, PROTOCOLS, THRESHOLDS
 
-__all__ = [
-    "DEFAULT_OPTIONS",
-    "RobustCell",
-    "RobustRun",
-    "estimate_path",
-    "even_pairs",
-    "measure",
-    "read_robust",
-    "record_robust",
-    "shuffled_pair",
-]
-
 DEFAULT_OPTIONS = {
     "pairs": 48,  # image pairs of each store; 0 for all
     "seeds": 5,  # runs on each pair
@@ -98,26 +86,11 @@ def record_robust(
     redo: Sequence[str] = (),
     command: str = "",
 ) -> list[str]:
-    """Compute the missing results of a run, with a progress bar.
+    """Compute the missing results of a run; return the estimators that were left out: their packages are not installed.
 
-    An estimator whose package is not installed is left out, and the run records that.
-
-    Args:
-        folder: the run, created if it does not exist.
-        stores: paths of the stores by their names in tables.
-        estimators: names for :func:`~kornia_learnnorm.evaluation.robust.robust_estimators.find_estimator`.
-        options: options that differ from :data:`DEFAULT_OPTIONS`.
-        redo: estimators whose results are computed again.
-        command: the command line that asks for it, for the report.
-
-    Returns:
-        the names of the estimators that were left out, since their packages are not installed.
-
-    Raises:
-        ValueError: if the folder holds a run of other options, an option, a store or an estimator is wrong, an existing
-            file is damaged, or, at the end, if an estimator has failed.
-        OSError: if a file is missing or cannot be written, or another process writes this run.
-
+    ``stores`` are paths by their names in tables, ``estimators`` names for ``find_estimator``, ``options`` those that
+    differ from ``DEFAULT_OPTIONS``. The results of ``redo`` are computed again. ``command`` is the command line that
+    asks for it, for the report. The errors are those of ``record_run``.
     """
     folder, options = Path(folder), {**DEFAULT_OPTIONS, **(options or {})}
     for name, value in options.items():
@@ -229,18 +202,7 @@ def estimate_path(folder: Path, store: str, protocol: str, threshold: float, nam
 
 
 def read_robust(folder: str | Path) -> RobustRun | None:
-    """Read a run of robust estimation.
-
-    Args:
-        folder: the folder that ``learnnorm robust --out`` wrote.
-
-    Returns:
-        the run; None where the folder has none.
-
-    Raises:
-        ValueError: if another version of the package made it, or a file is damaged.
-
-    """
+    """Read a run of robust estimation, None where the folder has none; raise ValueError if it is damaged."""
     folder = Path(folder)
     about, missing = read_section(folder, "robust"), list[str]()
     if about is None:

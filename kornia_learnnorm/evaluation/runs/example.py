@@ -15,8 +15,6 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["EXAMPLE", "SWEEP", "TRIALS", "random_pair", "sweep"]
-
 # Arrays in the files; read by name, so that a damaged file is recognised before it is used.
 EXAMPLE = ("store", "pair", "names", "points1", "points2", "truth", "F", "size")
 SWEEP = ("size", "own", "truth")

@@ -14,8 +14,6 @@ from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.metrics.poses import rotation_error
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
-__all__ = ["MOTIONS", "PAIRS", "ground_truth_inliers", "median_distance", "pair_matches", "pair_motions"]
-
 MOTIONS = ("rotation", "forward", "parallax", "inliers")
 PAIRS = (*MOTIONS, "names")  # arrays in the file of a store's pairs
 MIN_INLIERS = 16  # a pair with fewer has no ground-truth inliers to measure with

@@ -21,8 +21,6 @@ from kornia_learnnorm.metrics.poses import rotation_error, translation_error
 from kornia_learnnorm.normalizers.contract import normalizing_transforms
 from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
 
-__all__ = ["AGREEMENT", "DIAGNOSTICS", "ERRORS", "SampleOptions", "consensus", "predict"]
-
 # What a run keeps of each sample, by name.
 DIAGNOSTICS = ("condition_number", "rho", "distance1", "distance2", "rank2_share")  # in the order of Diagnostics
 ERRORS = ("F_mat", "own", "heldout", "truth", "rotation_error", "translation_error", *DIAGNOSTICS)

@@ -39,8 +39,6 @@ from kornia_learnnorm.evaluation.runs.results_store import (
 )
 from kornia_learnnorm.protocol import PROTOCOLS
 
-__all__ = ["Run", "RunCell", "read_run", "record_run", "temporary_run"]
-
 SAMPLES = ("pair", "plain_residual")  # arrays in the file of samples
 
 
@@ -73,10 +71,7 @@ class Run:
 
 
 def temporary_run(stores: Mapping[str, str], methods: Sequence[str], options: SampleOptions | None = None) -> Run:
-    """Return a run that is not kept, without shares of inliers and errors by the number of correspondences.
-
-    The arguments and errors are those of :func:`record_run`.
-    """
+    """Return a run that is not kept, without shares of inliers and errors by the number of correspondences."""
     with TemporaryDirectory(prefix="learnnorm-") as folder:
         record_run(folder, stores, methods, options, complete=False)
         return read_run(folder, complete=False)
@@ -90,25 +85,15 @@ def record_run(
     complete: bool = True,
     command: str = "",
 ) -> str:
-    """Compute what a run does not have yet, with a progress bar.
+    """Compute what a run does not have yet; return why there is no example of a pair, empty where there is one.
 
-    Args:
-        folder: the run, made if missing.
-        stores: paths of the stores by the names that tables give them.
-        methods: names for :func:`~kornia_learnnorm.evaluation.methods.find_method`.
-        options: how the samples are drawn.
-        complete: compute everything that a report shows: also the shares of inliers, F1 and, for one pair, the errors
-            by the number of correspondences.
-        command: the command line that asks for it, for the report.
+    ``stores`` are paths by the names that tables give them, ``methods`` names for ``find_method``. A run that
+    is ``complete`` has all that a report shows: also the shares of inliers, F1 and, for one pair, the errors by the
+    number of correspondences. ``command`` is the command line that asks for it, for the report.
 
-    Returns:
-        why there is no example of a pair; empty where there is one or none was wanted.
-
-    Raises:
-        ValueError: if the folder holds a run of other options, a store or a method is wrong, a file is damaged, or, at
-            the end, if a method has failed.
-        OSError: if a file is missing or cannot be written, or another process writes this run.
-
+    A ValueError tells that the folder holds a run of other options, a store or a method is wrong, a file is damaged,
+    or, at the end, that a method has failed; an OSError that a file is missing or cannot be written, or that another
+    process writes this run.
     """
     options = SampleOptions() if options is None else options
     folder, names = Path(folder), short_names(methods)
@@ -202,17 +187,7 @@ def _record_example(folder: Path, stores: Mapping[str, CorrespondenceStore], see
 
 
 def read_run(folder: str | Path, complete: bool = True) -> Run:
-    """Read what has been computed of a run.
-
-    Args:
-        folder: the folder that ``learnnorm evaluate --out`` wrote.
-        complete: as for :func:`record_run`.
-
-    Raises:
-        FileNotFoundError: if the folder holds no run, or a file that others depend on is missing.
-        ValueError: if another version of the package made it, or a file is damaged.
-
-    """
+    """Read what there is of a run; raise FileNotFoundError for a folder without one, ValueError if it is damaged."""
     folder = Path(folder)
     about, missing = read_section(folder, "evaluate"), list[str]()
     if about is None:

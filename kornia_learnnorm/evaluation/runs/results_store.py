@@ -26,21 +26,6 @@ from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import atomic_write, exclusive, write_text
 from kornia_learnnorm.optional import import_extra
 
-__all__ = [
-    "About",
-    "Arrays",
-    "Job",
-    "begin_section",
-    "file_name",
-    "once",
-    "read_arrays",
-    "read_section",
-    "record",
-    "result_files",
-    "run_folder",
-    "write_arrays",
-]
-
 FORMAT = 4  # of the folder; runs of another format are refused
 # Parts of a section that may grow: what each is, by its name. The second are its methods.
 JOINED = {"evaluate": ("stores", "methods", "trained_on", "versions"), "robust": ("stores", "estimators", "versions")}
@@ -80,18 +65,9 @@ def run_folder(folder: Path) -> Iterator[None]:
 
 
 def record(folder: Path, section: str, jobs: Iterable[Job], total: int, known: Collection[str]) -> str:
-    """Do the jobs whose files are missing, with a progress bar.
+    """Do the jobs whose files are missing, with a bar of ``total`` jobs; return why methods failed, empty if none has.
 
-    Args:
-        folder: the run.
-        section: ``evaluate`` or ``robust``.
-        jobs: made one after the other.
-        total: number of jobs, for the bar.
-        known: methods that stay in the run even if they fail: those that it had before.
-
-    Returns:
-        why methods have failed; empty if none has.
-
+    Methods that failed leave the run, unless they are ``known``: the run had them before.
     """
     tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
     failed = dict[str, str]()
@@ -152,18 +128,9 @@ def begin_section(
 ) -> About:
     """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
 
-    Args:
-        folder: the run.
-        section: ``evaluate`` or ``robust``.
-        stores: by their names.
-        about: the options and, by the names in ``JOINED``, what each method or estimator is, None for one whose package
-            is not installed.
-        redo: methods or estimators whose descriptions may change.
-        command: noted with the date of today.
-
-    Returns:
-        what the section was before; empty for a new one.
-
+    ``about`` has the options and, by the names in ``JOINED``, what each method or estimator is, None for one whose
+    package is not installed. The descriptions of ``redo`` may change. ``command`` is noted with the date of today.
+    Return what the section was before, empty for a new one.
     """
     about = about | {
         "stores": {

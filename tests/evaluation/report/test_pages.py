@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import json
 import re
+import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -24,15 +28,36 @@ from kornia_learnnorm.evaluation.tables import Table
 matplotlib = pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 
 
-def test_files(copied, capsys):
-    assert main(["report", str(copied)]) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("scenes, filtered (")
-    assert "Better than Hartley" in printed
-    text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
-    for name in re.findall(r"\]\(([\w-]+\.svg)\)", text):
-        ElementTree.parse(copied / name)
-    assert page.count("<svg") == text.count(".svg)") == 7
+class Written(NamedTuple):
+    """A report in all its forms."""
+
+    folder: Path
+    text: str  # report.md
+    page: str  # report.html
+    printed: str  # in a wide terminal
+    tables: dict  # of --json, rows by title
+
+
+@pytest.fixture(scope="module")
+def written(run, tmp_path_factory):
+    """The report of a run, not to be changed."""
+    folder = shutil.copytree(run, tmp_path_factory.mktemp("reports") / "run")
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setenv("COLUMNS", "300")
+        assert main(["report", str(folder), "--json", str(folder / "tables.json")]) == 0
+    tables = {table["title"]: table["rows"] for table in json.loads((folder / "tables.json").read_text())["tables"]}
+    texts = ((folder / name).read_text() for name in ("report.md", "report.html"))
+    return Written(folder, *texts, printed.getvalue(), tables)
+
+
+def test_files(written):
+    assert written.printed.startswith("scenes, filtered (")
+    assert "Better than Hartley" in written.printed
+    for name in re.findall(r"\]\(([\w-]+\.svg)\)", written.text):
+        ElementTree.parse(written.folder / name)
+    page = written.page
+    assert page.count("<svg") == written.text.count(".svg)") == 7
     assert not re.findall(r'(?:src|href)="(?!#)', page)  # nothing from elsewhere
     identifiers = re.findall(r'\bid="([^"]+)"', page)
     assert len(identifiers) == len(set(identifiers))
@@ -64,18 +89,16 @@ def test_lines_of_learned_methods_are_dashed(name, style):
     assert line_style("module:Name") == "-"
 
 
-def test_the_answer_comes_first_then_contents_date_and_command(copied, methods):
-    write_report(copied)
-    text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
-    titles = re.findall(r"^## (.+)$", text, flags=re.MULTILINE)
+def test_the_answer_comes_first_then_contents_date_and_command(written):
+    titles = re.findall(r"^## (.+)$", written.text, flags=re.MULTILINE)
     assert titles[:3] == ["Summary", "Contents", "Data and methods"]
-    contents = re.findall(r"^- \[(.+)\]\(#(.+)\)$", text, flags=re.MULTILINE)
+    contents = re.findall(r"^- \[(.+)\]\(#(.+)\)$", written.text, flags=re.MULTILINE)
     assert [title for title, _ in contents] == titles[2:]
     for _, anchor in contents:
-        assert f'<h2 id="{anchor}">' in page
-    ((command, date),) = json.loads((copied / "run.json").read_text())["evaluate"]["commands"].items()
+        assert f'<h2 id="{anchor}">' in written.page
+    ((command, date),) = json.loads((written.folder / "run.json").read_text())["evaluate"]["commands"].items()
     assert command.startswith("learnnorm evaluate ")
-    assert f"{date}: `{command}`" in text
+    assert f"{date}: `{command}`" in written.text
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", date)
 
 
@@ -119,30 +142,23 @@ def test_robust_estimators_alone_and_beside_predictions(robust_copied, robust_st
     assert re.findall(r"^## .+ \(Figure (.+)\)$", text, flags=re.MULTILINE) == ["4a", "4b", "5", "10", "11", "12"]
 
 
-def test_numbers_of_the_paper_are_only_beside_its_data(copied, capsys):
+def test_numbers_of_the_paper_are_only_beside_its_data(written):
     """The run's store is made of synthetic scenes."""
-    assert main(["report", str(copied), "--json", "-"]) == 0
-    for text in (capsys.readouterr().out, (copied / "report.md").read_text(), (copied / "report.html").read_text()):
+    for text in (written.printed, json.dumps(written.tables), written.text, written.page):
         assert not re.findall(r"Fan et al|Figure \d|Table \d", text)
 
 
-def test_no_form_of_the_report_has_the_row_of_a_method_against_itself(copied, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "300")
-    assert main(["report", str(copied)]) == 0
-    printed = capsys.readouterr().out
-    assert main(["report", str(copied), "--json", "-"]) == 0
-    tables = {table["title"]: table["rows"] for table in json.loads(capsys.readouterr().out)["tables"]}
-    text, page = (copied / "report.md").read_text(), (copied / "report.html").read_text()
+def test_no_form_of_the_report_has_the_row_of_a_method_against_itself(written):
     for name in ("Hartley", "whitening"):
         title = f"Better than {name}, filtered"
-        names = [row["method"] for row in tables[title]]
+        names = [row["method"] for row in written.tables[title]]
         assert names == [one for one in ("none", "Hartley", "whitening", "crossview") if one != name] + names[3:]
-        section = text.split(f"## {title}\n")[1].split("\n## ")[0]
+        section = written.text.split(f"## {title}\n")[1].split("\n## ")[0]
         assert re.findall(r"^\| (\S+) ", section, flags=re.MULTILINE) == ["method", *names]
-        section = page.split(f">{title}</h2>")[1].split("</table>")[0]
+        section = written.page.split(f">{title}</h2>")[1].split("</table>")[0]
         assert re.findall(r"<tr>\s*<td[^>]*>(.+?)</td>", section) == names
-        section = printed.split(title)[-1].split("└")[0]
-        assert re.findall(r"^│ (\S+) ", section, flags=re.MULTILINE)[1:] == names
+        section = written.printed.split(title)[-1].split("└")[0]
+        assert re.findall(r"^│ (\S+) ", section, flags=re.MULTILINE) == ["method", *names]
 
 
 def test_incomplete_robust_run(robust_copied):
