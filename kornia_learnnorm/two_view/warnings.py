@@ -61,8 +61,7 @@ def find_warnings(
         points1: pixels of all matches in image 1, (N, 2), float64.
         points2: pixels of all matches in image 2, (N, 2).
         distance: symmetric epipolar distances of the matches to the matrix, (N,), pixels.
-        off_plane: distances of the matches from the plane that explains most inliers, pixels, (N,), or None; see
-            :func:`~kornia_learnnorm.two_view.plane_distances.distances_from_plane`.
+        off_plane: distances of the matches from the plane that explains most inliers, pixels, (N,), or None.
         threshold: largest distance of an inlier, pixels.
         size2: width and height of image 2.
         angle: standard error of the pose, see :class:`~kornia_learnnorm.two_view.predicted_error.PredictedError`.
