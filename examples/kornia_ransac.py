@@ -15,7 +15,7 @@ from pairs import Pairs, load_pairs
 from torch import Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.normalizers.contract import Normalizer
+from kornia_learnnorm.normalizers.normalizer import Normalizer
 
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 

@@ -9,20 +9,16 @@ Example:
 
 """
 
-from kornia_learnnorm.estimators.eight_point import EightPoint, TwoViewEstimate
-from kornia_learnnorm.estimators.essential import EssentialRefinement, refine_essential
-from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedEstimate, StageEstimate
-from kornia_learnnorm.estimators.refinement import Refinement, refine_fundamental
+from kornia_learnnorm.estimators.linear import EightPoint, TwoViewEstimate, find_fundamental
+from kornia_learnnorm.estimators.refinement import EssentialRefinement, Refinement, refine_essential, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated, squared_loss
 from kornia_learnnorm.evaluation.diagnostics import Diagnostics, diagnose
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.geometry.distances import (
     algebraic_distance,
     sampson_distance,
-    sampson_scale,
     symmetric_epipolar_distance,
-    symmetric_scale,
 )
 from kornia_learnnorm.geometry.dlt import design_matrix, null_vector
 from kornia_learnnorm.geometry.pose import relative_pose
@@ -33,12 +29,12 @@ from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate
 from kornia_learnnorm.metrics.bootstrap import PairedDifference, bootstrap_interval, paired_bootstrap
 from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
 from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc, pose_error
-from kornia_learnnorm.normalizers.contract import PerView
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.identity import Identity
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 from kornia_learnnorm.normalizers.networks.paper import PaperNetwork
+from kornia_learnnorm.normalizers.normalizer import PerView
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
@@ -112,9 +108,7 @@ __all__ = [
     "relative_pose",
     "sample_minimal_sets",
     "sampson_distance",
-    "sampson_scale",
     "spd_transform",
     "squared_loss",
     "symmetric_epipolar_distance",
-    "symmetric_scale",
 ]

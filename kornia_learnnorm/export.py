@@ -20,11 +20,11 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
-from kornia_learnnorm.estimators.eight_point import EightPoint
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedEstimate
+from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES
-from kornia_learnnorm.normalizers.learned import FORMAT as NORMALIZER_FORMAT
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.learned_normalizer import FORMAT as NORMALIZER_FORMAT
+from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.pretrained import shipped_weights, weights_format
 

@@ -9,7 +9,7 @@ from typing import Any
 from torch import nn
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
 
 import_extra("huggingface_hub", "hub", "kornia_learnnorm.hub")

@@ -23,7 +23,7 @@ from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSe
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.files import atomic_write, short_name
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from lightning_modules.task import EstimatorTask
 
 __all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "WritePredictions"]

@@ -15,14 +15,14 @@ from torch.optim.lr_scheduler import LRScheduler
 from torchmetrics import CatMetric, MeanMetric, Metric, SumMetric
 
 from kornia_learnnorm.data.sets import MatchSets
-from kornia_learnnorm.estimators.eight_point import EightPoint
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss
 from kornia_learnnorm.metrics.better_rate import comparable
 from kornia_learnnorm.normalizers.hartley import Hartley
-from kornia_learnnorm.normalizers.learned import LearnedNormalizer
+from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.normalizers.whitening import Whitening
 from lightning_modules.schedule import one_cycle
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.estimators.linear import find_fundamental
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.normalizers.identity import Identity

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from kornia_learnnorm.data.images import Size, image_size, import_cv2, read_colour
 from kornia_learnnorm.data.synthetic.render import render_pair
-from kornia_learnnorm.estimators.fundamental import find_fundamental
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.linear import find_fundamental
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.ransac.ransac import RANSAC

@@ -5,20 +5,20 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, NoReturn
+from typing import Literal, NamedTuple, NoReturn, Self
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.eight_point import (
+from kornia_learnnorm.estimators.linear import (
     essential_matrix,
     prepare_problem,
     refuse_jit,
+    solve_in_coordinates,
     solve_undetermined,
     solve_where_determined,
 )
-from kornia_learnnorm.estimators.fundamental import solve_in_coordinates
 from kornia_learnnorm.estimators.match_features import (
     POINT_FEATURES,
     RESIDUAL_FEATURES,
@@ -27,31 +27,24 @@ from kornia_learnnorm.estimators.match_features import (
     residual_features,
 )
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
+from kornia_learnnorm.estimators.optimize import refine_unrolled
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
-from kornia_learnnorm.estimators.weighted_refinement import refine_weighted
-from kornia_learnnorm.geometry.checks import check_rank2, check_tensor, is_true, weighted_mean
-from kornia_learnnorm.geometry.distances import sampson_distance
+from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, read_condition, weighted_mean
+from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.rank2 import correct_rank2
-from kornia_learnnorm.geometry.transforms import spd_transform, transform_fundamental, unit_fundamental
-from kornia_learnnorm.normalizers.hartley import Hartley
+from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
-__all__ = ["LearnedEightPoint", "LearnedEstimate", "StageEstimate"]
+__all__ = ["LearnedEightPoint", "LearnedEstimate", "LearnedLayer", "StageEstimate"]
 
 FORMAT = "kornia_learnnorm.eight_point.v1"
-ARCHITECTURE = (
-    "width",
-    "depth",
-    "stages",
-    "learn_transforms",
-    "rank2",
-    "refine_steps",
-)  # arguments of the constructor in a file
-EARLY_STEPS = 3  # of the refinement, in all stages but the last
-MAX_EIGHT_DISTANCE = 0.01  # of the frame's unit; quadratic mean after the optimal correction of eight inliers
+EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
+MAX_MINIMAL_DISTANCE = 0.01  # of the frame's unit; quadratic mean that the best fit of `min_points` inliers leaves
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
+TRANSFORM_PARAMS = 5  # of each view's SPD transform
 
 
 class StageEstimate(NamedTuple):
@@ -64,6 +57,234 @@ class StageEstimate(NamedTuple):
 
     F_mat: Tensor
     logits: Tensor
+
+
+class LearnedLayer(nn.Module):
+    r"""Networks weigh the correspondences and choose the transforms of a model's DLT, in stages.
+
+    Args:
+        model: what the matrix is, see :class:`~kornia_learnnorm.models.contract.TwoViewModel`.
+        width: channels of the networks.
+        depth: blocks of each stage's network.
+        stages: number of stages.
+        learn_transforms: predict transforms; without, they are Hartley's of the weighted points.
+        refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
+
+    Attributes:
+        detach_stages: send no gradient from a stage into the one before and don't refine the last.
+        trained_on: names of the data that the weights were trained on.
+
+    Raises:
+        ValueError: if a number is not whole or too small, or ``learn_transforms`` is no bool.
+
+    """
+
+    model_name: str  # of the model whose files this class loads
+    architecture: tuple[str, ...] = (
+        "width",
+        "depth",
+        "stages",
+        "learn_transforms",
+        "refine_steps",
+    )  # arguments that files hold
+
+    def __init__(
+        self, model: TwoViewModel, width: int, depth: int, stages: int, learn_transforms: bool, refine_steps: int
+    ) -> None:
+        super().__init__()
+        numbers = {"width": (width, 1), "depth": (depth, 1), "stages": (stages, 1), "refine_steps": (refine_steps, 0)}
+        for name, (number, least) in numbers.items():
+            if not isinstance(number, int) or number < least:
+                raise ValueError(f"{name} must be a whole number, at least {least}, got {number!r}")
+        if not isinstance(learn_transforms, bool):
+            raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
+        self.model, self.width, self.depth, self.stages = model, width, depth, stages
+        self.learn_transforms, self.refine_steps = learn_transforms, refine_steps
+        self.networks = nn.ModuleList(
+            SetWeightingNetwork(
+                POINT_FEATURES + (RESIDUAL_FEATURES if stage else 0), width, depth, 2 * TRANSFORM_PARAMS
+            )
+            for stage in range(stages)
+        )
+        self.detach_stages = False
+        self.trained_on: tuple[str, ...] = ()
+
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        return f"learn_transforms={self.learn_transforms}, trained_on={self.trained_on}"
+
+    def forward(
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        scores: Tensor | None = None,
+    ) -> Tensor:
+        r"""Return the matrices; arguments, shapes and errors as for :meth:`LearnedEightPoint.estimate`."""
+        return self._estimate(points1, points2, weights, mask, scores)[1][-1].F_mat
+
+    def save_pretrained(self, path: str | Path) -> None:
+        """Write weights and architecture to one safetensors file, beside the target and then renamed.
+
+        Args:
+            path: the file to write.
+
+        Raises:
+            ValueError: if ``path`` does not end in ``.safetensors``.
+            OSError: if it cannot be written.
+
+        """
+        save_module(
+            path, self, FORMAT, {"model": self.model.name} | {key: getattr(self, key) for key in self.architecture}
+        )
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path = "robust-synthetic") -> Self:
+        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
+
+        Args:
+            name: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
+
+        Returns:
+            the estimator, in evaluation mode.
+
+        Raises:
+            FileNotFoundError: if there are no such weights; the message lists those that ship.
+            ValueError: if the file is not an estimator of this package or its tensors do not fit.
+
+        """
+
+        def build(path: Path, text: str) -> LearnedLayer:
+            try:
+                architecture = dict(json.loads(text))
+                model = architecture.pop("model", Fundamental.name)  # files before the name was written
+                if model != cls.model_name:
+                    raise ValueError(f"it estimates matrices of the model {model!r}, expected {cls.model_name!r}")
+                if set(architecture) != set(cls.architecture):
+                    raise ValueError(f"expected {', '.join(cls.architecture)}, got {', '.join(map(str, architecture))}")
+                check_architecture(architecture)
+                return cls(**architecture)
+            except (ValueError, TypeError, AttributeError, RuntimeError) as error:
+                raise ValueError(f"{path} describes no estimator of this version: {error}") from error
+
+        layer: Self = load_module(name, FORMAT, build)  # type: ignore[assignment]
+        return layer
+
+    def _estimate(
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, mask: Tensor | None, scores: Tensor | None
+    ) -> tuple[LinearProblem, tuple[StageEstimate, ...], Tensor]:
+        """Return the problem, what each stage gives and the final estimate, and the probabilities of inliers."""
+        problem = prepare_problem(self.model, points1, points2, weights, mask)
+        scores = None if scores is None else _check_scores(scores, points1, mask).to(problem.x1)
+
+        def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
+            return self._solve(problem, scores if scores is None or rows is None else scores[rows])
+
+        def solve_rest(problem: LinearProblem) -> tuple[Tensor, ...]:
+            number = self.stages if self.detach_stages else self.stages + 1
+            M, logits = solve_undetermined(problem, None), torch.zeros_like(problem.x1[..., 0])
+            return M.expand(number, -1, -1, -1).transpose(0, 1), logits.expand(number, -1, -1).transpose(0, 1)
+
+        M, logits = solve_where_determined(problem, solve, solve_rest)
+        stages = tuple(map(StageEstimate, M.to(points1.dtype).unbind(1), logits.to(points1.dtype).unbind(1)))
+        probability = stages[-1].logits.sigmoid()
+        if problem.weights is not None:
+            probability = torch.where(problem.weights > 0, probability, 0.0)
+        return problem, stages, probability
+
+    def _solve(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return matrices (B, S, 3, 3) and logits (B, S, N) of the stages, for sets that determine their matrix.
+
+        All but the last change of coordinates is the common frame's.
+        """
+        present = problem.present
+        frame = CommonFrame.from_points(problem.points1, problem.points2, present)
+        features, factor = match_features(frame, scores, present), None
+        found: list[tuple[Tensor, Tensor]] = []
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.detach_stages):
+            refine = _Refinement(self.model, problem, frame)
+        dtype = self.dtype
+        for network in self.networks:
+            seen = features
+            if found:
+                with torch.set_grad_enabled(torch.is_grad_enabled() and not self.detach_stages):
+                    before = refine(*found[-1], min(EARLY_STEPS, self.refine_steps))
+                    residuals, factor = residual_features(self.model, refine.x1, refine.x2, *before, present)
+                seen = torch.cat([features, residuals], -1)
+            logits, params = network(seen.to(dtype), None if present is None else present == 0)
+            logits, params = logits.to(problem.x1), params.to(problem.x1)
+            weights = logits.sigmoid() if factor is None else logits.sigmoid() * factor
+            weights = weights if problem.weights is None else weights * problem.weights
+            found.append((self._solve_weighted(frame, weights, present, params), logits))
+        if not self.detach_stages:
+            found.append(refine(*found[-1], self.refine_steps))
+        matrices, all_logits = zip(*found, strict=True)
+        T = frame.T[:, None]
+        return unit_matrix(self.model.carry(torch.stack(matrices, 1), T, T)), torch.stack(all_logits, 1)
+
+    def _solve_weighted(self, frame: CommonFrame, weights: Tensor, present: Tensor | None, params: Tensor) -> Tensor:
+        """Return the matrices of the weighted DLT with the predicted transforms, in the frame."""
+        weights = weights / weights.detach().amax(1, keepdim=True)
+        weights = weights + (MIN_WEIGHT if present is None else MIN_WEIGHT * present)
+        weighted = LinearProblem.from_points(frame.x1, frame.x2, weights, self.model)
+        if not self.learn_transforms:
+            return solve_in_coordinates(weighted, weighted.T1, weighted.T2)
+        params = torch.unflatten(BOUND * torch.tanh(params / BOUND), -1, (2, TRANSFORM_PARAMS))
+        params = torch.where(frame.swapped[:, None, None], params.flip(1), params)
+        T1, T2 = (spd_transform(params) @ torch.stack([weighted.T1, weighted.T2], 1)).unbind(1)
+        return solve_in_coordinates(weighted, T1, T2)
+
+    def __prepare_scriptable__(self) -> NoReturn:
+        """Raise a TypeError: ``torch.jit`` is not supported."""
+        refuse_jit()
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The dtype of the networks' weights."""
+        return next(self.parameters()).dtype
+
+
+class _Refinement:
+    """Robust refinement of a stage's matrices in the frame; sets of as few as possible matches are solved once."""
+
+    def __init__(self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame) -> None:
+        self.model, self.weights = model, problem.weights
+        self.x1, self.x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
+        self.minimal: Tensor | None = None
+        self.is_minimal: Tensor | None = None
+        if problem.x1.shape[1] > model.min_points and problem.weights is None:
+            return
+        self.minimal = _solve_minimal(model, problem, frame, self.x1, self.x2)
+        if problem.weights is not None:
+            self.is_minimal = ((problem.weights > 0).sum(1) <= model.min_points)[:, None, None]
+
+    def __call__(self, M: Tensor, logits: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Return a stage's matrices after so many steps, and its logits."""
+        if self.minimal is not None and self.x1.shape[-1] == self.model.min_points:
+            # The stage has no effect; through the zero, its network, scores and weights still get a gradient of zero.
+            return self.minimal + 0.0 * M, logits
+        weights = logits.sigmoid() if self.weights is None else logits.sigmoid() * self.weights
+        refined = refine_unrolled(self.model, self.x1, self.x2, M, weights, steps)
+        if self.minimal is not None and self.is_minimal is not None:
+            refined = torch.where(self.is_minimal, self.minimal, refined)
+        return refined, logits
+
+
+def _solve_minimal(model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, x1: Tensor, x2: Tensor) -> Tensor:
+    """Return the matrices, in the frame, of ``min_points`` matches; Hartley's where the best ones don't fit.
+
+    A best fit that leaves large distances is one of outliers. There the optimum of the first-order distances is, on
+    average, worse than the projection in Hartley's coordinates.
+    """
+    T1, T2 = problem.T1 @ frame.inverse, problem.T2 @ frame.inverse
+    best = model.carry(model.solve_minimal(problem), T1, T2)
+    plain = model.carry(model.constrain(problem.null_matrix), T1, T2)
+    squares = model.squares(model.residual(best.detach(), x1, x2))
+    fits = weighted_mean(squares[..., None], problem.present) < MAX_MINIMAL_DISTANCE**2
+    M = torch.where(fits[..., None], best, plain)
+    unit: Tensor = M / torch.linalg.matrix_norm(M, keepdim=True)
+    return unit
 
 
 class LearnedEstimate(NamedTuple):
@@ -87,7 +308,7 @@ class LearnedEstimate(NamedTuple):
     stages: tuple[StageEstimate, ...]
 
 
-class LearnedEightPoint(nn.Module):
+class LearnedEightPoint(LearnedLayer):
     r"""Estimate the fundamental matrix from matches with outliers in one differentiable pass.
 
     Each stage reads the correspondences and, from the second on, their distances under the matrix of the stage before.
@@ -99,7 +320,7 @@ class LearnedEightPoint(nn.Module):
     (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds an
     SPD transform and Hartley's is that of the weighted points. A few robust steps of Levenberg-Marquardt on the Sampson
     distances, weighted by :math:`\sigma(l_i)`, end each stage
-    (:func:`~kornia_learnnorm.estimators.weighted_refinement.refine_weighted`).
+    (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`).
 
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
     their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
@@ -135,6 +356,9 @@ class LearnedEightPoint(nn.Module):
 
     """
 
+    model_name = Fundamental.name
+    architecture = ("width", "depth", "stages", "learn_transforms", "rank2", "refine_steps")
+
     def __init__(
         self,
         width: int = 48,
@@ -144,39 +368,12 @@ class LearnedEightPoint(nn.Module):
         rank2: Literal["projection", "optimal"] = "projection",
         refine_steps: int = 10,
     ) -> None:
-        super().__init__()
-        check_rank2(rank2)
-        numbers = {"width": (width, 1), "depth": (depth, 1), "stages": (stages, 1), "refine_steps": (refine_steps, 0)}
-        for name, (number, least) in numbers.items():
-            if not isinstance(number, int) or number < least:
-                raise ValueError(f"{name} must be a whole number, at least {least}, got {number!r}")
-        if not isinstance(learn_transforms, bool):
-            raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
-        self.width, self.depth, self.stages = width, depth, stages
-        self.learn_transforms = learn_transforms
-        self.rank2: Literal["projection", "optimal"] = rank2
-        self.refine_steps = refine_steps
-        self.networks = nn.ModuleList(
-            SetWeightingNetwork(POINT_FEATURES + (RESIDUAL_FEATURES if stage else 0), width, depth, 10)
-            for stage in range(stages)
-        )
-        self.detach_stages = False
-        self.trained_on: tuple[str, ...] = ()
+        super().__init__(Fundamental(rank2), width, depth, stages, learn_transforms, refine_steps)
+        self.rank2 = rank2
 
     def extra_repr(self) -> str:
         """Return the parameters."""
         return f"learn_transforms={self.learn_transforms}, rank2={self.rank2!r}, trained_on={self.trained_on}"
-
-    def forward(
-        self,
-        points1: Tensor,
-        points2: Tensor,
-        weights: Tensor | None = None,
-        mask: Tensor | None = None,
-        scores: Tensor | None = None,
-    ) -> Tensor:
-        r"""Return the fundamental matrices; arguments, shapes and errors as for :meth:`estimate`."""
-        return self.estimate(points1, points2, weights=weights, mask=mask, scores=scores).F_mat
 
     def estimate(
         self,
@@ -214,23 +411,9 @@ class LearnedEightPoint(nn.Module):
                 weight is negative, a score is outside of 0 to 1, or only one camera is given or one is not invertible.
 
         """
-        problem = prepare_problem(points1, points2, weights, mask, K1, K2)
-        scores = None if scores is None else _check_scores(scores, points1, mask).to(problem.x1)
-
-        def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
-            found = self._solve(problem, scores if scores is None or rows is None else scores[rows])
-            return tuple(value for stage in found for value in stage)
-
-        def solve_rest(problem: LinearProblem) -> tuple[Tensor, ...]:
-            number = self.stages if self.detach_stages else self.stages + 1
-            return (solve_undetermined(problem, Hartley()), torch.zeros_like(problem.x1[..., 0])) * number
-
-        flat = [value.to(points1.dtype) for value in solve_where_determined(problem, solve, solve_rest)]
-        stages = tuple(StageEstimate(*flat[i : i + 2]) for i in range(0, len(flat), 2))
-        F_mat, logits = stages[-1]
-        probability = logits.sigmoid()
-        if problem.weights is not None:
-            probability = torch.where(problem.weights > 0, probability, 0.0)
+        problem, stages, probability = self._estimate(points1, points2, weights, mask, scores)
+        check_cameras(K1, K2, points1.shape[0])
+        F_mat = stages[-1].F_mat
         E_mat = essential_matrix(F_mat, K1, K2)
         return LearnedEstimate(F_mat, E_mat, problem.determined, problem.gap, probability, stages[: self.stages])
 
@@ -265,124 +448,6 @@ class LearnedEightPoint(nn.Module):
         points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
         return self.estimate(points1, points2, mask=mask, scores=weights, K1=K1, K2=K2)
 
-    def save_pretrained(self, path: str | Path) -> None:
-        """Write weights and architecture to one safetensors file, beside the target and then renamed.
-
-        Args:
-            path: the file to write.
-
-        Raises:
-            ValueError: if ``path`` does not end in ``.safetensors``.
-            OSError: if it cannot be written.
-
-        """
-        save_module(path, self, FORMAT, {key: getattr(self, key) for key in ARCHITECTURE})
-
-    @classmethod
-    def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:
-        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
-
-        Args:
-            name: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
-
-        Returns:
-            the estimator, in evaluation mode.
-
-        Raises:
-            FileNotFoundError: if there are no such weights; the message lists those that ship.
-            ValueError: if the file is not an estimator of this package or its tensors do not fit.
-
-        """
-
-        def build(path: Path, text: str) -> LearnedEightPoint:
-            try:
-                architecture = dict(json.loads(text))
-                if set(architecture) != set(ARCHITECTURE):
-                    raise ValueError(f"expected {', '.join(ARCHITECTURE)}, got {', '.join(map(str, architecture))}")
-                check_architecture(architecture)
-                return cls(**architecture)
-            except (ValueError, TypeError, AttributeError, RuntimeError) as error:
-                raise ValueError(f"{path} describes no estimator of this version: {error}") from error
-
-        return load_module(name, FORMAT, build)
-
-    def _solve(self, problem: LinearProblem, scores: Tensor | None) -> list[StageEstimate]:
-        """Return what the stages give for sets that determine their matrix."""
-        given = problem.weights
-        present = None if given is None else (given > 0).to(problem.x1)
-        absent = None if given is None else given <= 0
-        frame = CommonFrame.from_points(problem.points1, problem.points2, present)
-        features = match_features(frame, scores, present)
-        factor: Tensor | None = None
-        found: list[StageEstimate] = []
-        for network in self.networks:
-            seen = features
-            if found:
-                with torch.set_grad_enabled(torch.is_grad_enabled() and not self.detach_stages):
-                    before = self._refine(problem, frame, found[-1], min(EARLY_STEPS, self.refine_steps))
-                    residuals, factor = residual_features(frame, *before, present)
-                seen = torch.cat([features, residuals], -1)
-            logits, params = network(seen.to(self.dtype), absent)
-            logits, params = logits.to(problem.x1), params.to(problem.x1)
-            weights = logits.sigmoid() if factor is None else logits.sigmoid() * factor
-            weights = weights if given is None else weights * given
-            F_mat = self._solve_weighted(problem, weights, params, frame.swapped)
-            found.append(StageEstimate(F_mat, logits))
-        return found if self.detach_stages else [*found, self._refine(problem, frame, found[-1], self.refine_steps)]
-
-    def _refine(self, problem: LinearProblem, frame: CommonFrame, stage: StageEstimate, steps: int) -> StageEstimate:
-        """Return a stage's matrices after robust refinement; for eight matches, those of :func:`_solve_eight`."""
-        given, x1, x2 = problem.weights, frame.x1, frame.x2
-        if x1.shape[1] == 8:
-            # The stage has no effect; through the zero, its network, scores and weights still get a gradient of zero.
-            return StageEstimate(_solve_eight(problem, frame) + 0.0 * stage.F_mat, stage.logits)
-        weights = stage.logits.sigmoid() if given is None else stage.logits.sigmoid() * given
-        F_frame = transform_fundamental(stage.F_mat, frame.inverse, frame.inverse)
-        x1, x2 = convert_points_to_homogeneous(x1), convert_points_to_homogeneous(x2)
-        refined = refine_weighted(x1, x2, F_frame, weights, steps)
-        F_mat = unit_fundamental(transform_fundamental(refined, frame.T, frame.T))
-        if given is not None:
-            eight = ((given > 0).sum(1) <= 8)[:, None, None]
-            F_mat = torch.where(eight, _solve_eight(problem, frame), F_mat)
-        return StageEstimate(F_mat, stage.logits)
-
-    def _solve_weighted(self, problem: LinearProblem, weights: Tensor, params: Tensor, swapped: Tensor) -> Tensor:
-        """Return the matrices of the weighted eight-point algorithm with the predicted transforms."""
-        weights = weights / weights.detach().amax(1, keepdim=True)
-        weights = weights + MIN_WEIGHT * (1.0 if problem.weights is None else (problem.weights > 0).to(weights))
-        weighted = LinearProblem.from_points(problem.points1, problem.points2, weights)
-        if not self.learn_transforms:
-            return solve_in_coordinates(weighted, weighted.T1, weighted.T2, self.rank2)
-        first, second = (BOUND * torch.tanh(params / BOUND)).chunk(2, -1)
-        params1 = torch.where(swapped[:, None], second, first)
-        params2 = torch.where(swapped[:, None], first, second)
-        T1, T2 = spd_transform(params1) @ weighted.T1, spd_transform(params2) @ weighted.T2
-        return solve_in_coordinates(weighted, T1, T2, self.rank2)
-
-    def __prepare_scriptable__(self) -> NoReturn:
-        """Raise a TypeError: ``torch.jit`` is not supported."""
-        refuse_jit()
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The dtype of the networks' weights."""
-        return next(self.parameters()).dtype
-
-
-def _solve_eight(problem: LinearProblem, frame: CommonFrame) -> Tensor:
-    """Return the optimal corrections of the null matrices of eight matches; Hartley's where they don't fit.
-
-    A correction that leaves large distances is one of outliers. There the optimum of the first-order distances is, on
-    average, worse than the projection in Hartley's coordinates.
-    """
-    corrected = correct_rank2(problem, problem.null_matrix)
-    projected = solve_in_coordinates(problem, problem.T1, problem.T2)
-    present = None if problem.weights is None else (problem.weights > 0).to(problem.x1)
-    F_frame = transform_fundamental(corrected.detach(), frame.inverse, frame.inverse)
-    square = sampson_distance(frame.x1, frame.x2, F_frame).square()
-    fits = weighted_mean(square[..., None], present) < MAX_EIGHT_DISTANCE**2
-    return torch.where(fits[..., None], corrected, projected)
-
 
 def _check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor:
     """Return the scores, zero where masked; raise a clear error for scores outside of 0 to 1 or of a wrong shape."""
@@ -390,7 +455,7 @@ def _check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tenso
     if scores.shape != points1.shape[:-1]:
         raise ValueError(f"scores must have shape {[*points1.shape[:-1]]}, got {[*scores.shape]}")
     scores = scores if mask is None else torch.where(mask, scores, 0.0)
-    if is_true(~((scores >= 0) & (scores <= 1)).all()):
+    if read_condition(~((scores >= 0) & (scores <= 1)).all()):
         low, high = scores.aminmax()
         raise ValueError(f"scores must be between 0 and 1, got {low.item():g} to {high.item():g}")
     return scores

@@ -9,19 +9,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import safe_divisor, weighted_mean
-from kornia_learnnorm.geometry.distances import line_norms
-from kornia_learnnorm.geometry.transforms import affine_transform, transform_fundamental, transform_points
+from kornia_learnnorm.models.contract import TwoViewModel
 
 __all__ = ["POINT_FEATURES", "RESIDUAL_FEATURES", "CommonFrame", "masked_median", "match_features", "residual_features"]
 
 POINT_FEATURES, RESIDUAL_FEATURES = 9, 5  # numbers of a correspondence
 RESIDUAL_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
 MIN_PROBABILITY = 1e-3  # added to the probabilities of inliers in a mean
-LINE_FLOOR = 0.3  # of the mean norm of a line's normal, added to each, or points near an epipole outweigh all others
 
 
 class CommonFrame(NamedTuple):
@@ -47,21 +44,23 @@ class CommonFrame(NamedTuple):
 
         The view whose points spread less comes first: a camera that moves forward sees them spread.
         """
-        mean1, mean2 = weighted_mean(points1, present), weighted_mean(points2, present)
-        origin = (mean1 + mean2) / 2
-        radius = (_mean_distance(points1, origin, present) + _mean_distance(points2, origin, present)) / 2
-        radius = safe_divisor(radius)[:, None]
-        eye = torch.eye(2).to(points1)
-        T = affine_transform(eye / radius, origin)
-        inverse = affine_transform(eye * radius, -origin / radius[:, 0])
-        spreads = (_mean_distance(points1, mean1, present), _mean_distance(points2, mean2, present))
-        swapped = spreads[0].detach() > spreads[1].detach()
-        return cls(transform_points(points1, T), transform_points(points2, T), T, inverse, swapped[:, 0])
-
-
-def _mean_distance(points: Tensor, origin: Tensor, present: Tensor | None) -> Tensor:
-    """Return the mean distance (B, 1) of the points (B, N, 2) that count from an origin (B, 2)."""
-    return weighted_mean((points - origin[:, None]).norm(dim=-1, keepdim=True), present)
+        points = torch.stack([points1, points2], 1)
+        share = None if present is None else (present / safe_divisor(present.sum(-1, keepdim=True)))[:, None]
+        mean = points.mean(2) if share is None else (points * share[..., None]).sum(2)
+        origin = mean.mean(1)
+        from_origin, from_mean = (points - origin[:, None, None]).norm(dim=-1), (points - mean[:, :, None]).norm(dim=-1)
+        distances = torch.stack([from_origin, from_mean])
+        distances = distances.mean(-1) if share is None else (distances * share).sum(-1)
+        radius = distances[0].mean(1)
+        radius = radius + (radius == 0)
+        one, zero = torch.ones_like(radius), torch.zeros_like(radius)
+        x, y = origin.unbind(-1)
+        entries = [one / radius, zero, -x / radius, zero, one / radius, -y / radius, zero, zero, one]
+        inverse = [radius, zero, x, zero, radius, y, zero, zero, one]
+        T, back = torch.unflatten(torch.stack([torch.stack(entries, -1), torch.stack(inverse, -1)]), -1, (3, 3))
+        x1, x2 = ((points - origin[:, None, None]) / radius[:, None, None, None]).unbind(1)
+        swapped = distances[1, :, 0].detach() > distances[1, :, 1].detach()
+        return cls(x1, x2, T, back, swapped)
 
 
 def match_features(frame: CommonFrame, scores: Tensor | None, present: Tensor | None) -> Tensor:
@@ -86,29 +85,32 @@ def match_features(frame: CommonFrame, scores: Tensor | None, present: Tensor | 
 
 
 def residual_features(
-    frame: CommonFrame, F_mat: Tensor, logits: Tensor, present: Tensor | None
+    model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, logits: Tensor, present: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     r"""Return the features of correspondences under a matrix, :math:`(B, N, 5)`, and gradient factors, :math:`(B, N)`.
 
-    The features are the Sampson distance, its ratios to the median and to the geometric mean over the inliers, and the
-    gradient factor, all as logarithms, and the logit before. The mean is weighted by the probabilities of the logits.
+    The features are the distance, its ratios to the median and to the geometric mean over the inliers, and the gradient
+    factor, all as logarithms, and the logit before. The mean is weighted by the probabilities of the logits.
 
-    The gradient factor :math:`1 / (\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2)` turns squared algebraic residuals
-    into squared Sampson distances; its median is one.
+    The gradient factor turns squared algebraic residuals into squared distances; its median is one.
+
+    Args:
+        model: the model of the matrices.
+        x1: homogeneous points of the first view in the frame, :math:`(B, 3, N)`.
+        x2: homogeneous points of the second view in the frame.
+        M: matrices in the frame, :math:`(B, 3, 3)`.
+        logits: logits of the stage before, :math:`(B, N)`.
+        present: one for correspondences that count, zero for others, :math:`(B, N)`; None where all count.
+
     """
-    x1, x2 = convert_points_to_homogeneous(frame.x1), convert_points_to_homogeneous(frame.x2)
-    F = transform_fundamental(F_mat, frame.inverse, frame.inverse)
-    F = F / torch.linalg.matrix_norm(F, keepdim=True)
-    norm1, norm2 = line_norms(x1, x2, F, present, floor=LINE_FLOOR)
-    factor = 1 / (norm1.square() + norm2.square())
-    residual = (x2 * (x1 @ F.mT)).sum(-1).square() * factor
-    distance = (residual + RESIDUAL_FLOOR**2).log()[..., None] / 2
+    squares, factor = model.robust_distance(M / torch.linalg.matrix_norm(M, keepdim=True), x1, x2, present)
+    distance = (squares + RESIDUAL_FLOOR**2).log()[..., None] / 2
     factor = factor / masked_median(factor[..., None], present)[..., 0]
     relative = distance - masked_median(distance, present)
-    probability = logits.to(F).sigmoid() + MIN_PROBABILITY
+    probability = logits.to(M).sigmoid() + MIN_PROBABILITY
     among_inliers = weighted_mean(distance, probability if present is None else probability * present)[:, None]
     features = [distance / 2 + 3, relative / 2, (distance - among_inliers) / 2, factor.log()[..., None]]
-    return torch.cat([*features, logits.to(F)[..., None] / 4], -1), factor
+    return torch.cat([*features, logits.to(M)[..., None] / 4], -1), factor
 
 
 def masked_median(values: Tensor, present: Tensor | None) -> Tensor:

@@ -1,27 +1,26 @@
-r"""Non-linear refinement of fundamental matrices: Levenberg-Marquardt on distances in pixels, batched.
-
-Matrices move on the manifold of :mod:`~kornia_learnnorm.geometry.manifold`, in coordinates that are Hartley's up to the
-scale of homogeneous vectors: pixels from the centroid, and a third coordinate as large as they are. Distances in them
-are those in pixels.
-"""
+r"""Non-linear refinement of fundamental and essential matrices on distances in pixels, by Levenberg-Marquardt."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Generic, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
+from kornia_learnnorm.estimators.optimize import RobustCost, attach_gradient, minimize
 from kornia_learnnorm.estimators.robust_losses import Loss, squared_loss
-from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, solve_dtype
-from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
-from kornia_learnnorm.geometry.manifold import Rank2, State, decompose, retract
-from kornia_learnnorm.geometry.transforms import hartley_transform, transform_fundamental, unit_fundamental
+from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, check_matrices, solve_dtype
+from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.geometry.problem import hartley_transform
+from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.essential import Essential
+from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["Optimum", "Refinement", "check_options", "minimize", "refine_fundamental"]
+__all__ = ["EssentialRefinement", "Refinement", "refine_essential", "refine_fundamental"]
+
+Distance = Literal["sampson", "symmetric"]
 
 
 class Refinement(NamedTuple):
@@ -30,11 +29,31 @@ class Refinement(NamedTuple):
     Attributes:
         F_mat: fundamental matrices of rank 2 and unit Frobenius norm, (B, 3, 3).
         cost_before: weighted sum of the losses in square pixels at the given matrices, projected to rank 2, (B,).
-        cost: the same at ``F_mat``, never larger, (B,).
+        cost: weighted sum of the losses at ``F_mat``, never larger, (B,).
         iterations: steps tried, (B,) int64.
         converged: whether the gradient vanishes, up to ``tolerance`` of what its terms could sum to, (B,) bool.
     """
 
+    F_mat: Tensor
+    cost_before: Tensor
+    cost: Tensor
+    iterations: Tensor
+    converged: Tensor
+
+
+class EssentialRefinement(NamedTuple):
+    """Refined essential matrices and how they were reached.
+
+    Attributes:
+        E_mat: essential matrices of unit Frobenius norm, singular values (s, s, 0), (B, 3, 3).
+        F_mat: fundamental matrices of unit Frobenius norm of the same poses, for pixels, (B, 3, 3).
+        cost_before: weighted sum of the losses in square pixels at the nearest essential matrices to those given, (B,).
+        cost: weighted sum of the losses at ``E_mat``, never larger, (B,).
+        iterations: steps tried, (B,) int64.
+        converged: whether the gradient vanishes, up to ``tolerance`` of what its terms could sum to, (B,) bool.
+    """
+
+    E_mat: Tensor
     F_mat: Tensor
     cost_before: Tensor
     cost: Tensor
@@ -47,7 +66,7 @@ def refine_fundamental(
     points2: Tensor,
     F_mat: Tensor,
     weights: Tensor | None = None,
-    distance: Literal["sampson", "symmetric"] | DistanceScale = "sampson",
+    distance: Distance = "sampson",
     loss: Loss = squared_loss,
     max_iterations: int = 50,
     tolerance: float = 1e-7,
@@ -72,8 +91,7 @@ def refine_fundamental(
             Hartley's coordinates.
         weights: optional non-negative weights of the losses, :math:`(B, N)` or :math:`(1, N)` as the points; zero means
             absent.
-        distance: the distance :math:`d`: ``"sampson"``, ``"symmetric"`` (Fan et al., Eq. 7), or a function that returns
-            :math:`g` and its derivatives such as :func:`~kornia_learnnorm.sampson_scale`.
+        distance: the distance :math:`d`: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
         loss: :math:`\rho` of squared distances: :func:`~kornia_learnnorm.estimators.robust_losses.squared_loss`,
             :class:`~kornia_learnnorm.Huber`, :class:`~kornia_learnnorm.Cauchy`,
             :class:`~kornia_learnnorm.GemanMcClure` or :class:`~kornia_learnnorm.Truncated`.
@@ -104,30 +122,107 @@ def refine_fundamental(
         True
 
     """
-    check_correspondences(points1, points2, weights)
-    check_fundamental(F_mat, F_mat if len(points1) == 1 else points1)
-    check_options(loss, max_iterations, tolerance)
-    dtype = solve_dtype(points1.device)
-    x1, x2 = points1.to(dtype), points2.to(dtype)
-    w = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)
+    model = Fundamental(distance=distance)
+    _check(points1, points2, weights, "F_mat", F_mat, model.min_points, loss, max_iterations, tolerance)
+    cost, T1, T2 = _cost(model, points1, points2, weights, loss)
     with torch.no_grad():
         # The optimum does not depend on the coordinates in which it is sought.
-        T1, T2 = (T / T[:, :1, :1] for T in (hartley_transform(x1, w), hartley_transform(x2, w)))
-        F = transform_fundamental(F_mat.to(dtype), torch.linalg.inv_ex(T1)[0], torch.linalg.inv_ex(T2)[0])
-    x1, x2 = T1 @ convert_points_to_homogeneous(x1).mT, T2 @ convert_points_to_homogeneous(x2).mT
-    objective = EpipolarCost(x1, x2, w, find_scale(distance), loss)
-    with torch.no_grad():
-        before, best = minimize(objective, decompose(F), max_iterations, tolerance)
+        F = transform_fundamental(F_mat.to(T1), torch.linalg.inv_ex(T1)[0], torch.linalg.inv_ex(T2)[0])
+        before, best = minimize(cost, model.state(F), max_iterations, tolerance)
     state = best.state
-    if torch.is_grad_enabled() and (x1.requires_grad or x2.requires_grad or w.requires_grad):
-        state = _attach_gradient(objective, state, best.converged)
-    F = unit_fundamental(transform_fundamental(state.matrix(), T1, T2))
+    if torch.is_grad_enabled() and (cost.x1.requires_grad or cost.x2.requires_grad or cost.weights.requires_grad):
+        state = attach_gradient(cost, best)
+    F = unit_matrix(transform_fundamental(state.matrix(), T1, T2))
     dtype = points1.dtype
     return Refinement(F.to(dtype), before.to(dtype), best.cost.to(dtype), best.iterations, best.converged)
 
 
-def check_options(loss: Loss, max_iterations: int, tolerance: float) -> None:
-    """Raise a clear error for options that :func:`refine_fundamental` does not take."""
+@torch.no_grad()
+def refine_essential(
+    points1: Tensor,
+    points2: Tensor,
+    E_mat: Tensor,
+    K1: Tensor,
+    K2: Tensor,
+    weights: Tensor | None = None,
+    loss: Loss = squared_loss,
+    distance: Distance = "sampson",
+    max_iterations: int = 50,
+    tolerance: float = 1e-7,
+) -> EssentialRefinement:
+    r"""Refine essential matrices to a local minimum of a sum over the correspondences, by Levenberg-Marquardt.
+
+    .. math:: \min_{E = U \mathrm{diag}(1, 1, 0) V^\top / \sqrt 2} \sum_i w_i\, \rho(d_i^2), \quad
+              d_i \text{ the distance in pixels under } F = K_2^{-\top} E K_1^{-1}
+
+    over rotations :math:`U` and :math:`V`, which have five parameters in :math:`E`: those of a relative pose. Each
+    element of the batch has its own damping; a step is taken where it lowers the cost and refused where it does not or
+    cannot be computed. The steps are computed in float64. There are no gradients: the result carries none. Use
+    :func:`~kornia_learnnorm.refine_fundamental` where gradients are needed or the cameras are not known.
+
+    Args:
+        points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 5`, float32 or float64; with shape
+            :math:`(1, N, 2)`, all matrices share them.
+        points2: pixels in the second image with the same shape.
+        E_mat: where to start, with shape :math:`(B, 3, 3)`, any scale but zero; the nearest essential matrix is taken.
+        K1: cameras of the first images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
+        K2: cameras of the second images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
+        weights: optional non-negative weights of the losses, :math:`(B, N)` or :math:`(1, N)` as the points; zero means
+            absent.
+        loss: :math:`\rho` of squared distances, as for :func:`~kornia_learnnorm.refine_fundamental`.
+        distance: the distance :math:`d`: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
+        max_iterations: largest number of steps tried.
+        tolerance: largest cosine between the distances and their derivatives at which a matrix has converged.
+
+    Returns:
+        the matrices with their costs, in the dtype of the points.
+
+    Raises:
+        TypeError: if an argument is not a floating-point tensor, the points are not of one dtype, ``loss`` cannot be
+            called or ``max_iterations`` is not a whole number.
+        ShapeError: if a shape is wrong.
+        ValueError: if there are fewer than five correspondences, shapes do not pair up, a value is not finite, a matrix
+            is zero, a camera is not invertible, there is no distance of that name, or ``max_iterations`` or
+            ``tolerance`` is negative.
+
+    Reference:
+        R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, sections 9.6 and 11.4.3; V. Larsson, PoseLib,
+        which refines a rotation and a direction of translation on the same cost.
+
+    Example:
+        >>> from kornia_learnnorm.data.synthetic import handheld
+        >>> scene = handheld(4, 20, torch.Generator().manual_seed(0), noise=0.5)
+        >>> E_mat = scene.K2.mT @ scene.F_mat @ scene.K1
+        >>> refinement = refine_essential(scene.points1, scene.points2, E_mat, scene.K1, scene.K2)
+        >>> bool((refinement.cost < refinement.cost_before).all())
+        True
+
+    """
+    _check(points1, points2, weights, "E_mat", E_mat, Essential.sample_size, loss, max_iterations, tolerance)
+    check_cameras(K1, K2, len(E_mat))
+    cost, T1, T2 = _cost(Fundamental(distance=distance), points1, points2, weights, loss)
+    state = Essential.of_cameras(K1.to(T1), K2.to(T2), T1, T2).calibrated(E_mat.to(T1))
+    before, best = minimize(cost, state, max_iterations, tolerance)
+    E, F = best.state.essential(), transform_fundamental(best.state.matrix(), T1, T2)
+    values = (unit_matrix(E), unit_matrix(F), before, best.cost)
+    E, F, before, last = (value.to(points1.dtype) for value in values)
+    return EssentialRefinement(E, F, before, last, best.iterations, best.converged)
+
+
+def _check(
+    points1: Tensor,
+    points2: Tensor,
+    weights: Tensor | None,
+    name: str,
+    matrices: Tensor,
+    min_points: int,
+    loss: Loss,
+    max_iterations: int,
+    tolerance: float,
+) -> None:
+    check_correspondences(points1, points2, weights, min_points)
+    shared = len(points1) == 1 and isinstance(matrices, Tensor)
+    check_matrices(name, matrices, len(matrices) if shared else len(points1))
     if isinstance(loss, type):
         raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
     if not callable(loss):
@@ -138,112 +233,15 @@ def check_options(loss: Loss, max_iterations: int, tolerance: float) -> None:
         raise ValueError(f"max_iterations and tolerance must be >= 0, got {max_iterations} and {tolerance}")
 
 
-class Optimum(NamedTuple, Generic[State]):
-    """States, their costs and normal equations, convergence, damping of the next steps and number of past ones."""
-
-    state: State
-    cost: Tensor
-    normal: Tensor
-    gradient: Tensor
-    converged: Tensor
-    damping: Tensor
-    iterations: Tensor
-
-
-def minimize(
-    objective: EpipolarCost, state: State, max_iterations: int, tolerance: float
-) -> tuple[Tensor, Optimum[State]]:
-    """Return the costs at the states and the best found from there, on the manifold that the states belong to."""
-    # What a step computes of so many correspondences stays in the cache of a CPU: 2.5 times faster than all at once.
-    size = max(1, (2**14 if state.A.device.type == "cpu" else 2**24) // objective.x1.shape[-1])
-    if len(state.A) > size:
-        parts = torch.split(torch.arange(len(state.A), device=state.A.device), size)
-        found = [minimize(objective.select(rows), _select(state, rows), max_iterations, tolerance) for rows in parts]
-        costs, optima = zip(*found, strict=True)
-        return torch.cat(costs), _each(lambda *values: torch.cat(values), *optima)
-    damping = state.A.new_full((len(state.A),), 1e-3)
-    start = _evaluate(objective, state, tolerance, damping, torch.zeros_like(damping, dtype=torch.int64))
-    return start.cost, _minimise(objective, start, max_iterations, tolerance)
-
-
-def _each(function: Callable[..., Tensor], *optima: Optimum[State]) -> Optimum[State]:
-    """Return what a function makes of the same tensor of all optima, for each of their tensors."""
-    state = type(optima[0].state)(*map(function, *(optimum.state for optimum in optima)))
-    return Optimum(state, *map(function, *(optimum[1:] for optimum in optima)))
-
-
-def _select(state: State, rows: Tensor) -> State:
-    return type(state)(*(value[rows] for value in state))
-
-
-def _minimise(
-    objective: EpipolarCost, estimate: Optimum[State], max_iterations: int, tolerance: float
-) -> Optimum[State]:
-    for iteration in range(max_iterations):
-        # No step that is damped this much changes the cost by more than rounding.
-        active = ~estimate.converged & (estimate.damping < 1e8)
-        count = int(active.sum())
-        if count == 0:
-            break
-        if 2 * count <= len(active):
-            rows = torch.nonzero(active)[:, 0]
-            return _minimise_some(objective, estimate, rows, max_iterations - iteration, tolerance)
-        estimate = _try_step(objective, estimate, active, tolerance)
-    return estimate
-
-
-def _minimise_some(
-    objective: EpipolarCost, estimate: Optimum[State], rows: Tensor, max_iterations: int, tolerance: float
-) -> Optimum[State]:
-    """Return the estimates, of which only some go on."""
-    part = _each(lambda value: value[rows], estimate)
-    part = _minimise(objective.select(rows), part, max_iterations, tolerance)
-    return _each(lambda value, new: value.index_copy(0, rows, new), estimate, part)
-
-
-def _try_step(objective: EpipolarCost, estimate: Optimum[State], active: Tensor, tolerance: float) -> Optimum[State]:
-    damped = estimate.normal.clone()
-    damped.diagonal(dim1=-2, dim2=-1).mul_(1 + estimate.damping[:, None])
-    step = -torch.linalg.solve_ex(damped, estimate.gradient)[0]
-    state, iterations = retract(estimate.state, step), estimate.iterations + active
-    moved = _evaluate(objective, state, tolerance, 0.1 * estimate.damping, iterations)
-    better = active & (moved.cost < estimate.cost)  # not where either is NaN
-    if better.all():
-        return moved
-    kept = estimate._replace(damping=10 * estimate.damping, iterations=iterations)
-    return _each(lambda new, old: torch.where(better.view(-1, *[1] * (new.ndim - 1)), new, old), moved, kept)
-
-
-def _evaluate(
-    objective: EpipolarCost, state: State, tolerance: float, damping: Tensor, iterations: Tensor
-) -> Optimum[State]:
-    J = objective.linearise(state.matrix())
-    value, weights = objective.loss(J[:, 9].square())
-    products = (weights * objective.weights)[:, None] * J @ J.mT
-    D = state.tangents()
-    reduced = D.mT @ products[:, :9]
-    normal, gradient, size = reduced[..., :9] @ D, reduced[..., 9], products[:, 9, 9]
-    diagonal = normal.diagonal(dim1=-2, dim2=-1).clamp_(min=torch.finfo(D.dtype).tiny)
-    # The cosines of the distances with their derivatives have no unit.
-    flat = (gradient.square() <= tolerance**2 * size[:, None] * diagonal).all(-1)
-    converged = flat | (size <= objective.rounding())
-    cost = (objective.weights * value).sum(-1)
-    return Optimum(state, cost, normal, gradient, converged, damping, iterations)
-
-
-def _attach_gradient(objective: EpipolarCost, state: Rank2, converged: Tensor) -> Rank2:
-    """Return the same states with the derivatives that the optimum has by the implicit function theorem."""
-    step = state.A.new_zeros(len(state.A), 7).requires_grad_()
-    distance = objective.distances(retract(state, step).matrix())
-    cost = (objective.weights * objective.loss(distance.square())[0]).sum()
-    (gradient,) = torch.autograd.grad(cost, step, create_graph=True)
-    rows = [torch.autograd.grad(g.sum(), step, retain_graph=True)[0] for g in gradient.unbind(-1)]
-    hessian = torch.stack(rows, -2).detach()
-    norms = hessian.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    norms = torch.where(norms > 0, norms, 1.0)
-    root, failed = torch.linalg.cholesky_ex(hessian / (norms[:, :, None] * norms[:, None, :]))
-    definite = (failed == 0) & (root.diagonal(dim1=-2, dim2=-1).amin(-1) > 1e-5)
-    determined = (converged & definite)[:, None]
-    hessian = torch.where(determined[..., None], hessian, torch.eye(7).to(hessian))
-    change = torch.where(determined, gradient - gradient.detach(), 0.0)
-    return retract(state, -torch.linalg.solve(hessian, change))
+def _cost(
+    model: TwoViewModel, points1: Tensor, points2: Tensor, weights: Tensor | None, loss: Loss
+) -> tuple[RobustCost, Tensor, Tensor]:
+    """Return the cost of correspondences, and the transforms from pixels to its coordinates, without gradient."""
+    dtype = solve_dtype(points1.device)
+    x1, x2 = points1.to(dtype), points2.to(dtype)
+    weights = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)
+    with torch.no_grad():
+        # Pixels from the centroid, and a third coordinate as large as they are: distances are those in pixels.
+        T1, T2 = (T / T[:, :1, :1] for T in (hartley_transform(x1, weights), hartley_transform(x2, weights)))
+    x1, x2 = (T @ convert_points_to_homogeneous(x).mT for T, x in ((T1, x1), (T2, x2)))
+    return RobustCost(model, x1, x2, weights, loss), T1, T2

@@ -6,16 +6,15 @@ squares.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Real
 
 import torch
 from torch import Tensor
 
-__all__ = ["Cauchy", "GemanMcClure", "Huber", "Truncated", "squared_loss"]
+from kornia_learnnorm.geometry.constrained_fit import Loss
 
-Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
+__all__ = ["Cauchy", "GemanMcClure", "Huber", "Loss", "Truncated", "squared_loss"]
 
 
 def squared_loss(squares: Tensor) -> tuple[Tensor, Tensor]:

@@ -97,7 +97,10 @@ def set_statistics(features: Tensor, logits: Tensor, absent: Tensor | None) -> t
     """
     features = features.to(logits.dtype)
     absent = None if absent is None else absent[..., None]
-    maximum = set_maximum(features, absent, 1, keepdim=True)
+    if absent is None and not features.requires_grad:
+        maximum = features.amax(1, keepdim=True)
+    else:
+        maximum = set_maximum(features, absent, 1, keepdim=True)
     if absent is not None:
         logits = logits.masked_fill(absent, torch.finfo(logits.dtype).min)
     attention = torch.softmax(logits, 1).mT

@@ -15,7 +15,8 @@ from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import rank2_projection
 from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.normalizers.normalizer import Normalizer, normalizing_transforms
 
 __all__ = [
     "Diagnostics",
@@ -75,7 +76,7 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
 
     """
     check_correspondences(points1, points2)
-    problem = LinearProblem.from_points(points1, points2)
+    problem = LinearProblem.from_points(points1, points2, None, Fundamental())
     return diagnose_in_coordinates(problem, *normalizing_transforms(normalizer, problem))
 
 

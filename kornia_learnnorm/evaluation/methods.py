@@ -12,17 +12,18 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from kornia_learnnorm.estimators.fundamental import solve_in_coordinates
 from kornia_learnnorm.estimators.learned import FORMAT as LAYER_FORMAT
+from kornia_learnnorm.estimators.linear import solve_in_coordinates
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.files import short_name
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.normalizers.contract import Normalizer, normalizing_transforms
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.identity import Identity
-from kornia_learnnorm.normalizers.learned import FORMAT, LearnedNormalizer
+from kornia_learnnorm.normalizers.learned_normalizer import FORMAT, LearnedNormalizer
+from kornia_learnnorm.normalizers.normalizer import Normalizer, normalizing_transforms
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.optional import working_folder_importable
@@ -80,12 +81,12 @@ class Method(NamedTuple):
 
     def estimate(self, points1: Tensor, points2: Tensor) -> Tensor:
         """Return the fundamental matrices (B, 3, 3) of points in pixels, (B, N, 2) float64 each."""
-        problem = LinearProblem.from_points(points1, points2)
+        problem = LinearProblem.from_points(points1, points2, None, Fundamental(self.rank2))
         return self.solve(problem, *normalizing_transforms(self.normalizer, problem))
 
     def solve(self, problem: LinearProblem, T1: Tensor, T2: Tensor) -> Tensor:
         """Return the fundamental matrices (B, 3, 3) of a problem under the transforms of the normaliser."""
-        F_mat = solve_in_coordinates(problem, T1, T2, self.rank2)
+        F_mat = solve_in_coordinates(problem, T1, T2)
         return refine_fundamental(problem.points1, problem.points2, F_mat).F_mat if self.refined else F_mat
 
 
@@ -160,7 +161,7 @@ def _own_normalizer(name: str) -> Normalizer:
 
     def normalize(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         try:
-            return normalizing_transforms(made, LinearProblem.from_points(points1, points2, weights))
+            return normalizing_transforms(made, LinearProblem.from_points(points1, points2, weights, Fundamental()))
         except Exception as error:
             text = f"{type(error).__name__}: {error}"
             raise ValueError(f"{name} failed, called with points1, points2 and weights: {text}") from error

@@ -7,12 +7,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.fundamental import solve_in_coordinates
+from kornia_learnnorm.estimators.linear import solve_in_coordinates
 from kornia_learnnorm.geometry.checks import weighted_mean
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform
-from kornia_learnnorm.normalizers.contract import Normalizer, ProblemNormalizer, transforms_of
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = ["SearchedNormalizer"]
@@ -72,7 +73,7 @@ class SearchedNormalizer(ProblemNormalizer):
         with torch.inference_mode(False):  # a caller's inference mode has no gradients to offer
             weights = None if problem.weights is None else problem.weights.detach().clone()
             points1, points2 = problem.points1.detach().clone(), problem.points2.detach().clone()
-            problem = LinearProblem.from_points(points1, points2, weights)
+            problem = LinearProblem.from_points(points1, points2, weights, Fundamental())
             with torch.no_grad():
                 T1, T2 = (T.to(problem.x1) for T in transforms_of(self.base, problem))
             with torch.enable_grad():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -11,20 +11,18 @@ from torch.autograd.forward_ad import unpack_dual
 
 __all__ = [
     "check_cameras",
+    "check_choice",
     "check_correspondences",
-    "check_fundamental",
     "check_mask",
-    "check_rank2",
+    "check_matrices",
+    "check_pairs",
     "check_tensor",
-    "is_true",
     "needs_gradient",
     "read_condition",
     "safe_divisor",
     "solve_dtype",
     "weighted_mean",
 ]
-
-RANK2 = ("projection", "optimal")
 
 
 def solve_dtype(device: torch.device) -> torch.dtype:
@@ -79,9 +77,9 @@ def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None =
         check_tensor(name, K)
         if [*K.shape] not in shapes:
             raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {[*K.shape]}")
-        if is_true(~(K.isfinite().all() & (torch.linalg.det(K.detach().to(solve_dtype(K.device))) != 0).all())):
+        if read_condition(~(K.isfinite().all() & (torch.linalg.det(K.detach().to(solve_dtype(K.device))) != 0).all())):
             raise ValueError(f"{name} must be finite and invertible")
-        if is_true((K[..., 2, :2] != 0).any()):
+        if read_condition((K[..., 2, :2] != 0).any()):
             rows = K.detach().reshape(-1, 3, 3)[:, 2]
             got = " ".join(f"{value:g}" for value in rows[(rows[:, :2] != 0).any(-1)][0].tolist())
             raise ValueError(f"{name} must have a last row of 0 0 1, up to scale, got {got}; is it transposed?")
@@ -103,14 +101,9 @@ def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | No
             weight is negative.
 
     """
-    for name, points in (("points1", points1), ("points2", points2)):
-        check_tensor(name, points, ["B", "N", "2"], precise=True)
-    if points1.dtype != points2.dtype:
-        raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
-    if points1.shape != points2.shape:
-        raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
-    devices = {str(tensor.device) for tensor in (points1, points2, weights) if isinstance(tensor, Tensor)}
-    if len(devices) > 1:
+    check_pairs(points1, points2, ["B", "N", "2"])
+    if points2.device != points1.device or (isinstance(weights, Tensor) and weights.device != points1.device):
+        devices = {str(tensor.device) for tensor in (points1, points2, weights) if tensor is not None}
         raise ValueError(f"points and weights must be on one device, got {' and '.join(sorted(devices))}")
     if points1.shape[1] < min_points:
         raise ValueError(f"at least {min_points} correspondences are needed, got {points1.shape[1]}")
@@ -122,8 +115,18 @@ def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | No
         if weights.shape != points1.shape[:2]:
             raise ValueError(f"weights must have shape {[*points1.shape[:2]]}, got {[*weights.shape]}")
         valid = valid & ~(weights < 0).any() & weights.sum().isfinite()
-    if is_true(~valid):  # one look at the device for all values
+    if read_condition(~valid):  # one look at the device for all values
         _complain_about_values(points1, points2, weights)
+
+
+def check_pairs(points1: Tensor, points2: Tensor, shape: Sequence[str]) -> None:
+    """Raise a clear error for anything but two tensors of points of a shape, of one precise dtype, that pair up."""
+    check_tensor("points1", points1, shape, precise=True)
+    check_tensor("points2", points2, shape, precise=True)
+    if points1.dtype != points2.dtype:
+        raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
+    if points1.shape != points2.shape:
+        raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
 
 
 def _complain_about_values(points1: Tensor, points2: Tensor, weights: Tensor | None) -> None:
@@ -145,22 +148,22 @@ def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor |
             raise ValueError(f"mask must have shape {[*shape]} as {name}, got {[*mask.shape]}")
 
 
-def check_fundamental(F_mat: Tensor, points: Tensor) -> None:
-    """Raise a clear error for anything but finite matrices ``(B, 3, 3)`` other than zero, as many as sets of points."""
-    check_tensor("F_mat", F_mat, ["B", "3", "3"])
-    if len(F_mat) != len(points):
-        raise ValueError(f"one matrix per set of points is needed, got {len(F_mat)} matrices and {len(points)} sets")
-    if is_true(~F_mat.isfinite().all()):
-        raise ValueError(f"F_mat must be finite, got {int((~F_mat.isfinite()).sum())} NaN or infinite values")
-    zero = (F_mat == 0).all(-1).all(-1)
-    if is_true(zero.any()):
-        raise ValueError(f"F_mat must not be zero, got {int(zero.sum())} zero matrices")
+def check_matrices(name: str, matrices: Tensor, number: int) -> None:
+    """Raise a clear error for anything but so many finite matrices ``(B, 3, 3)`` other than zero."""
+    check_tensor(name, matrices, ["B", "3", "3"])
+    if len(matrices) != number:
+        raise ValueError(f"one matrix per set of points is needed, got {len(matrices)} matrices and {number} sets")
+    if read_condition(~matrices.isfinite().all()):
+        raise ValueError(f"{name} must be finite, got {int((~matrices.isfinite()).sum())} NaN or infinite values")
+    zero = (matrices == 0).all(-1).all(-1)
+    if read_condition(zero.any()):
+        raise ValueError(f"{name} must not be zero, got {int(zero.sum())} zero matrices")
 
 
-def check_rank2(rank2: object) -> None:
-    """Raise a ValueError for anything but ``"projection"`` and ``"optimal"``."""
-    if rank2 not in RANK2:
-        raise ValueError(f"rank2 must be 'projection' or 'optimal', got {rank2!r}")
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Raise a ValueError for anything but one of the choices."""
+    if value not in choices:
+        raise ValueError(f"{name} must be {' or '.join(map(repr, choices))}, got {value!r}")
 
 
 def read_condition(condition: Tensor) -> bool | None:
@@ -173,19 +176,19 @@ def read_condition(condition: Tensor) -> bool | None:
         return None
 
 
-def is_true(condition: Tensor) -> bool:
-    """Return a boolean scalar's value; False where it cannot be read."""
-    return read_condition(condition) is True
-
-
-def needs_gradient(value: Tensor) -> bool:
+def needs_gradient(*values: Tensor | None) -> bool:
     """Return whether derivatives by a tensor may be asked for; true where that cannot be told, as inside ``vmap``."""
     if not torch.is_grad_enabled():
         return False
-    if torch.compiler.is_compiling() or value.requires_grad:
+    if torch.compiler.is_compiling():
         return True
-    wrapped: bool = torch._C._functorch.is_functorch_wrapped_tensor(value)  # noqa: SLF001 (there is no public name)
-    return wrapped or unpack_dual(value).tangent is not None  # type: ignore[no-untyped-call]
+    for value in values:
+        if value is None:
+            continue
+        wrapped = torch._C._functorch.is_functorch_wrapped_tensor(value)  # noqa: SLF001 (there is no public name)
+        if value.requires_grad or wrapped or unpack_dual(value).tangent is not None:  # type: ignore[no-untyped-call]
+            return True
+    return False
 
 
 def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:

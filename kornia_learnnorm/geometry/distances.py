@@ -8,7 +8,6 @@ distance in pixels, a function of the squared norms :math:`n_1 = \|(F^\top x_2)_
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
@@ -23,19 +22,16 @@ from torch import Tensor
 from kornia_learnnorm.geometry.checks import check_tensor, safe_divisor, weighted_mean
 
 __all__ = [
+    "DISTANCE_SCALES",
     "algebraic_distance",
-    "find_scale",
     "line_norms",
     "sampson_distance",
     "sampson_scale",
-    "scale_value",
     "symmetric_epipolar_distance",
     "symmetric_scale",
 ]
 
 EPIPOLE_TOLERANCE = 1e-12  # length of an epipolar line's normal over that of its summands; rounding leaves less
-
-DistanceScale = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 def _check(points1: Tensor, points2: Tensor, F_mat: Tensor) -> None:
@@ -161,8 +157,8 @@ def line_norms(
     r"""Return the norms of both epipolar lines' normals, :math:`\|(F^\top x_2)_{1:2}\|` and :math:`\|(F x_1)_{1:2}\|`.
 
     Args:
-        x1: homogeneous points of the first view with shape :math:`(*, N, 3)`.
-        x2: homogeneous points of the second view with shape :math:`(*, N, 3)`.
+        x1: homogeneous points of the first view with shape :math:`(*, 3, N)`.
+        x2: homogeneous points of the second view with shape :math:`(*, 3, N)`.
         F_mat: fundamental matrices with shape :math:`(*, 3, 3)`.
         weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
         floor: share of the set's mean norm added to each, against points on an epipole.
@@ -171,32 +167,21 @@ def line_norms(
         two tensors with shape :math:`(*, N)`, positive.
 
     """
-    norms = (x2 @ F_mat)[..., :2].norm(dim=-1), (x1 @ F_mat.mT)[..., :2].norm(dim=-1)
-    first, second = (n + floor * safe_divisor(weighted_mean(n[..., None], weights)) for n in norms)
-    return first, second
+    norm1, norm2 = (F_mat.mT[..., :2, :] @ x2).norm(dim=-2), (F_mat[..., :2, :] @ x1).norm(dim=-2)
+    floor1 = floor * safe_divisor(weighted_mean(norm1[..., None], weights))
+    return norm1 + floor1, norm2 + floor * safe_divisor(weighted_mean(norm2[..., None], weights))
 
 
-def find_scale(distance: object) -> DistanceScale:
-    """Return the distance scale of a name, or the function that was given."""
-    scales: dict[str, DistanceScale] = {"sampson": sampson_scale, "symmetric": symmetric_scale}
-    if isinstance(distance, str):
-        if distance not in scales:
-            raise ValueError(f"distance must be 'sampson', 'symmetric' or a function, got {distance!r}")
-        return scales[distance]
-    if not callable(distance):
-        raise TypeError(f"distance must be 'sampson', 'symmetric' or a function, got {distance!r}")
-    return distance
-
-
-def sampson_scale(sq_norm1: Tensor, sq_norm2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def sampson_scale(sq_norm1: Tensor, sq_norm2: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
     r"""Return the scale of the Sampson distance, :math:`(n_1 + n_2)^{-1/2}`, and its derivatives.
 
     Args:
         sq_norm1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
-        sq_norm2: the same in view 2.
+        sq_norm2: squared norms of those in view 2.
+        slopes: compute the derivatives, which cost more than the scale itself.
 
     Returns:
-        the scale and its derivatives by ``sq_norm1`` and by ``sq_norm2``, each with shape :math:`(*, N)`.
+        the scale and, with ``slopes``, its derivatives by ``sq_norm1`` and ``sq_norm2``, each :math:`(*, N)`.
 
     Reference:
         R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, section 11.4.3.
@@ -208,19 +193,22 @@ def sampson_scale(sq_norm1: Tensor, sq_norm2: Tensor) -> tuple[Tensor, Tensor, T
     """
     total = sq_norm1 + sq_norm2
     scale = total.rsqrt()
+    if not slopes:
+        return (scale,)
     slope = scale / (-2 * total)
     return scale, slope, slope
 
 
-def symmetric_scale(sq_norm1: Tensor, sq_norm2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def symmetric_scale(sq_norm1: Tensor, sq_norm2: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
     r"""Return the scale of the symmetric epipolar distance, :math:`n_1^{-1/2} + n_2^{-1/2}`, and its derivatives.
 
     Args:
         sq_norm1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
-        sq_norm2: the same in view 2.
+        sq_norm2: squared norms of those in view 2.
+        slopes: compute the derivatives, which cost more than the scale itself.
 
     Returns:
-        the scale and its derivatives by ``sq_norm1`` and by ``sq_norm2``, each with shape :math:`(*, N)`.
+        the scale and, with ``slopes``, its derivatives by ``sq_norm1`` and ``sq_norm2``, each :math:`(*, N)`.
 
     Reference:
         Fan et al., Eq. 7.
@@ -231,15 +219,9 @@ def symmetric_scale(sq_norm1: Tensor, sq_norm2: Tensor) -> tuple[Tensor, Tensor,
 
     """
     first, second = sq_norm1.rsqrt(), sq_norm2.rsqrt()
+    if not slopes:
+        return (first + second,)
     return first + second, -first / (2 * sq_norm1), -second / (2 * sq_norm2)
 
 
-def scale_value(scale: DistanceScale, sq_norm1: Tensor, sq_norm2: Tensor) -> Tensor:
-    """Return a distance scale without its derivatives, which cost more than the scale itself.
-
-    Example:
-        >>> scale_value(sampson_scale, torch.tensor(2.0), torch.tensor(2.0))
-        tensor(0.5000)
-
-    """
-    return (sq_norm1 + sq_norm2).rsqrt() if scale is sampson_scale else scale(sq_norm1, sq_norm2)[0]
+DISTANCE_SCALES = {"sampson": sampson_scale, "symmetric": symmetric_scale}

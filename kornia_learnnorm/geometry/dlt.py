@@ -12,22 +12,24 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import is_true, needs_gradient, safe_divisor
+from kornia_learnnorm.geometry.checks import needs_gradient, read_condition
 
 __all__ = [
+    "DEPENDENT_GAP",
     "MIN_GAP",
     "design_matrix",
-    "independence_gap",
+    "nearest_null_vector",
     "null_vector",
-    "sideways_null_vector",
     "smallest_right_singular_vector",
-    "solve_epipolar",
+    "solve_rows",
 ]
 
 MIN_GAP = 1e-6  # relative gap above which a null vector counts as unique; that of float32 pixels
 MIN_GRAM_RATIO = 1e-5  # of the last but one singular value to the first; below, a Gram matrix has lost too many digits
 # Generic numbers: no null vector of note is orthogonal to them.
 NINTH_ROW = (0.118, -0.264, 0.354, -0.028, -0.41, 0.208, -0.174, 0.444, 0.062)
+# Relative gap up to which rows are linearly dependent but for rounding.
+DEPENDENT_GAP = {dtype: 256 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
 MAX_ZERO_VALUE = 1e-10  # relative singular value up to which dependent rows have another null vector
 
 
@@ -58,8 +60,7 @@ def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
 def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
     r"""Return the unit vector :math:`h` that minimises :math:`\sum_i w_i (A_i h)^2`.
 
-    Eight rows have an exact null vector, whatever the positive weights; more rows go to
-    :func:`smallest_right_singular_vector`.
+    Eight rows have an exact null vector, whatever the positive weights.
 
     Args:
         A: design matrix with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
@@ -69,37 +70,33 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
         unit vectors with shape :math:`(*, 9)`, sign arbitrary; without gradient where the rows are linearly dependent.
 
     """
-    return _null_vector_of_eight(A, weights)[0] if A.shape[-2] == 8 else smallest_right_singular_vector(A, weights)
+    return solve_rows(A, weights)[0]
 
 
-def solve_epipolar(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    r"""Return the null vector of correspondences' design matrix, and the relative gap that tells how unique it is.
+def solve_rows(
+    A: Tensor, weights: Tensor | None = None, product: Callable[[Tensor], Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    r"""Return the null vector of a design matrix, and the relative gap that tells how unique it is.
 
-    Of eight correspondences, the gap is the smallest pivot over the largest of the LU factorisation of :math:`A^\top`
-    with partial pivoting. Of more, it is the eighth singular value of :math:`\sqrt w A` over the first. Derivatives of
-    the null vector grow as its inverse.
+    Of eight rows, the gap is the smallest pivot over the largest of the LU factorisation of :math:`A^\top` with partial
+    pivoting. Of more, it is the eighth singular value of :math:`\sqrt w A` over the first. Derivatives of the null
+    vector grow as its inverse.
 
     Args:
-        x1: homogeneous points of the first view with shape :math:`(*, N, 3)`, :math:`N \ge 8`.
-        x2: homogeneous points of the second view with shape :math:`(*, N, 3)`.
-        weights: optional non-negative weights with shape :math:`(*, N)`.
+        A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
+        weights: optional non-negative weights of the rows with shape :math:`(*, N)`.
+        product: multiplies vectors :math:`(*, 9)` by :math:`A^\top W A` and has the derivatives, where there is a
+            cheaper way than through ``A``; for more than eight rows.
 
     Returns:
         unit vectors with shape :math:`(*, 9)`, sign arbitrary, and gaps in :math:`[0, 1]` with shape :math:`(*)`,
         without gradient.
 
     """
-    if x1.shape[-2] == 8:
-        return _null_vector_of_eight(design_matrix(x1, x2), weights)
-
-    rows1, rows2 = x1.mT, x2.mT
-
-    def product(h: Tensor) -> Tensor:  # with derivatives by the points, without those by the nine columns
-        residual = ((torch.unflatten(h, -1, (3, 3)).mT @ rows2) * rows1).sum(-2, keepdim=True)
-        return ((rows2 * (residual if weights is None else residual * weights[..., None, :])) @ x1).flatten(-2)
-
-    h, s = _smallest(design_matrix(x1, x2), weights, product)
-    return h, s[..., 7] / safe_divisor(s[..., 0])
+    if A.shape[-2] == 8:
+        return _null_vector_of_eight(A, weights)
+    h, s = _smallest(A, weights, product or _gram_product(A, weights))
+    return h, s[..., 7] / (s[..., 0] + (s[..., 0] == 0))
 
 
 def _null_vector_of_eight(A: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -108,13 +105,14 @@ def _null_vector_of_eight(A: Tensor, weights: Tensor | None) -> tuple[Tensor, Te
         A = A * (weights > 0).to(A)[..., None]
     with torch.no_grad():
         h0, pivots = _eliminate(A)
-        gap = pivots.amin(-1) / safe_divisor(pivots.amax(-1))
+        largest = pivots.amax(-1)
+        gap = pivots.amin(-1) / (largest + (largest == 0))
     if not needs_gradient(A):
         return h0, gap
     # The linear system [A; h0^T] h = e9, with h0 held fixed, has the solution h0 and gives its derivatives. The
     # substitute enters before the solve and its result is dropped after it: no derivative meets a singular matrix.
-    independent = gap > independence_gap(A.dtype)
-    scale = torch.where(independent, pivots.amax(-1), 1.0)
+    independent = gap > DEPENDENT_GAP[A.dtype]
+    scale = torch.where(independent, largest, 1.0)
     bordered = torch.cat([A / scale[..., None, None], h0[..., None, :]], -2)
     eye = torch.eye(9, dtype=A.dtype, device=A.device)
     bordered = torch.where(independent[..., None, None], bordered, eye)
@@ -136,26 +134,22 @@ def _eliminate(A: Tensor) -> tuple[Tensor, Tensor]:
     diagonal = LU.diagonal(dim1=-2, dim2=-1)
     pivots = diagonal.abs()
     least = torch.finfo(A.dtype).eps * pivots.amax(-1, keepdim=True)
-    diagonal.copy_(torch.where(pivots < least, safe_divisor(least), diagonal))
+    diagonal.copy_(torch.where(pivots < least, least + (least == 0), diagonal))
     last = torch.eye(9, dtype=A.dtype, device=A.device)[:, 8:].expand(*A.shape[:-2], 9, 1)
     h = torch.linalg.lu_solve(LU, permutation, last, adjoint=True)[..., 0]
     return normalize(h, dim=-1), pivots[..., :8]
 
 
-def independence_gap(dtype: torch.dtype) -> float:
-    """Return the relative gap up to which rows are linearly dependent but for rounding."""
-    return 256 * torch.finfo(dtype).eps
-
-
 @torch.no_grad()
-def sideways_null_vector(A: Tensor) -> Tensor:
-    r"""Return the vector of the null space nearest to the matrix of a sideways motion, for linearly dependent rows.
+def nearest_null_vector(A: Tensor, preferred: Tensor) -> Tensor:
+    r"""Return the vector of the null space nearest to a preferred one, for linearly dependent rows.
 
     A null space of more than one dimension leaves the choice to rounding, and so to the processor. This choice does not
-    depend on the order of the rows, nor on which view comes first.
+    depend on the order of the rows, nor, where the preferred matrix is symmetric in the views, on which comes first.
 
     Args:
         A: design matrices with shape :math:`(*, N, 9)`, whose singular values below 1e-10 of the first count as zero.
+        preferred: vector with shape :math:`(9)`.
 
     Returns:
         unit vectors with shape :math:`(*, 9)`.
@@ -164,8 +158,7 @@ def sideways_null_vector(A: Tensor) -> Tensor:
     _, s, Vh = torch.linalg.svd(A)
     zero = torch.ones_like(Vh[..., 0], dtype=torch.bool)  # the ninth of eight rows is zero
     zero[..., :8] = s[..., :8] <= MAX_ZERO_VALUE * s[..., :1]
-    sideways = A.new_tensor([0.0, 0, 0, 0, 0, 1, 0, -1, 0])
-    return normalize(Vh.mT @ (zero * (Vh @ sideways))[..., None], dim=-2).squeeze(-1)
+    return normalize(Vh.mT @ (zero * (Vh @ preferred))[..., None], dim=-2).squeeze(-1)
 
 
 def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -189,12 +182,17 @@ def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> 
         tensor([0., 1., 0.])
 
     """
+    return _smallest(A, weights, _gram_product(A, weights))[0]
+
+
+def _gram_product(A: Tensor, weights: Tensor | None) -> Callable[[Tensor], Tensor]:
+    """Return the product of vectors with ``A^T W A``."""
 
     def product(v: Tensor) -> Tensor:
         residual = A @ v[..., None]
         return (A.mT @ (residual if weights is None else residual * weights[..., None]))[..., 0]
 
-    return _smallest(A, weights, product)[0]
+    return product
 
 
 def _smallest(A: Tensor, weights: Tensor | None, product: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
@@ -203,33 +201,25 @@ def _smallest(A: Tensor, weights: Tensor | None, product: Callable[[Tensor], Ten
     ``product`` multiplies vectors by the Gram matrix and has the derivatives.
     """
     with torch.no_grad():
-        gram = A.mT @ (A if weights is None else A * weights[..., None])
-        s, Vh = _decompose(gram, A, weights)
+        values, vectors = torch.linalg.eigh(A.mT @ (A if weights is None else A * weights[..., None]))
+        s, Vh = values.clamp(min=0).sqrt().flip(-1), vectors.mT.flip(-2)
+        precise = s[..., -2] > MIN_GRAM_RATIO * s[..., 0]
+        if not read_condition(precise.all()):
+            rooted = A if weights is None else A * weights.sqrt()[..., None]
+            _, s_exact, Vh_exact = torch.linalg.svd(rooted, full_matrices=False)
+            s, Vh = torch.where(precise[..., None], s, s_exact), torch.where(precise[..., None, None], Vh, Vh_exact)
         others, v = Vh[..., :-1, :], Vh[..., -1, :]
         gap = s[..., :-1].square() - s[..., -1:].square()
         simple = gap > 64 * torch.finfo(A.dtype).eps * s[..., :-1] * s[..., :1]
         inverse_gap = torch.where(simple, gap, torch.inf).reciprocal()
         v = normalize(_newton_step(v, product(v), others, inverse_gap), dim=-1)
-    if not (needs_gradient(A) or (weights is not None and needs_gradient(weights))):
+    if not needs_gradient(A, weights):
         return v, s
     x = v
     for _ in range(2):  # each makes the derivatives of one more order right
         x = _newton_step(x, product(x), others, inverse_gap)
     x = normalize(x, dim=-1)
     return v + (x - x.detach()), s  # the values do not depend on whether derivatives are wanted
-
-
-def _decompose(gram: Tensor, A: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return singular values and right singular vectors of ``sqrt(weights) A``, the last a good start."""
-    values, vectors = torch.linalg.eigh(gram)
-    s, Vh = values.clamp(min=0).sqrt().flip(-1), vectors.mT.flip(-2)
-    safe = s[..., -2] > MIN_GRAM_RATIO * s[..., 0]
-    if is_true(safe.all()):
-        return s, Vh
-    _, s_exact, Vh_exact = torch.linalg.svd(
-        A if weights is None else A * weights.sqrt()[..., None], full_matrices=False
-    )
-    return torch.where(safe[..., None], s, s_exact), torch.where(safe[..., None, None], Vh, Vh_exact)
 
 
 def _newton_step(v: Tensor, image: Tensor, others: Tensor, inverse_gap: Tensor) -> Tensor:

@@ -16,8 +16,10 @@ __all__ = [
     "cofactors",
     "determinant",
     "inverse",
+    "nearest_rank2",
     "smallest_right_singular_vector_3x3",
     "smallest_singular_vectors",
+    "unit_matrix",
 ]
 
 RANK1_WEIGHT = 1e-27  # of the complement of the rows, above the square of what rounding leaves of vanishing cofactors
@@ -75,6 +77,42 @@ def inverse(A: Tensor) -> Tensor:
     return C.mT / (A[..., 0, :] * C[..., 0, :]).sum(-1)[..., None, None]
 
 
+def nearest_rank2(A: Tensor) -> Tensor:
+    r"""Return the nearest matrices of rank 2 in Frobenius norm to matrices :math:`(*, 3, 3)`, twice differentiable.
+
+    :math:`A - A v v^\top` with the right singular vector :math:`v` of the smallest singular value.
+    """
+    v = _smallest(A)[0][..., None]
+    return A - (A @ v) @ v.mT
+
+
+def unit_matrix(M: Tensor) -> Tensor:
+    """Return matrices scaled to unit Frobenius norm, with a canonical sign.
+
+    Of the entries of at least half of the largest magnitude, the first in row-major order is positive. The sign does
+    not depend on rounding, also where two entries are equal up to their signs, as under pure translation.
+
+    Args:
+        M: matrices with shape :math:`(*, 3, 3)`, any scale but zero.
+
+    Returns:
+        matrices with shape :math:`(*, 3, 3)`.
+
+    Example:
+        >>> unit_matrix(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -3.0], [0.0, 4.0, 0.0]]))[1:, 1:]
+        tensor([[-0.0000,  0.6000],
+                [-0.8000, -0.0000]])
+
+    """
+    entries = M.detach().flatten(-2)
+    size = entries.abs()
+    large = torch.where(size >= size.amax(-1, keepdim=True) / 2, entries.sign(), 0.0)
+    powers = torch.arange(8, -1, -1, dtype=M.dtype, device=M.device).exp2()  # the first outweighs all others
+    sign = torch.where(large @ powers < 0, -1.0, 1.0)[..., None, None]
+    unit: Tensor = M * (sign / torch.linalg.matrix_norm(M, keepdim=True))
+    return unit
+
+
 def smallest_right_singular_vector_3x3(A: Tensor) -> Tensor:
     r"""Return the right singular vector of the smallest singular value, twice differentiable.
 
@@ -104,14 +142,18 @@ def smallest_singular_vectors(A: Tensor) -> tuple[Tensor, Tensor]:
     As :func:`smallest_right_singular_vector_3x3`, with :math:`u \propto C v`.
     """
     v, C = _smallest(A)
-    return _unit((C @ v[..., None])[..., 0]), v
+    u = (C @ v[..., None])[..., 0]
+    return u / safe_divisor(torch.linalg.vector_norm(u, dim=-1, keepdim=True)), v
 
 
 def _smallest(A: Tensor) -> tuple[Tensor, Tensor]:
     """Return the vector, and the cofactors up to scale."""
-    A = A / safe_divisor(A.detach().abs().amax((-2, -1), keepdim=True))  # a norm could over- or underflow
-    A = A / safe_divisor(torch.linalg.matrix_norm(A.detach(), keepdim=True))
-    C, eye = cofactors(A), torch.eye(3, dtype=A.dtype, device=A.device)
+    peak = A.detach().abs().amax((-2, -1), keepdim=True)
+    A = A / (peak + (peak == 0))  # a norm could over- or underflow
+    norm = torch.linalg.matrix_norm(A.detach(), keepdim=True)
+    A = A / (norm + (norm == 0))
+    C: Tensor = torch.linalg.cross(A.roll(-1, -2), A.roll(-2, -2))  # cofactors
+    eye = torch.eye(3, dtype=A.dtype, device=A.device)
     # All that a matrix of rank one leaves are the vectors orthogonal to its rows.
     M = C.mT @ C + RANK1_WEIGHT * (eye - A.mT @ A)
     with torch.no_grad():
@@ -143,7 +185,7 @@ def _largest_eigenvector(M: Tensor) -> tuple[Tensor, Tensor]:
     mean = M.diagonal().sum(-1) / 3
     B = M - mean * eye
     spread = (B.square().sum((0, 1)) / 6).sqrt()
-    B = B / safe_divisor(spread)
+    B = B / (spread + (spread == 0))
     cosine = ((B[0] * torch.linalg.cross(B[1], B[2], dim=0)).sum(0) / 2).clamp(-1, 1)
     largest = mean + 2 * spread * torch.cos(torch.acos(cosine) / 3)
     shifted = M - largest * eye
@@ -155,9 +197,6 @@ def _largest_eigenvector(M: Tensor) -> tuple[Tensor, Tensor]:
     # The column of about the largest diagonal entry. Columns of equal entries must not add up: they may cancel.
     size = columns.diagonal() * torch.linspace(1.0, COLUMN_PREFERENCE, 3, dtype=M.dtype, device=M.device)
     best = (size == size.amax(-1, keepdim=True)).movedim(-1, 0)
-    v = (M * (columns * best).sum(1)).sum(1).movedim(0, -1)
-    return _unit(v), largest[..., None, None]
-
-
-def _unit(v: Tensor) -> Tensor:
-    return v / safe_divisor(torch.linalg.vector_norm(v, dim=-1, keepdim=True))
+    v = (M * (columns * best).sum(1)).sum(1)
+    norm = torch.linalg.vector_norm(v, dim=0)
+    return (v / (norm + (norm == 0))).movedim(0, -1), largest[..., None, None]

@@ -1,26 +1,55 @@
-r"""The linear problem of one set of correspondences: normalised and solved once, then handed down."""
+r"""The linear problem of sets of correspondences: normalised and solved once, then handed down."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
+from torch.nn.functional import pad
 
-from kornia_learnnorm.geometry.checks import needs_gradient, read_condition, solve_dtype
-from kornia_learnnorm.geometry.dlt import (
-    MIN_GAP,
-    design_matrix,
-    independence_gap,
-    sideways_null_vector,
-    solve_epipolar,
+from kornia_learnnorm.geometry.checks import (
+    needs_gradient,
+    read_condition,
+    solve_dtype,
+    weighted_mean,
 )
+from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP, MIN_GAP, nearest_null_vector
 from kornia_learnnorm.geometry.matrices import inverse
-from kornia_learnnorm.geometry.transforms import hartley_coordinates, transform_fundamental
 
-__all__ = ["LinearProblem"]
+__all__ = ["LinearModel", "LinearProblem", "hartley_coordinates", "hartley_transform"]
+
+
+class LinearModel(Protocol):
+    """What a linear problem asks of a model; :class:`~kornia_learnnorm.models.contract.TwoViewModel` has it."""
+
+    min_points: int
+    preferred: tuple[float, ...]
+
+    def rows(self, x1: Tensor, x2: Tensor) -> Tensor:
+        """Return the design matrix (B, M, 9) of homogeneous points (B, N, 3)."""
+
+    def null_vector(self, x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the null vector (B, 9) of the design matrix and its relative gap (B,)."""
+
+    def row_weights(self, weights: Tensor) -> Tensor:
+        """Return the weights (B, M) of the rows of correspondences with weights (B, N)."""
+
+    def carry(self, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
+        """Return matrices of transformed points brought back to the points."""
+
+    def needs_transforms(self, problem: LinearProblem) -> bool:
+        """Return whether the solution depends on the coordinates of a normaliser."""
+
+    def constrain_in(self, problem: LinearProblem, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
+        """Return matrices of pixels that meet the constraint, from null matrices in the coordinates of T1 and T2."""
+
+    def fallback(self, M: Tensor) -> Tensor:
+        """Return the matrices of undetermined sets, or other ones in place of those that are none of the model."""
 
 
 @dataclass
@@ -28,10 +57,11 @@ class LinearProblem:
     r"""Correspondences in Hartley's coordinates and the null matrix of their design matrix.
 
     Built once per call, from checked input, by :meth:`from_points`. The null matrix is solved when it is first asked
-    for. Eight points have an exact null vector, so it is carried to other coordinates,
-    :math:`F' = R_2^{-\top} F R_1^{-1}`; with more points it minimises another sum of squares there and is solved again.
+    for. As few points as determine it have an exact null vector, so it is carried to other coordinates; with more
+    points it minimises another sum of squares there and is solved again.
 
     Attributes:
+        model: gives the rows of the design matrix, and carries matrices between coordinates.
         points1: pixels in the first view, (B, N, 2), float64 where the device has it.
         points2: pixels in the second view.
         weights: weights, (B, N), or None.
@@ -43,13 +73,15 @@ class LinearProblem:
         all_determined: whether all null matrices are unique, once solved; None where values cannot be read.
 
     Example:
+        >>> from kornia_learnnorm.models.fundamental import Fundamental
         >>> _ = torch.manual_seed(0)
-        >>> problem = LinearProblem.from_points(torch.rand(2, 8, 2) * 600, torch.rand(2, 8, 2) * 600)
+        >>> problem = LinearProblem.from_points(torch.rand(2, 8, 2), torch.rand(2, 8, 2), None, Fundamental())
         >>> problem.null_matrix.shape, problem.determined
         (torch.Size([2, 3, 3]), tensor([True, True]))
 
     """
 
+    model: LinearModel
     points1: Tensor
     points2: Tensor
     weights: Tensor | None
@@ -61,46 +93,55 @@ class LinearProblem:
     all_determined: bool | None = None
 
     @classmethod
-    def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> LinearProblem:
+    def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None, model: LinearModel) -> LinearProblem:
         r"""Return the problem of correspondences, in float64 where the device has it."""
         dtype = solve_dtype(points1.device)
-        points, weights = torch.stack([points1, points2]).to(dtype), None if weights is None else weights.to(dtype)
+        points = torch.stack([points1, points2]).to(dtype)
+        weights = None if weights is None else weights.to(dtype)
         (x1, x2), (T1, T2) = hartley_coordinates(points, weights)
         points1, points2 = points
-        return cls(points1, points2, weights, T1, T2, x1, x2)
+        return cls(model, points1, points2, weights, T1, T2, x1, x2)
 
     @property
     def null_matrix(self) -> Tensor:
-        """The DLT's solution before the rank-2 constraint in Hartley's coordinates, unit norm, (B, 3, 3)."""
-        return self._solve()[0]
+        """The DLT's solution before any constraint in Hartley's coordinates, unit norm, (B, 3, 3)."""
+        return self.solve()[0]
 
     @property
     def gap(self) -> Tensor:
-        """Relative gap that tells how well the points determine the null matrix, (B,); see ``solve_epipolar``."""
-        return self._solve()[1]
+        """Relative gap that tells how well the points determine the null matrix, (B,); see ``dlt.solve_rows``."""
+        return self.solve()[1]
 
     @property
     def determined(self) -> Tensor:
         """Whether the null matrix is unique, (B,) bool."""
         return self.gap > MIN_GAP
 
-    def _solve(self) -> tuple[Tensor, Tensor]:
+    @property
+    def present(self) -> Tensor | None:
+        """One for correspondences of positive weight, zero for absent ones, (B, N); None where all are present."""
+        return None if self.weights is None else (self.weights > 0).to(self.x1)
+
+    def solve(self) -> tuple[Tensor, Tensor]:
+        """Return the null matrix in Hartley's coordinates, (B, 3, 3), and its relative gap, (B,)."""
         # A solution found under `no_grad` must not cut the derivatives of a later caller.
         wanted = torch.is_grad_enabled() and self.x1.requires_grad
         if self.solution is None or (wanted and not self.solution[0].requires_grad):
-            self.solution, self.all_determined = self._solve_between(self.x1, self.x2)
+            M, gap, self.all_determined = self._solve_between(self.x1, self.x2)
+            self.solution = M, gap
         return self.solution
 
-    def _solve_between(self, x1: Tensor, x2: Tensor) -> tuple[tuple[Tensor, Tensor], bool | None]:
+    def _solve_between(self, x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor, bool | None]:
         """Return null matrix and gap in some coordinates, and whether all null matrices are unique."""
-        h, gap = solve_epipolar(x1, x2, self.weights)
+        h, gap = self.model.null_vector(x1, x2, self.weights)
         all_determined = read_condition((gap > MIN_GAP).all())
         if all_determined is False:
-            rows = (gap <= independence_gap(gap.dtype)).nonzero()[:, 0]
-            A = design_matrix(x1[rows], x2[rows])
-            A = A if self.weights is None else A * self.weights[rows].sqrt()[..., None]
-            h = h.index_copy(0, rows, sideways_null_vector(A))
-        return (torch.unflatten(h, -1, (3, 3)), gap), all_determined
+            rows = (gap <= DEPENDENT_GAP[gap.dtype]).nonzero()[:, 0]
+            A = self.model.rows(x1[rows], x2[rows])
+            if self.weights is not None:
+                A = A * self.model.row_weights(self.weights[rows]).sqrt()[..., None]
+            h = h.index_copy(0, rows, nearest_null_vector(A, A.new_tensor(self.model.preferred)))
+        return torch.unflatten(h, -1, (3, 3)), gap, all_determined
 
     def null_matrix_in(self, T1: Tensor, T2: Tensor) -> Tensor:
         r"""Return the null matrix in the coordinates :math:`T_i x_i` of pixels :math:`x_i`, unit norm, (B, 3, 3)."""
@@ -109,33 +150,70 @@ class LinearProblem:
     def solve_in(self, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return the null matrix in the coordinates :math:`T_i x_i`, (B, 3, 3), and its relative gap, (B,)."""
         if T1 is self.T1 and T2 is self.T2:
-            return self._solve()
-        if self.points1.shape[1] == 8:
+            return self.solve()
+        if self.points1.shape[1] == self.model.min_points:
             R1, R2 = torch.stack([self.T1, self.T2]) @ inverse(torch.stack([T1, T2]))
-            F = transform_fundamental(self.null_matrix, R1, R2)
+            M = self.model.carry(self.null_matrix, R1, R2)
             # A null matrix without gradient must not get one by way of Hartley's transforms either.
-            if needs_gradient(F):
-                F = torch.where((self.gap > independence_gap(F.dtype))[:, None, None], F, F.detach())
-            return F / torch.linalg.matrix_norm(F, keepdim=True), self.gap
-        x1, x2 = (T @ convert_points_to_homogeneous(p).mT for T, p in ((T1, self.points1), (T2, self.points2)))
-        return self._solve_between(x1.mT, x2.mT)[0]
+            if needs_gradient(M):
+                M = torch.where((self.gap > DEPENDENT_GAP[M.dtype])[:, None, None], M, M.detach())
+            return M / torch.linalg.matrix_norm(M, keepdim=True), self.gap
+        rows = convert_points_to_homogeneous(torch.stack([self.points1, self.points2])).mT
+        x1, x2 = (torch.stack([T1, T2]) @ rows).mT
+        return self._solve_between(x1, x2)[:2]
 
     def select(self, rows: Tensor) -> LinearProblem:
         """Return the problem of some of the sets, by their indices or a mask (B,); solved if this one is."""
-        return self._changed(lambda value: value[rows])
+        return self._map(lambda value: value[rows])
 
     def detach(self, rows: Tensor) -> LinearProblem:
         """Return the same problem, in which the sets marked in ``rows``, (B,) bool, send no gradient."""
-        return self._changed(lambda v: torch.where(rows.view(-1, *[1] * (v.ndim - 1)), v.detach(), v))
+        return self._map(lambda v: torch.where(rows.view(-1, *[1] * (v.ndim - 1)), v.detach(), v))
 
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> LinearProblem:
-        return LinearProblem(
-            change(self.points1),
-            change(self.points2),
-            None if self.weights is None else change(self.weights),
-            change(self.T1),
-            change(self.T2),
-            change(self.x1),
-            change(self.x2),
-            None if self.solution is None else (change(self.solution[0]), change(self.solution[1])),
-        )
+    def _map(self, function: Callable[[Tensor], Tensor]) -> LinearProblem:
+        tensors = (self.points1, self.points2, self.weights, self.T1, self.T2, self.x1, self.x2)
+        changed: Any = [None if value is None else function(value) for value in tensors]
+        problem = LinearProblem(self.model, *changed)
+        if self.solution is not None:
+            problem.solution = function(self.solution[0]), function(self.solution[1])
+        return problem
+
+
+def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:
+    r"""Return the similarity that moves the centroid to the origin and makes the mean distance from it :math:`\sqrt 2`.
+
+    Coincident points keep their scale.
+
+    Args:
+        points: points with shape :math:`(*, N, 2)`.
+        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
+
+    Returns:
+        transforms with shape :math:`(*, 3, 3)`.
+
+    Reference:
+        R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; Fan et al., Eq. 4.
+
+    """
+    return hartley_coordinates(points, weights)[1]
+
+
+def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Return homogeneous points :math:`(*, N, 3)` in Hartley's coordinates, and :func:`hartley_transform`.
+
+    The points come transposed in memory: on a CPU, one coordinate of all points is a longer run than all of one point.
+    """
+    rows = points.mT.contiguous()
+    origin = weighted_mean(rows.mT, weights)
+    centred = rows - origin[..., None]
+    least = torch.finfo(points.dtype).tiny  # so that the distance of a point at the centroid has a derivative
+    distance = (centred.square().sum(-2) + least).sqrt()
+    radius = weighted_mean(distance[..., None], weights)[..., 0]
+    # A mean is not exact: up to this distance from it, points coincide.
+    rounding = 16 * torch.finfo(points.dtype).eps * torch.linalg.vector_norm(origin.detach(), dim=-1)
+    scale = math.sqrt(2) / torch.where(radius > rounding + 2 * math.sqrt(least), radius, math.sqrt(2))
+    shift_x, shift_y = (origin * -scale[..., None]).unbind(-1)
+    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
+    entries = torch.stack([scale, zero, shift_x, zero, scale, shift_y, zero, zero, one], -1)
+    homogeneous = pad(centred * scale[..., None, None], (0, 0, 0, 1), value=1.0)
+    return homogeneous.mT, torch.unflatten(entries, -1, (3, 3))

@@ -11,12 +11,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import check_correspondences, check_fundamental, check_tensor, safe_divisor
+from kornia_learnnorm.geometry.checks import (
+    check_correspondences,
+    check_matrices,
+    check_tensor,
+    safe_divisor,
+    solve_dtype,
+)
 from kornia_learnnorm.geometry.distances import line_norms
 from kornia_learnnorm.geometry.dlt import design_matrix
-from kornia_learnnorm.geometry.matrices import cofactors, inverse, smallest_right_singular_vector_3x3
-from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
+from kornia_learnnorm.geometry.matrices import cofactors, inverse, nearest_rank2, unit_matrix
+from kornia_learnnorm.geometry.problem import hartley_coordinates
+from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 __all__ = ["correct_rank2", "optimal_rank2", "rank2_projection"]
 
@@ -44,8 +50,7 @@ def rank2_projection(F_mat: Tensor) -> Tensor:
 
     """
     check_tensor("F_mat", F_mat, ["*", "3", "3"])
-    v = smallest_right_singular_vector_3x3(F_mat)[..., None]
-    return F_mat - (F_mat @ v) @ v.mT
+    return nearest_rank2(F_mat)
 
 
 def optimal_rank2(
@@ -97,29 +102,41 @@ def optimal_rank2(
 
     """
     check_correspondences(points1, points2, weights)
-    check_fundamental(F_mat, points1)
+    check_matrices("F_mat", F_mat, len(points1))
     if iterations < 0:
         raise ValueError(f"iterations must be >= 0, got {iterations}")
-    problem = LinearProblem.from_points(points1, points2, weights)
-    F_hat = transform_fundamental(F_mat.to(problem.x1), inverse(problem.T1), inverse(problem.T2))
-    return correct_rank2(problem, F_hat, iterations).to(points1.dtype)
+    dtype = solve_dtype(points1.device)
+    weights = None if weights is None else weights.to(dtype)
+    (x1, x2), (T1, T2) = hartley_coordinates(torch.stack([points1, points2]).to(dtype), weights)
+    F_hat = transform_fundamental(F_mat.to(x1), inverse(T1), inverse(T2))
+    F_hat = correct_rank2(F_hat, x1, x2, weights, T1[:, 0, 0] / T2[:, 0, 0], iterations)
+    return unit_matrix(transform_fundamental(F_hat, T1, T2)).to(points1.dtype)
 
 
-def correct_rank2(problem: LinearProblem, F_hat: Tensor, iterations: int = ITERATIONS) -> Tensor:
-    """Return the optimal correction of matrices in Hartley's coordinates; see :func:`optimal_rank2`."""
+def correct_rank2(
+    F_hat: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor, iterations: int = ITERATIONS
+) -> Tensor:
+    """Return the optimal correction of matrices in Hartley's coordinates; see :func:`optimal_rank2`.
+
+    Args:
+        F_hat: matrices with shape :math:`(B, 3, 3)`, any scale but zero.
+        x1: homogeneous points of the first view with shape :math:`(B, N, 3)`.
+        x2: homogeneous points of the second view.
+        weights: optional weights with shape :math:`(B, N)`.
+        scale: scale of the first view over that of the second, (B,): equal noise in pixels is not equal there.
+        iterations: number of steps.
+
+    """
     u = normalize(F_hat.flatten(-2), dim=-1)
     if iterations:
-        u = _correct(u, _covariance(u, problem), iterations)
-    F_hat = rank2_projection(torch.unflatten(u, -1, (3, 3)))
-    return unit_fundamental(transform_fundamental(F_hat, problem.T1, problem.T2))
+        u = _correct(u, _covariance(u, x1, x2, weights, scale[:, None]), iterations)
+    return nearest_rank2(torch.unflatten(u, -1, (3, 3)))
 
 
-def _covariance(u: Tensor, problem: LinearProblem) -> Tensor:
+def _covariance(u: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor) -> Tensor:
     """Return a matrix that equals ``V_0`` of the unit vectors ``u`` up to scale once projected, ``(B, 9, 9)``."""
-    x1, x2, weights = problem.x1, problem.x2, problem.weights
-    # (u, V_i u) is the sum of the squared normals of both epipolar lines; equal noise in pixels is not equal here.
-    scale = (problem.T1[:, 0, 0] / problem.T2[:, 0, 0])[:, None]
-    n1, n2 = line_norms(x1, x2, torch.unflatten(u, -1, (3, 3)), weights, floor=EPIPOLE_FLOOR)
+    # (u, V_i u) is the sum of the squared normals of both epipolar lines.
+    n1, n2 = line_norms(x1.mT, x2.mT, torch.unflatten(u, -1, (3, 3)), weights, floor=EPIPOLE_FLOOR)
     variance = scale * n1.square() + n2.square() / scale
     A = design_matrix(x1, x2)
     A = torch.addcmul(A, A @ u[..., None], u[:, None], value=-1)

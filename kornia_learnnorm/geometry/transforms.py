@@ -2,25 +2,19 @@ r"""Normalising transforms of the plane, their builders, and how points and fund
 
 from __future__ import annotations
 
-import math
-
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
-from torch.nn.functional import pad
 
 from kornia_learnnorm.geometry.checks import solve_dtype, weighted_mean
 
 __all__ = [
     "affine_transform",
-    "hartley_coordinates",
-    "hartley_transform",
     "inverse_sqrt",
     "paper_transform",
     "spd_transform",
     "transform_fundamental",
     "transform_points",
-    "unit_fundamental",
     "whitening_from_moments",
     "whitening_transform",
 ]
@@ -52,71 +46,6 @@ def transform_points(points: Tensor, T: Tensor) -> Tensor:
     return points @ T[..., :2, :2].mT + T[..., None, :2, 2]
 
 
-def unit_fundamental(F_mat: Tensor) -> Tensor:
-    """Return fundamental matrices scaled to unit Frobenius norm, with a canonical sign.
-
-    Of the entries of at least half of the largest magnitude, the first in row-major order is positive. The sign does
-    not depend on rounding, also where two entries are equal up to their signs, as under pure translation.
-
-    Args:
-        F_mat: fundamental matrices with shape :math:`(*, 3, 3)`, any scale but zero.
-
-    Returns:
-        matrices with shape :math:`(*, 3, 3)`.
-
-    Example:
-        >>> unit_fundamental(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -3.0], [0.0, 4.0, 0.0]]))[1:, 1:]
-        tensor([[-0.0000,  0.6000],
-                [-0.8000, -0.0000]])
-
-    """
-    entries = F_mat.detach().flatten(-2)
-    size = entries.abs()
-    large = torch.where(size >= size.amax(-1, keepdim=True) / 2, entries.sign(), 0.0)
-    powers = torch.arange(8, -1, -1, dtype=F_mat.dtype, device=F_mat.device).exp2()  # the first outweighs all others
-    sign = torch.where(large @ powers < 0, -1.0, 1.0)[..., None, None]
-    F: Tensor = F_mat * (sign / torch.linalg.matrix_norm(F_mat, keepdim=True))
-    return F
-
-
-def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return the similarity that moves the centroid to the origin and makes the mean distance from it :math:`\sqrt 2`.
-
-    Coincident points keep their scale.
-
-    Args:
-        points: points with shape :math:`(*, N, 2)`.
-        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
-
-    Returns:
-        transforms with shape :math:`(*, 3, 3)`.
-
-    Reference:
-        R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; Fan et al., Eq. 4.
-
-    """
-    return hartley_coordinates(points, weights)[1]
-
-
-def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return homogeneous points :math:`(*, N, 3)` in Hartley's coordinates, and :func:`hartley_transform`.
-
-    The points come transposed in memory: on a CPU, one coordinate of all points is a longer run than all of one point.
-    """
-    rows = points.mT.contiguous()
-    origin = weighted_mean(rows.mT, weights)
-    centred = rows - origin[..., None]
-    least = torch.finfo(points.dtype).tiny  # so that the distance of a point at the centroid has a derivative
-    distance = (centred.square().sum(-2) + least).sqrt()
-    radius = weighted_mean(distance[..., None], weights)[..., 0]
-    scale = math.sqrt(2) / torch.where(radius > _rounding(origin) + 2 * math.sqrt(least), radius, math.sqrt(2))
-    shift_x, shift_y = (origin * -scale[..., None]).unbind(-1)
-    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
-    entries = torch.stack([scale, zero, shift_x, zero, scale, shift_y, zero, zero, one], -1)
-    homogeneous = pad(centred * scale[..., None, None], (0, 0, 0, 1), value=1.0)
-    return homogeneous.mT, torch.unflatten(entries, -1, (3, 3))
-
-
 def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: float = 1e-6) -> Tensor:
     r"""Return the transform that moves the centroid to the origin and makes the covariance the identity.
 
@@ -143,14 +72,11 @@ def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: fl
 def whitening_from_moments(mean: Tensor, covariance: Tensor, floor: float = 1e-6) -> Tensor:
     r"""Return :func:`whitening_transform` of points with a mean :math:`(*, 2)` and covariance :math:`(*, 2, 2)`."""
     spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-    covariance = torch.where((spread > _rounding(mean))[..., None, None], covariance, 0.0)
+    rounding = (
+        16 * torch.finfo(mean.dtype).eps * torch.linalg.vector_norm(mean.detach(), dim=-1)
+    )  # of coincident points
+    covariance = torch.where((spread > rounding)[..., None, None], covariance, 0.0)
     return affine_transform(inverse_sqrt(covariance, floor), mean)
-
-
-def _rounding(origin: Tensor) -> Tensor:
-    """Return the spread ``(B,)`` about ``origin`` up to which points coincide: a mean is not exact."""
-    size: Tensor = torch.linalg.vector_norm(origin.detach(), dim=-1)
-    return 16 * torch.finfo(origin.dtype).eps * size
 
 
 def paper_transform(params: Tensor, origin: Tensor | None = None) -> Tensor:
@@ -216,10 +142,11 @@ def spd_transform(params: Tensor) -> Tensor:
     cosh = torch.where(small, 1 + square / 2 + square.square() / 24, d.cosh())
     sinhc = torch.where(small, 1 + square / 6 + square.square() / 120, d.sinh() / d)
     scale = mean.exp()
-    row1 = torch.stack([scale * (cosh + sinhc * half), scale * sinhc * b], -1)
-    row2 = torch.stack([scale * sinhc * b, scale * (cosh - sinhc * half)], -1)
-    origin = params[..., 3:] if params.shape[-1] == 5 else torch.zeros_like(params[..., :2])
-    return affine_transform(torch.stack([row1, row2], -2), origin)
+    xx, xy, yy = scale * (cosh + sinhc * half), scale * sinhc * b, scale * (cosh - sinhc * half)
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+    ox, oy = params[..., 3:].unbind(-1) if params.shape[-1] == 5 else (zero, zero)
+    entries = torch.stack([xx, xy, -xx * ox - xy * oy, xy, yy, -xy * ox - yy * oy, zero, zero, one], -1)
+    return torch.unflatten(entries, -1, (3, 3))
 
 
 def inverse_sqrt(covariance: Tensor, floor: float = 1e-6) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.normalizers.contract import ProblemNormalizer
+from kornia_learnnorm.normalizers.normalizer import ProblemNormalizer
 
 __all__ = ["Hartley"]
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.normalizers.contract import ProblemNormalizer
+from kornia_learnnorm.normalizers.normalizer import ProblemNormalizer
 
 __all__ = ["Identity"]
 

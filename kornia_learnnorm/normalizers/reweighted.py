@@ -19,7 +19,7 @@ from kornia_learnnorm.geometry.checks import safe_divisor
 from kornia_learnnorm.geometry.matrices import adjugate, smallest_right_singular_vector_3x3
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, whitening_from_moments
-from kornia_learnnorm.normalizers.contract import ProblemNormalizer
+from kornia_learnnorm.normalizers.normalizer import ProblemNormalizer
 
 __all__ = ["ReweightedWhitening"]
 

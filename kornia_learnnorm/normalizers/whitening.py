@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import whitening_transform
-from kornia_learnnorm.normalizers.contract import ProblemNormalizer
+from kornia_learnnorm.normalizers.normalizer import ProblemNormalizer
 
 __all__ = ["Whitening"]
 

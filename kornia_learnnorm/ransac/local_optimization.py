@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.epipolar_cost import EpipolarCost
-from kornia_learnnorm.estimators.refinement import minimize
+from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
-from kornia_learnnorm.geometry.manifold import Calibrated, Rank2, decompose
-from kornia_learnnorm.geometry.pose import in_front_of_best_pose
-from kornia_learnnorm.ransac.constrained_fit import constrained_fit
-from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
 
-__all__ = ["fit_final", "fit_final_calibrated", "optimize_calibrated", "optimize_locally"]
+__all__ = ["fit_final", "optimize_locally"]
 
 LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps: a noisy sample has few inliers
 FINAL_POOL_SIZE = 4  # best hypotheses that the final fit starts from
@@ -25,13 +21,13 @@ FINAL_STEPS = 3  # steps of least squares on that loss
 FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
-CALIBRATED_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages, with cameras
-CALIBRATED_STEPS = 2  # steps of Levenberg-Marquardt in a stage
+MANIFOLD_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages by Levenberg-Marquardt
+MANIFOLD_STEPS = 2  # steps of Levenberg-Marquardt in a stage
 SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
 MIN_NOISE = 0.01  # thresholds; smaller distances don't speak against cameras
 
 
-def optimize_locally(scorer: PairScorer, F_mat: Tensor, number: int) -> Hypotheses:
+def optimize_locally(scorer: PairScorer, M: Tensor, number: int) -> Hypotheses:
     """Return the best of the matrices (K, 3, 3) fitted to their inliers among the scored correspondences.
 
     Reference:
@@ -39,58 +35,56 @@ def optimize_locally(scorer: PairScorer, F_mat: Tensor, number: int) -> Hypothes
 
     """
     losses = [Truncated(scale * scorer.threshold) for scale in LOCAL_SCALES]
-    x1, x2 = scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows]
-    return scorer.best(constrained_fit(x1, x2, F_mat, losses, scorer.scale).F_mat, number)
-
-
-def optimize_calibrated(scorer: PairScorer, state: Calibrated, number: int) -> Hypotheses:
-    """Return the best of the essential matrices fitted to their inliers among the scored correspondences."""
-    for scale in CALIBRATED_SCALES:
-        objective = _objective(scorer, Truncated(scale * scorer.threshold), scorer.rows)
-        state = minimize(objective, state, CALIBRATED_STEPS, LM_TOLERANCE)[1].state
+    fit = scorer.model.reweighted_fit(scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows], M, losses)
+    if fit is not None:
+        return scorer.best(fit.F_mat, number)
+    state = scorer.model.state(M)
+    for scale in MANIFOLD_SCALES:
+        cost = _cost(scorer, Truncated(scale * scorer.threshold), scorer.rows)
+        state = minimize(cost, state, MANIFOLD_STEPS, LM_TOLERANCE)[1].state
     return scorer.best(state.matrix(), number)
 
 
-def fit_final(scorer: PairScorer, pool: Hypotheses) -> Rank2:
+def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
     """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
-    threshold, loss = scorer.threshold, GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold)
-    losses: list[Loss] = [Truncated(threshold), *FINAL_STEPS * [loss]]
-    fit = constrained_fit(scorer.x1, scorer.x2, pool.F_mat[:FINAL_POOL_SIZE], losses, scorer.scale)
+    model, threshold = scorer.model, scorer.threshold
+    loss = GemanMcClure(FINAL_LOSS_SCALE * threshold)
+    start = pool.F_mat[:FINAL_POOL_SIZE]
+    fit = model.reweighted_fit(scorer.x1, scorer.x2, start, [Truncated(threshold), *FINAL_STEPS * [loss]])
+    if fit is None:
+        return _fit_on_manifold(scorer, start, loss)
     best = int(fit.cost.argmin())
-    state, cost = decompose(fit.F_mat[best : best + 1]), float(fit.cost[best])
+    state, cost = model.state(fit.F_mat[best : best + 1]), float(fit.cost[best])
     if not float(fit.gain[best]) <= FINAL_GAIN:
-        optimum = minimize(_objective(scorer, loss), state, MAX_LM_STEPS, LM_TOLERANCE)[1]
+        optimum = minimize(_cost(scorer, loss), state, MAX_LM_STEPS, LM_TOLERANCE)[1]
         state, cost = optimum.state, float(optimum.cost[0])
-    return state if cost <= _largest_cost(scorer, pool) else decompose(pool.F_mat[:1])
+    return state if cost <= _largest_cost(scorer, pool) else model.state(pool.F_mat[:1])
 
 
-def fit_final_calibrated(scorer: PairScorer, pool: Hypotheses, start: Calibrated) -> Calibrated | Rank2:
-    """Return the optimum (1, 3, 3) among essential matrices that is next to the best of the pool.
+def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
+    """Return the optimum (1, 3, 3) of the model that is next to the best of some matrices (K, 3, 3).
 
     Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
-    contradict the cameras, the optimum is that of fundamental matrices.
-
-    Args:
-        scorer: all correspondences.
-        pool: the best hypotheses.
-        start: the best of the pool as essential matrices, the first of them first.
-
+    contradict the model, the optimum is that of the relaxed one.
     """
-    distances = torch.stack([scorer.distances(F) for F in pool.F_mat[: len(start.A)]])
+    model, state = scorer.model, scorer.model.state(M)
+    distances = torch.stack([scorer.distances(matrix) for matrix in M])
     gains = (1 - (distances / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
-    rays1, rays2 = (scorer.x1.mT @ start.C1[0].mT), (scorer.x2.mT @ start.C2[0].mT)
-    front = in_front_of_best_pose(start.essential(), rays1, rays2, gains)
-    best = int((gains * front).sum(-1).argmax())
-    state, weights = Calibrated(*(value[best : best + 1] for value in start)), front[best : best + 1].to(gains)
-    near = _objective(scorer, Truncated(scorer.threshold), weights=weights)
-    last = _objective(scorer, GemanMcClure(FINAL_LOSS_SCALE * scorer.threshold), weights=weights)
-    state = minimize(near, state, CALIBRATED_STEPS, LM_TOLERANCE)[1].state
+    voters = model.voters(state, scorer.x1, scorer.x2, gains)
+    best = int((gains * voters).sum(-1).argmax())
+    state, weights = type(state)(*(value[best : best + 1] for value in state)), voters[best : best + 1].to(gains)
+    near, last = (_cost(scorer, rho, weights=weights) for rho in (Truncated(scorer.threshold), loss))
+    state = minimize(near, state, MANIFOLD_STEPS, LM_TOLERANCE)[1].state
     state = minimize(last, state, MAX_LM_STEPS, LM_TOLERANCE)[1].state
-    before, free = minimize(last, decompose(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)
-    return free.state if _contradicts(last, free.state, float(before - free.cost), scorer.threshold) else state
+    relaxed = model.relaxed()
+    if relaxed is None:
+        return state
+    before, free = minimize(last, relaxed.state(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)
+    contradicts = _contradicts(last, free.state.matrix(), float(before - free.cost), scorer.threshold)
+    return free.state if contradicts else state
 
 
-def _contradicts(objective: EpipolarCost, free: Rank2, gain: float, threshold: float) -> bool:
+def _contradicts(cost: RobustCost, free: Tensor, gain: float, threshold: float) -> bool:
     r"""Return whether two more parameters lower the cost of Geman and McClure's loss by more than noise would.
 
     The :math:`\tau` test: the gain over the mean of :math:`\psi^2` and times that of :math:`\psi'`, where
@@ -101,8 +95,8 @@ def _contradicts(objective: EpipolarCost, free: Rank2, gain: float, threshold: f
         F. Hampel, E. Ronchetti, P. Rousseeuw, W. Stahel, Robust Statistics, 1986, section 7.2.
 
     """
-    squares = objective.distances(free.matrix()).square()
-    weights = objective.weights * objective.loss(squares)[1]
+    squares = cost.squares(free)
+    weights = cost.weights * cost.loss(squares)[1]
     freedom = float(weights.sum()) - 7
     if freedom < 1:
         return False
@@ -112,15 +106,15 @@ def _contradicts(objective: EpipolarCost, free: Rank2, gain: float, threshold: f
     return statistic > freedom * (math.pow(SIGNIFICANCE, -2 / freedom) - 1)
 
 
-def _objective(
+def _cost(
     scorer: PairScorer, loss: Loss, rows: Tensor | slice = slice(None), weights: Tensor | None = None
-) -> EpipolarCost:
+) -> RobustCost:
     x1, x2 = scorer.x1[None, :, rows], scorer.x2[None, :, rows]
-    return EpipolarCost(x1, x2, torch.ones_like(x1[:, 0]) if weights is None else weights, scorer.scale, loss)
+    return RobustCost(scorer.model, x1, x2, torch.ones_like(x1[:, 0]) if weights is None else weights, loss)
 
 
 def _largest_cost(scorer: PairScorer, pool: Hypotheses) -> float:
     """Return what an optimum costs at most: the loss is nowhere above that of MSAC, up to a margin for the scores."""
     share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
-    most: float = scorer.threshold**2 * (1.1 * share * scorer.x1.shape[-1] + SAMPLE_SIZE)
+    most: float = scorer.threshold**2 * (1.1 * share * scorer.x1.shape[-1] + scorer.model.sample_size)
     return most

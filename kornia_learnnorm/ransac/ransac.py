@@ -12,14 +12,19 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.geometry.checks import check_cameras, check_rank2, check_tensor, solve_dtype
-from kornia_learnnorm.geometry.distances import DistanceScale, find_scale
+from kornia_learnnorm.estimators.linear import solve_linear
+from kornia_learnnorm.geometry.checks import check_cameras, check_pairs, check_tensor, solve_dtype
 from kornia_learnnorm.geometry.distinct_points import distinct_points
-from kornia_learnnorm.geometry.transforms import unit_fundamental
-from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
+from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.geometry.minimal import are_independent
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.essential import Essential
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.hartley import Hartley
-from kornia_learnnorm.ransac.models import EssentialModel, FundamentalModel
-from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler, UniformSampler
+from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
+from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
+from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.ransac.scoring import (
     MAX_MEDIAN_DISTANCES,
     PRESCORED,
@@ -35,9 +40,8 @@ FIRST_BATCH = 64  # samples in the first batch; each batch is four times as larg
 MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
 POOL_SIZE = 8  # best hypotheses of a batch, which local optimisation fits
-MIN_RANK2_DETERMINANT = 1e-9  # of the 2x2 part of a matrix of rank 2 and unit norm
+MIN_SAMPLE_SHIFT = 0.01  # thresholds; a sample that a shift of a point by less makes degenerate is dropped
 
-Model = FundamentalModel | EssentialModel
 Cameras = tuple[Tensor, Tensor]
 
 
@@ -93,8 +97,7 @@ class RANSAC(nn.Module):
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
             best matrix so far has found all inliers; 1 draws all ``max_samples`` samples. It is close to 1 by default,
             since a sample must not have much noise either.
-        distance: ``"sampson"``, ``"symmetric"`` (Fan et al., Eq. 7), or a function such as
-            :func:`~kornia_learnnorm.sampson_scale`.
+        distance: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
         rank2: how the singularity constraint is enforced on minimal samples: ``"projection"`` in the normaliser's
             coordinates, or ``"optimal"`` correction, which takes fewer samples and, without a normaliser, a fraction of
             the time. When not given, ``"projection"`` with a ``normalizer`` and ``"optimal"`` without.
@@ -103,6 +106,7 @@ class RANSAC(nn.Module):
             :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`. It is called with the weights, and with cameras
             also with ``size=5``.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
+        model: what the matrix is, in place of a fundamental matrix of that ``distance`` and ``rank2``.
 
     Raises:
         TypeError: if ``normalizer``, ``distance`` or ``sampler`` cannot be called, or an argument that must be a number
@@ -133,11 +137,12 @@ class RANSAC(nn.Module):
         max_samples: int = 50_000,
         max_seconds: float | None = None,
         confidence: float = 0.999999,
-        distance: Literal["sampson", "symmetric"] | DistanceScale = "sampson",
+        distance: Literal["sampson", "symmetric"] = "sampson",
         rank2: Literal["projection", "optimal"] | None = None,
         refine: bool = True,
         sampler: Callable[..., Sampler] = ProsacSampler,
         seed: int | None = None,
+        model: TwoViewModel | None = None,
     ) -> None:
         super().__init__()
         _check_numbers(inl_th, max_samples, max_seconds, confidence, seed)
@@ -147,8 +152,7 @@ class RANSAC(nn.Module):
             raise TypeError(f"sampler must be a function or a class, got {sampler!r}")
         if rank2 is None:
             rank2 = "optimal" if normalizer is None else "projection"
-        check_rank2(rank2)
-        find_scale(distance)
+        self.model = Fundamental(rank2, distance) if model is None else model
         self.normalizer = Hartley() if normalizer is None and rank2 == "projection" else normalizer
         self.rank2: Literal["projection", "optimal"] = rank2
         self.inl_th, self.max_samples, self.max_seconds, self.confidence = inl_th, max_samples, max_seconds, confidence
@@ -228,7 +232,7 @@ class RANSAC(nn.Module):
         """
         check_cameras(K1, K2)
         cameras = None if K1 is None or K2 is None else (K1, K2)
-        _check_matches(points1, points2, weights, self._model_of(cameras).sample_size)
+        _check_matches(points1, points2, weights, self._sample_size(cameras))
         device = points1.device.type
         with ExitStack() as stack:
             if device == "cpu":
@@ -256,7 +260,7 @@ class RANSAC(nn.Module):
     def _estimate_kept(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None
     ) -> RansacResult:
-        size = self._model_of(cameras).sample_size
+        size = self._sample_size(cameras)
         if (len(points1) if weights is None else int((weights > 0).sum())) < size:
             return _failure(points1, 0, cameras)
         x1, x2 = (points.to(solve_dtype(points.device)) for points in (points1, points2))
@@ -266,13 +270,13 @@ class RANSAC(nn.Module):
         scored: Tensor | slice = slice(None)
         if len(x1) >= 2 * PRESCORED:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:MAX_SCORED]
-        scorer = PairScorer(x1, x2, self.inl_th, find_scale(self.distance), scored)
-        model = self._model(scorer, cameras)
-        pool, drawn = self._search(model, sampler, generator)
+        scorer = PairScorer(x1, x2, self.inl_th, self.model, scored)
+        scorer = scorer if cameras is None else scorer.of_cameras(*cameras)
+        pool, drawn = self._search(scorer, sampler, generator)
         if len(pool.F_mat) == 0:
             return _failure(points1, drawn, cameras)
-        state = model.fit(pool, self.refine)
-        if state.A.det().abs() < MIN_RANK2_DETERMINANT:
+        state = fit_final(scorer, pool) if self.refine else scorer.model.state(pool.F_mat[:1])
+        if bool(scorer.model.is_degenerate(state)):
             return _failure(points1, drawn, cameras)
         F = state.matrix()
         distances = scorer.distances(F[0])
@@ -280,25 +284,20 @@ class RANSAC(nn.Module):
         if int(inliers.sum()) <= size:
             return _failure(points1, drawn, cameras)
         score = float((1 - (distances / self.inl_th).square()).clamp(min=0).nansum())
-        F_mat = unit_fundamental(scorer.to_pixels(F)[0]).to(points1.dtype)
-        E_mat = model.essential(F)[0].to(points1.dtype) if isinstance(model, EssentialModel) else None
+        F_mat = unit_matrix(scorer.to_pixels(F)[0]).to(points1.dtype)
+        E_mat = None
+        if isinstance(scorer.model, Essential):
+            E_mat = scorer.model.state(F).essential()[0].to(points1.dtype)
         return RansacResult(F_mat, inliers, drawn, score, E_mat)
 
-    def _model(self, scorer: PairScorer, cameras: Cameras | None) -> Model:
-        if cameras is None:
-            return FundamentalModel(scorer, self.normalizer, self.rank2)
-        return EssentialModel(scorer, *cameras)
-
-    @staticmethod
-    def _model_of(cameras: Cameras | None) -> type[Model]:
-        return FundamentalModel if cameras is None else EssentialModel
+    def _sample_size(self, cameras: Cameras | None) -> int:
+        return self.model.sample_size if cameras is None else Essential.sample_size
 
     def _sampler(self, weights: Tensor, size: int) -> Sampler:
-        return self.sampler(weights) if size == FundamentalModel.sample_size else self.sampler(weights, size=size)
+        return self.sampler(weights) if size == SAMPLE_SIZE else self.sampler(weights, size=size)
 
-    def _search(self, model: Model, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
+    def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
         """Return the best hypotheses that enough minimal samples give, best first, and the number of samples."""
-        scorer = model.scorer
         pool = Hypotheses(scorer.x1.new_zeros(0, 3, 3), scorer.x1.new_zeros(0))
         batch, drawn, needed, start = FIRST_BATCH, 0, self.max_samples, time.perf_counter()
         while drawn < needed:
@@ -306,15 +305,48 @@ class RANSAC(nn.Module):
                 break
             rows = sampler.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, MAX_BATCH)
-            F_mat = model.solve(rows)
+            F_mat = self._solve(scorer, rows)
             found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL_SIZE)
             pool = pool.join(found, POOL_SIZE)
             needed = self._samples_needed(pool, scorer, sampler)
             # A pool that ends the search is optimised anyway.
             if self.refine and drawn < needed and len(found.F_mat):
-                pool = pool.join(model.optimize(found.F_mat, POOL_SIZE), POOL_SIZE)
+                pool = pool.join(self._optimize(scorer, found.F_mat), POOL_SIZE)
                 needed = self._samples_needed(pool, scorer, sampler)
         return pool, drawn
+
+    def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
+        """Return the matrices of the non-degenerate minimal samples (K, S), or of all where every one is degenerate.
+
+        Matches on one line give none.
+        """
+        model, shift = scorer.model, MIN_SAMPLE_SHIFT * scorer.threshold
+        x1, x2 = scorer.samples(rows)
+        if self.normalizer is None or model.sample_size < model.min_points:
+            M = model.solve_samples(x1, x2, shift)
+            if len(M) or model.sample_size < model.min_points:
+                return M
+            determined = torch.zeros_like(rows[:, 0], dtype=torch.bool)
+        else:
+            determined = are_independent(model.rows(x1, x2), x1, x2, shift)
+        if bool(determined.any()):
+            rows = rows[determined]
+        elif any(_on_a_line(points, shift) for points in scorer.pixels):
+            return x1.new_zeros(0, 3, 3)
+        points1, points2 = (points[rows] for points in scorer.pixels)
+        return self._solve_linearly(scorer, points1, points2, None)
+
+    def _optimize(self, scorer: PairScorer, M: Tensor) -> Hypotheses:
+        """Return the best of the matrices fitted to their inliers, the first of them also by the normaliser."""
+        if self.normalizer is not None and scorer.model is self.model:
+            points1, points2 = (points[None, scorer.rows] for points in scorer.pixels)
+            M = torch.cat([self._solve_linearly(scorer, points1, points2, scorer.inliers(M[:1]).to(M)), M])
+        return optimize_locally(scorer, M, POOL_SIZE)
+
+    def _solve_linearly(self, scorer: PairScorer, points1: Tensor, points2: Tensor, weights: Tensor | None) -> Tensor:
+        """Return the matrices of sets of pixels (K, M, 2) by the normaliser, in the scorer's coordinates."""
+        problem = LinearProblem.from_points(points1, points2, weights, self.model)
+        return scorer.from_pixels(solve_linear(problem, self.normalizer))
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
@@ -324,6 +356,12 @@ class RANSAC(nn.Module):
         if hit_rate == 0:
             return self.max_samples
         return math.ceil(min(self.max_samples, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
+
+
+def _on_a_line(points: Tensor, shift: float) -> bool:
+    """Return whether points (N, 2) are less than ``shift`` pixels from one line, in root mean square."""
+    distance = torch.linalg.svdvals(points - points.mean(0))[1] / len(points) ** 0.5
+    return bool(distance < shift)
 
 
 def _failure(points: Tensor, drawn: int, cameras: Cameras | None) -> RansacResult:
@@ -357,12 +395,7 @@ def _is_whole(value: object) -> bool:
 
 
 def _check_matches(points1: Tensor, points2: Tensor, weights: Tensor | None, min_points: int) -> None:
-    for name, points in (("points1", points1), ("points2", points2)):
-        check_tensor(name, points, ["N", "2"], precise=True)
-    if points1.dtype != points2.dtype:
-        raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
-    if points1.shape != points2.shape:
-        raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
+    check_pairs(points1, points2, ["N", "2"])
     if len(points1) < min_points:
         raise ValueError(f"at least {min_points} correspondences are needed, got {len(points1)}")
     if weights is None:

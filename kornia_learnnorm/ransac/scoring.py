@@ -2,14 +2,15 @@ r"""Scores of many fundamental matrices on the correspondences of one image pair
 
 from __future__ import annotations
 
+import copy
 from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.geometry.distances import DistanceScale, sampson_scale, scale_value
-from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.essential import Essential
 
 __all__ = ["Hypotheses", "PairScorer", "finite_and_bounded"]
 
@@ -42,9 +43,8 @@ class Hypotheses(NamedTuple):
 class PairScorer:
     r"""MSAC scores on one pair's correspondences, :math:`\sum_i \max(0, 1 - d_i^2 / \tau^2)`.
 
-    The algebraic residuals are the design matrix times :math:`\mathrm{vec}(F)`, and the squared norms of the epipolar
-    lines' normals are quadratic in the points. So three matrix products give the distances of all correspondences under
-    all matrices, in float32.
+    Matrix products of what the model says of the correspondences give the distances of all correspondences under all
+    matrices, in float32.
 
     All matrices are in coordinates of which the first two are pixels from the points' median, and the third is the
     median of their absolute values, or the threshold where that is larger. They are conditioned like Hartley's,
@@ -54,7 +54,7 @@ class PairScorer:
         points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, :func:`finite_and_bounded`.
         points2: pixels in the second image with shape :math:`(N, 2)`.
         threshold: largest distance :math:`\tau` of an inlier, pixels.
-        scale: the distance: :func:`~kornia_learnnorm.sampson_scale` or :func:`~kornia_learnnorm.symmetric_scale`.
+        model: the model of the matrices.
         rows: the correspondences that count in scores, those that count in :meth:`shortlist` first; all by default.
 
     Attributes:
@@ -70,10 +70,10 @@ class PairScorer:
         points1: Tensor,
         points2: Tensor,
         threshold: float,
-        scale: DistanceScale = sampson_scale,
+        model: TwoViewModel,
         rows: Tensor | slice = slice(None),
     ) -> None:
-        self.threshold, self.scale, self.rows = threshold, scale, rows
+        self.threshold, self.model, self.rows = threshold, model, rows
         both = torch.stack([points1.mT, points2.mT])
         origin = both.median(-1, keepdim=True).values
         centred = both - origin
@@ -82,10 +82,14 @@ class PairScorer:
         self.x1, self.x2 = x
         columns = torch.eye(3, 2, dtype=both.dtype, device=both.device).expand(2, 3, 2)
         self.T1, self.T2 = torch.cat([columns, torch.cat([-origin, spread], 1)], 2)
-        x = x[..., rows]
-        x1, x2 = x
-        # What the algebraic residuals are linear in, and the squared norms of the normals of lines in view 2 and 1.
-        self.terms = torch.cat([(x2[:, None] * x1)[None], x[:, :, None] * x[:, None]]).flatten(0, 2).float()
+        self.terms = model.score_terms(self.x1[:, rows], self.x2[:, rows]).float()
+
+    def of_cameras(self, K1: Tensor, K2: Tensor) -> PairScorer:
+        """Return the scorer of the same correspondences whose model are essential matrices of cameras (3, 3)."""
+        other = copy.copy(self)
+        K1, K2 = (K.to(self.x1)[None] for K in (K1, K2))
+        other.model = Essential.of_cameras(K1, K2, self.T1, self.T2, getattr(self.model, "distance", "sampson"))
+        return other
 
     @cached_property
     def pixels(self) -> tuple[Tensor, Tensor]:
@@ -98,11 +102,11 @@ class PairScorer:
 
     def from_pixels(self, F_mat: Tensor) -> Tensor:
         """Return matrices (K, 3, 3) of pixels in the scorer's coordinates."""
-        return transform_fundamental(F_mat, torch.linalg.inv_ex(self.T1)[0], torch.linalg.inv_ex(self.T2)[0])
+        return self.model.carry(F_mat, torch.linalg.inv_ex(self.T1)[0], torch.linalg.inv_ex(self.T2)[0])
 
     def to_pixels(self, F_mat: Tensor) -> Tensor:
         """Return matrices (K, 3, 3) of the scorer's coordinates in pixels."""
-        return transform_fundamental(F_mat, self.T1, self.T2)
+        return self.model.carry(F_mat, self.T1, self.T2)
 
     def best(self, F_mat: Tensor, number: int) -> Hypotheses:
         r"""Return the matrices of highest score, at most so many, of those with an inlier."""
@@ -123,10 +127,8 @@ class PairScorer:
 
     def distances(self, F_mat: Tensor) -> Tensor:
         """Return the distances of all correspondences from one matrix (3, 3), pixels, (N,); NaN on an epipole."""
-        line1, line2 = F_mat.mT[:2] @ self.x2, F_mat @ self.x1
-        sq_norm1, sq_norm2 = line1.square_().sum(0), line2[:2].square().sum(0)
-        distances: Tensor = (self.x2 * line2).sum(0).abs_() * scale_value(self.scale, sq_norm1, sq_norm2)
-        return distances
+        residual = self.model.residual(F_mat[None], self.x1[None], self.x2[None])
+        return self.model.squares(residual)[0].sqrt()
 
     def _scores(self, F_mat: Tensor, terms: Tensor) -> Tensor:
         size = max(1, BLOCK // terms.shape[-1])
@@ -136,12 +138,7 @@ class PairScorer:
     def _gains(self, F_mat: Tensor, terms: Tensor) -> Tensor:
         """Return the term of each correspondence in each score before truncation at zero, (K, M)."""
         F = (F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)).float()
-        tiny = torch.finfo(F.dtype).tiny
-        residuals, products1, products2 = torch.unflatten(terms, 0, (3, 9))
-        sq_norm1 = ((F[:, :, :2] @ F[:, :, :2].mT).flatten(1) @ products2).clamp_(min=tiny)
-        sq_norm2 = ((F[:, :2].mT @ F[:, :2]).flatten(1) @ products1).clamp_(min=tiny)
-        ratio = ((F / self.threshold).flatten(1) @ residuals).mul_(scale_value(self.scale, sq_norm1, sq_norm2))
-        gains: Tensor = 1 - ratio.square_()
+        gains: Tensor = 1 - self.model.score_squares(F, terms, self.threshold)
         return gains
 
 

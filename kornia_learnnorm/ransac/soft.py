@@ -13,10 +13,10 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Generator, Tensor
 
-from kornia_learnnorm.estimators.fundamental import find_fundamental
+from kornia_learnnorm.estimators.linear import find_fundamental
 from kornia_learnnorm.geometry.checks import check_correspondences
 from kornia_learnnorm.geometry.distances import sampson_distance
-from kornia_learnnorm.normalizers.contract import Normalizer
+from kornia_learnnorm.normalizers.normalizer import Normalizer
 
 __all__ = ["SoftChoice", "expected_loss", "sample_minimal_sets"]
 

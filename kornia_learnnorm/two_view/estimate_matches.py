@@ -9,10 +9,10 @@ from torch import Tensor
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.geometry.manifold import nearest_essential
 from kornia_learnnorm.geometry.pose import in_front, relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.median import median
+from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size

@@ -16,7 +16,8 @@ from kornia_learnnorm.data.masks import content_mask
 from kornia_learnnorm.data.matching.features import DETECTORS, Features, keep_features
 from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points, unit_fundamental
+from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
 from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, check_whole, read_cameras
@@ -141,7 +142,7 @@ class MatchedPair:
         scale = float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
         return replace(
             found,
-            F_mat=unit_fundamental(transform_fundamental(found.F_mat, S1, S2)),
+            F_mat=unit_matrix(transform_fundamental(found.F_mat, S1, S2)),
             points1=transform_points(found.points1[None], torch.linalg.inv(S1)[None])[0],
             points2=transform_points(found.points2[None], torch.linalg.inv(S2)[None])[0],
             predicted_error=found.predicted_error / scale,

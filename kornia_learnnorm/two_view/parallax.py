@@ -19,7 +19,8 @@ from torch import Tensor
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
-from kornia_learnnorm.geometry.transforms import unit_fundamental
+from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 
@@ -97,8 +98,8 @@ def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshol
     x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
     lines = torch.linalg.cross(x1[off] @ H.mT, x2[off])
     epipole = torch.linalg.cross(lines[first[chosen]], lines[second[chosen]])
-    F_mat = unit_fundamental(cross_product_matrix(epipole) @ H)
-    scorer = PairScorer(points1, points2, threshold)
+    F_mat = unit_matrix(cross_product_matrix(epipole) @ H)
+    scorer = PairScorer(points1, points2, threshold, Fundamental())
     found = scorer.best(scorer.from_pixels(F_mat[F_mat.isfinite().flatten(1).all(1)]), 1).F_mat
     if len(found) == 0:
         return None

@@ -14,9 +14,9 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.geometry.transforms import unit_fundamental
-from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
-from kornia_learnnorm.ransac.models import EssentialModel
+from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view.inputs import Cameras
@@ -138,7 +138,7 @@ class TwoViewSolver:
     @cached_property
     def scorer(self) -> PairScorer:
         """Scores of matrices on the matches."""
-        return PairScorer(self.points1, self.points2, self.threshold)
+        return PairScorer(self.points1, self.points2, self.threshold, Fundamental())
 
     def _score(self, F_mat: Tensor) -> float:
         """Return the MSAC score of a matrix (3, 3); zero for a matrix of zeros."""
@@ -187,8 +187,8 @@ class TwoViewSolver:
         start = self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1)
         if len(start.F_mat) == 0:
             return F_mat
-        fitted = EssentialModel(self.scorer, *self.cameras).fit(start, refine=True)
-        return unit_fundamental(self.scorer.to_pixels(fitted.matrix()))[0]
+        scorer = self.scorer.of_cameras(*self.cameras)
+        return unit_matrix(scorer.to_pixels(fit_final(scorer, start).matrix()))[0]
 
     def _refine_at(self, scale: float, F_mat: Tensor) -> Tensor:
         """Return the matrix refined on a loss of a scale, pixels."""

@@ -2,16 +2,49 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
+from pathlib import Path
 
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from two_view import correspondences
 
+import kornia_learnnorm
 from kornia_learnnorm import EightPoint, Hartley, LearnedEightPoint, LearnedNormalizer, ReweightedWhitening, Whitening
 
 FACTORISATIONS = ("linalg_lu_factor_ex", "_linalg_eigh", "_linalg_svd", "linalg_qr", "_linalg_det", "linalg_inv_ex")
+
+
+def python_calls(function) -> tuple[int, int]:
+    """Return how many calls of the package's own functions a call makes, and in how many files."""
+    root, files = str(Path(kornia_learnnorm.__file__).parent), Counter()
+
+    def profile(frame, event, arg):
+        if event == "call" and frame.f_code.co_filename.startswith(root):
+            files[frame.f_code.co_filename] += 1
+
+    function()
+    sys.setprofile(profile)
+    try:
+        function()
+    finally:
+        sys.setprofile(None)
+    return files.total(), len(files)
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 14), reason="what counts as a call differs between versions of Python")
+@pytest.mark.parametrize(
+    ("layer", "num_points", "most", "files"),
+    [(EightPoint(), 8, 35, 6), (LearnedEightPoint.from_pretrained(), 50, 300, 14)],
+)
+def test_python_calls_of_a_forward_pass(layer, num_points, most, files):
+    points = correspondences("handheld", 4, num_points)
+    with torch.no_grad():
+        calls, found = python_calls(lambda: layer(*points))
+    assert calls <= most
+    assert found <= files
 
 
 class Operations(TorchDispatchMode):

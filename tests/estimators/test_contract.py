@@ -40,6 +40,7 @@ from kornia_learnnorm import (
 )
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.models.fundamental import Fundamental
 
 LOSSES = {
     "squared": squared_loss,
@@ -52,7 +53,7 @@ LOSSES = {
 
 def rank_three(points1, points2, weights=None):
     """The DLT's solution before any correction, in pixels."""
-    problem = LinearProblem.from_points(points1, points2, weights)
+    problem = LinearProblem.from_points(points1, points2, weights, Fundamental())
     return transform_fundamental(problem.null_matrix, problem.T1, problem.T2)
 
 

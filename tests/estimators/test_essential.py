@@ -8,10 +8,9 @@ import torch
 from kornia.core.exceptions import ShapeError
 from two_view import homogeneous, scenes, uniform, unit, up_to_sign
 
-from kornia_learnnorm.estimators.essential import refine_essential
-from kornia_learnnorm.estimators.minimal import solve_calibrated_samples
-from kornia_learnnorm.estimators.refinement import refine_fundamental
+from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, squared_loss
+from kornia_learnnorm.geometry.minimal import solve_calibrated_samples
 
 NAN = float("nan")
 

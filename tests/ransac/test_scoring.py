@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from two_view import correspondences, epipolar_distances, scenes, uniform
 
-from kornia_learnnorm import find_fundamental, sampson_distance, sampson_scale, symmetric_scale
+from kornia_learnnorm import find_fundamental, sampson_distance
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import PairScorer, finite_and_bounded
 
 
@@ -26,15 +27,15 @@ def matrices(pair):
 
 
 def distances(points1, points2, F, factor) -> np.ndarray:
-    if factor is symmetric_scale:
+    if factor == "symmetric":
         return epipolar_distances(points1, points2, F)
     return sampson_distance(points1.expand(len(F), -1, -1), points2.expand(len(F), -1, -1), F).numpy()
 
 
-@pytest.mark.parametrize("factor", [sampson_scale, symmetric_scale])
+@pytest.mark.parametrize("factor", ["sampson", "symmetric"])
 class TestBest:
     def test_scores_of_distances(self, pair, matrices, factor):
-        scorer = PairScorer(*pair, 1.5, factor)
+        scorer = PairScorer(*pair, 1.5, Fundamental(distance=factor))
         best = scorer.best(scorer.from_pixels(matrices), 200)
         reference = distances(*pair, matrices, factor)
         scores = np.maximum(0, 1 - (reference / 1.5) ** 2).sum(-1)
@@ -45,7 +46,10 @@ class TestBest:
 
     def test_rows_that_count(self, pair, matrices, factor):
         rows = torch.arange(0, 500, 3)
-        some, few = PairScorer(*pair, 1.5, factor, rows), PairScorer(pair[0][rows], pair[1][rows], 1.5, factor)
+        some, few = (
+            PairScorer(*pair, 1.5, Fundamental(distance=factor), rows),
+            PairScorer(pair[0][rows], pair[1][rows], 1.5, Fundamental(distance=factor)),
+        )
         best = few.to_pixels(few.best(few.from_pixels(matrices), 5).F_mat)
         assert torch.allclose(
             some.best(some.from_pixels(matrices), 5).score, few.best(few.from_pixels(best), 5).score, rtol=1e-3
@@ -53,7 +57,7 @@ class TestBest:
         assert some.x1.shape == (3, 500)
 
     def test_fewer_than_asked_for(self, pair, matrices, factor):
-        scorer = PairScorer(*pair, 1.5, factor)
+        scorer = PairScorer(*pair, 1.5, Fundamental(distance=factor))
         matrices = scorer.from_pixels(matrices)
         assert len(scorer.best(matrices[:3], 8).F_mat) <= 3
         assert scorer.best(matrices[:0], 8).F_mat.shape == (0, 3, 3)
@@ -67,33 +71,33 @@ class TestBest:
         samples = torch.rand(300, 1200, generator=torch.Generator().manual_seed(1)).topk(8).indices
         matrices = find_fundamental(*(p[samples] for p in points))
         rows = torch.randperm(1200, generator=torch.Generator().manual_seed(2))
-        scorer = PairScorer(*points, 1.5, factor, rows)
+        scorer = PairScorer(*points, 1.5, Fundamental(distance=factor), rows)
         matrices = scorer.from_pixels(matrices)
         kept = scorer.shortlist(matrices)
-        few = PairScorer(*(p[rows[:512]] for p in points), 1.5, factor)
+        few = PairScorer(*(p[rows[:512]] for p in points), 1.5, Fundamental(distance=factor))
         expected = few.best(few.from_pixels(scorer.to_pixels(matrices)), 64)
         assert torch.allclose(few.best(few.from_pixels(scorer.to_pixels(kept)), 64).score, expected.score, rtol=1e-3)
         assert torch.equal(scorer.best(kept, 8).F_mat, scorer.best(matrices, 8).F_mat)
 
     def test_no_shortlist_of_few(self, pair, matrices, factor):
         many = [points.repeat(3, 1) for points in pair]
-        assert len(PairScorer(*many, 1.5, factor).shortlist(matrices)) == 64
-        assert len(PairScorer(*many, 1.5, factor).shortlist(matrices[:50])) == 50
-        assert len(PairScorer(*pair, 1.5, factor).shortlist(matrices)) == 200
+        assert len(PairScorer(*many, 1.5, Fundamental(distance=factor)).shortlist(matrices)) == 64
+        assert len(PairScorer(*many, 1.5, Fundamental(distance=factor)).shortlist(matrices[:50])) == 50
+        assert len(PairScorer(*pair, 1.5, Fundamental(distance=factor)).shortlist(matrices)) == 200
 
     @given(scale=st.sampled_from([-1e6, -1.0, 1e-6, 3.0]))
     def test_scale_and_sign_do_not_count(self, factor, scale):
         points = correspondences("driving", 1, 60)
-        scorer = PairScorer(points[0][0], points[1][0], 1.0, factor)
+        scorer = PairScorer(points[0][0], points[1][0], 1.0, Fundamental(distance=factor))
         F = scorer.from_pixels(find_fundamental(points[0][:, :20], points[1][:, :20]))
         assert torch.allclose(scorer.best(F, 1).score, scorer.best(scale * F, 1).score, rtol=1e-3)
 
     def test_nothing_speaks_for_zero_or_nan(self, pair, factor):
         F = torch.tensor([0.0, torch.nan, torch.inf]).double()[:, None, None].expand(3, 3, 3)
-        assert len(PairScorer(*pair, 1.0, factor).best(F, 3).F_mat) == 0
+        assert len(PairScorer(*pair, 1.0, Fundamental(distance=factor)).best(F, 3).F_mat) == 0
 
     def test_distances_and_pixels(self, pair, matrices, factor):
-        scorer = PairScorer(*pair, 1.5, factor, torch.arange(10))
+        scorer = PairScorer(*pair, 1.5, Fundamental(distance=factor), torch.arange(10))
         got = np.stack([scorer.distances(F) for F in scorer.from_pixels(matrices)])
         assert np.allclose(got, distances(*pair, matrices, factor), rtol=1e-6)
         assert all(map(torch.allclose, scorer.pixels, pair))

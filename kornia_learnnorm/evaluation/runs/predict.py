@@ -18,7 +18,8 @@ from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.metrics.inliers import f1_from_masks, finite_distance
 from kornia_learnnorm.metrics.poses import rotation_error, translation_error
-from kornia_learnnorm.normalizers.contract import normalizing_transforms
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.normalizers.normalizer import normalizing_transforms
 from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
 
 # What a run keeps of each sample, by name.
@@ -78,7 +79,7 @@ def predict(
 
 
 def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStore, truth: Tensor) -> dict[str, Tensor]:
-    problem = LinearProblem.from_points(samples.points1, samples.points2)
+    problem = LinearProblem.from_points(samples.points1, samples.points2, None, Fundamental())
     x1, x2 = problem.points1, problem.points2
     T1, T2 = normalizing_transforms(method.normalizer, problem)
     F_mat = method.solve(problem, T1, T2)

@@ -8,17 +8,18 @@ outliers, it may not converge.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.robust_losses import Loss
-from kornia_learnnorm.geometry.distances import DistanceScale, sampson_scale
+from kornia_learnnorm.geometry.distances import sampson_scale
 from kornia_learnnorm.geometry.matrices import cofactors
 
-__all__ = ["Fit", "constrained_fit"]
+__all__ = ["Fit", "Loss", "constrained_fit"]
+
+Loss = Callable[[Tensor], tuple[Tensor, Tensor]]  # of squared distances: values and derivatives
 
 EPIPOLE_FLOOR = 1e-4  # smallest norm of a line's normal, relative to the size of the points
 STEP_LENGTH = 1.3  # over the least-squares step, which bounded losses make too short
@@ -43,7 +44,7 @@ def constrained_fit(
     x2: Tensor,
     F_mat: Tensor,
     losses: Iterable[Loss],
-    scale: DistanceScale = sampson_scale,
+    scale: Callable[[Tensor, Tensor], tuple[Tensor, ...]] = sampson_scale,
 ) -> Fit:
     r"""Return matrices fitted to correspondences that they share, one step for each loss.
 

@@ -8,7 +8,12 @@ from torch.autograd import gradcheck
 from two_view import correspondences, homogeneous, scenes, signless, uniform, up_to_sign
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators.weighted_refinement import SCALE, refine_weighted
+from kornia_learnnorm.estimators.optimize import UNROLLED_SCALE, refine_unrolled
+from kornia_learnnorm.models.fundamental import Fundamental
+
+
+def refine_weighted(x1, x2, F_mat, weights, steps):
+    return refine_unrolled(Fundamental(), x1.mT, x2.mT, F_mat, weights, steps)
 
 
 def framed(num_points: int = 40, **options):
@@ -27,7 +32,7 @@ def test_is_the_optimum_at_its_scale(num_points):
     distance = kln.sampson_distance(points1, points2, F_mat)
     mean = ((weights * (distance**2 + 1e-10).log() / 2).sum(1) / weights.sum(1)).exp()
     effective = (weights.sum(1) ** 2 / (weights**2).sum(1)).clamp(min=8)
-    scale = (SCALE * mean * (effective / (effective - 7)).sqrt())[:, None, None]
+    scale = (UNROLLED_SCALE * mean * (effective / (effective - 7)).sqrt())[:, None, None]
     T = torch.diag_embed(torch.cat([scale[:, 0], scale[:, 0], torch.ones_like(scale[:, 0])], -1))
     options = {"loss": kln.GemanMcClure(1.0), "max_iterations": 200}
     expected = kln.refine_fundamental(points1 / scale, points2 / scale, T @ F_mat @ T, weights, **options).F_mat

@@ -14,16 +14,16 @@ from torch import Tensor
 from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.matrices import cofactors
 
-__all__ = ["are_determined", "solve_calibrated_samples", "solve_samples"]
+__all__ = ["are_independent", "solve_calibrated_samples", "solve_samples"]
 
 
-def are_determined(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-    r"""Return a mask of the non-degenerate minimal samples, which do not lie on one line or plane.
+def are_independent(A: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
+    r"""Return a mask of the non-degenerate minimal samples (K, S, 3), by their design matrices (K, M, 9).
 
-    The eight constraints must be independent: each row of the design matrix is farther from the span of the rows before
+    The constraints must be independent: each row of the design matrix is farther from the span of the rows before
     it than the least that a shift of the point moves it.
     """
-    return _independent(torch.linalg.qr(design_matrix(x1, x2).mT, mode="r")[1], x1, x2, shift)
+    return _independent(torch.linalg.qr(A.mT, mode="r")[1], x1, x2, shift)
 
 
 def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
@@ -37,7 +37,7 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     Args:
         x1: homogeneous points of view 1 with shape :math:`(K, 8, 3)`, pixels and a third coordinate as large.
         x2: their counterparts with shape :math:`(K, 8, 3)`.
-        shift: of a point that must not make a sample undetermined, see :func:`are_determined`, pixels.
+        shift: of a point that must not make a sample undetermined, see :func:`are_independent`, pixels.
 
     Returns:
         matrices of unit norm of the samples that determine one, :math:`(M, 3, 3)`, :math:`M \le K`; of rank 2 up to

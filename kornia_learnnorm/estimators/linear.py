@@ -1,4 +1,9 @@
-r"""The normalised eight-point algorithm as a layer: masks, weights, cameras, and samples that determine no matrix."""
+r"""Linear estimation: the DLT of a model in the coordinates of a normaliser, as a function and as a layer.
+
+A pair of point sets goes from pixels to a fundamental matrix in :func:`find_fundamental`: checked, normalised and
+solved once as a :class:`~kornia_learnnorm.geometry.problem.LinearProblem`, then given rank 2 in the coordinates that a
+normaliser chooses. :class:`EightPoint` adds masks, cameras, and sets that determine no matrix.
+"""
 
 from __future__ import annotations
 
@@ -7,33 +12,164 @@ from typing import Literal, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize
 
-from kornia_learnnorm.estimators.fundamental import solve_fundamental
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
 from kornia_learnnorm.geometry.checks import (
     check_cameras,
     check_correspondences,
     check_mask,
-    check_rank2,
+    needs_gradient,
     solve_dtype,
 )
+from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP
+from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.transforms import transform_fundamental, unit_fundamental
-from kornia_learnnorm.normalizers.contract import Normalizer, check_normalizer
+from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.hartley import Hartley
+from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer, normalizing_transforms
 
 __all__ = [
     "EightPoint",
+    "LinearLayer",
     "TwoViewEstimate",
     "essential_matrix",
+    "find_fundamental",
     "prepare_problem",
     "refuse_jit",
+    "solve_linear",
     "solve_undetermined",
     "solve_where_determined",
 ]
 
-MIN_RANK2_RATIO = 1e-10  # second over first singular value of a matrix of rank 2
+
+def find_fundamental(
+    points1: Tensor,
+    points2: Tensor,
+    weights: Tensor | None = None,
+    normalizer: Normalizer | None = None,
+    rank2: Literal["projection", "optimal"] = "projection",
+) -> Tensor:
+    r"""Compute the fundamental matrix from eight or more correspondences by the normalised eight-point algorithm.
+
+    The points are mapped to normalised coordinates :math:`\hat x_i = T_i x_i`, the direct linear transformation (DLT)
+    finds :math:`\hat F` with :math:`\hat x_2^\top \hat F \hat x_1 = 0`, the rank-2 constraint is enforced **there**,
+    and :math:`F = T_2^\top \hat F T_1`. With eight points the DLT is exact, and the normalisation acts only through the
+    metric in which :math:`F` is projected. With ``rank2="optimal"``, :math:`T_2^\top \hat F T_1` is corrected by
+    :func:`~kornia_learnnorm.optimal_rank2` instead; eight points then need no normalisation, and the normaliser is not
+    called.
+
+    Args:
+        points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64.
+        points2: pixels in the second image with shape :math:`(B, N, 2)`.
+        weights: optional non-negative weights :math:`(B, N)` of the squared algebraic residuals; zero means absent.
+        normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views;
+            :class:`~kornia_learnnorm.Hartley` when not given.
+        rank2: how the singularity constraint is enforced: ``"projection"`` in Frobenius norm in normalised coordinates,
+            or ``"optimal"`` correction with the covariance of :math:`F`.
+
+    Returns:
+        fundamental matrices with shape :math:`(B, 3, 3)` in the dtype of the points, of rank 2 and unit Frobenius norm,
+        :math:`x_2^\top F x_1 = 0`, with the sign of :func:`~kornia_learnnorm.geometry.matrices.unit_matrix`.
+        Where the correspondences do not determine :math:`F` (coincident, collinear or coplanar points) it is one of the
+        solutions and carries no gradient.
+
+    Raises:
+        TypeError: if the points are not floating-point tensors of one dtype, or the normaliser cannot be called.
+        ShapeError: if the shapes do not agree with the above.
+        ValueError: if there are fewer than eight correspondences, the views do not pair up, a value is not finite, a
+            weight is negative, the normaliser does not return two finite and invertible transforms :math:`(B, 3, 3)`,
+            or ``rank2`` is neither ``"projection"`` nor ``"optimal"``.
+
+    Reference:
+        R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; B. Fan, Y. Dai, Y. Seo, M. He, A revisit of the
+        normalized eight-point algorithm and a self-supervised deep solution, section 3.
+
+    Example:
+        >>> _ = torch.manual_seed(0)
+        >>> points1, points2 = torch.rand(4, 8, 2) * 600, torch.rand(4, 8, 2) * 600
+        >>> find_fundamental(points1, points2).shape
+        torch.Size([4, 3, 3])
+
+    """
+    check_correspondences(points1, points2, weights)
+    problem = LinearProblem.from_points(points1, points2, weights, Fundamental(rank2))
+    return solve_linear(problem, normalizer).to(points1.dtype)
+
+
+def solve_linear(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
+    """Return the matrices of a problem in the coordinates of a normaliser; None for Hartley's, in which it comes."""
+    if normalizer is None or isinstance(normalizer, Hartley) or not problem.model.needs_transforms(problem):
+        return solve_in_coordinates(problem, problem.T1, problem.T2)
+    return solve_in_coordinates(problem, *normalizing_transforms(normalizer, problem))
+
+
+def solve_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> Tensor:
+    """Return the matrices of a problem under known transforms :math:`(B, 3, 3)` of the pixels."""
+    null_matrix, gap = problem.solve_in(T1, T2)
+    M = unit_matrix(problem.model.constrain_in(problem, null_matrix, T1, T2))
+    if not needs_gradient(M):
+        return M
+    # Rounding chose among the solutions; one with an epipole on a point makes the loss as steep as rounding is small.
+    return torch.where((gap > DEPENDENT_GAP[gap.dtype])[:, None, None], M, M.detach())
+
+
+class LinearLayer(nn.Module):
+    r"""The DLT of a model as an nn.Module, with finite outputs and gradients on degenerate sets.
+
+    Args:
+        model: what the matrix is, see :class:`~kornia_learnnorm.models.contract.TwoViewModel`.
+        normalizer: a module or callable ``(points1, points2, weights) -> (T1, T2)``; Hartley's when not given.
+
+    Raises:
+        TypeError: if ``normalizer`` is neither a module nor a function.
+
+    """
+
+    def __init__(self, model: TwoViewModel, normalizer: Normalizer | None = None) -> None:
+        super().__init__()
+        if normalizer is not None:
+            check_normalizer(normalizer)
+        self.model = model
+        self.normalizer = Hartley() if normalizer is None else normalizer
+
+    def forward(
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
+    ) -> Tensor:
+        r"""Return the matrices of the model.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, float32 or float64, at least as many as
+                determine a matrix.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`.
+            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`.
+
+        Returns:
+            matrices with shape :math:`(B, 3, 3)`, in the dtype of the points.
+
+        Raises:
+            TypeError: if the points are not floating-point tensors of one dtype, weights not floating-point, or the
+                mask not boolean.
+            ShapeError: if a shape is wrong.
+            ValueError: if there are too few rows, shapes do not pair up, an unmasked value is not finite, or a weight
+                is negative.
+
+        """
+        problem = prepare_problem(self.model, points1, points2, weights, mask)
+        (M,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
+        return M.to(points1.dtype)
+
+    def _solve(self, problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor]:
+        return (solve_linear(problem, self.normalizer),)
+
+    def _solve_undetermined(self, problem: LinearProblem) -> tuple[Tensor]:
+        return (solve_undetermined(problem, getattr(self.normalizer, "base", None)),)
+
+    def __prepare_scriptable__(self) -> NoReturn:
+        """Raise a TypeError: ``torch.jit`` is not supported."""
+        refuse_jit()
 
 
 class TwoViewEstimate(NamedTuple):
@@ -47,7 +183,7 @@ class TwoViewEstimate(NamedTuple):
             (fewer than eight of positive weight, coincident, collinear, coplanar), it is the base normaliser's and
             carries no gradient. It is a rank test: a plane with 0.01 px of noise passes.
         gap: relative gap of the design matrix, from 0 to 1, that ``determined`` is decided on, (B,); see
-            :func:`~kornia_learnnorm.geometry.dlt.solve_epipolar`. Errors grow as its inverse.
+            :func:`~kornia_learnnorm.geometry.dlt.solve_rows`. Errors grow as its inverse.
     """
 
     F_mat: Tensor
@@ -56,7 +192,7 @@ class TwoViewEstimate(NamedTuple):
     gap: Tensor
 
 
-class EightPoint(nn.Module):
+class EightPoint(LinearLayer):
     r"""The normalised eight-point algorithm as an nn.Module, with finite outputs and gradients on degenerate samples.
 
     They are finite for points within 1e50 of the origin whose mean distance from their centroid is zero or at least
@@ -88,38 +224,12 @@ class EightPoint(nn.Module):
     def __init__(
         self, normalizer: Normalizer | None = None, rank2: Literal["projection", "optimal"] = "projection"
     ) -> None:
-        super().__init__()
-        check_rank2(rank2)
-        if normalizer is not None:
-            check_normalizer(normalizer)
-        self.normalizer = Hartley() if normalizer is None else normalizer
-        self.rank2: Literal["projection", "optimal"] = rank2
+        super().__init__(Fundamental(rank2), normalizer)
+        self.rank2 = rank2
 
     def extra_repr(self) -> str:
         """Return the parameters."""
         return f"rank2={self.rank2!r}"
-
-    def forward(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
-    ) -> Tensor:
-        r"""Return the fundamental matrices.
-
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`.
-            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`.
-
-        Returns:
-            matrices with shape :math:`(B, 3, 3)`, see :meth:`estimate`.
-
-        Raises:
-            TypeError: as :meth:`estimate`.
-            ShapeError: as :meth:`estimate`.
-            ValueError: as :meth:`estimate`.
-
-        """
-        return self.estimate(points1, points2, weights=weights, mask=mask).F_mat
 
     def estimate(
         self,
@@ -154,7 +264,8 @@ class EightPoint(nn.Module):
                 weight is negative, or only one camera is given or one is not invertible.
 
         """
-        problem = prepare_problem(points1, points2, weights, mask, K1, K2)
+        problem = prepare_problem(self.model, points1, points2, weights, mask)
+        check_cameras(K1, K2, points1.shape[0])
         (F_mat,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
         F_mat = F_mat.to(points1.dtype)
         return TwoViewEstimate(F_mat, essential_matrix(F_mat, K1, K2), problem.determined, problem.gap)
@@ -190,16 +301,6 @@ class EightPoint(nn.Module):
         points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
         return self.estimate(points1, points2, weights=weights, mask=mask, K1=K1, K2=K2)
 
-    def _solve(self, problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor]:
-        return (solve_fundamental(problem, self.normalizer, self.rank2),)
-
-    def _solve_undetermined(self, problem: LinearProblem) -> tuple[Tensor]:
-        return (solve_undetermined(problem, getattr(self.normalizer, "base", None) or Hartley(), self.rank2),)
-
-    def __prepare_scriptable__(self) -> NoReturn:
-        """Raise a TypeError: ``torch.jit`` is not supported."""
-        refuse_jit()
-
 
 def refuse_jit() -> NoReturn:
     """Raise a TypeError that says what to use instead of ``torch.jit``."""
@@ -207,27 +308,18 @@ def refuse_jit() -> NoReturn:
 
 
 def prepare_problem(
-    points1: Tensor,
-    points2: Tensor,
-    weights: Tensor | None,
-    mask: Tensor | None,
-    K1: Tensor | None,
-    K2: Tensor | None,
+    model: TwoViewModel, points1: Tensor, points2: Tensor, weights: Tensor | None, mask: Tensor | None
 ) -> LinearProblem:
-    """Return the problem of the arguments of :meth:`EightPoint.estimate`, checked; masked rows have weight zero."""
+    """Return the problem of a layer's arguments, checked; masked rows have weight zero."""
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
         refuse_jit()
-    if (K1 is None) != (K2 is None):
-        raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
     if mask is not None:
         check_mask(mask, points1, points2, weights)
         points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
         weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
-    check_correspondences(points1, points2, weights)
-    check_cameras(K1, K2, points1.shape[0])
-    return LinearProblem.from_points(
-        points1, points2, None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
-    )
+    check_correspondences(points1, points2, weights, model.min_points)
+    weights = None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
+    return LinearProblem.from_points(points1, points2, weights, model)
 
 
 def solve_where_determined(
@@ -243,11 +335,12 @@ def solve_where_determined(
         solve_undetermined: returns the same tensors of a problem that does not determine its matrices.
 
     """
-    determined = problem.determined
+    problem.solve()
     if problem.all_determined:
         return solve(problem, None)
     if problem.all_determined is None:
         return _solve_traced(problem, solve, solve_undetermined)
+    determined = problem.determined
     found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
     with torch.no_grad():
         others = solve_undetermined(problem.select(rest))
@@ -271,7 +364,7 @@ def _solve_traced(
     generic = _generic_points(problem.points1)
     points1, points2 = (torch.where(rows[..., None], p, g) for p, g in zip(points, generic, strict=True))
     weights = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
-    solutions = solve(LinearProblem.from_points(points1, points2, weights), None)
+    solutions = solve(LinearProblem.from_points(points1, points2, weights, problem.model), None)
     with torch.no_grad():
         others = solve_undetermined(problem)
     return tuple(
@@ -281,21 +374,16 @@ def _solve_traced(
 
 
 @torch.no_grad()
-def solve_undetermined(
-    problem: LinearProblem, normalizer: Normalizer, rank2: Literal["projection", "optimal"] = "projection"
-) -> Tensor:
-    """Return matrices of rank 2 of sets of correspondences that do not determine them, without gradient."""
-    F_mat = solve_fundamental(problem, normalizer, rank2)
-    # With at most one point F has rank 1; use the F of a sideways motion.
-    values = torch.linalg.svdvals(F_mat)
-    return torch.where((values[:, 1] > MIN_RANK2_RATIO * values[:, 0])[:, None, None], F_mat, _sideways(F_mat))
+def solve_undetermined(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
+    """Return matrices of the model for sets of correspondences that do not determine them, without gradient."""
+    return problem.model.fallback(solve_linear(problem, normalizer))
 
 
 def essential_matrix(F_mat: Tensor, K1: Tensor | None, K2: Tensor | None) -> Tensor | None:
     r"""Return :math:`K_2^\top F K_1` with unit Frobenius norm, None without cameras."""
     if K1 is None or K2 is None:
         return None
-    return unit_fundamental(transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat)))
+    return unit_matrix(transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat)))
 
 
 def _rescale(weights: Tensor) -> Tensor:
@@ -303,11 +391,6 @@ def _rescale(weights: Tensor) -> Tensor:
     top = weights.detach().amax(-1, keepdim=True)
     weights = torch.where(top < 1e-30, 0.0, weights)
     return weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)
-
-
-def _sideways(like: Tensor) -> Tensor:
-    """Return the fundamental matrix of a sideways motion, whose epipolar lines are the rows of the image."""
-    return normalize(like.new_tensor([0.0, 0, 0, 0, 0, 1, 0, -1, 0]), dim=-1).view(3, 3)
 
 
 def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:

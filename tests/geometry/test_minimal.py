@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from two_view import SCENES, correspondences, epipolar_distances, scenes, uniform, up_to_sign
 
 from kornia_learnnorm import find_fundamental
-from kornia_learnnorm.estimators.minimal import are_determined, solve_samples
+from kornia_learnnorm.geometry.dlt import design_matrix
+from kornia_learnnorm.geometry.minimal import are_independent, solve_samples
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import PairScorer
 
 NOISY = ["driving", "handheld", "orbit"]
@@ -18,13 +20,17 @@ NOISY = ["driving", "handheld", "orbit"]
 
 def coordinates(points1, points2):
     """Homogeneous points (K, 8, 3) in coordinates of all samples together."""
-    scorer = PairScorer(points1.flatten(0, 1), points2.flatten(0, 1), 1.0)
+    scorer = PairScorer(points1.flatten(0, 1), points2.flatten(0, 1), 1.0, Fundamental())
     return scorer.samples(torch.arange(points1[..., 0].numel()).view(-1, 8))
+
+
+def are_determined(x1, x2, shift):
+    return are_independent(design_matrix(x1, x2), x1, x2, shift)
 
 
 def solve(points1, points2):
     """Matrices of pixels."""
-    scorer = PairScorer(points1.flatten(0, 1), points2.flatten(0, 1), 1.0)
+    scorer = PairScorer(points1.flatten(0, 1), points2.flatten(0, 1), 1.0, Fundamental())
     F = scorer.to_pixels(solve_samples(*coordinates(points1, points2), 0.01))
     return F / torch.linalg.matrix_norm(F, keepdim=True)
 

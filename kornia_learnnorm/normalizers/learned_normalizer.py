@@ -15,9 +15,9 @@ from kornia_learnnorm.geometry.checks import read_condition
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform, transform_points
 from kornia_learnnorm.normalizers import hartley, identity, reweighted, whitening
-from kornia_learnnorm.normalizers.contract import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.networks import crossview, paper
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
+from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.pretrained import (
     check_architecture,

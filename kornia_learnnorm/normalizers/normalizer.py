@@ -13,9 +13,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.geometry.checks import check_correspondences, is_true
+from kornia_learnnorm.geometry.checks import check_correspondences, read_condition
 from kornia_learnnorm.geometry.matrices import determinant
 from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.models.fundamental import Fundamental
 
 __all__ = ["PerView", "ProblemNormalizer", "check_normalizer", "normalizing_transforms", "transforms_of"]
 
@@ -49,7 +50,7 @@ class ProblemNormalizer(nn.Module):
 
         """
         check_correspondences(points1, points2, weights, self.min_points)
-        T1, T2 = self.transforms(LinearProblem.from_points(points1, points2, weights))
+        T1, T2 = self.transforms(LinearProblem.from_points(points1, points2, weights, Fundamental()))
         return T1.to(points1.dtype), T2.to(points1.dtype)
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
@@ -137,6 +138,6 @@ def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tu
         return result
     T1, T2 = (T.to(problem.x1) for T in result)
     both = torch.stack([T1, T2]).detach()
-    if is_true(~(both.sum().isfinite() & (determinant(both) != 0).all())):
+    if read_condition(~(both.sum().isfinite() & (determinant(both) != 0).all())):
         raise ValueError(f"the transforms of {type(normalizer).__name__} are not finite and invertible")
     return T1, T2

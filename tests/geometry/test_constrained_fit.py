@@ -9,10 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from two_view import epipolar_distances, scenes, uniform, up_to_sign
 
-from kornia_learnnorm import find_fundamental, sampson_scale, symmetric_scale
+from kornia_learnnorm import find_fundamental
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, Truncated, squared_loss
-from kornia_learnnorm.ransac.constrained_fit import constrained_fit
+from kornia_learnnorm.geometry.constrained_fit import constrained_fit
+from kornia_learnnorm.geometry.distances import sampson_scale, symmetric_scale
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import PairScorer
 
 
@@ -21,12 +23,15 @@ def scene(request):
     return scenes(request.param, 1, 200, noise=0.5, outliers=0.2)
 
 
+NAMES = {sampson_scale: "sampson", symmetric_scale: "symmetric"}
+
+
 def begin(scene, number: int = 3):
     """A scorer, and matrices of samples of twelve inliers in its coordinates."""
     points = scene.points1[0], scene.points2[0]
     inliers = torch.nonzero(scene.inliers[0])[:, 0]
     rows = inliers[uniform(number, len(inliers)).topk(12).indices]
-    scorer = PairScorer(*points, 1.0)
+    scorer = PairScorer(*points, 1.0, Fundamental())
     return scorer, scorer.from_pixels(find_fundamental(*(p[rows] for p in points)))
 
 
@@ -77,7 +82,7 @@ class TestSteps:
         loss = Truncated(2.0)
         fit = constrained_fit(scorer.x1, scorer.x2, F0, 40 * [loss], factor)
         refined = refine_fundamental(
-            scene.points1, scene.points2, scorer.to_pixels(fit.F_mat), None, factor, loss, tolerance=1e-5
+            scene.points1, scene.points2, scorer.to_pixels(fit.F_mat), None, NAMES[factor], loss, tolerance=1e-5
         )
         np.testing.assert_allclose(refined.cost_before, refined.cost, rtol=1e-6)
         np.testing.assert_allclose(fit.cost, refined.cost, rtol=1e-6)
@@ -123,7 +128,7 @@ class TestResults:
         points2 = epipole + (points1 - epipole) * uniform(200, 1, low=1.1, high=1.4, seed=1)
         points1[0] = points2[0] = epipole
         F_true = torch.tensor([[[0.0, -1, 300], [1, 0, -300], [-300, 300, 0]]], dtype=torch.float64)
-        scorer = PairScorer(points1, points2, 1.0)
+        scorer = PairScorer(points1, points2, 1.0, Fundamental())
         F0 = scorer.from_pixels(torch.cat([F_true, F_true + 1e-4 * uniform(3, 3, 3, seed=3)]))
         fitted = constrained_fit(scorer.x1, scorer.x2, F0, 8 * [Truncated(3.0)], factor).F_mat
         for F in scorer.to_pixels(fitted):

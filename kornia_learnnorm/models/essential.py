@@ -1,0 +1,134 @@
+r"""The essential matrix as a two-view model: two equal singular values, five degrees of freedom.
+
+It is a fundamental matrix :math:`F = C_2^\top E C_1` of known cameras: distances are those in pixels. On the manifold
+of :class:`~kornia_learnnorm.models.fundamental.Rank2` the matrix :math:`A` of :math:`E` is a rotation over
+:math:`\sqrt 2`. Of the three turns of a step, the first alone keeps it one: the step has the five parameters of a
+relative pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
+from kornia_learnnorm.geometry.minimal import solve_calibrated_samples
+from kornia_learnnorm.geometry.pose import in_front_of_best_pose
+from kornia_learnnorm.models.fundamental import Fundamental, Rank2
+
+__all__ = ["Calibrated", "Essential", "nearest_essential"]
+
+
+class Essential(Fundamental):
+    r"""Fundamental matrices :math:`F = C_2^\top E C_1` of essential matrices.
+
+    Args:
+        C1: from the coordinates of view 1 to directions in the camera, such as :math:`K_1^{-1}`, with shape
+            :math:`(B, 3, 3)` or :math:`(1, 3, 3)`.
+        C2: from the coordinates of view 2 to directions in the camera.
+        distance: the residual of a correspondence: ``"sampson"`` or ``"symmetric"`` distance in the coordinates.
+
+    """
+
+    name = "essential"
+    dof = 5
+    sample_size = 5
+
+    def __init__(self, C1: Tensor, C2: Tensor, distance: Literal["sampson", "symmetric"] = "sampson") -> None:
+        super().__init__(distance=distance)
+        # Of unit norm, so that the fundamental matrices have a norm of about one too.
+        self.C1, self.C2 = (C / torch.linalg.matrix_norm(C, keepdim=True) for C in (C1, C2))
+
+    @classmethod
+    def of_cameras(
+        cls,
+        K1: Tensor,
+        K2: Tensor,
+        T1: Tensor,
+        T2: Tensor,
+        distance: Literal["sampson", "symmetric"] = "sampson",
+    ) -> Essential:
+        """Return the model of pixels after transforms, of cameras and transforms that broadcast to (B, 3, 3)."""
+        return cls(torch.linalg.inv_ex(T1 @ K1)[0], torch.linalg.inv_ex(T2 @ K2)[0], distance)
+
+    def constrain(self, M: Tensor) -> Tensor:
+        """Return the matrices of the nearest essential matrices."""
+        F_mat: Tensor = self.state(M).matrix()
+        return F_mat
+
+    def state(self, M: Tensor) -> Any:
+        """Return the nearest essential matrices of unit norm."""
+        inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (self.C1, self.C2))
+        return self.calibrated(inverse2.mT @ M @ inverse1)
+
+    def calibrated(self, E_mat: Tensor) -> Calibrated:
+        """Return the nearest essential matrices of unit norm to matrices of directions (B, 3, 3)."""
+        axes, A = Fundamental().state(E_mat)
+        equal = torch.eye(2).to(A).expand_as(A) * 0.5**0.5
+        return Calibrated(axes, equal, self.C1.expand_as(E_mat), self.C2.expand_as(E_mat))
+
+    def solve_samples(self, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
+        """Return the matrices of samples of five, up to ten each."""
+        F_mat: Tensor = self.C2.mT @ solve_calibrated_samples(x1 @ self.C1.mT, x2 @ self.C2.mT) @ self.C1
+        return F_mat
+
+    def reweighted_fit(self, x1: Tensor, x2: Tensor, M: Tensor, losses: Sequence[Loss]) -> Fit | None:
+        """Return None: there is no fit but Levenberg-Marquardt."""
+        return None
+
+    def voters(self, state: Any, x1: Tensor, x2: Tensor, gains: Tensor) -> Tensor:
+        """Return which correspondences are in front of both cameras under the best of the four poses."""
+        return in_front_of_best_pose(state.essential(), x1.mT @ self.C1[0].mT, x2.mT @ self.C2[0].mT, gains)
+
+    def relaxed(self) -> Fundamental:
+        """Return the model of fundamental matrices: cameras may be inexact."""
+        return Fundamental(distance=self.distance)
+
+
+class Calibrated(NamedTuple):
+    r"""Fundamental matrices :math:`F = C_2^\top E C_1` of essential matrices :math:`E` of unit norm.
+
+    Attributes:
+        axes: rotations of view 2 and of view 1, (B, 2, 3, 3).
+        A: rotations of the plane over the root of two, (B, 2, 2).
+        C1: from the coordinates of view 1 to directions in the camera, such as :math:`K_1^{-1}`, (B, 3, 3).
+        C2: from the coordinates of view 2 to directions in the camera, (B, 3, 3).
+    """
+
+    axes: Tensor
+    A: Tensor
+    C1: Tensor
+    C2: Tensor
+
+    def essential(self) -> Tensor:
+        """Return the essential matrices, (B, 3, 3)."""
+        return Rank2(self.axes, self.A).matrix()
+
+    def matrix(self) -> Tensor:
+        """Return the fundamental matrices, (B, 3, 3)."""
+        return self.C2.mT @ self.essential() @ self.C1
+
+    def tangents(self) -> Tensor:
+        """Return the derivatives (B, 9, 5) of the fundamental matrices' column-major entries by a step."""
+        D = Rank2(self.axes, self.A).tangents()[..., :5]
+        columns = self.C2.mT[:, None] @ torch.unflatten(D, 1, (3, 3))  # (B, column of E, row of F, 5)
+        return (self.C1.mT @ columns.flatten(2)).view_as(D)
+
+    def retract(self, step: Tensor) -> Calibrated:
+        """Return the state after a step, (B, 5)."""
+        return Calibrated(*Rank2(self.axes, self.A).retract(step), self.C1, self.C2)
+
+
+def nearest_essential(E_mat: Tensor) -> Tensor:
+    """Return the nearest essential matrices, scaled to unit norm, to matrices (B, 3, 3).
+
+    Example:
+        >>> nearest_essential(torch.diag(torch.tensor([4.0, 3.0, 1.0]))[None]).diagonal(dim1=1, dim2=2)
+        tensor([[0.7071, 0.7071, 0.0000]])
+
+    """
+    eye = torch.eye(3).to(E_mat)[None]
+    return Essential(eye, eye).calibrated(E_mat).essential()
