@@ -115,14 +115,12 @@ def test_lightglue_of_random_weights(monkeypatch):
     assert ((matches.ratio >= 0) & (matches.ratio <= 1)).all()
 
 
-@pytest.mark.parametrize("error", [RuntimeError("cut"), EOFError("Ran out of input")])
-def test_weights_that_are_not_there(error):
+def test_weights_that_are_not_there():
     def load():
-        raise error
+        raise EOFError("Ran out of input")
 
-    with pytest.raises(OSError, match=r"the weights of DISK are not in .*checkpoints and could not be loaded: ") as got:
+    with pytest.raises(OSError, match=r"the weights of DISK are not in .*checkpoints and could not be loaded: Ran out"):
         pretrained("DISK", load)
-    assert "\n" not in str(got.value)
 
 
 @pytest.mark.parametrize("detect", [detect_disk, detect_keynet])
@@ -153,11 +151,6 @@ class TestKeepFeatures:
         assert np.array_equal(found.points, points[away].astype(np.float32))
         assert found.size == (width, height)
 
-    def test_border_of_the_image_drops_nothing(self):
-        points = np.array([[0, 0], [-0.5, 20.4], [29.49, 39.49]])
-        found = keep_features(self.features(points, (30, 40)), np.ones((40, 30), bool))
-        assert len(found.points) == 3
-
     def test_letterbox(self):
         """No feature of the frame's edge is left, and those of the content are."""
         content = detect_sift(texture())
@@ -170,14 +163,9 @@ class TestKeepFeatures:
         distance = np.abs(inner[:, None] + [0, 40] - found.points[None]).max(-1).min(1)
         assert (distance < 0.1).mean() > 0.95
 
-    @pytest.mark.parametrize(
-        ("mask", "error", "message"),
-        [
-            (np.ones((40, 30), np.uint8), TypeError, "a mask must be an array of bool, got uint8"),
-            ([[True]], TypeError, "a mask must be an array of bool, got .*list"),
-            (np.ones((30, 40), bool), ValueError, r"shape of its image, \(40, 30\), got \(30, 40\)"),
-        ],
-    )
-    def test_wrong_masks(self, mask, error, message):
-        with pytest.raises(error, match=message):
-            keep_features(self.features(np.zeros((2, 2)), (30, 40)), mask)
+    def test_wrong_masks(self):
+        features = self.features(np.zeros((2, 2)), (30, 40))
+        with pytest.raises(TypeError, match="a mask must be an array of bool, got uint8"):
+            keep_features(features, np.ones((40, 30), np.uint8))
+        with pytest.raises(ValueError, match=r"shape of its image, \(40, 30\), got \(30, 40\)"):
+            keep_features(features, np.ones((30, 40), bool))

@@ -50,9 +50,7 @@ class TestMatchImages:
         [
             ({"image1": np.full((180, 240), 7, np.uint8)}, ValueError, r"image 1 is blank .* 0 features"),
             ({"image2": np.full((180, 240), 7, np.uint8)}, ValueError, r"image 2 is blank .* 0 features"),
-            ({"image1": np.zeros((1, 1), np.uint8)}, ValueError, "image 1 is blank or nearly so"),
             ({"image1": texture() / 255.0}, TypeError, "an image must be an array of uint8, got float64"),
-            ({"image2": "right.png"}, TypeError, "an image must be an array of uint8"),
             ({"image2": np.zeros((180, 240, 3), np.uint8)}, ValueError, r"must be grey .* got \(180, 240, 3\)"),
             ({"num_features": 0}, ValueError, "num_features must be at least 2, got 0"),
         ],
