@@ -8,13 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.datasets.textfiles import (
-    camera_matrix,
-    listed_image,
-    parse_numbers,
-    quaternion_pose,
-    text_lines,
-)
+from kornia_learnnorm.data.datasets.textfiles import TextLine, camera_matrix, text_lines
 from kornia_learnnorm.data.images import image_size
 
 __all__ = ["read_cambridge"]
@@ -47,19 +41,19 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
     frames: dict[str, Frame] = {}
     for part in (split,) if split else ("train", "test"):
         path, before = root / f"dataset_{part}.txt", len(frames)
-        for number, line in text_lines(path, "list of images"):
-            if number <= 3:  # the header
+        for line in text_lines(path, "list of images"):
+            if line.number <= 3:  # the header
                 continue
-            name, *words = line.split()
-            row = parse_numbers(path, number, words, 7, "ImageFile X Y Z W P Q R", line)
+            name, *words = line.text.split()
+            row = line.numbers(words, 7, "ImageFile X Y Z W P Q R")
             if name in frames:
-                raise ValueError(f"{path}, line {number}: {name} is listed twice")
-            size = image_size(root / listed_image(path, number, name))
+                raise ValueError(f"{path}, line {line.number}: {name} is listed twice")
+            size = image_size(root / line.image(name))
             focal = focals.get(_without_suffix(name), np.nan) if size != (0, 0) else np.nan
             K = np.full((3, 3), np.nan)
             if focal > 0:
                 K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
-            pose = quaternion_pose(path, number, row[3:] * [1, -1, -1, -1], row[:3])
+            pose = line.pose(row[3:] * [1, -1, -1, -1], row[:3])  # the inverse rotation
             frames[name] = Frame(root / name, name, name.rpartition("/")[0], size, K, pose)
         if len(frames) == before:
             raise ValueError(f"{path} lists no images after the three lines of its header")
@@ -69,21 +63,21 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
 def _nvm_focals(path: Path) -> dict[str, float]:
     """Return the focal lengths, pixels, by the images' names without suffix; the points after them are not read."""
     lines = text_lines(path, "reconstruction")
-    number, line = next(lines, (1, ""))
-    if line != "NVM_V3":
-        raise ValueError(f"{path}, line {number}: NVM_V3 expected, got {line!r}")
-    number, line = next(lines, (number, ""))
-    if not line.isdecimal():
-        raise ValueError(f"{path}, line {number}: the number of images expected, got {line!r}")
-    expected, focals = "an image, its focal length, quaternion, centre, radial distortion and 0", {}
-    for number, text in islice(lines, int(line)):
-        name, *words = text.split()
-        focal = float(parse_numbers(path, number, words, 10, expected, text)[0])
-        focals[_without_suffix(name)] = focal
-        if focal <= 0:
-            raise ValueError(f"{path}, line {number}: a positive focal length expected, got {words[0]}")
-    if len(focals) < int(line):
-        raise ValueError(f"{path} announces {line} images and has {len(focals)}")
+    line = next(lines, TextLine(path, 1, ""))
+    if line.text != "NVM_V3":
+        raise line.error("NVM_V3")
+    line = next(lines, line._replace(text=""))
+    if not line.text.isdecimal():
+        raise line.error("the number of images")
+    number, focals = int(line.text), {}
+    for line in islice(lines, number):
+        name, *words = line.text.split()
+        row = line.numbers(words, 10, "an image, its focal length, quaternion, centre, radial distortion and 0")
+        focals[_without_suffix(name)] = float(row[0])
+        if row[0] <= 0:
+            raise ValueError(f"{path}, line {line.number}: a positive focal length expected, got {words[0]}")
+    if len(focals) < number:
+        raise ValueError(f"{path} announces {number} images and has {len(focals)}")
     return focals
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.splits import choose_sequences
-from kornia_learnnorm.data.datasets.textfiles import parse_numbers, rigid_motion, text_lines
+from kornia_learnnorm.data.datasets.textfiles import rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 
 __all__ = ["read_calibration", "read_kitti"]
@@ -57,24 +57,22 @@ def read_calibration(path: Path, key: str) -> tuple[Array, Array]:
 
     ``key`` is the projection's name, ``P0`` to ``P3`` for ``image_0`` to ``image_3``; ValueError without it.
     """
-    for number, line in text_lines(path, "calibration"):
-        name, _, rest = line.partition(":")
-        if name.strip() != key:
-            continue
-        K, b = np.split(
-            parse_numbers(path, number, rest.split(), 12, f"{key}: and 12 numbers", line).reshape(3, 4), [3], 1
-        )
-        if min(K[0, 0], K[1, 1]) <= 0 or K[1, 0] or K[2].tolist() != [0, 0, 1]:
-            raise ValueError(f"{path}, line {number}: a camera matrix and a fourth column expected, got {line!r}")
-        return K, rigid_motion(np.eye(3), np.asarray(-np.linalg.solve(K, b)[:, 0], np.float64))
+    for line in text_lines(path, "calibration"):
+        name, _, rest = line.text.partition(":")
+        if name.strip() == key:
+            numbers = line.numbers(rest.split(), 12, f"{key}: and 12 numbers")
+            K, b = np.split(numbers.reshape(3, 4), [3], 1)
+            if min(K[0, 0], K[1, 1]) <= 0 or K[1, 0] or K[2].tolist() != [0, 0, 1]:
+                raise line.error("a camera matrix and a fourth column")
+            return K, rigid_motion(np.eye(3), np.asarray(-np.linalg.solve(K, b)[:, 0], np.float64))
     raise ValueError(f"{path} has no line '{key}: 12 numbers'")
 
 
 def _poses(path: Path) -> dict[int, Array]:
     poses = {}
-    for number, line in text_lines(path, "poses"):
-        rows = parse_numbers(path, number, line.split(), 12, "the 12 numbers of a pose").reshape(3, 4)
-        poses[number - 1] = rigid_motion(rows[:, :3], rows[:, 3])
+    for line in text_lines(path, "poses"):
+        rows = line.numbers(line.text.split(), 12, "the 12 numbers of a pose").reshape(3, 4)
+        poses[line.number - 1] = rigid_motion(rows[:, :3], rows[:, 3])
     return poses
 
 

@@ -54,13 +54,13 @@ def listed_pairs(frames: Sequence[Frame], path: str | Path) -> Iterator[FramePai
     path = Path(path)
     named = {frame.name: frame for frame in frames}
     first: dict[tuple[str, ...], int] = {}
-    for number, line in text_lines(path, "list of pairs"):
-        names = tuple(line.split())
+    for line in text_lines(path, "list of pairs"):
+        names = tuple(line.text.split())
         if len(names) != 2 or names[0] == names[1]:
-            raise ValueError(f"{path}, line {number}: two names of two images expected, got {line!r}")
-        if first.setdefault(names, number) != number:
-            raise ValueError(f"{path}, line {number}: {line!r} is in line {first[names]} already")
+            raise line.error("two names of two images")
+        if first.setdefault(names, line.number) != line.number:
+            raise ValueError(f"{path}, line {line.number}: {line.text!r} is in line {first[names]} already")
         if unknown := [name for name in names if name not in named]:
-            some = next(iter(named), "none")
-            raise ValueError(f"{path}, line {number}: no frame {unknown[0]!r} among {len(named)}, such as {some!r}")
+            what = f"no frame {unknown[0]!r} among {len(named)}, such as {next(iter(named), 'none')!r}"
+            raise ValueError(f"{path}, line {line.number}: {what}")
         yield FramePair(named[names[0]], named[names[1]])

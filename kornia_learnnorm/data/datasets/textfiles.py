@@ -4,54 +4,64 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from numpy.typing import NDArray
 
-__all__ = ["camera_matrix", "listed_image", "parse_numbers", "quaternion_pose", "rigid_motion", "text_lines"]
+__all__ = ["TextLine", "camera_matrix", "rigid_motion", "text_lines"]
 
 Array = NDArray[np.float64]
 
 
-def text_lines(path: Path, what: str) -> Iterator[tuple[int, str]]:
-    """Yield the number, from 1, and the text of each line that is neither empty nor a comment."""
+class TextLine(NamedTuple):
+    """A line of a text file."""
+
+    path: Path
+    number: int  # from 1
+    text: str  # without white space around it
+
+    def error(self, expected: str) -> ValueError:
+        """Return the error that says what was expected and quotes the line."""
+        return ValueError(f"{self.path}, line {self.number}: {expected} expected, got {self.text!r}")
+
+    def numbers(self, words: list[str], count: int, expected: str) -> Array:
+        """Return ``count`` finite numbers, (count,)."""
+        try:
+            values = np.array([float(word) for word in words])
+        except ValueError:
+            values = np.empty(0)
+        if len(values) != count or not np.isfinite(values).all():
+            raise self.error(expected)
+        return values
+
+    def image(self, name: str) -> str:
+        """Return the name of an image that the line has, if it exists beside the file."""
+        if not (self.path.parent / name).is_file():
+            raise FileNotFoundError(f"{self.path}, line {self.number}: no image at {self.path.parent / name}")
+        return name
+
+    def pose(self, wxyz: Array, centre: Array) -> Array:
+        """Return the matrix (4, 4) of a quaternion (w, x, y, z) of any norm but zero and a translation."""
+        norm = np.linalg.norm(wxyz)
+        if norm == 0:
+            raise self.error("a quaternion other than zero")
+        return rigid_motion(np.asarray(quaternion_to_rotation_matrix(torch.from_numpy(wxyz / norm))), centre)
+
+
+def text_lines(path: Path, what: str) -> Iterator[TextLine]:
+    """Yield the lines that are neither empty nor a comment."""
     if not path.is_file():
         raise FileNotFoundError(f"no {what} at {path}")
     with path.open(encoding="utf-8") as file:
         try:
             for number, line in enumerate(file, 1):
                 if line.strip() and not line.startswith("#"):
-                    yield number, line.strip()
+                    yield TextLine(path, number, line.strip())
         except UnicodeDecodeError as error:
             raise ValueError(f"{path} is not a text file in UTF-8: {error}") from error
-
-
-def parse_numbers(path: Path, number: int, words: list[str], count: int, expected: str, line: str = "") -> Array:
-    """Return ``count`` finite numbers, (count,); the error says what was ``expected`` and quotes the line."""
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        values = np.empty(0)
-    if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{path}, line {number}: {expected} expected, got {line or ' '.join(words)!r}")
-    return values
-
-
-def listed_image(path: Path, number: int, name: str) -> str:
-    """Return the name of an image that a file lists, if it exists beside that file."""
-    if not (path.parent / name).is_file():
-        raise FileNotFoundError(f"{path}, line {number}: no image at {path.parent / name}")
-    return name
-
-
-def quaternion_pose(path: Path, number: int, wxyz: Array, centre: Array) -> Array:
-    """Return the pose (4, 4) of a rotation, a quaternion (w, x, y, z) of any norm but zero, and a translation."""
-    norm = np.linalg.norm(wxyz)
-    if norm == 0:
-        raise ValueError(f"{path}, line {number}: a quaternion other than zero expected, got {wxyz}")
-    return rigid_motion(np.asarray(quaternion_to_rotation_matrix(torch.from_numpy(wxyz / norm))), centre)
 
 
 def rigid_motion(R: Array, t: Array) -> Array:

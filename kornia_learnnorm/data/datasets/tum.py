@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.splits import choose_sequences
-from kornia_learnnorm.data.datasets.textfiles import (
-    camera_matrix,
-    listed_image,
-    parse_numbers,
-    quaternion_pose,
-    text_lines,
-)
+from kornia_learnnorm.data.datasets.textfiles import camera_matrix, text_lines
 from kornia_learnnorm.data.images import image_size
 
 __all__ = ["read_tum"]
@@ -81,10 +75,10 @@ def _camera(name: str) -> tuple[Array, tuple[float, ...]]:
 
 def _images(folder: Path) -> list[tuple[float, str]]:
     path, images = folder / "rgb.txt", []
-    for number, line in text_lines(path, "list of images"):
-        time, _, listed = line.replace("\t", " ").partition(" ")
-        seconds = parse_numbers(path, number, [time] if listed else [], 1, "a timestamp and a file name", line)
-        images.append((float(seconds[0]), listed_image(path, number, listed.strip())))
+    for line in text_lines(path, "list of images"):
+        time, _, name = line.text.replace("\t", " ").partition(" ")
+        seconds = line.numbers([time] if name else [], 1, "a timestamp and a file name")
+        images.append((float(seconds[0]), line.image(name.strip())))
     if not images:
         raise ValueError(f"{path} lists no images")
     return sorted(images)
@@ -95,9 +89,9 @@ def _trajectory(path: Path) -> tuple[Array, Array]:
     if not path.exists():
         return np.empty(0), np.empty((0, 4, 4))
     rows = []
-    for number, line in text_lines(path, "poses"):
-        row = parse_numbers(path, number, line.split(), 8, "timestamp tx ty tz qx qy qz qw")
-        rows.append((row[0], quaternion_pose(path, number, row[[7, 4, 5, 6]], row[1:4])))
+    for line in text_lines(path, "poses"):
+        row = line.numbers(line.text.split(), 8, "timestamp tx ty tz qx qy qz qw")
+        rows.append((row[0], line.pose(row[[7, 4, 5, 6]], row[1:4])))
     if not rows:
         raise ValueError(f"{path} has no poses")
     rows.sort(key=lambda row: row[0])
