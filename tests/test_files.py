@@ -22,22 +22,17 @@ with exclusive(sys.argv[1]):
 
 
 @pytest.mark.parametrize("name", ["", "store.h5"])
-def test_a_lock_is_refused_then_released_and_leaves_no_file(tmp_path, name):
+def test_a_lock_is_refused_then_released_also_after_an_error_and_leaves_no_file(tmp_path, name):
     with exclusive(tmp_path / name):
         with pytest.raises(BlockingIOError, match=r"is in use by process \d+ on .*: wait for it to end, or"):
             exclusive(tmp_path / name).__enter__()
         with exclusive(tmp_path / "other.h5"):
             pass
+    with pytest.raises(KeyboardInterrupt), exclusive(tmp_path / name):
+        raise KeyboardInterrupt
     with exclusive(tmp_path / name):
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_lock_is_released_after_an_error(tmp_path):
-    with pytest.raises(KeyboardInterrupt), exclusive(tmp_path):
-        raise KeyboardInterrupt
-    with exclusive(tmp_path):
-        pass
 
 
 def test_a_missing_folder_is_named(tmp_path):
@@ -84,12 +79,8 @@ def test_commands_refuse_a_folder_that_another_run_writes(tmp_path, refused):
         options = ["--trainer.max_steps=1", f"--trainer.default_root_dir={out}"]
         refused(["fit", "--config", "crossview-synthetic", *options], "run is in use by process ")
         assert [path.name for path in out.iterdir()] == [".lock"]
+    match = ["match", "folder", str(tmp_path / "images"), "--out", str(tmp_path / "matched.h5"), "--jobs", "1"]
     with exclusive(tmp_path / "matched.h5"):
-        assert (
-            main(["match", "folder", str(tmp_path / "images"), "--out", str(tmp_path / "matched.h5"), "--jobs", "1"])
-            == 2
-        )
+        assert main(match) == 2
     assert not (tmp_path / "matched.h5.parts").exists()
-    assert (
-        main(["match", "folder", str(tmp_path / "images"), "--out", str(tmp_path / "matched.h5"), "--jobs", "1"]) == 0
-    )
+    assert main(match) == 0

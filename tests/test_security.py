@@ -216,19 +216,13 @@ def test_actions_are_pinned():
             assert action.startswith("./") or re.search(r"@[0-9a-f]{40}$", action), (path, action)
 
 
-@pytest.mark.parametrize(
-    ("found", "message"),
-    [
-        ("echo requests.exceptions.ConnectionError; exit 1", "audit: not done (offline?): requests.exceptions.Conn"),
-        ("echo 'Found 1 known vulnerability' >&2; echo one 1.0 CVE-1; exit 1", "audit: Found 1 known vuln"),
-    ],
-)
-def test_audit_never_fails(tmp_path, found, message):
+@pytest.mark.parametrize("found", ["not done (offline?): no connection", "Found 1 known vulnerability"])
+def test_audit_never_fails(tmp_path, found):
     """``make audit`` reports; where nothing can be reached it says so and goes on."""
     (tmp_path / "bin").mkdir()
-    (tmp_path / "bin/pip-audit").write_text(f"#!/bin/sh\n{found}\n")
+    printed = found.rpartition("): ")[2]
+    (tmp_path / "bin/pip-audit").write_text(f"#!/bin/sh\necho '{printed}' >&2; exit 1\n")
     (tmp_path / "bin/pip-audit").chmod(0o755)
     command = ["make", "--no-print-directory", "audit", f"AUDIT={tmp_path}", "PYTHON=false"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(message)
+    assert (done.returncode, done.stdout) == (0, f"audit: {found}\n")
