@@ -10,7 +10,7 @@ import pytest
 import torch
 from two_view import correspondences, shaken, shaken_estimator, signless, small, up_to_sign
 
-from kornia_learnnorm import EightPoint, LearnedEightPoint, LearnedNormalizer, PaperNetwork, Whitening
+from kornia_learnnorm import CrossViewNetwork, EightPoint, LearnedEightPoint, LearnedNormalizer, PaperNetwork, Whitening
 from kornia_learnnorm.export import export_layer, export_networks, load_layer
 from kornia_learnnorm.pretrained import shipped_weights
 
@@ -96,24 +96,30 @@ def test_any_batch_and_number_of_points_also_without_the_package(layer, program,
         run(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
 
 
-def test_gradients(program):
-    (points1, points2), given = masked_sets(2, 20)
-    assert not any(value.requires_grad for value in program.module()(points1.requires_grad_(), points2, **given))
-    layer, found = EightPoint(shaken(small(Whitening()))), []
-    for call in (export_layer(layer, gradients=True).module(), lambda *points: (layer(*points),)):
-        points = [points.requires_grad_() for points in sets(3, 20)]
-        found.append(torch.autograd.grad(signless(call(*points)[0]).sum(), points))
+def check_gradients_of_program(program, layer, *points, **given) -> None:
+    points = [value.clone().requires_grad_() for value in points]
+    calls = (program, lambda *values, **given: layer.estimate(*values, **given))
+    found = [torch.autograd.grad(signless(call(*points, **given)[0]).sum(), points) for call in calls]
     torch.testing.assert_close(*found, rtol=1e-3, atol=1e-6)
 
 
-def test_eights_with_weights_and_mask():
+def test_gradients_of_sets(program):
+    (points1, points2), given = masked_sets(2, 20)
+    assert not any(value.requires_grad for value in program.module()(points1.requires_grad_(), points2, **given))
+    layer = EightPoint(Whitening())
+    check_gradients_of_program(export_layer(layer, gradients=True).module(), layer, *sets(3, 20))
+
+
+def test_eights_with_weights_mask_and_gradients():
     layer, points = EightPoint(shaken(small(Whitening()))), sets(4, 8)
     points[0][2] = points[0][2, :1]  # coincident
     mask, weights = torch.ones(4, 8, dtype=torch.bool), torch.rand(4, 8) + 0.5
     mask[3, 5:] = False
-    program = export_layer(layer, ["weights", "mask"], num_points=8).module()
+    program = export_layer(layer, ["weights", "mask"], num_points=8, gradients=True).module()
     assert program(*points, mask=mask, weights=weights)[1].tolist() == [True, True, False, False]
-    check(program, layer, *(p[:2] for p in points), mask=mask[:2], weights=weights[:2])
+    determined, given = [p[:2] for p in points], {"mask": mask[:2], "weights": weights[:2]}
+    check(program, layer, *determined, **given)
+    check_gradients_of_program(program, layer, *determined, **given)
 
 
 @pytest.mark.slow
@@ -173,7 +179,7 @@ class TestNetworks:
     @pytest.mark.parametrize("name", ["crossview", "paper"])
     def test_network_of_a_normaliser(self, name):
         """The layer stays as it is, in training and float64."""
-        network = PaperNetwork(16, 2, num_parameters=5) if name == "paper" else None
+        network = PaperNetwork(8, 2, num_parameters=5) if name == "paper" else CrossViewNetwork(width=8, depth=1)
         layer = EightPoint(shaken(LearnedNormalizer(network=network))).double().train()
         (program,) = export_networks(layer).values()
         assert layer.training

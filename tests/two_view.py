@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import kornia_learnnorm as kln
@@ -63,6 +65,15 @@ def shaken_estimator(seed: int = 0, **options) -> LearnedEightPoint:
                 for value in last.parameters():
                     value.normal_(0, 0.3)
     return layer.eval()
+
+
+def rewrite_weights(file, change) -> None:
+    """Change the tensors and metadata of a file of weights in place, by a function of both."""
+    with safe_open(file, "pt") as opened:
+        metadata = opened.metadata()
+    state = load_file(file)
+    change(state, metadata)
+    save_file(state, file, metadata=metadata)
 
 
 def homogeneous(points: np.ndarray) -> np.ndarray:

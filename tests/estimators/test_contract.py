@@ -24,31 +24,14 @@ from two_view import (
     up_to_sign,
 )
 
-from kornia_learnnorm import (
-    Cauchy,
-    EightPoint,
-    GemanMcClure,
-    Huber,
-    Identity,
-    ReweightedWhitening,
-    Truncated,
-    Whitening,
-    find_fundamental,
-    optimal_rank2,
-    refine_fundamental,
-    squared_loss,
-)
+import kornia_learnnorm as kln
+from kornia_learnnorm import EightPoint, find_fundamental, optimal_rank2, refine_fundamental
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.fundamental import Fundamental
 
-LOSSES = {
-    "squared": squared_loss,
-    "Huber": Huber(0.5),
-    "Cauchy": Cauchy(0.5),
-    "Geman-McClure": GemanMcClure(2.0),
-    "truncated": Truncated(3.0),
-}
+LOSSES = {"squared": kln.squared_loss, "Huber": kln.Huber(0.5), "Cauchy": kln.Cauchy(0.5)}
+LOSSES |= {"Geman-McClure": kln.GemanMcClure(2.0), "truncated": kln.Truncated(3.0)}
 
 
 def rank_three(points1, points2, weights=None):
@@ -69,9 +52,9 @@ def refined(points1, points2, weights=None, **options):
 
 LINEAR = {
     "projection": find_fundamental,
-    "identity": partial(find_fundamental, normalizer=Identity()),
-    "whitening": partial(find_fundamental, normalizer=Whitening()),
-    "reweighted": partial(find_fundamental, normalizer=ReweightedWhitening()),
+    "identity": partial(find_fundamental, normalizer=kln.Identity()),
+    "whitening": partial(find_fundamental, normalizer=kln.Whitening()),
+    "reweighted": partial(find_fundamental, normalizer=kln.ReweightedWhitening()),
     "optimal": partial(find_fundamental, rank2="optimal"),
     "corrected": corrected,
 }

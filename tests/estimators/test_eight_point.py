@@ -67,8 +67,7 @@ class TestEightPoint:
 
     def test_default_is_hartley(self, device, dtype):
         points = [p.to(device, dtype) for p in correspondences()]
-        assert isinstance(EightPoint().normalizer, Hartley)
-        assert torch.equal(EightPoint()(*points), find_fundamental(*points))
+        assert torch.equal(EightPoint()(*points), find_fundamental(*points, normalizer=Hartley()))
 
     def test_owns_its_normalizer(self):
         normalizer = shaken()
@@ -125,14 +124,11 @@ class TestMask:
             assert not gradient[:, 12:].any()
 
     def test_gradients_are_those_without_the_rows(self):
-        points = [p.requires_grad_() for p in correspondences("handheld", 3, 12)]
-        plain = torch.autograd.grad(signless(EightPoint()(*points)).sum(), points)
+        points, mask = [p.requires_grad_() for p in correspondences("handheld", 3, 12)], torch.arange(16) < 12
         padded = [torch.cat([p, torch.full((3, 4, 2), torch.nan)], 1) for p in points]
-        masked = torch.autograd.grad(
-            signless(EightPoint()(*padded, None, torch.arange(16).expand(3, 16) < 12)).sum(), points
-        )
-        for expected, got in zip(plain, masked, strict=True):
-            assert torch.allclose(expected, got, rtol=1e-8, atol=1e-12)
+        F_mats = EightPoint()(*padded, None, mask.expand(3, 16)), EightPoint()(*points)
+        masked, plain = (torch.autograd.grad(signless(F_mat).sum(), points) for F_mat in F_mats)
+        torch.testing.assert_close(masked, plain, rtol=1e-8, atol=1e-12)
 
     @pytest.mark.parametrize(
         ("mask", "error", "message"),
@@ -195,8 +191,8 @@ class TestDetermined:
         weights = torch.ones(4, 12)
         for k in range(4):
             weights[k, 5 + 2 * k :] = 0
-        assert layer.estimate(*points, weights=weights).determined.tolist() == [False, False, True, True]
-        assert layer.estimate(*points, mask=weights > 0).determined.tolist() == [False, False, True, True]
+        for given in ({"weights": weights}, {"mask": weights > 0}):
+            assert layer.estimate(*points, **given).determined.tolist() == [False, False, True, True]
         assert not layer.estimate(*points, weights=torch.zeros(4, 12)).determined.any()
 
     @pytest.mark.parametrize("number", [0, 1])
@@ -256,31 +252,30 @@ class TestCameras:
     @pytest.mark.parametrize(
         ("K", "error", "message"),
         [
-            (torch.rand(3, 4), ValueError, r"K1 must have shape \[3, 3\] or \[20, 3, 3\], got \[3, 4\]"),
+            (torch.rand(3, 4), ValueError, r"K1 .* \[3, 3\] or \[20, 3, 3\], got \[3, 4\]"),
             (torch.eye(3).expand(4, 3, 3), ValueError, r"got \[4, 3, 3\]"),
             (torch.zeros(3, 3), ValueError, "K1 must be finite and invertible"),
-            (torch.eye(3).long(), TypeError, r"K1 must be a floating-point tensor, got torch\.int64"),
-            (np.eye(3), TypeError, "got <class 'numpy.ndarray'>"),
+            (torch.eye(3).long(), TypeError, r"K1 .* got torch\.int64"),
         ],
     )
     def test_wrong_cameras(self, K, error, message):
         with pytest.raises(error, match=message):
             EightPoint().estimate(*correspondences(), K1=K, K2=torch.eye(3))
-
-    def test_one_camera(self):
-        with pytest.raises(ValueError, match="must be given together, got only K1"):
+        with pytest.raises(ValueError, match="got only K1"):
             EightPoint().estimate(*correspondences(), K1=torch.eye(3))
 
 
 class TestMatches:
-    def test_is_the_layer_of_the_matched_points(self):
-        points1, points2 = correspondences("handheld", 2, 30)
+    @pytest.mark.parametrize(("name", "argument"), [("hartley", "weights"), ("estimator", "scores")])
+    def test_is_the_layer_of_the_matched_points(self, name, argument):
+        layer, (points1, points2) = LAYERS[name]().double(), correspondences("handheld", 2, 30)
         index = torch.stack([torch.randperm(30)[:20] for _ in range(2)])
         matches = [torch.stack([row, row], -1) for row in index]
         scores = [torch.rand(20, requires_grad=True) for _ in range(2)]
-        estimate = EightPoint().from_matches(points1, points2, matches, scores)
+        estimate = layer.from_matches(points1, points2, matches, scores)
         gathered = [torch.stack([p[k, index[k]] for k in range(2)]) for p in (points1, points2)]
-        assert up_to_sign(estimate.F_mat.detach(), EightPoint()(*gathered, torch.stack(scores)).detach()) < 1e-9
+        expected = layer(*gathered, **{argument: torch.stack(scores)})
+        assert up_to_sign(estimate.F_mat.detach(), expected.detach()) < 1e-9
         signless(estimate.F_mat).sum().backward()
         assert all(score.grad.any() and score.grad.isfinite().all() for score in scores)
 

@@ -8,9 +8,17 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
-from two_view import check_gradients, correspondences, scenes, seeded, shaken_estimator, signless, uniform, up_to_sign
+from two_view import (
+    check_gradients,
+    correspondences,
+    rewrite_weights,
+    scenes,
+    seeded,
+    shaken_estimator,
+    signless,
+    uniform,
+    up_to_sign,
+)
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators.match_features import CommonFrame, masked_median
@@ -99,22 +107,11 @@ class TestEstimate:
         assert estimate.E_mat is None
         assert estimate.determined.all()
 
+    @torch.no_grad()
     def test_cameras(self):
         scene = scenes("handheld", 5, 20)
         estimate = shaken_double().estimate(scene.points1, scene.points2, K1=scene.K1, K2=scene.K2)
-        expected = scene.K2.mT @ estimate.F_mat @ scene.K1
-        assert up_to_sign(estimate.E_mat.detach(), expected.detach()) < 1e-12
-
-    def test_matches(self):
-        points1, points2 = correspondences("handheld", 2, 30)
-        index = torch.arange(30)[:, None].expand(30, 2)
-        scores = [torch.rand(30, requires_grad=True) for _ in range(2)]
-        layer = shaken_double()
-        estimate = layer.from_matches(points1, points2, [index, index], scores)
-        expected = layer(points1, points2, scores=torch.stack(scores))
-        assert up_to_sign(estimate.F_mat.detach(), expected.detach()) < 1e-9
-        signless(estimate.F_mat).sum().backward()
-        assert all(score.grad.any() and score.grad.isfinite().all() for score in scores)
+        assert up_to_sign(estimate.E_mat, scene.K2.mT @ estimate.F_mat @ scene.K1) < 1e-12
 
     @pytest.mark.parametrize("number", [0, 5, 8])
     def test_scores_of_few_matches_get_zero(self, number):
@@ -149,11 +146,11 @@ class TestEstimate:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"stages": 0}, "stages must be a whole number, at least 1, got 0"),
-            ({"refine_steps": -1}, "refine_steps must be a whole number, at least 0, got -1"),
+            ({"stages": 0}, "stages must be .* 1, got 0"),
+            ({"refine_steps": -1}, "refine_steps must be .* 0, got -1"),
             ({"width": 0}, "width must be"),
             ({"depth": 1.5}, "depth must be .* got 1.5"),
-            ({"learn_transforms": "no"}, "learn_transforms must be true or false, got 'no'"),
+            ({"learn_transforms": "no"}, "learn_transforms must be .* got 'no'"),
             ({"rank2": "no"}, "rank2 must be"),
         ],
     )
@@ -189,24 +186,20 @@ class TestFiles:
         "architecture", ["", "[]", "3", "{}x", '{"widht": 3}', '{"width": 10000}', '{"stages": 0}', '{"rank2": "no"}']
     )
     def test_garbled_architecture(self, file, architecture):
-        with safe_open(file, "pt") as opened:
-            metadata = opened.metadata()
-        save_file(load_file(file), file, metadata=metadata | {"architecture": architecture})
+        rewrite_weights(file, lambda _, metadata: metadata.update(architecture=architecture))
         with pytest.raises(ValueError, match=r"weights\.safetensors describes no estimator of this version"):
             kln.LearnedEightPoint.from_pretrained(file)
 
     def test_architecture_of_another_size(self, file):
-        with safe_open(file, "pt") as opened:
-            metadata = opened.metadata()
-        architecture = json.loads(metadata["architecture"]) | {"depth": 5}
-        save_file(load_file(file), file, metadata=metadata | {"architecture": json.dumps(architecture)})
+        def deepen(_, metadata):
+            metadata["architecture"] = json.dumps(json.loads(metadata["architecture"]) | {"depth": 5})
+
+        rewrite_weights(file, deepen)
         with pytest.raises(ValueError, match="do not fit the architecture"):
             kln.LearnedEightPoint.from_pretrained(file)
 
     def test_weights_of_a_normaliser(self):
-        with pytest.raises(
-            ValueError, match=r"crossview.* of a LearnedNormalizer, expected .* LearnedEightPoint, such as"
-        ):
+        with pytest.raises(ValueError, match=r"crossview.* LearnedNormalizer, expected .* LearnedEightPoint"):
             kln.LearnedEightPoint.from_pretrained("crossview")
 
 

@@ -64,33 +64,22 @@ FIRST = [torch.tensor([[0, 0]])] * 2  # the first keypoints of both views, in bo
 
 
 @pytest.mark.parametrize(
-    ("matches", "error", "message"),
-    [
-        (FIRST[:1], ValueError, "got 1 for 2 and 2 pairs"),
-        ([torch.zeros(1, 2)] * 2, TypeError, r"matches must be tensors of integers, got torch\.float32"),
-        ([[[0, 0]]] * 2, TypeError, "matches must be tensors of integers, got <class 'list'>"),
-        ([torch.zeros(2, dtype=torch.int64)] * 2, ValueError, r"pair 0 must have shape \[S, 2\], got \[2\]"),
-        ([torch.tensor([[0, 25]])] * 2, ValueError, "indices of 30 and 25 keypoints"),
-        ([torch.tensor([[-1, 2]])] * 2, ValueError, "indices of 30 and 25 keypoints"),
-        (torch.zeros(2, 25, dtype=torch.int64), ValueError, r"shape \[2, 30\] or be a list, got \[2, 25\]"),
-    ],
-)
-def test_wrong_matches(matches, error, message):
-    with pytest.raises(error, match=message):
-        correspondences_from_matches(*KEYPOINTS, matches)
-
-
-@pytest.mark.parametrize(
     ("matches", "scores", "error", "message"),
     [
-        (FIRST, [torch.rand(2)] * 2, ValueError, r"scores of pair 0 must have shape \[1\], got \[2\]"),
-        (torch.zeros(2, 30).long(), torch.rand(2, 3), ValueError, r"of the matches, \[2, 30\], got \[2, 3\]"),
-        (FIRST, [torch.rand(1), None], TypeError, "scores must be floating-point tensors, got"),
-        (FIRST, [torch.rand(1)], ValueError, "scores of every pair are needed, got 1 for 2 pairs"),
+        (FIRST[:1], None, ValueError, "got 1 for 2 and 2 pairs"),
+        ([torch.zeros(1, 2)] * 2, None, TypeError, r"integers, got torch\.float32"),
+        ([[[0, 0]]] * 2, None, TypeError, "integers, got <class 'list'>"),
+        ([torch.zeros(2, dtype=torch.int64)] * 2, None, ValueError, r"pair 0 .* \[S, 2\], got \[2\]"),
+        *(([torch.tensor([pair])] * 2, None, ValueError, "30 and 25 keypoints") for pair in ([0, 25], [-1, 2])),
+        (torch.zeros(2, 25, dtype=torch.int64), None, ValueError, r"\[2, 30\] .*, got \[2, 25\]"),
+        (FIRST, [torch.rand(2)] * 2, ValueError, r"scores of pair 0 .* \[1\], got \[2\]"),
+        (torch.zeros(2, 30).long(), torch.rand(2, 3), ValueError, r"\[2, 30\], got \[2, 3\]"),
+        (FIRST, [torch.rand(1), None], TypeError, "scores must be floating-point"),
+        (FIRST, [torch.rand(1)], ValueError, "scores .* got 1 for 2 pairs"),
         (FIRST, [torch.rand(1), -torch.rand(1)], ValueError, "scores of pair 1 must be finite and not negative"),
     ],
 )
-def test_wrong_scores(matches, scores, error, message):
+def test_wrong_matches_and_scores(matches, scores, error, message):
     with pytest.raises(error, match=message):
         correspondences_from_matches(*KEYPOINTS, matches, scores)
 

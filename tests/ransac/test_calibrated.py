@@ -64,7 +64,7 @@ class TestSmoke:
         assert torch.equal(found.F_mat, F_mat)
         assert torch.equal(found.inliers, inliers)
         assert up_to_sign(F_mat[None], of_pixels(found.E_mat, K1, K2)) < 1e-10
-        distances = kln.sampson_distance(*(p[None] for p in points), F_mat[None])[0]
+        distances = kln.sampson_distance(*points, F_mat)
         assert torch.equal(inliers, distances <= 1)
         assert found.score == pytest.approx((1 - distances.square()).clamp(min=0).sum().item(), rel=1e-6)
 
@@ -104,9 +104,7 @@ class TestExceptions:
     def test_failure(self):
         """Five matches fit exactly: no other one confirms the matrix."""
         found = estimate((uniform(5, 2), uniform(5, 2, seed=1)), (torch.eye(3), torch.eye(3)))
-        assert not found.E_mat.any()
-        assert not found.F_mat.any()
-        assert not found.inliers.any()
+        assert not any(value.any() for value in (found.E_mat, found.F_mat, found.inliers))
 
 
 class TestAccuracy:
@@ -133,20 +131,20 @@ class TestAccuracy:
         points, cameras, R, t = plane(seed=seed)
         found = estimate(points, cameras)
         assert found.inliers.all()
-        assert kln.sampson_distance(*(p[None] for p in points), found.F_mat[None]).max() < 1e-6
+        assert kln.sampson_distance(*points, found.F_mat).max() < 1e-6
         H = R + 0.5 * np.outer(t / np.linalg.norm(t), np.array([0.2, -0.1, 1.0]) / 4)
         _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
         solutions = [essential(R, t[:, 0]) for R, t in zip(rotations, translations, strict=True)]
         assert min(up_to_sign(found.E_mat[None], E[None]) for E in solutions) < 1e-5
 
     def test_is_closer_to_the_truth_than_without_cameras(self):
-        errors = {True: [], False: []}
+        errors = []
         for seed in range(10):
             points, (K1, K2), E, _ = pair(num_points=60, noise=0.5, seed=seed)
-            for known, cameras in ((True, (K1, K2)), (False, ())):
-                F = estimate(points, cameras).F_mat
-                errors[known].append(up_to_sign((K2.mT @ F @ K1)[None], E[None]))
-        assert np.median(errors[True]) < np.median(errors[False])
+            F_mats = [estimate(points, cameras).F_mat for cameras in ((K1, K2), ())]
+            errors.append([up_to_sign((K2.mT @ F @ K1)[None], E[None]) for F in F_mats])
+        known, unknown = np.median(errors, 0)
+        assert known < unknown
 
     def test_many_matches_and_few_inliers(self):
         points, cameras, E, true = pair(num_points=2000, outliers=0.85)
@@ -164,8 +162,7 @@ class TestAccuracy:
 def distorted(seed: int, scale: float = 1.0):
     """Correspondences of a lens that moves the corners inwards by 3 %, and the cameras, E, R and t of a pinhole."""
     scene = scenes("handheld", 1, 300, seed, noise=0.3, outliers=0.3)
-    T = torch.diag(torch.tensor([scale, scale, 1.0])).double()
-    points = []
+    T, points = torch.diag(torch.tensor([scale, scale, 1.0])).double(), []
     for pixels, K in ((scene.points1[0], scene.K1[0]), (scene.points2[0], scene.K2[0])):
         offset = pixels - K[:2, 2]
         square = offset.square().sum(-1, keepdim=True)
@@ -175,17 +172,19 @@ def distorted(seed: int, scale: float = 1.0):
 
 def error_of_pose(F_mat, points, cameras, R, t):
     near = kln.sampson_distance(*points, F_mat) <= 1
-    pose = kln.relative_pose(*(v[None] for v in (F_mat, *cameras, *points, near)))
-    return pose_error(*pose, R, t).item()
+    return pose_error(*kln.relative_pose(*(v[None] for v in (F_mat, *cameras, *points, near))), R, t).item()
 
 
 class TestInexactCameras:
     """Where the correspondences contradict the cameras, the fit has seven parameters."""
 
-    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
-    def test_exact_cameras_are_kept(self, name):
+    @pytest.mark.parametrize(
+        ("name", "noise"), [("driving", 0.5), ("handheld", 0.5), ("orbit", 0.5), ("handheld", 0.0)]
+    )
+    def test_exact_cameras_are_kept(self, name, noise):
+        """Rounding does not speak against cameras either."""
         for seed in range(5):
-            points, cameras, _, _ = pair(name, noise=0.5, seed=seed)
+            points, cameras, _, _ = pair(name, noise=noise, seed=seed)
             found = estimate(points, cameras)
             assert up_to_sign(found.F_mat[None], of_pixels(found.E_mat, *cameras)) < 1e-9
 
@@ -199,8 +198,6 @@ class TestInexactCameras:
             fitted = kln.refine_essential(*one, loss=kln.GemanMcClure(0.7))
             free.append(error_of_pose(found.F_mat, points, cameras, R, t))
             known.append(error_of_pose(fitted.F_mat[0], points, cameras, R, t))
-            values = torch.linalg.svdvals(found.E_mat)
-            assert torch.allclose(values, torch.tensor([0.5**0.5, 0.5**0.5, 0.0]).double(), atol=1e-12)
             U, _, Vh = torch.linalg.svd(cameras[1].mT @ found.F_mat @ cameras[0])
             assert up_to_sign(found.E_mat[None], (U[:, :2] @ Vh[:2] * 0.5**0.5)[None]) < 1e-9
         assert np.mean(free) < 0.8 * np.mean(known)
@@ -210,12 +207,6 @@ class TestInexactCameras:
         found, (scaled_points, scaled_cameras, _, _) = estimate(*distorted(0)[:2]), distorted(0, scale)
         scaled = estimate(scaled_points, scaled_cameras, inl_th=scale)
         assert up_to_sign(found.E_mat[None], scaled.E_mat[None]) < 1e-2
-
-    def test_points_without_noise(self):
-        """Rounding does not speak against cameras."""
-        points, cameras, _, _ = pair(noise=0.0, outliers=0.3)
-        found = estimate(points, cameras)
-        assert up_to_sign(found.F_mat[None], of_pixels(found.E_mat, *cameras)) < 1e-9
 
 
 class TestInFront:
