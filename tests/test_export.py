@@ -195,17 +195,14 @@ class TestNetworks:
             export_networks(EightPoint())
 
 
-@pytest.mark.parametrize(
-    ("layer", "options", "error", "message"),
-    [
+def test_wrong_arguments():
+    for layer, options, error, message in [
         (torch.nn.Linear(2, 2), {}, TypeError, "got .*Linear"),
         (EightPoint(), {"inputs": ["scores"]}, ValueError, "weights, mask, got scores"),
         (EightPoint(), {"num_points": 7}, ValueError, "num_points .* 8, got 7"),
-    ],
-)
-def test_wrong_arguments(layer, options, error, message):
-    with pytest.raises(error, match=message):
-        export_layer(layer, **options)
+    ]:
+        with pytest.raises(error, match=message):
+            export_layer(layer, **options)
 
 
 def test_load_layer():

@@ -130,33 +130,27 @@ class TestEstimate:
 
         check_gradients(numbers, uniform(1, 12), atol=1e-4)
 
-    @pytest.mark.parametrize(
-        ("scores", "error", "message"),
-        [
+    def test_wrong_scores(self):
+        for scores, error, message in [
             (torch.rand(2, 9), ValueError, r"scores .*\[2, 12\], got \[2, 9\]"),
             (torch.full((2, 12), 1.5), ValueError, r"scores .* got 1\.5 to 1\.5"),
             (torch.full((2, 12), torch.nan), ValueError, r"scores .* got nan"),
             (torch.ones(2, 12, dtype=torch.int64), TypeError, r"scores .* got torch\.int64"),
-        ],
-    )
-    def test_wrong_scores(self, scores, error, message):
-        with pytest.raises(error, match=message):
-            shaken_estimator()(*correspondences("handheld", 2, 12), scores=scores)
+        ]:
+            with pytest.raises(error, match=message):
+                shaken_estimator()(*correspondences("handheld", 2, 12), scores=scores)
 
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
+    def test_wrong_options(self):
+        for options, message in [
             ({"stages": 0}, "stages must be .* 1, got 0"),
             ({"refine_steps": -1}, "refine_steps must be .* 0, got -1"),
             ({"width": 0}, "width must be"),
             ({"depth": 1.5}, "depth must be .* got 1.5"),
             ({"learn_transforms": "no"}, "learn_transforms must be .* got 'no'"),
             ({"rank2": "no"}, "rank2 must be"),
-        ],
-    )
-    def test_wrong_options(self, options, message):
-        with pytest.raises(ValueError, match=message):
-            kln.LearnedEightPoint(**options)
+        ]:
+            with pytest.raises(ValueError, match=message):
+                kln.LearnedEightPoint(**options)
 
     def test_masked_scores_may_hold_anything(self):
         points, layer = correspondences("handheld", 2, 12), shaken_double()

@@ -63,9 +63,8 @@ def test_gradients_reach_keypoints_and_scores():
 FIRST = [torch.tensor([[0, 0]])] * 2  # the first keypoints of both views, in both pairs
 
 
-@pytest.mark.parametrize(
-    ("matches", "scores", "error", "message"),
-    [
+def test_wrong_matches_and_scores():
+    for matches, scores, error, message in [
         (FIRST[:1], None, ValueError, "got 1 for 2 and 2 pairs"),
         ([torch.zeros(1, 2)] * 2, None, TypeError, r"integers, got torch\.float32"),
         ([[[0, 0]]] * 2, None, TypeError, "integers, got <class 'list'>"),
@@ -77,11 +76,9 @@ FIRST = [torch.tensor([[0, 0]])] * 2  # the first keypoints of both views, in bo
         (FIRST, [torch.rand(1), None], TypeError, "scores must be floating-point"),
         (FIRST, [torch.rand(1)], ValueError, "scores .* got 1 for 2 pairs"),
         (FIRST, [torch.rand(1), -torch.rand(1)], ValueError, "scores of pair 1 must be finite and not negative"),
-    ],
-)
-def test_wrong_matches_and_scores(matches, scores, error, message):
-    with pytest.raises(error, match=message):
-        correspondences_from_matches(*KEYPOINTS, matches, scores)
+    ]:
+        with pytest.raises(error, match=message):
+            correspondences_from_matches(*KEYPOINTS, matches, scores)
 
 
 def test_wrong_keypoints():

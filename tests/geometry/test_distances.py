@@ -92,9 +92,8 @@ class TestAll:
         compiled = torch.compile(distance, fullgraph=True, backend="aot_eager")
         assert torch.allclose(compiled(points1, points2, F_mat), distance(points1, points2, F_mat))
 
-    @pytest.mark.parametrize(
-        ("points1", "points2", "F_mat", "error", "message"),
-        [
+    def test_exceptions(self, distance):
+        for points1, points2, F_mat, error, message in [
             (torch.rand(2, 8, 3), POINTS, MATRICES, ShapeError, r"\[2, 8, 3\]"),
             (POINTS, torch.rand(8), MATRICES, ShapeError, r"\[8\]"),
             (POINTS, POINTS, MATRICES[:, 0], ShapeError, r"\[2, 3\]"),
@@ -102,11 +101,9 @@ class TestAll:
             (POINTS.long(), POINTS, MATRICES, TypeError, "points1 must be .* got torch.int64"),
             (POINTS, POINTS.numpy(), MATRICES, TypeError, "points2 must be .* got .*numpy"),
             (POINTS, POINTS, None, TypeError, "F_mat must be .* got <class 'NoneType'>"),
-        ],
-    )
-    def test_exceptions(self, distance, points1, points2, F_mat, error, message):
-        with pytest.raises(error, match=message):
-            distance(points1, points2, F_mat)
+        ]:
+            with pytest.raises(error, match=message):
+                distance(points1, points2, F_mat)
 
 
 class TestSymmetricEpipolarDistance:

@@ -55,9 +55,7 @@ def file(tmp_path):
 
 
 class TestForward:
-    @pairwise(
-        base=["paper", "Identity", "Hartley", "Whitening", "ReweightedWhitening"], num_points=[8, 20], dtype=DTYPES
-    )
+    @pairwise(base=["", "Identity", "Hartley", "Whitening", "ReweightedWhitening"], num_points=[8, 20], dtype=DTYPES)
     def test_untrained_is_exactly_the_base(self, base, num_points, dtype):
         normalizer = small(getattr(kln, base)()) if base else paper()
         points = [p.to(dtype) for p in correspondences("handheld", 5, num_points)]

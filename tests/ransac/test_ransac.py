@@ -87,9 +87,8 @@ POINTS, NAN = uniform(20, 2), float("nan")
 
 
 class TestExceptions:
-    @pytest.mark.parametrize(
-        ("wrong", "error", "message"),
-        [
+    def test_options(self):
+        for wrong, error, message in [
             ({"inl_th": 0.0}, ValueError, "inl_th .* got 0.0"),
             ({"inl_th": NAN}, ValueError, "inl_th"),
             ({"inl_th": 1e300}, ValueError, "inl_th .* to 1e12, got 1e[+]300"),
@@ -106,15 +105,12 @@ class TestExceptions:
             ({"sampler": "prosac"}, TypeError, "sampler must be .* got 'prosac'"),
             ({"normalizer": "hartley"}, TypeError, "normalizer must be .* got 'hartley'"),
             *(({k: "1"}, TypeError, f"{k} must be a number, got '1'") for k in ("inl_th", "confidence", "max_seconds")),
-        ],
-    )
-    def test_options(self, wrong, error, message):
-        with pytest.raises(error, match=message):
-            RANSAC(**wrong)
+        ]:
+            with pytest.raises(error, match=message):
+                RANSAC(**wrong)
 
-    @pytest.mark.parametrize(
-        ("points1", "points2", "weights", "error", "message"),
-        [
+    def test_correspondences(self):
+        for points1, points2, weights, error, message in [
             (POINTS.long(), POINTS, None, TypeError, "points1 must be .* got torch.int64"),
             (POINTS.numpy(), POINTS, None, TypeError, r"numpy.ndarray.*torch.from_numpy\(points1\)"),
             (POINTS, POINTS.float(), None, TypeError, "one dtype"),
@@ -127,11 +123,9 @@ class TestExceptions:
                 (POINTS, POINTS, torch.full((20,), bad), ValueError, "finite and not negative")
                 for bad in (-1.0, NAN, float("inf"))
             ),
-        ],
-    )
-    def test_correspondences(self, points1, points2, weights, error, message):
-        with pytest.raises(error, match=message):
-            RANSAC()(points1, points2, weights)
+        ]:
+            with pytest.raises(error, match=message):
+                RANSAC()(points1, points2, weights)
 
 
 class TestAccuracy:

@@ -102,20 +102,17 @@ class TestSampleMinimalSets:
         (gradient,) = torch.autograd.grad(log_probs.sum(), logits)
         assert torch.isfinite(gradient).all()
 
-    @pytest.mark.parametrize(
-        ("logits", "count", "error", "message"),
-        [
+    def test_exceptions(self):
+        for logits, count, error, message in [
             (None, 1, TypeError, "logits must be .* got <class 'NoneType'>"),
             (torch.ones(1, 9, dtype=torch.int64), 1, TypeError, "got torch.int64"),
             (torch.ones(9), 1, ShapeError, r"\[9\]"),
             (torch.ones(1, 7), 1, ValueError, "at least 8 .* got 7"),
             (torch.full((1, 9), -torch.inf), 1, ValueError, "logits must be finite, got 9"),
             (torch.ones(1, 9), 0, ValueError, "count must be >= 1, got 0"),
-        ],
-    )
-    def test_exceptions(self, logits, count, error, message):
-        with pytest.raises(error, match=message):
-            sample_minimal_sets(logits, count)
+        ]:
+            with pytest.raises(error, match=message):
+                sample_minimal_sets(logits, count)
 
 
 class TestExpectedLoss:
@@ -252,9 +249,8 @@ POINTS, SAMPLES = torch.rand(2, 9, 2), torch.arange(8).expand(2, 3, 8)
 
 
 class TestExceptions:
-    @pytest.mark.parametrize(
-        ("wrong", "error", "message"),
-        [
+    def test_expected_loss(self):
+        for wrong, error, message in [
             ({"samples": None}, TypeError, "samples must be .* got <class 'NoneType'>"),
             ({"samples": torch.zeros(2, 3, 8)}, TypeError, "samples must be .* got torch.float32"),
             ({"samples": SAMPLES[..., :7]}, ShapeError, r"\[2, 3, 7\]"),
@@ -264,8 +260,6 @@ class TestExceptions:
             ({"samples": SAMPLES[:, :1], "log_probs": torch.zeros(2, 1)}, ValueError, r"log_probs .* got \[2, 1\]"),
             ({"loss": lambda F: F[:, 0, 0, 0]}, ValueError, r"one value per matrix, \[2, 3\], got \[2\]"),
             *(({name: 0.0}, ValueError, r"threshold and slope .* got .*0\.0") for name in ("threshold", "slope")),
-        ],
-    )
-    def test_expected_loss(self, wrong, error, message):
-        with pytest.raises(error, match=message):
-            expected_loss(**({"points1": POINTS, "points2": POINTS, "samples": SAMPLES, "loss": target} | wrong))
+        ]:
+            with pytest.raises(error, match=message):
+                expected_loss(**({"points1": POINTS, "points2": POINTS, "samples": SAMPLES, "loss": target} | wrong))
