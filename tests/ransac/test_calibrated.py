@@ -175,11 +175,11 @@ def error_of_pose(F_mat, points, cameras, R, t):
 class TestInexactCameras:
     """Where the correspondences contradict the cameras, the fit has seven parameters."""
 
-    @pytest.mark.parametrize(("name", "noise"), [("driving", 0.5), ("handheld", 0.5), ("orbit", 0.5), ("orbit", 0.0)])
-    def test_exact_cameras_are_kept(self, name, noise):
-        """Rounding does not speak against cameras either."""
-        for seed in range(5):
-            points, cameras, _, _ = pair(name, noise=noise, seed=seed)
+    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
+    def test_exact_cameras_are_kept(self, name):
+        """Rounding does not speak against cameras either: the last pair has no noise."""
+        pairs = [pair(name, noise=0.5, seed=seed) for seed in range(5)] + [pair(noise=0.0, outliers=0.3)]
+        for points, cameras, _, _ in pairs:
             found = estimate(points, cameras)
             assert up_to_sign(found.F_mat[None], of_pixels(found.E_mat, *cameras)) < 1e-9
 
