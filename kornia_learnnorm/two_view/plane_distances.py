@@ -7,22 +7,25 @@ parallax would. What one distortion of both images explains is therefore no evid
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
+from typing import Any, NamedTuple
 
 import torch
-from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
+
+from kornia_learnnorm.data.images import Size
+from kornia_learnnorm.estimators.optimize import RobustCost, minimize
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 
 __all__ = ["distances_from_plane"]
 
 MAX_DISTORTION = 0.2  # of the radius at the corners of an image
-STEPS = 10  # of Levenberg-Marquardt
-FIRST_DAMPING = 1e-6  # of the mean diagonal entry of the normal matrix
+MAX_STEPS = 10  # of Levenberg-Marquardt
+TOLERANCE = 1e-6  # cosine of offsets and derivatives at which it has converged
+AT_INFINITY = 1e6  # halves of the diagonal; offset of a point that the homography moves to infinity
 
 
 def distances_from_plane(
-    points1: Tensor, points2: Tensor, H: Tensor, size1: tuple[int, int], size2: tuple[int, int], threshold: float
+    points1: Tensor, points2: Tensor, H: Tensor, size1: Size, size2: Size, threshold: float
 ) -> Tensor:
     r"""Return the distances (N,) of points2 from where the plane and a radial distortion move points1, pixels.
 
@@ -40,63 +43,71 @@ def distances_from_plane(
         threshold: scale of the loss, pixels.
 
     """
-    centre1, radius1 = _centre_and_radius(size1)
-    centre2, radius2 = _centre_and_radius(size2)
-    linearise = partial(_linearise, u1=(points1 - centre1) / radius1, u2=(points2 - centre2) / radius2)
-    H = torch.linalg.inv(_to_pixels(centre2, radius2)) @ H @ _to_pixels(centre1, radius1)
-    start = torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])
-    distance: Tensor = radius2 * _minimize(linearise, start, threshold / radius2).norm(dim=-1)
-    return distance.nan_to_num(nan=math.inf)
+    T1, T2 = _from_pixels(size1), _from_pixels(size2)
+    ones = torch.ones_like(points1.mT[:1])
+    x1, x2 = (T @ torch.cat([points.mT, ones]) for T, points in ((T1, points1), (T2, points2)))
+    H = T2 @ H @ torch.linalg.inv(T1)
+    start = _Parameters(torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])[None])
+    model: Any = _BentPlane()
+    cost = RobustCost(model, x1[None], x2[None], ones, GemanMcClure(threshold * float(T2[0, 0])))
+    _, optimum = minimize(cost, start, MAX_STEPS, TOLERANCE)
+    distance = cost.squares(optimum.state.matrix())[0].sqrt()
+    return torch.where(distance < AT_INFINITY, distance / T2[0, 0], math.inf)
 
 
-def _linearise(parameters: Tensor, u1: Tensor, u2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the offsets (N, 2) of u2 and their derivatives by the entries of H and the distortion, (N, 2, 10)."""
-    H, bend = parameters[:9].view(3, 3), torch.tanh(parameters[9])  # the distortion is bounded
-    k, slope = MAX_DISTORTION * bend, MAX_DISTORTION * (1 - bend.square())
-    square1, square2 = (u.square().sum(-1, keepdim=True) for u in (u1, u2))
-    ideal1 = convert_points_to_homogeneous(u1 * (1 + k * square1))
-    moved = ideal1 @ H.mT
-    depth, v = moved[:, 2:], moved[:, :2] / moved[:, 2:]
-    # Over the local scale: a distortion that shrinks an image must not shrink its errors.
-    stretch = 1 + 2 * k * square2
-    offsets = (v - u2 * (1 + k * square2)) / stretch
-    by_point, zero = ideal1 / depth, torch.zeros_like(ideal1)
-    rows = [torch.cat([by_point, zero, -v[:, :1] * by_point], 1), torch.cat([zero, by_point, -v[:, 1:] * by_point], 1)]
-    by_k = ((u1 * square1) @ H[:2, :2].mT - v * ((u1 * square1) @ H[2, :2])[:, None]) / depth
-    by_k = (by_k - u2 * square2 - 2 * square2 * offsets) / stretch
-    return offsets, torch.cat([torch.stack(rows, 1) / stretch[..., None], slope * by_k[..., None]], -1)
+class _Parameters(NamedTuple):
+    """Nine entries of a homography, and a distortion as a share of its bound, through artanh, (1, 10)."""
+
+    values: Tensor
+
+    def matrix(self) -> Tensor:
+        return self.values
+
+    def retract(self, step: Tensor) -> _Parameters:
+        return _Parameters(self.values + step)
+
+    def tangents(self) -> Tensor:
+        return torch.eye(10).to(self.values)[None]
 
 
-def _minimize(linearise: Callable[[Tensor], tuple[Tensor, Tensor]], start: Tensor, scale: float) -> Tensor:
-    """Return the residuals (N, 2) after steps of Levenberg-Marquardt on Geman and McClure's loss from (P,) on."""
-    parameters, damping, eye = start, FIRST_DAMPING, torch.eye(len(start), dtype=start.dtype)
-    residual, J = linearise(start)
-    for _ in range(STEPS):
-        usable = J.isfinite().all(-1).all(-1) & residual.isfinite().all(-1)
-        weights = (1 + residual[usable].square().sum(-1) / scale**2).pow(-2)
-        weighted = (weights[:, None, None] * J[usable]).flatten(0, 1)
-        normal = weighted.mT @ J[usable].flatten(0, 1)
-        damped = normal + damping * normal.diagonal().mean() * eye
-        tried = parameters - torch.linalg.solve_ex(damped, weighted.mT @ residual[usable].flatten())[0]
-        moved, moved_J = linearise(tried)
-        if not _cost(moved, scale) < _cost(residual, scale):  # or NaN
-            damping *= 10
-            continue
-        parameters, residual, J, damping = tried, moved, moved_J, damping / 10
-    return residual
+class _BentPlane:
+    """What the optimiser asks of a model."""
+
+    components = 2
+
+    def squares(self, residual: Tensor) -> Tensor:
+        return torch.unflatten(residual.square(), 1, (2, -1)).sum(1)
+
+    def residual(self, values: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+        return self.linearise(values, x1, x2)[0]
+
+    def linearise(self, values: Tensor, x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the offsets (1, 2 N) of x2 from where x1 is moved, and their derivatives (1, 10, 2 N).
+
+        Those of a point that is moved to infinity are zero, so that it does not count.
+        """
+        H, bend = values[0, :9].view(3, 3), torch.tanh(values[0, 9])
+        k, slope = MAX_DISTORTION * bend, MAX_DISTORTION * (1 - bend.square())
+        u1, u2 = x1[0, :2], x2[0, :2]
+        square1, square2 = u1.square().sum(0), u2.square().sum(0)
+        ideal1 = torch.cat([u1 * (1 + k * square1), x1[0, 2:]])
+        moved = H @ ideal1
+        v, by_point = moved[:2] / moved[2], ideal1 / moved[2]
+        # Over the local scale: a distortion that shrinks an image must not shrink its errors.
+        stretch = 1 + 2 * k * square2
+        offsets = (v - u2 * (1 + k * square2)) / stretch
+        zero = torch.zeros_like(by_point)
+        rows = [torch.cat([by_point, zero, -v[0] * by_point]), torch.cat([zero, by_point, -v[1] * by_point])]
+        by_k = (H[:2, :2] @ (u1 * square1) - v * (H[2, :2] @ (u1 * square1))) / moved[2]
+        by_k = (by_k - u2 * square2 - 2 * square2 * offsets) / stretch
+        J = torch.cat([torch.stack(rows, 1) / stretch, slope * by_k[None]])
+        finite = (J.isfinite().all(0) & offsets.isfinite()).all(0)
+        offsets, J = torch.where(finite, offsets, AT_INFINITY), torch.where(finite, J, 0.0)
+        return offsets.flatten()[None], J.flatten(1)[None]
 
 
-def _cost(offsets: Tensor, scale: float) -> Tensor:
-    """Return the sum of Geman and McClure's losses; those of points at infinity are one."""
-    square = offsets.square().sum(-1) / scale**2
-    return (square / (1 + square)).nan_to_num(nan=1.0).sum()
-
-
-def _centre_and_radius(size: tuple[int, int]) -> tuple[Tensor, float]:
-    """Return the centre (2,) of an image and the half of its diagonal, pixels."""
-    return torch.tensor(size, dtype=torch.float64) / 2, math.hypot(*size) / 2
-
-
-def _to_pixels(centre: Tensor, radius: float) -> Tensor:
-    """Return the transform (3, 3) from halves of the diagonal, from the centre, to pixels."""
-    return torch.cat([torch.cat([radius * torch.eye(2).double(), centre[:, None]], 1), torch.eye(3)[2:].double()])
+def _from_pixels(size: Size) -> Tensor:
+    """Return the transform (3, 3) from pixels to halves of the diagonal, from the centre."""
+    radius = math.hypot(*size) / 2
+    x, y = (side / 2 / radius for side in size)
+    return torch.tensor([[1 / radius, 0, -x], [0, 1 / radius, -y], [0, 0, 1]], dtype=torch.float64)
