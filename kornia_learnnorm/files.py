@@ -93,11 +93,13 @@ def exclusive(path: str | Path) -> Iterator[None]:
     file = path / ".lock" if path.is_dir() else path.with_name(f".{path.name}.lock")
     if not file.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {file.parent} does not exist")
-    lock = FileLock(file)
+    lock, holder = FileLock(file), _holder(file)
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise BlockingIOError(f"{path} is in use by {_holder(file)}: wait for it to end, or write elsewhere") from error
+        with suppress(OSError):  # filelock before 3.30 empties the file when it asks for the lock
+            file.write_text(holder, encoding="utf-8")
+        raise BlockingIOError(f"{path} is in use by {holder}: wait for it to end, or write elsewhere") from error
     except OSError as error:
         raise type(error)(f"cannot write {path}: {error.strerror or error}") from error
     try:

@@ -30,6 +30,7 @@ FOLDER = Path(__file__).parents[2] / "configs"
 OF_SETS = ("crossview-sets", "robust", "robust-synthetic")
 CONFIGS = sorted(path for path in FOLDER.glob("*.yaml") if path.stem not in (*OF_SETS, "own"))
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
+SMALL += ["--trainer.num_sanity_val_steps=0"]
 NETWORK = "model.estimator.init_args.normalizer.init_args.network.init_args"
 SMALL_PAPER_NETWORK = [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
 
@@ -89,16 +90,13 @@ def test_every_config_runs(name, data, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LEARNNORM_DATA", str(data))
     options = [*together(RUNS[name]), *SMALL, f"--trainer.default_root_dir={tmp_path}"]
     options += ["--data.val.init_args.number=50"]
-    if name.endswith(("handheld", "synthetic")):
+    if name.endswith("synthetic"):
         options += ["--data.train.init_args.number=200"]
-    if name == "paper-handheld":
-        options += ["--data.batch_pairs=20"]
     if RUNS[name][0].stem.startswith("paper"):
         options += [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
     assert main(["fit", *options]) == 0
     assert_trained(tmp_path / "weights.safetensors")
-    if len(RUNS[name]) == 1 and name != "base":
-        options += ["--data.test.init_args.number=50"] if name.endswith("synthetic") else []
+    if name in ("crossview", "paper"):
         options += [f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"]
         assert [main([command, *options]) for command in ("validate", "test", "predict")] == [0, 0, 0]
         assert "better_than_hartley" in capsys.readouterr().out

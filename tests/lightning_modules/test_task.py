@@ -46,7 +46,7 @@ def test_samples_lower_the_loss(tmp_path, precision):
     network = task.trained.network
     network.set_network.head.register_forward_hook(lambda m, a, out: seen.append(out.dtype))
     network.register_forward_hook(lambda m, a, out: seen.append(out[0].dtype))
-    make_trainer(tmp_path, max_steps=150, enable_checkpointing=False, precision=precision).fit(task, data)
+    make_trainer(tmp_path, max_steps=80, enable_checkpointing=False, precision=precision).fit(task, data)
     assert set(seen[::2]) == {torch.bfloat16 if precision == "bf16-mixed" else torch.float32}
     assert set(seen[1::2]) == {torch.float64}
     assert all(p.dtype == torch.float32 and p.isfinite().all() for p in task.parameters())
@@ -55,13 +55,13 @@ def test_samples_lower_the_loss(tmp_path, precision):
 
 @pytest.mark.parametrize(
     ("make", "labels", "steps", "least"),
-    [(layer_task, True, 60, 0.05), (layer_task, False, 60, 0.01), (sets_task, True, 100, 0.02)],
+    [(layer_task, True, 30, 0.05), (layer_task, False, 50, 0.01), (sets_task, True, 60, 0.02)],
 )
 def test_sets_lower_the_loss(make, labels, steps, least, tmp_path):
     task, data = make(), make_sets(labels)
     batch = SyntheticSets(32, labels=labels).draw(64, 32, block_generator(9))
     before = task.compute_loss(batch).item()
-    trainer = make_trainer(tmp_path, [ExportWeights()], max_steps=steps, gradient_clip_val=1.0, limit_val_batches=8)
+    trainer = make_trainer(tmp_path, [ExportWeights()], max_steps=steps, gradient_clip_val=1.0, limit_val_batches=4)
     trainer.fit(task, data)
     assert task.compute_loss(batch).item() < before - least
     assert {"val/median_32", "val/median_256"} <= {*trainer.callback_metrics}
