@@ -153,7 +153,7 @@ def _add_training_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     if name == "fit":
         parser.add_argument("--trainer.max_steps", metavar="N", help="steps of the training")
     parser.add_argument("--trainer.accelerator", metavar="NAME", help="device: auto, cpu, gpu")
-    parser.add_argument("--data.batch_size", metavar="N", help="samples in a batch (normalisers only)")
+    parser.add_argument("--data.batch_size", metavar="N", help="sets in a batch")
     if name == "fit":
         parser.add_argument("--print_config", action="store_true", help="print the whole configuration and end")
     if name in MEASURED:
