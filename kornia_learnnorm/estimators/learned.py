@@ -3,9 +3,8 @@ r"""The learned eight-point algorithm: a network weighs the correspondences and 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, NoReturn, Self
+from typing import Literal, NamedTuple, Self
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -14,7 +13,6 @@ from torch import Tensor, nn
 from kornia_learnnorm.estimators.linear import (
     essential_matrix,
     prepare_problem,
-    refuse_jit,
     solve_in_coordinates,
     solve_undetermined,
     solve_where_determined,
@@ -26,7 +24,7 @@ from kornia_learnnorm.estimators.match_features import (
     match_features,
     residual_features,
 )
-from kornia_learnnorm.estimators.matches import correspondences_from_matches
+from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.estimators.optimize import refine_unrolled
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
 from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, read_condition, weighted_mean
@@ -59,7 +57,7 @@ class StageEstimate(NamedTuple):
     logits: Tensor
 
 
-class LearnedLayer(nn.Module):
+class LearnedLayer(MatchLayer):
     r"""Networks weigh the correspondences and choose the transforms of a model's DLT, in stages.
 
     Args:
@@ -79,6 +77,7 @@ class LearnedLayer(nn.Module):
 
     """
 
+    scores_are = "scores"
     model_name: str  # of the model whose files this class loads
     architecture: tuple[str, ...] = (
         "width",
@@ -234,10 +233,6 @@ class LearnedLayer(nn.Module):
         params = torch.where(frame.swapped[:, None, None], params.flip(1), params)
         T1, T2 = (spd_transform(params) @ torch.stack([weighted.T1, weighted.T2], 1)).unbind(1)
         return solve_in_coordinates(weighted, T1, T2)
-
-    def __prepare_scriptable__(self) -> NoReturn:
-        """Raise a TypeError: ``torch.jit`` is not supported."""
-        refuse_jit()
 
     @property
     def dtype(self) -> torch.dtype:
@@ -416,37 +411,6 @@ class LearnedEightPoint(LearnedLayer):
         F_mat = stages[-1].F_mat
         E_mat = essential_matrix(F_mat, K1, K2)
         return LearnedEstimate(F_mat, E_mat, problem.determined, problem.gap, probability, stages[: self.stages])
-
-    def from_matches(
-        self,
-        keypoints1: Tensor,
-        keypoints2: Tensor,
-        matches: Tensor | Sequence[Tensor],
-        scores: Tensor | Sequence[Tensor] | None = None,
-        K1: Tensor | None = None,
-        K2: Tensor | None = None,
-    ) -> LearnedEstimate:
-        r"""Return the estimate of the matches of a matching network, whose scores get gradients.
-
-        Args:
-            keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`.
-            keypoints2: pixels in the second view with shape :math:`(B, M_2, 2)`.
-            matches: see :func:`~kornia_learnnorm.estimators.matches.correspondences_from_matches`.
-            scores: optional, one for each match, from 0 to 1.
-            K1: optional cameras of the first view, as for :meth:`estimate`.
-            K2: optional cameras of the second view.
-
-        Returns:
-            the estimate; pairs with fewer than eight matches are not determined.
-
-        Raises:
-            TypeError: if keypoints, matches or scores are not tensors of the right kind.
-            ShapeError: if the keypoints do not have the shape above.
-            ValueError: if the matches do not fit the keypoints, or as :meth:`estimate`.
-
-        """
-        points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
-        return self.estimate(points1, points2, mask=mask, scores=weights, K1=K1, K2=K2)
 
 
 def _check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor:

@@ -7,13 +7,13 @@ normaliser chooses. :class:`EightPoint` adds masks, cameras, and sets that deter
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, NoReturn
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kornia_learnnorm.estimators.matches import correspondences_from_matches
+from kornia_learnnorm.estimators.matches import MatchLayer, refuse_jit
 from kornia_learnnorm.geometry.checks import (
     check_cameras,
     check_correspondences,
@@ -37,7 +37,6 @@ __all__ = [
     "essential_matrix",
     "find_fundamental",
     "prepare_problem",
-    "refuse_jit",
     "solve_linear",
     "solve_undetermined",
     "solve_where_determined",
@@ -115,7 +114,7 @@ def solve_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> Tens
     return torch.where((gap > DEPENDENT_GAP[gap.dtype])[:, None, None], M, M.detach())
 
 
-class LinearLayer(nn.Module):
+class LinearLayer(MatchLayer):
     r"""The DLT of a model as an nn.Module, with finite outputs and gradients on degenerate sets.
 
     Args:
@@ -166,10 +165,6 @@ class LinearLayer(nn.Module):
 
     def _solve_undetermined(self, problem: LinearProblem) -> tuple[Tensor]:
         return (solve_undetermined(problem, getattr(self.normalizer, "base", None)),)
-
-    def __prepare_scriptable__(self) -> NoReturn:
-        """Raise a TypeError: ``torch.jit`` is not supported."""
-        refuse_jit()
 
 
 class TwoViewEstimate(NamedTuple):
@@ -269,42 +264,6 @@ class EightPoint(LinearLayer):
         (F_mat,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
         F_mat = F_mat.to(points1.dtype)
         return TwoViewEstimate(F_mat, essential_matrix(F_mat, K1, K2), problem.determined, problem.gap)
-
-    def from_matches(
-        self,
-        keypoints1: Tensor,
-        keypoints2: Tensor,
-        matches: Tensor | Sequence[Tensor],
-        scores: Tensor | Sequence[Tensor] | None = None,
-        K1: Tensor | None = None,
-        K2: Tensor | None = None,
-    ) -> TwoViewEstimate:
-        r"""Return the estimate of the matches of a matching network; scores are weights, and get gradients.
-
-        Args:
-            keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`.
-            keypoints2: pixels in the second view with shape :math:`(B, M_2, 2)`.
-            matches: see :func:`~kornia_learnnorm.estimators.matches.correspondences_from_matches`.
-            scores: one for each match, non-negative.
-            K1: optional cameras of the first view, as for :meth:`estimate`.
-            K2: optional cameras of the second view.
-
-        Returns:
-            the matrices; pairs with fewer than eight matches are not determined.
-
-        Raises:
-            TypeError: if keypoints, matches or scores are not tensors of the right kind.
-            ShapeError: if the keypoints do not have the shape above.
-            ValueError: if the matches do not fit the keypoints, or as :meth:`estimate`.
-
-        """
-        points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
-        return self.estimate(points1, points2, weights=weights, mask=mask, K1=K1, K2=K2)
-
-
-def refuse_jit() -> NoReturn:
-    """Raise a TypeError that says what to use instead of ``torch.jit``."""
-    raise TypeError("this layer cannot be compiled by torch.jit, use torch.compile or torch.export")
 
 
 def prepare_problem(

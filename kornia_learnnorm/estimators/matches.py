@@ -2,15 +2,15 @@ r"""Correspondences from the output of matching networks: matches by index, one 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
-__all__ = ["Correspondences", "correspondences_from_matches"]
+__all__ = ["Correspondences", "MatchLayer", "correspondences_from_matches", "refuse_jit"]
 
 
 class Correspondences(NamedTuple):
@@ -91,6 +91,57 @@ def correspondences_from_matches(
     )
     weights = pad_sequence([*scores, padding], batch_first=True)[:-1]
     return Correspondences(points1, points2, weights, mask)
+
+
+class MatchLayer(nn.Module):
+    """What all layers have in common: they take the output of matching networks, and refuse ``torch.jit``.
+
+    Attributes:
+        scores_are: what the scores of matches are to :meth:`estimate`, ``"weights"`` or ``"scores"``.
+    """
+
+    scores_are = "weights"
+    estimate: Callable[..., Any]
+
+    def from_matches(
+        self,
+        keypoints1: Tensor,
+        keypoints2: Tensor,
+        matches: Tensor | Sequence[Tensor],
+        scores: Tensor | Sequence[Tensor] | None = None,
+        K1: Tensor | None = None,
+        K2: Tensor | None = None,
+    ) -> Any:
+        r"""Return the estimate of the matches of a matching network, whose scores get gradients.
+
+        Args:
+            keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`.
+            keypoints2: pixels in the second view with shape :math:`(B, M_2, 2)`.
+            matches: see :func:`~kornia_learnnorm.estimators.matches.correspondences_from_matches`.
+            scores: optional, one for each match, non-negative; of a learned layer, from 0 to 1.
+            K1: optional cameras of the first view, as for :meth:`estimate`.
+            K2: optional cameras of the second view.
+
+        Returns:
+            the estimate; pairs with fewer than eight matches are not determined.
+
+        Raises:
+            TypeError: if keypoints, matches or scores are not tensors of the right kind.
+            ShapeError: if the keypoints do not have the shape above.
+            ValueError: if the matches do not fit the keypoints, or as :meth:`estimate`.
+
+        """
+        points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
+        return self.estimate(points1, points2, mask=mask, K1=K1, K2=K2, **{self.scores_are: weights})
+
+    def __prepare_scriptable__(self) -> NoReturn:
+        """Raise a TypeError: ``torch.jit`` is not supported."""
+        refuse_jit()
+
+
+def refuse_jit() -> NoReturn:
+    """Raise a TypeError that says what to use instead of ``torch.jit``."""
+    raise TypeError("this layer cannot be compiled by torch.jit, use torch.compile or torch.export")
 
 
 def _at_least_one(keypoints: Tensor) -> Tensor:

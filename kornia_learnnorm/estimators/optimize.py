@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss
 from kornia_learnnorm.geometry.checks import needs_gradient
-from kornia_learnnorm.models.contract import State, TwoViewModel
+from kornia_learnnorm.models.contract import Residuals, State, TwoViewModel
 
 __all__ = ["Optimum", "RobustCost", "attach_gradient", "minimize", "refine_unrolled"]
 
@@ -34,14 +34,14 @@ class RobustCost(NamedTuple):
     """Sum of losses over the correspondences of each matrix, or over one set that all matrices share.
 
     Attributes:
-        model: gives residuals and their derivatives.
+        model: residuals and their derivatives.
         x1: homogeneous points of view 1, the first two coordinates in pixels, (B or 1, 3, N).
         x2: homogeneous points of view 2, (B or 1, 3, N).
         weights: weights of the losses, (B or 1, N).
         loss: robust loss of squared distances.
     """
 
-    model: TwoViewModel
+    model: Residuals
     x1: Tensor
     x2: Tensor
     weights: Tensor

@@ -42,15 +42,10 @@ class Refinement(NamedTuple):
 
 
 class EssentialRefinement(NamedTuple):
-    """Refined essential matrices and how they were reached.
+    """Refined essential matrices, and :class:`Refinement`'s fields of the fundamental matrices of the same poses.
 
     Attributes:
         E_mat: essential matrices of unit Frobenius norm, singular values (s, s, 0), (B, 3, 3).
-        F_mat: fundamental matrices of unit Frobenius norm of the same poses, for pixels, (B, 3, 3).
-        cost_before: weighted sum of the losses in square pixels at the nearest essential matrices to those given, (B,).
-        cost: weighted sum of the losses at ``E_mat``, never larger, (B,).
-        iterations: steps tried, (B,) int64.
-        converged: whether the gradient vanishes, up to ``tolerance`` of what its terms could sum to, (B,) bool.
     """
 
     E_mat: Tensor

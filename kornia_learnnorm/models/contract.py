@@ -18,7 +18,7 @@ from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
 from kornia_learnnorm.geometry.dlt import MIN_GAP, solve_rows
 from kornia_learnnorm.geometry.problem import LinearProblem
 
-__all__ = ["State", "TwoViewModel"]
+__all__ = ["Residuals", "State", "TwoViewModel"]
 
 
 class State(Protocol):
@@ -37,7 +37,43 @@ class State(Protocol):
         """Return the derivatives (B, 9, dof) of the matrices' column-major entries by a step."""
 
 
-class TwoViewModel(ABC):
+class Residuals(ABC):
+    """What the optimiser minimises: residuals of correspondences under parameters such as the entries of a matrix.
+
+    Attributes:
+        components: components of a correspondence's residual.
+    """
+
+    components = 1
+
+    @abstractmethod
+    def linearise(self, M: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return residuals in the unit of the points and their derivatives by the column-major entries.
+
+        Args:
+            M: matrices (B, 3, 3).
+            x1: homogeneous points of view 1, (B or 1, 3, N), the first two coordinates in pixels or another unit.
+            x2: homogeneous points of view 2.
+            weights: where given, (B, N) of sum one, residuals stay smooth next to a singular point such as an epipole.
+
+        Returns:
+            residuals with signs, (B, C N), all of one component before those of the next, and derivatives (B, 9, C N).
+
+        """
+
+    def residual(self, M: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+        """Return residuals with signs, (B, C N); arguments as for :meth:`linearise`."""
+        return self.linearise(M, x1, x2)[0]
+
+    def squares(self, residual: Tensor) -> Tensor:
+        """Return the squared distances (B, N) of residuals (B, C N)."""
+        if self.components == 1:
+            return residual.square()
+        total: Tensor = torch.unflatten(residual.square(), 1, (self.components, -1)).sum(1)
+        return total
+
+
+class TwoViewModel(Residuals):
     r"""What a layer, the optimiser or RANSAC must know of a matrix between two views.
 
     Matrices are (B, 3, 3). Methods on single correspondences take homogeneous points (B, N, 3), as the design matrix
@@ -49,7 +85,6 @@ class TwoViewModel(ABC):
         dof: degrees of freedom, the size of a step on the manifold.
         sample_size: correspondences in a minimal sample of RANSAC.
         preferred: the matrix, row by row, that is chosen where the correspondences leave a choice.
-        components: components of a correspondence's residual.
     """
 
     name: str
@@ -57,7 +92,6 @@ class TwoViewModel(ABC):
     dof: int
     sample_size: int
     preferred: tuple[float, ...]
-    components = 1
 
     # The linear problem
 
@@ -104,32 +138,6 @@ class TwoViewModel(ABC):
         return M
 
     # Residuals
-
-    @abstractmethod
-    def linearise(self, M: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return residuals in the unit of the points and their derivatives by the column-major entries.
-
-        Args:
-            M: matrices (B, 3, 3).
-            x1: homogeneous points of view 1, (B or 1, 3, N), the first two coordinates in pixels or another unit.
-            x2: homogeneous points of view 2.
-            weights: where given, (B, N) of sum one, residuals stay smooth next to a singular point such as an epipole.
-
-        Returns:
-            residuals with signs, (B, C N), all of one component before those of the next, and derivatives (B, 9, C N).
-
-        """
-
-    def residual(self, M: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
-        """Return residuals with signs, (B, C N); arguments as for :meth:`linearise`."""
-        return self.linearise(M, x1, x2)[0]
-
-    def squares(self, residual: Tensor) -> Tensor:
-        """Return the squared distances (B, N) of residuals (B, C N)."""
-        if self.components == 1:
-            return residual.square()
-        total: Tensor = torch.unflatten(residual.square(), 1, (self.components, -1)).sum(1)
-        return total
 
     def robust_distance(self, M: Tensor, x1: Tensor, x2: Tensor, present: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return squared distances and the factor from squared algebraic residuals to them, each (B, N).

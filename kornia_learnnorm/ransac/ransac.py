@@ -173,23 +173,9 @@ class RANSAC(nn.Module):
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        r"""Return the fundamental matrix and the inliers of one image pair, as Kornia's RANSAC.
+        r"""Return the matrix :math:`(3, 3)` and the inliers :math:`(N,)` of one pair, as Kornia's RANSAC.
 
-        Args:
-            kp1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, float32 or float64.
-            kp2: pixels in the second image with shape :math:`(N, 2)`.
-            weights: optional non-negative scores with shape :math:`(N,)`.
-            K1: optional camera of the first image with shape :math:`(3, 3)`.
-            K2: optional camera of the second image; both or none.
-
-        Returns:
-            the matrix :math:`(3, 3)` and the inliers :math:`(N,)`, see :meth:`estimate`.
-
-        Raises:
-            TypeError: as :meth:`estimate`.
-            ShapeError: as :meth:`estimate`.
-            ValueError: as :meth:`estimate`.
-
+        Arguments, shapes and errors are those of :meth:`estimate`.
         """
         F_mat, inliers, *_ = self.estimate(kp1, kp2, weights, K1, K2)
         return F_mat, inliers
