@@ -145,7 +145,8 @@ def spd_transform(params: Tensor) -> Tensor:
     xx, xy, yy = scale * (cosh + sinhc * half), scale * sinhc * b, scale * (cosh - sinhc * half)
     zero, one = torch.zeros_like(a), torch.ones_like(a)
     ox, oy = params[..., 3:].unbind(-1) if params.shape[-1] == 5 else (zero, zero)
-    entries = torch.stack([xx, xy, -xx * ox - xy * oy, xy, yy, -xy * ox - yy * oy, zero, zero, one], -1)
+    shift_x, shift_y = zero - xx * ox - xy * oy, zero - xy * ox - yy * oy
+    entries = torch.stack([xx, xy, shift_x, xy, yy, shift_y, zero, zero, one], -1)
     return torch.unflatten(entries, -1, (3, 3))
 
 
