@@ -7,7 +7,7 @@ parallax would. What one distortion of both images explains is therefore no evid
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from torch import Tensor
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm.models.contract import Residuals
 
 __all__ = ["distances_from_plane"]
 
@@ -48,8 +49,7 @@ def distances_from_plane(
     x1, x2 = (T @ torch.cat([points.mT, ones]) for T, points in ((T1, points1), (T2, points2)))
     H = T2 @ H @ torch.linalg.inv(T1)
     start = _Parameters(torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])[None])
-    model: Any = _BentPlane()
-    cost = RobustCost(model, x1[None], x2[None], ones, GemanMcClure(threshold * float(T2[0, 0])))
+    cost = RobustCost(_BentPlane(), x1[None], x2[None], ones, GemanMcClure(threshold * float(T2[0, 0])))
     _, optimum = minimize(cost, start, MAX_STEPS, TOLERANCE)
     distance = cost.squares(optimum.state.matrix())[0].sqrt()
     return torch.where(distance < AT_INFINITY, distance / T2[0, 0], math.inf)
@@ -70,23 +70,17 @@ class _Parameters(NamedTuple):
         return torch.eye(10).to(self.values)[None]
 
 
-class _BentPlane:
-    """What the optimiser asks of a model."""
+class _BentPlane(Residuals):
+    """Homographies of images with one radial distortion, by ten parameters."""
 
     components = 2
 
-    def squares(self, residual: Tensor) -> Tensor:
-        return torch.unflatten(residual.square(), 1, (2, -1)).sum(1)
-
-    def residual(self, values: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
-        return self.linearise(values, x1, x2)[0]
-
-    def linearise(self, values: Tensor, x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
+    def linearise(self, M: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the offsets (1, 2 N) of x2 from where x1 is moved, and their derivatives (1, 10, 2 N).
 
         Those of a point that is moved to infinity are zero, so that it does not count.
         """
-        H, bend = values[0, :9].view(3, 3), torch.tanh(values[0, 9])
+        H, bend = M[0, :9].view(3, 3), torch.tanh(M[0, 9])
         k, slope = MAX_DISTORTION * bend, MAX_DISTORTION * (1 - bend.square())
         u1, u2 = x1[0, :2], x2[0, :2]
         square1, square2 = u1.square().sum(0), u2.square().sum(0)
