@@ -26,6 +26,9 @@ def test_calibration_of_kitti(tmp_path):
     rows = "{0} 0 607.1928 {1} 0 {0} 185.2157 0 0 0 1 0"
     path.write_text(f"P0: {rows.format(718.856, 0)}\nP1: {rows.format(700, -386.1448)}\n")
     assert read_camera(str(path)).tolist() == [[718.856, 0, 607.1928], [0, 718.856, 185.2157], [0, 0, 1]]
+    path.write_bytes(bytes(range(256)))
+    with pytest.raises(ValueError, match="not a text file"):
+        read_camera(str(path))
     path.write_text("P0: 1 2 3\n")
     with pytest.raises(ValueError, match=r"calib\.txt, line 1.*12 numbers"):
         read_camera(str(path))
@@ -49,12 +52,6 @@ def test_calibration_of_kitti(tmp_path):
 def test_what_is_refused(text, error, message):
     with pytest.raises(error, match=message):
         read_camera(text)
-
-
-def test_binary_file(tmp_path):
-    (tmp_path / "K").write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match="not a text file"):
-        read_camera(str(tmp_path / "K"))
 
 
 def test_exif(tmp_path):

@@ -37,7 +37,7 @@ OPTIONS = MatchOptions(num_features=200, max_matches=30)
 ARRAYS = ("points1", "points2", "ratio", "offsets", "image_size", "F", "K", "R", "t")
 
 
-def frames_of(root: Path, number: int = 6) -> Path:
+def frames_of(root: Path, number: int) -> Path:
     for frame in range(number):
         write_image(root / f"{frame:03}.png", 6 * frame)
     return root
