@@ -30,6 +30,7 @@ from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, find_peer
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import write_text
+from kornia_learnnorm.metrics.poses import pose_error
 
 DATASETS: dict[str, dict[str, Any]] = {"tum": {"max_difference": 0.1}, "kitti": {"sequences": ["06"]}}
 PEERS = {"opencv-usac-magsac": "OpenCV USAC_MAGSAC", "poselib": "PoseLib"}  # where installed
@@ -69,7 +70,7 @@ def error_of_pose(pair: Pair, F_mat: Tensor, points1: Tensor, points2: Tensor) -
     K1, K2 = pair.K
     R, t = kln.relative_pose(F_mat[None], K1[None], K2[None], points1[near][None], points2[near][None])
     true_R, true_t = (torch.from_numpy(value)[None] for value in pair.frames.motion)
-    return kln.pose_error(R, t, true_R, true_t).nan_to_num(nan=math.inf).item()
+    return pose_error(R, t, true_R, true_t).nan_to_num(nan=math.inf).item()
 
 
 def run_own(pair: Pair, solve: Callable[..., kln.PairEstimate]) -> tuple[Record, kln.PairEstimate | None]:

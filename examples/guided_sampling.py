@@ -12,6 +12,7 @@ import torch
 from pairs import Pairs, SetNetwork, load_pairs, parse
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.metrics.inliers import f1_score
 from kornia_learnnorm.ransac.samplers import WeightedSampler
 from kornia_learnnorm.ransac.soft import SoftChoice, expected_loss, sample_minimal_sets
 
@@ -29,7 +30,7 @@ def ransac_f1(pairs: Pairs, logits: torch.Tensor, normalizer: torch.nn.Module) -
     ransac = kln.RANSAC(normalizer, max_samples=64, confidence=1, refine=False, sampler=WeightedSampler, seed=0)
     rows = zip(pairs.points1, pairs.points2, logits.softmax(-1), strict=True)
     F_mat = torch.stack([ransac(*row)[0] for row in rows])
-    return 100 * kln.f1_score(pairs.points1, pairs.points2, F_mat, pairs.F_mat, threshold=1.0).nanmean().item()
+    return 100 * f1_score(pairs.points1, pairs.points2, F_mat, pairs.F_mat, threshold=1.0).nanmean().item()
 
 
 def main(args: Sequence[str] | None = None) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from pairs import Pairs, load_pairs
 from torch import Tensor
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score
 from kornia_learnnorm.normalizers.normalizer import Normalizer
 
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -32,7 +33,7 @@ def evaluate(estimator: Estimator, pairs: Pairs) -> tuple[float, float]:
     """Return mean F1 at 1 px in percent and the mean epipolar error in pixels."""
     found = [estimator(points1, points2)[0] for points1, points2 in zip(pairs.points1, pairs.points2, strict=True)]
     known = pairs.points1, pairs.points2, torch.stack(found), pairs.F_mat
-    return 100 * kln.f1_score(*known, threshold=1.0).nanmean().item(), kln.epipolar_error(*known).nanmean().item()
+    return 100 * f1_score(*known, threshold=1.0).nanmean().item(), epipolar_error(*known).nanmean().item()
 
 
 def main(args: Sequence[str] | None = None) -> dict[str, tuple[float, float]]:

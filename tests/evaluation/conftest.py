@@ -65,7 +65,7 @@ def robust_store(tmp_path_factory):
 @pytest.fixture(scope="session")
 def robust_command(robust_store):
     """The command of a run, without its folder."""
-    return ["robust", str(robust_store), "--seeds", "2", "--estimators", *ESTIMATORS, "--out"]
+    return ["robust", str(robust_store), "--pairs", "2", "--seeds", "2", "--estimators", *ESTIMATORS, "--out"]
 
 
 @pytest.fixture(scope="session")

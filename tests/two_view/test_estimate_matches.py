@@ -12,6 +12,7 @@ from two_view import epipolar_distances, seeded, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
+from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view import estimate_matches as module
 from kornia_learnnorm.two_view.solver import TwoViewSolver
 
@@ -56,7 +57,7 @@ class TestEstimateMatches:
 
     def test_cameras_give_the_pose(self, matches):
         found = kln.estimate_matches(*matches, **CAMERAS)
-        assert float(kln.pose_error(found.R[None], found.t[None], SCENE.R, SCENE.t)) < 5
+        assert float(pose_error(found.R[None], found.t[None], SCENE.R, SCENE.t)) < 5
         assert found.front[found.inliers].double().mean() > 0.9
 
     def test_cameras_solve_a_plane(self):

@@ -12,6 +12,7 @@ from two_view import WALL_SHIFT, epipolar_distances, homogeneous, repeated_wall,
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
+from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view.repeated_texture import coherent_matches, fitting_share, mutual_share, resolve_ambiguity
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
@@ -181,4 +182,4 @@ def test_rendered_windows():
     assert found.warnings == ()
     K = torch.from_numpy(pair.K)[None]
     R, t = kln.relative_pose(found.F_mat[None], K, K, found.points1[None], found.points2[None], found.inliers[None])
-    assert float(kln.pose_error(R, t, torch.from_numpy(pair.R)[None], torch.from_numpy(pair.t)[None])) < 5
+    assert float(pose_error(R, t, torch.from_numpy(pair.R)[None], torch.from_numpy(pair.t)[None])) < 5

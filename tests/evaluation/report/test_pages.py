@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.evaluation.report.example_picture import draw_example
-from kornia_learnnorm.evaluation.report.figures import report_figures
+from kornia_learnnorm.evaluation.report.figures import draw_example, report_figures
 from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 from kornia_learnnorm.evaluation.report.style import line_style
 from kornia_learnnorm.evaluation.robust.robust_run import read_robust

@@ -25,21 +25,6 @@ def as_text(rows):
     return [[*map(str, row)] for row in rows]
 
 
-def test_rates_are_those_of_the_samples(run):
-    found = read_run(run)
-    cell = found.cells[0]
-    own = {name: prediction["own"].numpy() for name, prediction in cell.predictions.items()}
-    table = report_tables(found)[0]
-    for row in as_text(table.rows):
-        if row[0] in own:
-            assert row[1].startswith(f"{100 * np.mean(own[row[0]] < own['Hartley']):.1f} [")
-    assert [row[0] for row in table.rows] == [name for name in own if name != "Hartley"]
-    assert table.header[1] == f"scenes: {len(cell.pair)} of {cell.drawn}"
-    assert {row[0]: row[-1] for row in table.rows}["crossview"] == "kitti_00, kitti_01, kitti_03"
-    raw = np.load(run / "scenes" / "filtered" / "samples.npz")["plain_residual"]
-    assert len(cell.pair) == (raw < 60).sum()
-
-
 def test_accuracy_and_tests(run):
     tables = {table.title: table for table in report_tables(read_run(run))}
     rows = {row[0]: row for row in as_text(tables["Fit and accuracy: scenes, filtered"].rows)}

@@ -27,14 +27,14 @@ def test_files_and_numbers(robust_run, robust_store):
     assert len(times(robust_run / "robust")) == 2 * 2 * 4  # protocols, thresholds, estimators
     filtered, unfiltered = read_robust(robust_run).cells
     assert unfiltered.title == "kitti_06, unfiltered"
-    assert unfiltered.estimates["opencv-usac"][0.1]["f1"].shape == (3, 2)
-    assert unfiltered.estimates["RANSAC"][1.0]["F_mat"].shape == (3, 1, 3, 3)
+    assert unfiltered.estimates["opencv-usac"][0.1]["f1"].shape == (2, 2)
+    assert unfiltered.estimates["RANSAC"][1.0]["F_mat"].shape == (2, 1, 3, 3)
     drawn = shuffled_pair(read_store(robust_store), 2, "filtered", 0, 1)
     found = run_estimator(find_estimator("opencv-usac"), drawn, 1, 1.0)
     figures = filtered.estimates["opencv-usac"][1.0]
-    assert torch.equal(figures["F_mat"][2, 1], found.F_mat)
+    assert torch.equal(figures["F_mat"][1, 1], found.F_mat)
     for key, value in measure(drawn, found.F_mat, 1.0).items():
-        assert figures[key][2, 1].item() == value
+        assert figures[key][1, 1].item() == value
 
 
 def test_again_computes_nothing_but_what_is_missing(robust_copied, robust_again, robust_run, monkeypatch):
@@ -72,7 +72,7 @@ def test_other_options_are_refused(robust_again, refused):
 def test_estimators_and_stores_join(robust_copied, tmp_path):
     write_store(tmp_path / "other.h5", synthetic_store(pairs=1, points=40, seed=2, scenes=["orbit"]))
     before = [*read_robust(robust_copied).about["estimators"]]
-    options = ["--seeds", "2", "--estimators", "opencv-usac", "opencv-lmeds"]
+    options = ["--pairs", "2", "--seeds", "2", "--estimators", "opencv-usac", "opencv-lmeds"]
     assert main(["robust", str(tmp_path / "other.h5"), *options, "--out", str(robust_copied)]) == 0
     found = read_robust(robust_copied)
     assert [*found.about["stores"]] == ["kitti_06", "other"]
@@ -90,7 +90,18 @@ def test_runs_of_before_the_hypotheses_were_dropped_are_read_and_joined(robust_c
 
 def test_a_package_that_is_not_installed(robust_copied, robust_store, monkeypatch):
     monkeypatch.setitem(peers.PEERS, "poselib", peers.PeerPackage(pytest.fail, "no_such_module", "poselib"))
-    command = ["robust", str(robust_store), "--seeds", "2", "--estimators", "poselib", "--out", str(robust_copied)]
+    command = [
+        "robust",
+        str(robust_store),
+        "--pairs",
+        "2",
+        "--seeds",
+        "2",
+        "--estimators",
+        "poselib",
+        "--out",
+        str(robust_copied),
+    ]
     assert main(command) == 0
     assert read_robust(robust_copied).about["estimators"]["poselib"] is None
 
