@@ -31,6 +31,7 @@ from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, find_peer
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import write_text
 from kornia_learnnorm.metrics.poses import pose_error
+from kornia_learnnorm.two_view.result import PairEstimate
 
 DATASETS: dict[str, dict[str, Any]] = {"tum": {"max_difference": 0.1}, "kitti": {"sequences": ["06"]}}
 PEERS = {"opencv-usac-magsac": "OpenCV USAC_MAGSAC", "poselib": "PoseLib"}  # where installed
@@ -73,7 +74,7 @@ def error_of_pose(pair: Pair, F_mat: Tensor, points1: Tensor, points2: Tensor) -
     return pose_error(R, t, true_R, true_t).nan_to_num(nan=math.inf).item()
 
 
-def run_own(pair: Pair, solve: Callable[..., kln.PairEstimate]) -> tuple[Record, kln.PairEstimate | None]:
+def run_own(pair: Pair, solve: Callable[..., PairEstimate]) -> tuple[Record, PairEstimate | None]:
     """Return the record of an estimate of this package, and the estimate where there is one."""
     try:
         found = solve(**pair.cameras)
@@ -120,7 +121,7 @@ def measure(pair: Pair, peers: dict[str, Any], sizes: Sequence[int]) -> list[Rec
         if 0 < size < found.num_matches:
             chosen = tuple(value[order[:size]] for value in matches)
 
-            def solve(chosen: tuple[Tensor, ...] = chosen, **cameras: Tensor) -> kln.PairEstimate:
+            def solve(chosen: tuple[Tensor, ...] = chosen, **cameras: Tensor) -> PairEstimate:
                 return kln.estimate_matches(*chosen, found.size1, found.size2, **cameras)
 
             records.append(

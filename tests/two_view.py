@@ -13,6 +13,7 @@ from torch import Tensor
 import kornia_learnnorm as kln
 from kornia_learnnorm import LearnedEightPoint, LearnedNormalizer
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
+from kornia_learnnorm.geometry.transforms import paper_transform
 
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
 DTYPES = [torch.float32, torch.float64]
@@ -42,7 +43,7 @@ def small(base=None) -> LearnedNormalizer:
 
 
 def paper() -> LearnedNormalizer:
-    return LearnedNormalizer(kln.Hartley(), kln.PaperNetwork(16, 3), kln.paper_transform)
+    return LearnedNormalizer(kln.Hartley(), kln.PaperNetwork(16, 3), paper_transform)
 
 
 def shaken(normalizer: LearnedNormalizer | None = None, scale: float = 0.3, seed: int = 0) -> LearnedNormalizer:

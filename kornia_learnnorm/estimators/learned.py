@@ -288,7 +288,8 @@ class LearnedEstimate(NamedTuple):
     Attributes:
         F_mat: fundamental matrices of rank 2 and unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, (B, 3, 3).
         E_mat: :math:`K_2^\top F K_1` with unit Frobenius norm, (B, 3, 3), or None without cameras.
-        determined: whether the correspondences determine a matrix; see :class:`~kornia_learnnorm.TwoViewEstimate`.
+        determined: whether the correspondences determine a matrix; see
+            :class:`~kornia_learnnorm.estimators.linear.TwoViewEstimate`.
         gap: relative gap of the design matrix that ``determined`` is decided on, (B,).
         weights: probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that
             do not determine their matrix.

@@ -26,11 +26,12 @@ from two_view import (
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import EightPoint, find_fundamental, optimal_rank2, refine_fundamental
+from kornia_learnnorm.estimators.robust_losses import squared_loss
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.fundamental import Fundamental
 
-LOSSES = {"squared": kln.squared_loss, "Huber": kln.Huber(0.5), "Cauchy": kln.Cauchy(0.5)}
+LOSSES = {"squared": squared_loss, "Huber": kln.Huber(0.5), "Cauchy": kln.Cauchy(0.5)}
 LOSSES |= {"Geman-McClure": kln.GemanMcClure(2.0), "truncated": kln.Truncated(3.0)}
 
 

@@ -9,6 +9,7 @@ from two_view import correspondences, homogeneous, scenes, signless, uniform, up
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators.optimize import UNROLLED_SCALE, refine_unrolled
+from kornia_learnnorm.geometry.rank2 import rank2_projection
 from kornia_learnnorm.models.fundamental import Fundamental
 
 
@@ -71,7 +72,7 @@ def test_gradcheck():
     x1, x2, F_mat, weights = (value[:2].clone().requires_grad_() for value in framed(12, noise=0.5))
 
     def refined(a, b, F, w):
-        projected = kln.rank2_projection(F)
+        projected = rank2_projection(F)
         return signless(refine_weighted(a, b, projected, w, 2))
 
     assert gradcheck(refined, (x1, x2, F_mat, weights), eps=1e-6, atol=1e-4, rtol=1e-3)

@@ -12,15 +12,9 @@ from hypothesis import strategies as st
 from pairwise import pairwise
 from two_view import SCENES, correspondences, eight_point, epipolar_distances, numpy_hartley, shaken, uniform
 
-from kornia_learnnorm import (
-    Hartley,
-    ReweightedWhitening,
-    Whitening,
-    find_fundamental,
-    paper_transform,
-    spd_transform,
-)
+from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening, find_fundamental
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
+from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
 
 BASES = {"hartley": Hartley(), "whitening": Whitening(), "reweighted": ReweightedWhitening(), "learned": shaken()}
 

@@ -9,8 +9,12 @@ from kornia.core.exceptions import ShapeError
 from torch.autograd import gradcheck, gradgradcheck
 from two_view import SCENES, correspondences, homogeneous, numpy_hartley, signless, uniform
 
-from kornia_learnnorm import design_matrix, null_vector
-from kornia_learnnorm.geometry.dlt import nearest_null_vector, smallest_right_singular_vector
+from kornia_learnnorm.geometry.dlt import (
+    design_matrix,
+    nearest_null_vector,
+    null_vector,
+    smallest_right_singular_vector,
+)
 
 
 class TestDesignMatrix:

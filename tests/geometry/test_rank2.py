@@ -21,10 +21,10 @@ from two_view import (
     up_to_sign,
 )
 
-from kornia_learnnorm import Hartley, Whitening, find_fundamental, rank2_projection
+from kornia_learnnorm import Hartley, Whitening, find_fundamental
 from kornia_learnnorm.data.sets import draw_samples
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.geometry.rank2 import optimal_rank2
+from kornia_learnnorm.geometry.rank2 import optimal_rank2, rank2_projection
 
 
 def linear(points1, points2, weights=None) -> torch.Tensor:

@@ -11,8 +11,7 @@ from kornia.core.exceptions import ShapeError
 from torch.autograd import gradcheck, gradgradcheck
 from two_view import mapped, uniform
 
-from kornia_learnnorm import paper_transform, spd_transform
-from kornia_learnnorm.geometry.transforms import affine_transform, transform_fundamental
+from kornia_learnnorm.geometry.transforms import affine_transform, paper_transform, spd_transform, transform_fundamental
 
 
 class TestAffineTransform:

@@ -35,7 +35,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm import Hartley, LearnedNormalizer, Whitening, find_fundamental, pretrained
 from kornia_learnnorm.data.random_sets import SyntheticSets
 from kornia_learnnorm.data.sources import block_generator
-from kornia_learnnorm.geometry.transforms import affine_transform
+from kornia_learnnorm.geometry.transforms import affine_transform, paper_transform, spd_transform
 
 
 def public(module: nn.Module) -> dict[str, object]:
@@ -151,7 +151,7 @@ class TestFiles:
             *((base, kln.CrossViewNetwork(8, 1, bound=2.0)) for base in (kln.Identity(), Hartley(), Whitening(1e-4))),
             (kln.ReweightedWhitening(3, 0.2), kln.CrossViewNetwork(8, 1, features="own")),
             (Whitening(), kln.CrossViewNetwork(8, 1, features="both")),
-            (Hartley(), kln.PaperNetwork(16, 3), kln.paper_transform),
+            (Hartley(), kln.PaperNetwork(16, 3), paper_transform),
         ],
     )
     def test_round_trip(self, parts, tmp_path):
@@ -340,7 +340,7 @@ class TestSavingFails:
         "parts",
         [
             {"network": nn.Linear(2, 5)},
-            {"transform": lambda params: kln.spd_transform(params)},
+            {"transform": lambda params: spd_transform(params)},
             {"base": kln.PerView(normalize_points)},
             {"base": type("Whitening", (Whitening,), {})()},  # the name is not enough
         ],

@@ -20,6 +20,7 @@ from kornia_learnnorm import RANSAC
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.geometry.constrained_fit import constrained_fit
 from kornia_learnnorm.metrics.inliers import f1_score
+from kornia_learnnorm.ransac.samplers import WeightedSampler
 
 
 def pair(name: str = "handheld", num_points: int = 400, noise: float = 0.3, outliers: float = 0.4, seed: int = 0):
@@ -230,7 +231,7 @@ class TestBudget:
         good = true + 0.5 * uniform(400)
         plain = self.count((points1, points2))
         assert self.count((points1, points2), good) < plain
-        assert self.count((points1, points2), 0.01 + good, sampler=kln.WeightedSampler) < plain
+        assert self.count((points1, points2), 0.01 + good, sampler=WeightedSampler) < plain
 
 
 LINE = torch.linspace(0, 300, 60, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0])

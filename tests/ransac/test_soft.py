@@ -25,7 +25,8 @@ from two_view import (
     up_to_sign,
 )
 
-from kornia_learnnorm import Hartley, Whitening, expected_loss, sample_minimal_sets
+from kornia_learnnorm import Hartley, Whitening
+from kornia_learnnorm.ransac.soft import expected_loss, sample_minimal_sets
 
 
 def target(F):

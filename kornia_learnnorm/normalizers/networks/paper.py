@@ -29,7 +29,8 @@ class PaperNetwork(nn.Module):
     Args:
         width: channels of a point, 128 in the paper.
         depth: residual blocks, 12 in the paper.
-        num_parameters: parameters per view; the three of :func:`~kornia_learnnorm.paper_transform` in the paper.
+        num_parameters: parameters per view; in the paper the three of
+            :func:`~kornia_learnnorm.geometry.transforms.paper_transform`.
 
     Raises:
         ValueError: if the stack of maxima is smaller than the convolution's kernel, 3x3.

@@ -11,7 +11,8 @@ from pairwise import pairwise
 from torch.autograd import gradcheck
 from two_view import DTYPES, correspondences, numpy_hartley, prepared, shaken, uniform
 
-from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork, paper_transform
+from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork
+from kornia_learnnorm.geometry.transforms import paper_transform
 
 
 def network(width: int = 16, depth: int = 3) -> PaperNetwork:
