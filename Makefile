@@ -1,8 +1,8 @@
 # make demo   set up, train a minute, evaluate, estimate; with DATA=<folder> on real images and stores
 # make test   set up, run all tests
 # make test-cpus   set up, run the numerical tests with the kernels of other processors
-# make test-oldest   in .venv-oldest, run the tests of the core with the oldest NumPy, Kornia, safetensors and filelock that
-#             pyproject.toml allows, and the torch of the lock; TORCH=torch==2.5.1 for the oldest, a CUDA build of 5 GB on Linux
+# make test-oldest   run the tests of the core with the oldest dependencies that pyproject.toml allows, in .venv-oldest;
+#             torch is that of the lock, or TORCH=torch==2.5.1, the oldest, a CUDA build of 5 GB on Linux
 # make test-newest   in .venv-newest, run all tests with the newest version of every dependency but torch
 # make lint   set up, run the linters and the type checker
 # make docs   set up, build the documentation in docs/_build/html, check its links and notebooks
@@ -71,9 +71,9 @@ test-cpus: $(VENV)/.ready
 			-m "numerical and not slow and not long" || exit 1; \
 	done
 
-CORE_TESTS = tests/geometry tests/normalizers tests/estimators tests/ransac tests/metrics tests/test_losses.py tests/test_files.py
+CORE_TESTS = tests/geometry tests/models tests/normalizers tests/estimators tests/ransac tests/metrics tests/test_losses.py tests/test_files.py
 
-# The lower bounds of the core as pins, without the extras: so the warnings of these have no filters, and no stores are read.
+# Only what the core requires is installed: no filters for warnings of the extras, and no stores to read.
 test-oldest: export OMP_NUM_THREADS = 1
 test-oldest:
 	$(PYTHON) -m venv $(OLDEST)
