@@ -335,7 +335,8 @@ def _solve_traced(
 @torch.no_grad()
 def solve_undetermined(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
     """Return matrices of the model for sets of correspondences that do not determine them, without gradient."""
-    return problem.model.fallback(solve_linear(problem, normalizer))
+    M: Tensor = problem.model.fallback(solve_linear(problem, normalizer))
+    return M
 
 
 def essential_matrix(F_mat: Tensor, K1: Tensor | None, K2: Tensor | None) -> Tensor | None:

@@ -31,18 +31,9 @@ def solve_dtype(device: torch.device) -> torch.dtype:
 
 
 def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, precise: bool = False) -> None:
-    """Raise a clear error for anything but a floating-point tensor of a shape.
+    """Raise a TypeError for anything but a floating-point tensor, and a ShapeError for a wrong shape.
 
-    Args:
-        name: the argument that the message names.
-        value: what was given.
-        shape: the dimensions as for ``KORNIA_CHECK_SHAPE``; None for any shape.
-        precise: accept float32 and float64 only.
-
-    Raises:
-        TypeError: if it is not a floating-point tensor, or with ``precise`` neither float32 nor float64.
-        ShapeError: if the shape is wrong.
-
+    ``shape`` is that of ``KORNIA_CHECK_SHAPE``, None for any; ``precise`` accepts float32 and float64 only.
     """
     kind = "a float32 or float64 tensor" if precise else "a floating-point tensor"
     if not isinstance(value, Tensor):
@@ -57,16 +48,8 @@ def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, p
 def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None = None) -> None:
     """Raise a clear error for anything but two finite and invertible cameras with a last row (0, 0, w), or none.
 
-    Args:
-        K1: camera of view 1 with shape :math:`(3, 3)`, or of a batch with shape :math:`(B, 3, 3)`.
-        K2: camera of view 2.
-        batch_size: number of image pairs :math:`B`; None where there is one pair without a batch.
-
-    Raises:
-        TypeError: if a camera is not a floating-point tensor.
-        ValueError: if only one is given, a shape is wrong, one is not finite and invertible, or its last row is not
-            :math:`(0, 0, w)`, as of a transposed camera.
-
+    Cameras are (3, 3), or (B, 3, 3) where there is a ``batch_size``. A last row of other numbers is a ValueError that
+    names a transposed camera.
     """
     if (K1 is None) != (K2 is None):
         raise ValueError(f"K1 and K2 must be given together, got only {'K1' if K2 is None else 'K2'}")
@@ -88,18 +71,7 @@ def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None =
 def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | None = None, min_points: int = 8) -> None:
     """Raise a clear error for anything but finite correspondences ``(B, N, 2)`` x 2 and weights ``(B, N)``.
 
-    Args:
-        points1: points of the first view.
-        points2: points of the second view.
-        weights: optional weights.
-        min_points: smallest number :math:`N` of correspondences.
-
-    Raises:
-        TypeError: if the points are not float32 or float64 tensors of one dtype, or the weights not floating-point.
-        ShapeError: if a shape is wrong.
-        ValueError: if shapes of the views differ, there are too few correspondences, a value is not finite, or a
-            weight is negative.
-
+    Points must be float32 or float64 of one dtype and device, at least ``min_points``, and weights not negative.
     """
     check_pairs(points1, points2, ["B", "N", "2"])
     if points2.device != points1.device or (isinstance(weights, Tensor) and weights.device != points1.device):

@@ -26,17 +26,11 @@ STEP_LENGTH = 1.3  # over the least-squares step, which bounded losses make too 
 
 
 class Fit(NamedTuple):
-    """Fitted matrices and their costs.
+    """Fitted matrices and their costs."""
 
-    Attributes:
-        F_mat: matrices of unit norm, singular up to the square of the last step, (K, 3, 3).
-        cost: sum of the last losses before the last step, (K,).
-        gain: share of the cost that a least-squares step could still remove, (K,); small close to an optimum.
-    """
-
-    F_mat: Tensor
-    cost: Tensor
-    gain: Tensor
+    F_mat: Tensor  # of unit norm, singular up to the square of the last step, (K, 3, 3)
+    cost: Tensor  # sum of the last losses before the last step, (K,)
+    gain: Tensor  # share of the cost that a least-squares step could still remove, (K,); small close to an optimum
 
 
 def constrained_fit(
@@ -46,7 +40,7 @@ def constrained_fit(
     losses: Iterable[Loss],
     scale: Callable[[Tensor, Tensor], tuple[Tensor, ...]] = sampson_scale,
 ) -> Fit:
-    r"""Return matrices fitted to correspondences that they share, one step for each loss.
+    r"""Return matrices (K, 3, 3) fitted to correspondences (3, N) that they share, one step for each of the losses.
 
     With :math:`u = \mathrm{vec}(F)`, :math:`\|u\| = 1`, :math:`\xi_i = x_{2,i} \otimes x_{1,i}`, the factors
     :math:`g_i(n_{1,i}, n_{2,i})` of the squared norms :math:`n_{v,i} = (u, V_{v,i} u)` of the epipolar lines' normals,
@@ -61,19 +55,8 @@ def constrained_fit(
     followed by :math:`u \leftarrow N[u + \alpha\, (u' - u)]`, :math:`\alpha = 1.3`. The first step comes from afar:
     there :math:`\alpha = 1`, and the derivatives of :math:`g`, which could make :math:`X` indefinite, are left out.
 
-    Args:
-        x1: homogeneous points of view 1 with shape :math:`(3, N)`, the first two coordinates in pixels.
-        x2: homogeneous points of view 2.
-        F_mat: where to start, with shape :math:`(K, 3, 3)`, any scale but zero.
-        losses: :math:`\rho` of each step, at least one, see :mod:`kornia_learnnorm.estimators.robust_losses`.
-        scale: :math:`g`, see :mod:`kornia_learnnorm.geometry.distances`.
-
-    Returns:
-        the matrices with their costs. Where a step cannot be computed, as without inliers, the matrix that was given
-        and an infinite cost. Fewer than seven inliers fit one of many matrices.
-
-    Raises:
-        ValueError: if there is no loss.
+    Points are homogeneous, the first two coordinates in pixels. Where a step cannot be computed, as without inliers,
+    the given matrix comes back with an infinite cost. Fewer than seven inliers fit one of many matrices.
 
     Reference:
         W. Chojnacki, M. Brooks, A. van den Hengel, D. Gawley, On the fitting of surfaces to data with covariances,

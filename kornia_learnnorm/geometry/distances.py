@@ -93,23 +93,10 @@ def _on_epipole(points: Tensor, F_mat: Tensor) -> Tensor:
 
 
 def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    r"""Return the Sampson distance, the first-order distance to the nearest exact correspondence.
+    r"""Return the Sampson distance in pixels, the first-order distance to the nearest exact correspondence.
 
     :math:`|x_2^\top F x_1| / \sqrt{\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2}` (Hartley and Zisserman, section
-    11.4.3; not squared).
-
-    Args:
-        points1: pixels in the first image with shape :math:`(*, N, 2)`.
-        points2: pixels in the second image with shape :math:`(*, N, 2)`.
-        F_mat: fundamental matrices with shape :math:`(*, 3, 3)`, any scale.
-
-    Returns:
-        distances in pixels with shape :math:`(*, N)`.
-
-    Raises:
-        TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
-        ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up.
+    11.4.3; not squared). Arguments, shapes and errors are those of :func:`symmetric_epipolar_distance`.
 
     Example:
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
@@ -125,18 +112,10 @@ def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
 def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
     r"""Return :math:`|x_2^\top F x_1|` with :math:`F` scaled to unit Frobenius norm.
 
-    Args:
-        points1: pixels in the first image with shape :math:`(*, N, 2)`.
-        points2: pixels in the second image with shape :math:`(*, N, 2)`.
-        F_mat: fundamental matrices with shape :math:`(*, 3, 3)`, any scale but zero.
+    Arguments and errors are those of :func:`symmetric_epipolar_distance`; a zero matrix gives NaN.
 
     Returns:
         algebraic residuals with shape :math:`(*, N)`; their unit depends on the coordinates of the points.
-
-    Raises:
-        TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
-        ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up.
 
     Example:
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
@@ -156,16 +135,8 @@ def line_norms(
 ) -> tuple[Tensor, Tensor]:
     r"""Return the norms of both epipolar lines' normals, :math:`\|(F^\top x_2)_{1:2}\|` and :math:`\|(F x_1)_{1:2}\|`.
 
-    Args:
-        x1: homogeneous points of the first view with shape :math:`(*, 3, N)`.
-        x2: homogeneous points of the second view with shape :math:`(*, 3, N)`.
-        F_mat: fundamental matrices with shape :math:`(*, 3, 3)`.
-        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
-        floor: share of the set's mean norm added to each, against points on an epipole.
-
-    Returns:
-        two tensors with shape :math:`(*, N)`, positive.
-
+    Points are homogeneous, :math:`(*, 3, N)`, optional weights and norms :math:`(*, N)`. ``floor`` times the set's mean
+    norm is added to each, against points on an epipole.
     """
     norm1, norm2 = (F_mat.mT[..., :2, :] @ x2).norm(dim=-2), (F_mat[..., :2, :] @ x1).norm(dim=-2)
     floor1 = floor * safe_divisor(weighted_mean(norm1[..., None], weights))
@@ -173,24 +144,7 @@ def line_norms(
 
 
 def sampson_scale(sq_norm1: Tensor, sq_norm2: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
-    r"""Return the scale of the Sampson distance, :math:`(n_1 + n_2)^{-1/2}`, and its derivatives.
-
-    Args:
-        sq_norm1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
-        sq_norm2: squared norms of those in view 2.
-        slopes: compute the derivatives, which cost more than the scale itself.
-
-    Returns:
-        the scale and, with ``slopes``, its derivatives by ``sq_norm1`` and ``sq_norm2``, each :math:`(*, N)`.
-
-    Reference:
-        R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, section 11.4.3.
-
-    Example:
-        >>> sampson_scale(torch.tensor(2.0), torch.tensor(2.0))
-        (tensor(0.5000), tensor(-0.0625), tensor(-0.0625))
-
-    """
+    """Return the scale of the Sampson distance, :math:`(n_1 + n_2)^{-1/2}`, and with ``slopes`` its derivatives."""
     total = sq_norm1 + sq_norm2
     scale = total.rsqrt()
     if not slopes:
@@ -200,24 +154,7 @@ def sampson_scale(sq_norm1: Tensor, sq_norm2: Tensor, slopes: bool = True) -> tu
 
 
 def symmetric_scale(sq_norm1: Tensor, sq_norm2: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
-    r"""Return the scale of the symmetric epipolar distance, :math:`n_1^{-1/2} + n_2^{-1/2}`, and its derivatives.
-
-    Args:
-        sq_norm1: squared norms of the normals of view 1's epipolar lines with shape :math:`(*, N)`, positive.
-        sq_norm2: squared norms of those in view 2.
-        slopes: compute the derivatives, which cost more than the scale itself.
-
-    Returns:
-        the scale and, with ``slopes``, its derivatives by ``sq_norm1`` and ``sq_norm2``, each :math:`(*, N)`.
-
-    Reference:
-        Fan et al., Eq. 7.
-
-    Example:
-        >>> symmetric_scale(torch.tensor(4.0), torch.tensor(4.0))
-        (tensor(1.), tensor(-0.0625), tensor(-0.0625))
-
-    """
+    """Return the scale of the symmetric distance, :math:`n_1^{-1/2} + n_2^{-1/2}`; with ``slopes`` its derivatives."""
     first, second = sq_norm1.rsqrt(), sq_norm2.rsqrt()
     if not slopes:
         return (first + second,)

@@ -9,25 +9,11 @@ __all__ = ["distinct_points"]
 
 
 def distinct_points(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return a mask of matches of which no two share a point, chosen greedily from the best to the worst.
+    """Return a mask (N,) of matches of which no two share a point, chosen greedily from the best to the worst.
 
-    A match is left out if it has the pixel, in view 1 or in view 2, of a better match that is kept. All matches on one
-    point count as one: they agree on every epipolar line through it.
-
-    Args:
-        points1: finite pixels in the first image with shape :math:`(N, 2)`; points are shared where pixels are equal
-            exactly.
-        points2: finite pixels in the second image with shape :math:`(N, 2)`.
-        weights: optional scores :math:`(N,)`, higher is better; of equal scores, and without any, the first is best.
-
-    Returns:
-        mask with shape :math:`(N,)`.
-
-    Example:
-        >>> points1 = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
-        >>> distinct_points(points1, points1[[0, 1, 1]], torch.tensor([0.1, 0.2, 0.3]))
-        tensor([ True, False,  True])
-
+    A match is left out if it has exactly the pixel, in view 1 or in view 2, of a better match that is kept. All matches
+    on one point count as one: they agree on every epipolar line through it. Pixels are finite, (N, 2); of equal
+    weights (N,), and without any, the first is best.
     """
     kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
     # A complex number for each pixel: equal where both coordinates are, and hashable.

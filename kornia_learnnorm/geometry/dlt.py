@@ -76,22 +76,14 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
 def solve_rows(
     A: Tensor, weights: Tensor | None = None, product: Callable[[Tensor], Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    r"""Return the null vector of a design matrix, and the relative gap that tells how unique it is.
+    r"""Return the null vectors :math:`(*, 9)` of design matrices :math:`(*, N, 9)`, and how unique they are.
 
-    Of eight rows, the gap is the smallest pivot over the largest of the LU factorisation of :math:`A^\top` with partial
-    pivoting. Of more, it is the eighth singular value of :math:`\sqrt w A` over the first. Derivatives of the null
-    vector grow as its inverse.
+    Of eight rows, the relative gap :math:`(*)`, from 0 to 1, is the smallest pivot over the largest of the LU
+    factorisation of :math:`A^\top` with partial pivoting. Of more, it is the eighth singular value of :math:`\sqrt w A`
+    over the first. Derivatives of the null vector grow as its inverse; the gap has none.
 
-    Args:
-        A: design matrices with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
-        weights: optional non-negative weights of the rows with shape :math:`(*, N)`.
-        product: multiplies vectors :math:`(*, 9)` by :math:`A^\top W A` and has the derivatives, where there is a
-            cheaper way than through ``A``; for more than eight rows.
-
-    Returns:
-        unit vectors with shape :math:`(*, 9)`, sign arbitrary, and gaps in :math:`[0, 1]` with shape :math:`(*)`,
-        without gradient.
-
+    ``product`` multiplies vectors :math:`(*, 9)` by :math:`A^\top W A` of more than eight rows and has the derivatives,
+    where there is a cheaper way than through ``A``.
     """
     if A.shape[-2] == 8:
         return _null_vector_of_eight(A, weights)
@@ -142,18 +134,10 @@ def _eliminate(A: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def nearest_null_vector(A: Tensor, preferred: Tensor) -> Tensor:
-    r"""Return the vector of the null space nearest to a preferred one, for linearly dependent rows.
+    """Return the unit vectors :math:`(*, 9)` of the null spaces nearest to a preferred one, for dependent rows.
 
     A null space of more than one dimension leaves the choice to rounding, and so to the processor. This choice does not
     depend on the order of the rows, nor, where the preferred matrix is symmetric in the views, on which comes first.
-
-    Args:
-        A: design matrices with shape :math:`(*, N, 9)`, whose singular values below 1e-10 of the first count as zero.
-        preferred: vector with shape :math:`(9)`.
-
-    Returns:
-        unit vectors with shape :math:`(*, 9)`.
-
     """
     _, s, Vh = torch.linalg.svd(A)
     zero = torch.ones_like(Vh[..., 0], dtype=torch.bool)  # the ninth of eight rows is zero
@@ -162,25 +146,13 @@ def nearest_null_vector(A: Tensor, preferred: Tensor) -> Tensor:
 
 
 def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return the unit vector :math:`v` that minimises :math:`\sum_i w_i (A_i v)^2`, twice differentiable.
+    r"""Return the unit vectors :math:`v` that minimise :math:`\sum_i w_i (A_i v)^2`, twice differentiable.
 
     The eigenvectors of the Gram matrix :math:`A^\top W A` are a start, and where it has lost the digits of small
     singular values, those of the singular value decomposition of :math:`\sqrt w A`. A Newton step with the residuals
     :math:`A v` brings the digits back, and two more give the derivatives. Other singular values
     may coincide, the weights may be zero, and a last singular value that is not simple sends a zero gradient instead of
     an infinite one.
-
-    Args:
-        A: matrices with shape :math:`(*, M, n)`, :math:`M \ge n`.
-        weights: optional non-negative weights with shape :math:`(*, M)`.
-
-    Returns:
-        unit vectors with shape :math:`(*, n)`, sign arbitrary.
-
-    Example:
-        >>> smallest_right_singular_vector(torch.diag(torch.tensor([3.0, 0.5, 2.0]))).abs()
-        tensor([0., 1., 0.])
-
     """
     return _smallest(A, weights, _gram_product(A, weights))[0]
 

@@ -29,50 +29,24 @@ MIN_RELATIVE_GAP = 1e-10  # of the two largest eigenvalues of the cofactors' Gra
 
 
 def adjugate(A: Tensor) -> Tensor:
-    r"""Return the adjugate of matrices :math:`(*, 3, 3)`: :math:`\mathrm{adj}(A)\, A = \det(A)\, I`.
-
-    Example:
-        >>> adjugate(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
-        tensor([[6., 0., 0.],
-                [0., 3., 0.],
-                [0., 0., 2.]])
-
-    """
+    r"""Return the adjugate of matrices :math:`(*, 3, 3)`: :math:`\mathrm{adj}(A)\, A = \det(A)\, I`."""
     return cofactors(A).mT
 
 
 def cofactors(A: Tensor) -> Tensor:
-    r"""Return the cofactors of matrices :math:`(*, 3, 3)`, the gradient of the determinant.
-
-    Example:
-        >>> cofactors(torch.diag(torch.tensor([1.0, 2.0, 3.0]))).diagonal()
-        tensor([6., 3., 2.])
-
-    """
+    """Return the cofactors of matrices :math:`(*, 3, 3)`, the gradient of the determinant."""
     rows: Tensor = torch.linalg.cross(A.roll(-1, -2), A.roll(-2, -2))
     return rows
 
 
 def determinant(A: Tensor) -> Tensor:
-    r"""Return the determinants of matrices :math:`(*, 3, 3)`.
-
-    Example:
-        >>> determinant(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
-        tensor(6.)
-
-    """
+    """Return the determinants of matrices :math:`(*, 3, 3)`."""
     value: Tensor = (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(-1)
     return value
 
 
 def inverse(A: Tensor) -> Tensor:
-    r"""Return the inverses of matrices :math:`(*, 3, 3)`.
-
-    Example:
-        >>> inverse(torch.diag(torch.tensor([1.0, 2.0, 4.0]))).diagonal()
-        tensor([1.0000, 0.5000, 0.2500])
-
-    """
+    """Return the inverses of matrices :math:`(*, 3, 3)`."""
     C = cofactors(A)
     return C.mT / (A[..., 0, :] * C[..., 0, :]).sum(-1)[..., None, None]
 
@@ -87,22 +61,10 @@ def nearest_rank2(A: Tensor) -> Tensor:
 
 
 def unit_matrix(M: Tensor) -> Tensor:
-    """Return matrices scaled to unit Frobenius norm, with a canonical sign.
+    """Return matrices :math:`(*, 3, 3)` scaled to unit Frobenius norm, with a canonical sign.
 
     Of the entries of at least half of the largest magnitude, the first in row-major order is positive. The sign does
     not depend on rounding, also where two entries are equal up to their signs, as under pure translation.
-
-    Args:
-        M: matrices with shape :math:`(*, 3, 3)`, any scale but zero.
-
-    Returns:
-        matrices with shape :math:`(*, 3, 3)`.
-
-    Example:
-        >>> unit_matrix(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -3.0], [0.0, 4.0, 0.0]]))[1:, 1:]
-        tensor([[-0.0000,  0.6000],
-                [-0.8000, -0.0000]])
-
     """
     entries = M.detach().flatten(-2)
     size = entries.abs()
@@ -114,24 +76,13 @@ def unit_matrix(M: Tensor) -> Tensor:
 
 
 def smallest_right_singular_vector_3x3(A: Tensor) -> Tensor:
-    r"""Return the right singular vector of the smallest singular value, twice differentiable.
+    r"""Return the right singular vector :math:`(*, 3)` of the smallest singular value, twice differentiable.
 
     The cofactors :math:`C = \det(A) A^{-\top}` have the singular vectors of :math:`A`, with singular values
     :math:`\sigma_1 \sigma_2 \ge \sigma_1 \sigma_3 \ge \sigma_2 \sigma_3`. So the vector belongs to the **largest**
     eigenvalue of :math:`C^\top C`, which the trigonometric solution of the characteristic polynomial gives with all its
-    digits: no condition number is squared.
-
-    Args:
-        A: matrices with shape :math:`(*, 3, 3)`.
-
-    Returns:
-        unit vectors with shape :math:`(*, 3)`, sign arbitrary. Where the smallest singular value is not simple it is
-        one of its vectors and sends no gradient.
-
-    Example:
-        >>> smallest_right_singular_vector_3x3(torch.diag(torch.tensor([3.0, 0.5, 2.0]))).abs()
-        tensor([0., 1., 0.])
-
+    digits: no condition number is squared. Its sign is arbitrary. Where the smallest singular value is not simple it is
+    one of its vectors and sends no gradient.
     """
     return _smallest(A)[0]
 

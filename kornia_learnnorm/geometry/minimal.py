@@ -18,10 +18,10 @@ __all__ = ["are_independent", "solve_calibrated_samples", "solve_samples"]
 
 
 def are_independent(A: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-    r"""Return a mask of the non-degenerate minimal samples (K, S, 3), by their design matrices (K, M, 9).
+    """Return a mask of the non-degenerate minimal samples (K, S, 3), by their design matrices (K, M, 9).
 
     The constraints must be independent: each row of the design matrix is farther from the span of the rows before
-    it than the least that a shift of the point moves it.
+    it than the least that a shift of the point, in pixels, moves it.
     """
     return _independent(torch.linalg.qr(A.mT, mode="r")[1], x1, x2, shift)
 
@@ -32,21 +32,10 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     A QR factorisation of the transposed design matrix, :math:`A^\top = Q R`, tells which samples determine a matrix
     and gives both the null vector, which is the last column of :math:`Q`, and a factor of its covariance,
     :math:`V_0 = L L^\top` with :math:`L = Q_{:,1:8} R^{-\top} \mathrm{diag}(\sqrt{(u, V_i u)})`, see
-    :func:`~kornia_learnnorm.geometry.rank2`, whose steps these are but that :math:`V_0` stays as it is.
+    :func:`~kornia_learnnorm.optimal_rank2`, whose steps these are but that :math:`V_0` stays as it is.
 
-    Args:
-        x1: homogeneous points of view 1 with shape :math:`(K, 8, 3)`, pixels and a third coordinate as large.
-        x2: their counterparts with shape :math:`(K, 8, 3)`.
-        shift: of a point that must not make a sample undetermined, see :func:`are_independent`, pixels.
-
-    Returns:
-        matrices of unit norm of the samples that determine one, :math:`(M, 3, 3)`, :math:`M \le K`; of rank 2 up to
-        the convergence of three steps.
-
-    Reference:
-        K. Kanatani, Y. Sugaya, Fundamental matrix computation: theory and practice, Memoirs of the Faculty of
-        Engineering, Okayama University 42, 2008, on a posteriori correction.
-
+    Samples are homogeneous points (K, 8, 3), pixels and a third coordinate as large; ``shift`` as for
+    :func:`are_independent`. Matrices (M, 3, 3), M <= K, have unit norm and rank 2 up to the convergence of three steps.
     """
     Q, R = torch.linalg.qr(design_matrix(x1, x2).mT, mode="complete")
     determined = _independent(R, x1, x2, shift)
@@ -66,21 +55,10 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
 
 
 def solve_calibrated_samples(rays1: Tensor, rays2: Tensor) -> Tensor:
-    r"""Return the essential matrices of minimal samples of five correspondences, by Kornia's five-point solver.
+    """Return the essential matrices of minimal samples of five correspondences, by Kornia's five-point solver.
 
-    Five points on one plane determine them too.
-
-    Args:
-        rays1: directions :math:`K_1^{-1} x_1` in the first camera with shape :math:`(K, 5, 3)`, any length.
-        rays2: directions in the second camera with shape :math:`(K, 5, 3)`.
-
-    Returns:
-        all real solutions of all samples, of unit norm, :math:`(M, 3, 3)`, :math:`M \le 10 K`. Degenerate samples,
-        such as those with a repeated correspondence, have none.
-
-    Reference:
-        D. Nister, An efficient solution to the five-point relative pose problem, TPAMI 2004.
-
+    Rays are directions :math:`K^{-1} x` (K, 5, 3) of any length. All real solutions come back, of unit norm, (M, 3, 3),
+    M <= 10 K; degenerate samples, as with a repeated correspondence, have none. Five points on one plane have.
     """
     E_mat: Tensor = find_essential(*(rays[..., :2] / rays[..., 2:] for rays in (rays1, rays2))).flatten(0, 1)
     return E_mat[E_mat.isfinite().flatten(1).all(1)]

@@ -69,35 +69,18 @@ def relative_pose(
 
 
 def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor) -> Tensor:
-    r"""Return which correspondences are triangulated in front of both cameras.
+    """Return which correspondences are triangulated in front of both cameras, (B, N) bool; false where a pose is NaN.
 
-    Args:
-        R: rotations with shape :math:`(B, 3, 3)`, :math:`X_2 = R X_1 + t`.
-        t: translations with shape :math:`(B, 3)`, any length.
-        K1: cameras of the first images with shape :math:`(B, 3, 3)`.
-        K2: cameras of the second images with shape :math:`(B, 3, 3)`.
-        points1: pixels in the first images with shape :math:`(B, N, 2)`.
-        points2: pixels in the second images with shape :math:`(B, N, 2)`.
-
-    Returns:
-        booleans with shape :math:`(B, N)`; false where a pose is NaN.
-
+    Poses are :math:`X_2 = R X_1 + t` with :math:`t` (B, 3) of any length, points pixels (B, N, 2).
     """
     return _in_front(R[:, None], t[:, None], _rays(points1, K1), _rays(points2, K2))[:, 0]
 
 
 def in_front_of_best_pose(E_mat: Tensor, rays1: Tensor, rays2: Tensor, weights: Tensor) -> Tensor:
-    r"""Return which correspondences are in front of both cameras under the best of the four poses.
+    """Return which correspondences are in front of both cameras under the best of the four poses, (B, N) bool.
 
-    Args:
-        E_mat: essential matrices with shape :math:`(B, 3, 3)`.
-        rays1: directions :math:`K_1^{-1} x_1` with shape :math:`(N, 3)`, shared by all matrices.
-        rays2: directions :math:`K_2^{-1} x_2` with the same shape.
-        weights: votes of the correspondences with shape :math:`(B, N)`; the pose with most in front is the best.
-
-    Returns:
-        booleans with shape :math:`(B, N)`.
-
+    Rays are directions :math:`K^{-1} x` (N, 3), shared by all matrices (B, 3, 3). The pose with the largest sum of
+    weights (B, N) in front is the best.
     """
     R, t = motion_from_essential(E_mat)
     front = _in_front(R, t[..., 0], rays1[None, None], rays2[None, None])

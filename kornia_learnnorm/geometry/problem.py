@@ -5,95 +5,42 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_learnnorm.geometry.checks import (
-    needs_gradient,
-    read_condition,
-    solve_dtype,
-    weighted_mean,
-)
+from kornia_learnnorm.geometry.checks import needs_gradient, read_condition, solve_dtype, weighted_mean
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP, MIN_GAP, nearest_null_vector
 from kornia_learnnorm.geometry.matrices import inverse
 
-__all__ = ["LinearModel", "LinearProblem", "hartley_coordinates", "hartley_transform"]
-
-
-class LinearModel(Protocol):
-    """What a linear problem asks of a model; :class:`~kornia_learnnorm.models.contract.TwoViewModel` has it."""
-
-    min_points: int
-    preferred: tuple[float, ...]
-
-    def rows(self, x1: Tensor, x2: Tensor) -> Tensor:
-        """Return the design matrix (B, M, 9) of homogeneous points (B, N, 3)."""
-
-    def null_vector(self, x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the null vector (B, 9) of the design matrix and its relative gap (B,)."""
-
-    def row_weights(self, weights: Tensor) -> Tensor:
-        """Return the weights (B, M) of the rows of correspondences with weights (B, N)."""
-
-    def carry(self, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
-        """Return matrices of transformed points brought back to the points."""
-
-    def needs_transforms(self, problem: LinearProblem) -> bool:
-        """Return whether the solution depends on the coordinates of a normaliser."""
-
-    def constrain_in(self, problem: LinearProblem, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
-        """Return matrices of pixels that meet the constraint, from null matrices in the coordinates of T1 and T2."""
-
-    def fallback(self, M: Tensor) -> Tensor:
-        """Return the matrices of undetermined sets, or other ones in place of those that are none of the model."""
+__all__ = ["LinearProblem", "hartley_coordinates", "hartley_transform"]
 
 
 @dataclass
 class LinearProblem:
-    r"""Correspondences in Hartley's coordinates and the null matrix of their design matrix.
+    """Correspondences in Hartley's coordinates and the null matrix of their design matrix.
 
     Built once per call, from checked input, by :meth:`from_points`. The null matrix is solved when it is first asked
     for. As few points as determine it have an exact null vector, so it is carried to other coordinates; with more
     points it minimises another sum of squares there and is solved again.
-
-    Attributes:
-        model: gives the rows of the design matrix, and carries matrices between coordinates.
-        points1: pixels in the first view, (B, N, 2), float64 where the device has it.
-        points2: pixels in the second view.
-        weights: weights, (B, N), or None.
-        T1: Hartley's transform of the first view, (B, 3, 3).
-        T2: Hartley's transform of the second view.
-        x1: homogeneous points of the first view in Hartley's coordinates, (B, N, 3).
-        x2: homogeneous points of the second view.
-        solution: null matrix and relative gap, once solved.
-        all_determined: whether all null matrices are unique, once solved; None where values cannot be read.
-
-    Example:
-        >>> from kornia_learnnorm.models.fundamental import Fundamental
-        >>> _ = torch.manual_seed(0)
-        >>> problem = LinearProblem.from_points(torch.rand(2, 8, 2), torch.rand(2, 8, 2), None, Fundamental())
-        >>> problem.null_matrix.shape, problem.determined
-        (torch.Size([2, 3, 3]), tensor([True, True]))
-
     """
 
-    model: LinearModel
-    points1: Tensor
+    model: Any  # a TwoViewModel, on which nothing of this package may depend here
+    points1: Tensor  # pixels, (B, N, 2), float64 where the device has it
     points2: Tensor
-    weights: Tensor | None
-    T1: Tensor
+    weights: Tensor | None  # (B, N)
+    T1: Tensor  # Hartley's transform, (B, 3, 3)
     T2: Tensor
-    x1: Tensor
+    x1: Tensor  # homogeneous points in Hartley's coordinates, (B, N, 3)
     x2: Tensor
-    solution: tuple[Tensor, Tensor] | None = None
-    all_determined: bool | None = None
+    solution: tuple[Tensor, Tensor] | None = None  # null matrix and relative gap, once solved
+    all_determined: bool | None = None  # whether all null matrices are unique; None where values cannot be read
 
     @classmethod
-    def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None, model: LinearModel) -> LinearProblem:
+    def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None, model: Any) -> LinearProblem:
         r"""Return the problem of correspondences, in float64 where the device has it."""
         dtype = solve_dtype(points1.device)
         points = torch.stack([points1, points2]).to(dtype)
@@ -180,20 +127,10 @@ class LinearProblem:
 
 
 def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return the similarity that moves the centroid to the origin and makes the mean distance from it :math:`\sqrt 2`.
+    r"""Return the similarities :math:`(*, 3, 3)` that centre points and make their mean distance :math:`\sqrt 2`.
 
-    Coincident points keep their scale.
-
-    Args:
-        points: points with shape :math:`(*, N, 2)`.
-        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
-
-    Returns:
-        transforms with shape :math:`(*, 3, 3)`.
-
-    Reference:
-        R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; Fan et al., Eq. 4.
-
+    Coincident points keep their scale (R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; Fan et al.,
+    Eq. 4). Points are :math:`(*, N, 2)`, optional weights :math:`(*, N)`.
     """
     return hartley_coordinates(points, weights)[1]
 

@@ -116,16 +116,10 @@ def optimal_rank2(
 def correct_rank2(
     F_hat: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor, iterations: int = ITERATIONS
 ) -> Tensor:
-    """Return the optimal correction of matrices in Hartley's coordinates; see :func:`optimal_rank2`.
+    """Return the optimal correction of matrices (B, 3, 3) in Hartley's coordinates; see :func:`optimal_rank2`.
 
-    Args:
-        F_hat: matrices with shape :math:`(B, 3, 3)`, any scale but zero.
-        x1: homogeneous points of the first view with shape :math:`(B, N, 3)`.
-        x2: homogeneous points of the second view.
-        weights: optional weights with shape :math:`(B, N)`.
-        scale: scale of the first view over that of the second, (B,): equal noise in pixels is not equal there.
-        iterations: number of steps.
-
+    Points are homogeneous, (B, N, 3). ``scale`` is that of view 1 over that of view 2, (B,): noise that is equal in
+    pixels is not equal there.
     """
     u = normalize(F_hat.flatten(-2), dim=-1)
     if iterations:

@@ -36,29 +36,16 @@ def transform_fundamental(F_mat: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
 
 
 def transform_points(points: Tensor, T: Tensor) -> Tensor:
-    """Return points :math:`(*, N, 2)` after affine transforms :math:`(*, 3, 3)`.
-
-    Example:
-        >>> transform_points(torch.tensor([[1.0, 2.0]]), torch.diag(torch.tensor([2.0, 3.0, 1.0])))
-        tensor([[2., 6.]])
-
-    """
+    """Return points :math:`(*, N, 2)` after affine transforms :math:`(*, 3, 3)`."""
     return points @ T[..., :2, :2].mT + T[..., None, :2, 2]
 
 
 def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: float = 1e-6) -> Tensor:
-    r"""Return the transform that moves the centroid to the origin and makes the covariance the identity.
+    r"""Return the transforms :math:`(*, 3, 3)` that move centroids to the origin and make covariances the identity.
 
-    :math:`T = [\Sigma^{-1/2}, -\Sigma^{-1/2} o; 0, 1]` with the symmetric root (ZCA), in closed form.
-
-    Args:
-        points: points with shape :math:`(*, N, 2)`.
-        weights: optional non-negative weights with shape :math:`(*, N)`; zero means absent.
-        floor: smallest ratio of the eigenvalues of :math:`\Sigma`.
-
-    Returns:
-        transforms with shape :math:`(*, 3, 3)`.
-
+    :math:`T = [\Sigma^{-1/2}, -\Sigma^{-1/2} o; 0, 1]` with the symmetric root (ZCA), in closed form, of points
+    :math:`(*, N, 2)` with optional weights :math:`(*, N)`. The ratio of the eigenvalues of :math:`\Sigma` is at least
+    ``floor``.
     """
     dtype = solve_dtype(points.device)
     rows, w = points.to(dtype).mT.contiguous(), None if weights is None else weights.to(dtype)
@@ -72,9 +59,8 @@ def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: fl
 def whitening_from_moments(mean: Tensor, covariance: Tensor, floor: float = 1e-6) -> Tensor:
     r"""Return :func:`whitening_transform` of points with a mean :math:`(*, 2)` and covariance :math:`(*, 2, 2)`."""
     spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-    rounding = (
-        16 * torch.finfo(mean.dtype).eps * torch.linalg.vector_norm(mean.detach(), dim=-1)
-    )  # of coincident points
+    # What rounding leaves of coincident points.
+    rounding = 16 * torch.finfo(mean.dtype).eps * torch.linalg.vector_norm(mean.detach(), dim=-1)
     covariance = torch.where((spread > rounding)[..., None, None], covariance, 0.0)
     return affine_transform(inverse_sqrt(covariance, floor), mean)
 

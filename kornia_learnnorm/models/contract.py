@@ -1,8 +1,7 @@
-r"""The contract of a two-view model: what differs between fundamental, essential matrices and homographies.
+"""The contract of a two-view model: what differs between fundamental, essential matrices and homographies.
 
 Layers, the optimiser and RANSAC are written once, against :class:`TwoViewModel`. A new model is one subclass and the
-:class:`State` on its manifold. Four points, for instance, give a homography its eight rows and an exact solution:
-normalisation and weights matter above four, and nothing constrains the matrix.
+:class:`State` on its manifold.
 """
 
 from __future__ import annotations
@@ -38,27 +37,17 @@ class State(Protocol):
 
 
 class Residuals(ABC):
-    """What the optimiser minimises: residuals of correspondences under parameters such as the entries of a matrix.
+    """What the optimiser minimises: residuals of correspondences under parameters such as the entries of a matrix."""
 
-    Attributes:
-        components: components of a correspondence's residual.
-    """
-
-    components = 1
+    components = 1  # of a correspondence's residual
 
     @abstractmethod
     def linearise(self, M: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return residuals in the unit of the points and their derivatives by the column-major entries.
 
-        Args:
-            M: matrices (B, 3, 3).
-            x1: homogeneous points of view 1, (B or 1, 3, N), the first two coordinates in pixels or another unit.
-            x2: homogeneous points of view 2.
-            weights: where given, (B, N) of sum one, residuals stay smooth next to a singular point such as an epipole.
-
-        Returns:
-            residuals with signs, (B, C N), all of one component before those of the next, and derivatives (B, 9, C N).
-
+        Residuals have signs, (B, C N), all of one component before those of the next; derivatives are (B, 9, C N).
+        Matrices are (B, 3, 3), points homogeneous, (B or 1, 3, N), in pixels or another unit. With weights, (B, N) of
+        sum one, residuals stay smooth next to a singular point such as an epipole.
         """
 
     def residual(self, M: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
@@ -74,24 +63,17 @@ class Residuals(ABC):
 
 
 class TwoViewModel(Residuals):
-    r"""What a layer, the optimiser or RANSAC must know of a matrix between two views.
+    """What a layer, the optimiser or RANSAC must know of a matrix between two views.
 
     Matrices are (B, 3, 3). Methods on single correspondences take homogeneous points (B, N, 3), as the design matrix
     does, or their transposes (B, 3, N), which distances need.
-
-    Attributes:
-        name: what files of weights call the model.
-        min_points: correspondences whose design matrix has an exact null vector.
-        dof: degrees of freedom, the size of a step on the manifold.
-        sample_size: correspondences in a minimal sample of RANSAC.
-        preferred: the matrix, row by row, that is chosen where the correspondences leave a choice.
     """
 
-    name: str
-    min_points: int
-    dof: int
-    sample_size: int
-    preferred: tuple[float, ...]
+    name: str  # of the model in files of weights
+    min_points: int  # correspondences whose design matrix has an exact null vector
+    dof: int  # degrees of freedom, the size of a step on the manifold
+    sample_size: int  # correspondences in a minimal sample of RANSAC
+    preferred: tuple[float, ...]  # the matrix, row by row, that is chosen where the correspondences leave a choice
 
     # The linear problem
 
@@ -109,11 +91,7 @@ class TwoViewModel(Residuals):
 
     @abstractmethod
     def carry(self, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
-        """Return the matrices of points of matrices of points after the transforms T1 and T2."""
-
-    @abstractmethod
-    def swap(self, M: Tensor) -> Tensor:
-        """Return the matrices of the swapped views."""
+        """Return the matrices of points from matrices of points after the transforms T1 and T2."""
 
     # The constraint
 
@@ -159,11 +137,7 @@ class TwoViewModel(Residuals):
     def solve_samples(self, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
         """Return the matrices (M, 3, 3) of the non-degenerate minimal samples (K, S, 3), any number of each.
 
-        Args:
-            x1: homogeneous points of view 1.
-            x2: homogeneous points of view 2.
-            shift: pixels; a sample that a shift of a point by less makes degenerate is dropped.
-
+        Samples that a shift of a point by less than ``shift`` pixels makes degenerate are dropped.
         """
         h, gap = self.null_vector(x1, x2, None)
         return self.constrain(torch.unflatten(h[gap > MIN_GAP], -1, (3, 3)))
@@ -179,12 +153,7 @@ class TwoViewModel(Residuals):
     def reweighted_fit(self, x1: Tensor, x2: Tensor, M: Tensor, losses: Sequence[Loss]) -> Fit | None:
         """Return matrices (K, 3, 3) after a step of reweighted least squares for each loss, if the model has any.
 
-        Args:
-            x1: homogeneous points of view 1, (3, N), that all matrices share.
-            x2: homogeneous points of view 2.
-            M: where to start, (K, 3, 3).
-            losses: robust losses of squared distances.
-
+        Homogeneous points (3, N) are shared by all matrices; losses are those of squared distances.
         """
         return None
 

@@ -25,12 +25,8 @@ __all__ = ["Calibrated", "Essential", "nearest_essential"]
 class Essential(Fundamental):
     r"""Fundamental matrices :math:`F = C_2^\top E C_1` of essential matrices.
 
-    Args:
-        C1: from the coordinates of view 1 to directions in the camera, such as :math:`K_1^{-1}`, with shape
-            :math:`(B, 3, 3)` or :math:`(1, 3, 3)`.
-        C2: from the coordinates of view 2 to directions in the camera.
-        distance: the residual of a correspondence: ``"sampson"`` or ``"symmetric"`` distance in the coordinates.
-
+    ``C1`` and ``C2``, :math:`(B, 3, 3)` or :math:`(1, 3, 3)`, go from the coordinates of a view to directions in its
+    camera, as :math:`K^{-1}` does. ``distance`` is ``"sampson"`` or ``"symmetric"``, in the coordinates.
     """
 
     name = "essential"
@@ -44,12 +40,7 @@ class Essential(Fundamental):
 
     @classmethod
     def of_cameras(
-        cls,
-        K1: Tensor,
-        K2: Tensor,
-        T1: Tensor,
-        T2: Tensor,
-        distance: Literal["sampson", "symmetric"] = "sampson",
+        cls, K1: Tensor, K2: Tensor, T1: Tensor, T2: Tensor, distance: Literal["sampson", "symmetric"] = "sampson"
     ) -> Essential:
         """Return the model of pixels after transforms, of cameras and transforms that broadcast to (B, 3, 3)."""
         return cls(torch.linalg.inv_ex(T1 @ K1)[0], torch.linalg.inv_ex(T2 @ K2)[0], distance)
@@ -89,18 +80,11 @@ class Essential(Fundamental):
 
 
 class Calibrated(NamedTuple):
-    r"""Fundamental matrices :math:`F = C_2^\top E C_1` of essential matrices :math:`E` of unit norm.
+    r"""Fundamental matrices :math:`F = C_2^\top E C_1` of essential matrices :math:`E` of unit norm."""
 
-    Attributes:
-        axes: rotations of view 2 and of view 1, (B, 2, 3, 3).
-        A: rotations of the plane over the root of two, (B, 2, 2).
-        C1: from the coordinates of view 1 to directions in the camera, such as :math:`K_1^{-1}`, (B, 3, 3).
-        C2: from the coordinates of view 2 to directions in the camera, (B, 3, 3).
-    """
-
-    axes: Tensor
-    A: Tensor
-    C1: Tensor
+    axes: Tensor  # rotations of view 2 and of view 1, (B, 2, 3, 3)
+    A: Tensor  # rotations of the plane over the root of two, (B, 2, 2)
+    C1: Tensor  # from the coordinates of view 1 to directions in the camera, (B, 3, 3)
     C2: Tensor
 
     def essential(self) -> Tensor:
@@ -123,12 +107,6 @@ class Calibrated(NamedTuple):
 
 
 def nearest_essential(E_mat: Tensor) -> Tensor:
-    """Return the nearest essential matrices, scaled to unit norm, to matrices (B, 3, 3).
-
-    Example:
-        >>> nearest_essential(torch.diag(torch.tensor([4.0, 3.0, 1.0]))[None]).diagonal(dim1=1, dim2=2)
-        tensor([[0.7071, 0.7071, 0.0000]])
-
-    """
+    """Return the nearest essential matrices, scaled to unit norm, to matrices (B, 3, 3)."""
     eye = torch.eye(3).to(E_mat)[None]
     return Essential(eye, eye).calibrated(E_mat).essential()

@@ -37,14 +37,9 @@ FEATURE_FLOOR = 0.3  # of the mean norm of a line's normal, added to each, or po
 class Fundamental(TwoViewModel):
     r"""Fundamental matrices, :math:`x_2^\top F x_1 = 0`.
 
-    Args:
-        rank2: ``"projection"`` in Frobenius norm in normalised coordinates, or ``"optimal"`` correction, see
-            :func:`~kornia_learnnorm.optimal_rank2`.
-        distance: the residual of a correspondence: ``"sampson"`` or ``"symmetric"`` distance (Fan et al., Eq. 7).
-
-    Raises:
-        ValueError: if there is no such ``rank2`` or ``distance``.
-
+    ``rank2`` is ``"projection"`` in Frobenius norm in normalised coordinates, or ``"optimal"`` correction, see
+    :func:`~kornia_learnnorm.optimal_rank2`. ``distance`` is the residual of a correspondence: the ``"sampson"`` or
+    ``"symmetric"`` distance (Fan et al., Eq. 7). Other names are a ValueError.
     """
 
     name = "fundamental"
@@ -79,10 +74,6 @@ class Fundamental(TwoViewModel):
     def carry(self, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
         r"""Return :math:`T_2^\top F T_1`."""
         return T2.mT @ M @ T1
-
-    def swap(self, M: Tensor) -> Tensor:
-        r"""Return :math:`F^\top`."""
-        return M.mT
 
     def constrain(self, M: Tensor) -> Tensor:
         """Return the nearest matrices of rank 2."""
@@ -179,15 +170,10 @@ class Fundamental(TwoViewModel):
 
 
 class Rank2(NamedTuple):
-    """Matrices of rank 2 and unit norm.
+    """Matrices of rank 2 and unit norm."""
 
-    Attributes:
-        axes: rotations of view 2 and of view 1, (B, 2, 3, 3).
-        A: unit matrices between them, (B, 2, 2).
-    """
-
-    axes: Tensor
-    A: Tensor
+    axes: Tensor  # rotations of view 2 and of view 1, (B, 2, 3, 3)
+    A: Tensor  # unit matrices between them, (B, 2, 2)
 
     def matrix(self) -> Tensor:
         """Return the matrices themselves, (B, 3, 3)."""

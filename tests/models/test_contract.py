@@ -53,9 +53,6 @@ class ToyHomography(TwoViewModel):
     def carry(self, M, T1, T2):
         return torch.linalg.solve(T2, M @ T1)
 
-    def swap(self, M):
-        return torch.linalg.inv(M)
-
     def constrain(self, M):
         return M
 
