@@ -8,7 +8,7 @@ import sys
 
 import pytest
 import torch
-from two_view import correspondences, shaken, shaken_estimator, signless, small, up_to_sign
+from scenes import correspondences, shaken, shaken_estimator, signless, small, up_to_sign
 
 from kornia_learnnorm import CrossViewNetwork, EightPoint, LearnedEightPoint, LearnedNormalizer, PaperNetwork, Whitening
 from kornia_learnnorm.export import export_layer, export_networks, load_layer

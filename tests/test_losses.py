@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from scenes import epipolar_distances, scenes, uniform
 from torch.autograd import gradcheck
-from two_view import epipolar_distances, scenes, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import BoundedEpipolarLoss, EpipolarLoss, LogEpipolarLoss

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from two_view import epipolar_distances
+from scenes import epipolar_distances
 
 cv2 = pytest.importorskip("cv2")
 from rendered import KINDS, MAX_RELIEF, render_kind  # noqa: E402

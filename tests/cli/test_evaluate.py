@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from two_view import epipolar_distances
+from scenes import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main

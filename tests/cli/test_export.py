@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import torch
-from two_view import correspondences, shaken, up_to_sign
+from scenes import correspondences, shaken, up_to_sign
 
 from kornia_learnnorm import EightPoint, Hartley, LearnedNormalizer, PaperNetwork
 from kornia_learnnorm.cli.main import main

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from two_view import correspondences, scenes, seeded
+from scenes import correspondences, scenes, seeded
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.augmentation import augment

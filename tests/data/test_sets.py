@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from two_view import eight_point, epipolar_distances, seeded
+from scenes import eight_point, epipolar_distances, seeded
 
 from kornia_learnnorm.data.residual_filter import plain_residual
 from kornia_learnnorm.data.sets import draw_samples

@@ -5,7 +5,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from two_view import epipolar_distances
+from scenes import epipolar_distances
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.data.writer import write_store

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from two_view import epipolar_distances
+from scenes import epipolar_distances
 
 from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.demo import compute as module

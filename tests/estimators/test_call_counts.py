@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from scenes import correspondences
 from torch.utils._python_dispatch import TorchDispatchMode
-from two_view import correspondences
 
 import kornia_learnnorm
 from kornia_learnnorm import EightPoint, Hartley, LearnedEightPoint, LearnedNormalizer, ReweightedWhitening, Whitening

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 import torch
 from pairwise import pairwise
-from torch.func import grad, jacrev, vmap
-from torch.utils.checkpoint import checkpoint
-from two_view import (
+from scenes import (
     check_gradients,
     correspondences,
     derivative,
@@ -23,6 +21,8 @@ from two_view import (
     unit,
     up_to_sign,
 )
+from torch.func import grad, jacrev, vmap
+from torch.utils.checkpoint import checkpoint
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import EightPoint, Hartley, ReweightedWhitening, Whitening, find_fundamental

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
-from two_view import homogeneous, scenes, uniform, unit, up_to_sign
+from scenes import homogeneous, scenes, uniform, unit, up_to_sign
 
 from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, squared_loss

@@ -10,7 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
-from two_view import DTYPES, shaken, shaken_estimator, uniform
+from scenes import DTYPES, shaken, shaken_estimator, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import EightPoint

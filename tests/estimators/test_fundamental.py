@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
-from torch.autograd import gradcheck, gradgradcheck
-from two_view import (
+from scenes import (
     SCENES,
     check_gradients,
     correspondences,
@@ -24,6 +23,7 @@ from two_view import (
     uniform,
     up_to_sign,
 )
+from torch.autograd import gradcheck, gradgradcheck
 
 from kornia_learnnorm import Hartley, Identity, PerView, ReweightedWhitening, Whitening, find_fundamental
 

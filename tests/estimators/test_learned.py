@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from two_view import (
+from scenes import (
     check_gradients,
     correspondences,
     rewrite_weights,

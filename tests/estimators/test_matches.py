@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from two_view import uniform
+from scenes import uniform
 
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
 

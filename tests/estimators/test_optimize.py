@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scenes import correspondences, homogeneous, scenes, signless, uniform, up_to_sign
 from torch.autograd import gradcheck
-from two_view import correspondences, homogeneous, scenes, signless, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators.optimize import UNROLLED_SCALE, refine_unrolled

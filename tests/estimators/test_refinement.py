@@ -9,8 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.autograd import gradcheck
-from two_view import (
+from scenes import (
     SCENES,
     correspondences,
     epipolar_distances,
@@ -24,6 +23,7 @@ from two_view import (
     unit,
     up_to_sign,
 )
+from torch.autograd import gradcheck
 
 from kornia_learnnorm import find_fundamental, sampson_distance, symmetric_epipolar_distance
 from kornia_learnnorm.estimators.refinement import refine_fundamental

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from pairwise import pairwise
+from scenes import SCENES, correspondences, epipolar_distances, homogeneous, shaken, uniform
 from torch.autograd import gradcheck
-from two_view import SCENES, correspondences, epipolar_distances, homogeneous, shaken, uniform
 
 from kornia_learnnorm import Hartley, Identity, ReweightedWhitening, Whitening
 from kornia_learnnorm.evaluation.diagnostics import (

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
-from two_view import SCENES, correspondences, eight_point, epipolar_distances, numpy_hartley, shaken, uniform
+from scenes import SCENES, correspondences, eight_point, epipolar_distances, numpy_hartley, shaken, uniform
 
 from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening, find_fundamental
 from kornia_learnnorm.evaluation.search import SearchedNormalizer

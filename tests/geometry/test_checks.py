@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
-from two_view import uniform
+from scenes import uniform
 
 from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, solve_dtype, weighted_mean
 

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
+from scenes import SCENES, correspondences, epipolar_distances, homogeneous, scenes, uniform
 from torch.autograd import gradcheck
-from two_view import SCENES, correspondences, epipolar_distances, homogeneous, scenes, uniform
 
 from kornia_learnnorm import algebraic_distance, find_fundamental, sampson_distance, symmetric_epipolar_distance
 from kornia_learnnorm.geometry.distances import line_norms, sampson_scale, symmetric_scale

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from two_view import scenes, uniform
+from scenes import scenes, uniform
 
 from kornia_learnnorm import RANSAC
 from kornia_learnnorm.geometry.distinct_points import distinct_points

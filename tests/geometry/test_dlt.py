@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
+from scenes import SCENES, correspondences, homogeneous, numpy_hartley, signless, uniform
 from torch.autograd import gradcheck, gradgradcheck
-from two_view import SCENES, correspondences, homogeneous, numpy_hartley, signless, uniform
 
 from kornia_learnnorm.geometry.dlt import (
     design_matrix,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scenes import uniform
 from torch.autograd import gradcheck, gradgradcheck
-from two_view import uniform
 
 from kornia_learnnorm.geometry.matrices import (
     adjugate,

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from two_view import SCENES, correspondences, epipolar_distances, scenes, uniform, up_to_sign
+from scenes import SCENES, correspondences, epipolar_distances, scenes, uniform, up_to_sign
 
 from kornia_learnnorm import find_fundamental
 from kornia_learnnorm.geometry.dlt import design_matrix

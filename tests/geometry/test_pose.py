@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from two_view import SCENES, homogeneous, scenes
+from scenes import SCENES, homogeneous, scenes
 
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.geometry.pose import relative_pose

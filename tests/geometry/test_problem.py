@@ -9,8 +9,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import correspondences, homogeneous, null_matrices, numpy_hartley, signless, uniform, up_to_sign
 from torch.overrides import TorchFunctionMode
-from two_view import correspondences, homogeneous, null_matrices, numpy_hartley, signless, uniform, up_to_sign
 
 from kornia_learnnorm import EightPoint, LearnedNormalizer, ReweightedWhitening, Whitening, find_fundamental
 from kornia_learnnorm.geometry import checks

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
-from torch.autograd import gradcheck, gradgradcheck
-from two_view import (
+from scenes import (
     check_gradients,
     correspondences,
     epipolar_distances,
@@ -20,6 +19,7 @@ from two_view import (
     unit,
     up_to_sign,
 )
+from torch.autograd import gradcheck, gradgradcheck
 
 from kornia_learnnorm import Hartley, Whitening, find_fundamental
 from kornia_learnnorm.data.sets import draw_samples

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from two_view import correspondences
+from scenes import correspondences
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from two_view import epipolar_distances, scenes
+from scenes import epipolar_distances, scenes
 
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share

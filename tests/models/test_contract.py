@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from scenes import uniform
 from torch.autograd import gradcheck
 from torch.nn.functional import normalize, one_hot
-from two_view import uniform
 
 from kornia_learnnorm import RANSAC, GemanMcClure, LearnedEightPoint, Whitening
 from kornia_learnnorm.estimators.learned import LearnedLayer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from two_view import uniform
+from scenes import uniform
 
 from kornia_learnnorm.models.essential import Essential, nearest_essential
 from kornia_learnnorm.models.fundamental import Fundamental

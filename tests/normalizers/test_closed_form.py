@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
+from scenes import SCENES, correspondences, mapped, numpy_hartley, numpy_whitening, uniform
 from torch.autograd import gradcheck
-from two_view import SCENES, correspondences, mapped, numpy_hartley, numpy_whitening, uniform
 
 from kornia_learnnorm import Hartley, Identity, PerView, Whitening
 from kornia_learnnorm.geometry.transforms import inverse_sqrt

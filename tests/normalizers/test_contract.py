@@ -7,7 +7,7 @@ import pytest
 import torch
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
-from two_view import DTYPES, check_refuses, correspondences, paper, shaken, small, uniform
+from scenes import DTYPES, check_refuses, correspondences, paper, shaken, small, uniform
 
 from kornia_learnnorm import Hartley, Identity, PerView, ReweightedWhitening, Whitening
 from kornia_learnnorm.evaluation.search import SearchedNormalizer

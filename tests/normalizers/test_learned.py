@@ -15,8 +15,7 @@ from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from torch import nn
-from two_view import (
+from scenes import (
     DTYPES,
     correspondences,
     eight_point,
@@ -30,6 +29,7 @@ from two_view import (
     uniform,
     up_to_sign,
 )
+from torch import nn
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import Hartley, LearnedNormalizer, Whitening, find_fundamental, pretrained

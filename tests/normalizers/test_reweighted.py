@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pairwise import pairwise
-from two_view import (
+from scenes import (
     SCENES,
     correspondences,
     epipolar_distances,

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from two_view import homogeneous, scenes, uniform, unit, up_to_sign
+from scenes import homogeneous, scenes, uniform, unit, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.geometry import ransac as kornia_ransac
-from two_view import epipolar_distances, scenes, shaken, uniform, up_to_sign
+from scenes import epipolar_distances, scenes, shaken, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC

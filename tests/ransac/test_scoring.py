@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from two_view import correspondences, epipolar_distances, scenes, uniform
+from scenes import correspondences, epipolar_distances, scenes, uniform
 
 from kornia_learnnorm import find_fundamental, sampson_distance
 from kornia_learnnorm.models.fundamental import Fundamental

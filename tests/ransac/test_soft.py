@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from pairwise import pairwise
-from torch.autograd import gradcheck
-from two_view import (
+from scenes import (
     DTYPES,
     check_gradients,
     correspondences,
@@ -24,6 +23,7 @@ from two_view import (
     uniform,
     up_to_sign,
 )
+from torch.autograd import gradcheck
 
 from kornia_learnnorm import Hartley, Whitening
 from kornia_learnnorm.ransac.soft import expected_loss, sample_minimal_sets

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from two_view import epipolar_distances
+from scenes import epipolar_distances
 
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from two_view import epipolar_distances
+from scenes import epipolar_distances
 
 from kornia_learnnorm.two_view.parallax import find_homography, fit_plane_and_parallax, parallax, parallax_evidence
 

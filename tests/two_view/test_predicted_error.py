@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from two_view import epipolar_distances
+from scenes import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld

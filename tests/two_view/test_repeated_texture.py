@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from rendered import render_kind
-from two_view import WALL_SHIFT, epipolar_distances, homogeneous, repeated_wall, seeded, uniform
+from scenes import WALL_SHIFT, epipolar_distances, homogeneous, repeated_wall, seeded, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld

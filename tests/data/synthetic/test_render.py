@@ -4,7 +4,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from two_view import epipolar_distances
+from scenes import epipolar_distances
 
 from kornia_learnnorm.data.synthetic.render import correspondences, render_pair, room, rotation, write_pair
 

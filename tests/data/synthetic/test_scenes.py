@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from two_view import homogeneous, seeded
+from scenes import homogeneous, seeded
 
 from kornia_learnnorm.data.synthetic import draws, forward_driving, handheld, orbit, random_scenes, scenes
 

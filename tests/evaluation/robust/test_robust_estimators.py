@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from two_view import shaken_estimator
+from scenes import shaken_estimator
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.evaluation.robust import peers

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pairwise import pairwise
-from two_view import DTYPES, numpy_hartley, numpy_whitening, prepared, shaken, uniform
+from scenes import DTYPES, numpy_hartley, numpy_whitening, prepared, shaken, uniform
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer, PaperNetwork
 

@@ -11,8 +11,8 @@ import torch
 from pairwise import pairwise
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from scenes import DTYPES, numpy_whitening, prepared, shaken, uniform
 from torch.autograd import gradcheck
-from two_view import DTYPES, numpy_whitening, prepared, shaken, uniform
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer
 from kornia_learnnorm.estimators.set_network import AttentiveContextBlock

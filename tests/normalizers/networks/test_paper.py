@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from pairwise import pairwise
+from scenes import DTYPES, correspondences, numpy_hartley, prepared, shaken, uniform
 from torch.autograd import gradcheck
-from two_view import DTYPES, correspondences, numpy_hartley, prepared, shaken, uniform
 
 from kornia_learnnorm import Hartley, LearnedNormalizer, PaperNetwork
 from kornia_learnnorm.geometry.transforms import paper_transform
