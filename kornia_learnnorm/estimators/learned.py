@@ -7,30 +7,15 @@ from pathlib import Path
 from typing import Literal, NamedTuple, Self
 
 import torch
-from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.linear import (
-    essential_matrix,
-    prepare_problem,
-    solve_in_coordinates,
-    solve_undetermined,
-    solve_where_determined,
-)
-from kornia_learnnorm.estimators.match_features import (
-    POINT_FEATURES,
-    RESIDUAL_FEATURES,
-    CommonFrame,
-    match_features,
-    residual_features,
-)
+from kornia_learnnorm.estimators.linear import essential_matrix, prepare_problem, solve_undetermined
+from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES
 from kornia_learnnorm.estimators.matches import MatchLayer
-from kornia_learnnorm.estimators.optimize import refine_unrolled
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
-from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, read_condition, weighted_mean
-from kornia_learnnorm.geometry.matrices import unit_matrix
-from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, run_stages
+from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, read_condition
+from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
@@ -38,54 +23,25 @@ from kornia_learnnorm.pretrained import check_architecture, load_module, save_mo
 __all__ = ["LearnedEightPoint", "LearnedEstimate", "LearnedLayer", "StageEstimate"]
 
 FORMAT = "kornia_learnnorm.eight_point.v1"
-EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
-MAX_MINIMAL_DISTANCE = 0.01  # of the frame's unit; quadratic mean that the best fit of `min_points` inliers leaves
-MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
-BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
-TRANSFORM_PARAMS = 5  # of each view's SPD transform
 
 
 class StageEstimate(NamedTuple):
-    """What one stage gives.
+    """What one stage gives."""
 
-    Attributes:
-        F_mat: fundamental matrices of rank 2 and unit Frobenius norm, (B, 3, 3).
-        logits: logits of the probabilities that the correspondences are inliers, (B, N).
-    """
-
-    F_mat: Tensor
-    logits: Tensor
+    F_mat: Tensor  # fundamental matrices of rank 2 and unit Frobenius norm, (B, 3, 3)
+    logits: Tensor  # of the probabilities that the correspondences are inliers, (B, N)
 
 
 class LearnedLayer(MatchLayer):
-    r"""Networks weigh the correspondences and choose the transforms of a model's DLT, in stages.
+    """Networks weigh the correspondences and choose the transforms of a model's DLT, in stages.
 
-    Args:
-        model: what the matrix is, see :class:`~kornia_learnnorm.models.contract.TwoViewModel`.
-        width: channels of the networks.
-        depth: blocks of each stage's network.
-        stages: number of stages.
-        learn_transforms: predict transforms; without, they are Hartley's of the weighted points.
-        refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
-
-    Attributes:
-        detach_stages: send no gradient from a stage into the one before and don't refine the last.
-        trained_on: names of the data that the weights were trained on.
-
-    Raises:
-        ValueError: if a number is not whole or too small, or ``learn_transforms`` is no bool.
-
+    Arguments, attributes and errors are those of :class:`LearnedEightPoint`; ``model`` says what the matrix is.
     """
 
     scores_are = "scores"
     model_name: str  # of the model whose files this class loads
-    architecture: tuple[str, ...] = (
-        "width",
-        "depth",
-        "stages",
-        "learn_transforms",
-        "refine_steps",
-    )  # arguments that files hold
+    # Arguments that files hold.
+    architecture: tuple[str, ...] = ("width", "depth", "stages", "learn_transforms", "refine_steps")
 
     def __init__(
         self, model: TwoViewModel, width: int, depth: int, stages: int, learn_transforms: bool, refine_steps: int
@@ -178,7 +134,9 @@ class LearnedLayer(MatchLayer):
         scores = None if scores is None else _check_scores(scores, points1, mask).to(problem.x1)
 
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
-            return self._solve(problem, scores if scores is None or rows is None else scores[rows])
+            given = scores if scores is None or rows is None else scores[rows]
+            options = self.learn_transforms, self.refine_steps, self.detach_stages
+            return run_stages(self.model, self.networks, problem, given, *options)
 
         def solve_rest(problem: LinearProblem) -> tuple[Tensor, ...]:
             number = self.stages if self.detach_stages else self.stages + 1
@@ -191,95 +149,6 @@ class LearnedLayer(MatchLayer):
         if problem.weights is not None:
             probability = torch.where(problem.weights > 0, probability, 0.0)
         return problem, stages, probability
-
-    def _solve(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return matrices (B, S, 3, 3) and logits (B, S, N) of the stages, for sets that determine their matrix.
-
-        All but the last change of coordinates is the common frame's.
-        """
-        present = problem.present
-        frame = CommonFrame.from_points(problem.points1, problem.points2, present)
-        features, factor = match_features(frame, scores, present), None
-        found: list[tuple[Tensor, Tensor]] = []
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.detach_stages):
-            refine = _Refinement(self.model, problem, frame)
-        dtype = self.dtype
-        for network in self.networks:
-            seen = features
-            if found:
-                with torch.set_grad_enabled(torch.is_grad_enabled() and not self.detach_stages):
-                    before = refine(*found[-1], min(EARLY_STEPS, self.refine_steps))
-                    residuals, factor = residual_features(self.model, refine.x1, refine.x2, *before, present)
-                seen = torch.cat([features, residuals], -1)
-            logits, params = network(seen.to(dtype), None if present is None else present == 0)
-            logits, params = logits.to(problem.x1), params.to(problem.x1)
-            weights = logits.sigmoid() if factor is None else logits.sigmoid() * factor
-            weights = weights if problem.weights is None else weights * problem.weights
-            found.append((self._solve_weighted(frame, weights, present, params), logits))
-        if not self.detach_stages:
-            found.append(refine(*found[-1], self.refine_steps))
-        matrices, all_logits = zip(*found, strict=True)
-        T = frame.T[:, None]
-        return unit_matrix(self.model.carry(torch.stack(matrices, 1), T, T)), torch.stack(all_logits, 1)
-
-    def _solve_weighted(self, frame: CommonFrame, weights: Tensor, present: Tensor | None, params: Tensor) -> Tensor:
-        """Return the matrices of the weighted DLT with the predicted transforms, in the frame."""
-        weights = weights / weights.detach().amax(1, keepdim=True)
-        weights = weights + (MIN_WEIGHT if present is None else MIN_WEIGHT * present)
-        weighted = LinearProblem.from_points(frame.x1, frame.x2, weights, self.model)
-        if not self.learn_transforms:
-            return solve_in_coordinates(weighted, weighted.T1, weighted.T2)
-        params = torch.unflatten(BOUND * torch.tanh(params / BOUND), -1, (2, TRANSFORM_PARAMS))
-        params = torch.where(frame.swapped[:, None, None], params.flip(1), params)
-        T1, T2 = (spd_transform(params) @ torch.stack([weighted.T1, weighted.T2], 1)).unbind(1)
-        return solve_in_coordinates(weighted, T1, T2)
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The dtype of the networks' weights."""
-        return next(self.parameters()).dtype
-
-
-class _Refinement:
-    """Robust refinement of a stage's matrices in the frame; sets of as few as possible matches are solved once."""
-
-    def __init__(self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame) -> None:
-        self.model, self.weights = model, problem.weights
-        self.x1, self.x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
-        self.minimal: Tensor | None = None
-        self.is_minimal: Tensor | None = None
-        if problem.x1.shape[1] > model.min_points and problem.weights is None:
-            return
-        self.minimal = _solve_minimal(model, problem, frame, self.x1, self.x2)
-        if problem.weights is not None:
-            self.is_minimal = ((problem.weights > 0).sum(1) <= model.min_points)[:, None, None]
-
-    def __call__(self, M: Tensor, logits: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Return a stage's matrices after so many steps, and its logits."""
-        if self.minimal is not None and self.x1.shape[-1] == self.model.min_points:
-            # The stage has no effect; through the zero, its network, scores and weights still get a gradient of zero.
-            return self.minimal + 0.0 * M, logits
-        weights = logits.sigmoid() if self.weights is None else logits.sigmoid() * self.weights
-        refined = refine_unrolled(self.model, self.x1, self.x2, M, weights, steps)
-        if self.minimal is not None and self.is_minimal is not None:
-            refined = torch.where(self.is_minimal, self.minimal, refined)
-        return refined, logits
-
-
-def _solve_minimal(model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, x1: Tensor, x2: Tensor) -> Tensor:
-    """Return the matrices, in the frame, of ``min_points`` matches; Hartley's where the best ones don't fit.
-
-    A best fit that leaves large distances is one of outliers. There the optimum of the first-order distances is, on
-    average, worse than the projection in Hartley's coordinates.
-    """
-    T1, T2 = problem.T1 @ frame.inverse, problem.T2 @ frame.inverse
-    best = model.carry(model.solve_minimal(problem), T1, T2)
-    plain = model.carry(model.constrain(problem.null_matrix), T1, T2)
-    squares = model.squares(model.residual(best.detach(), x1, x2))
-    fits = weighted_mean(squares[..., None], problem.present) < MAX_MINIMAL_DISTANCE**2
-    M = torch.where(fits[..., None], best, plain)
-    unit: Tensor = M / torch.linalg.matrix_norm(M, keepdim=True)
-    return unit
 
 
 class LearnedEstimate(NamedTuple):
@@ -384,27 +253,24 @@ class LearnedEightPoint(LearnedLayer):
     ) -> LearnedEstimate:
         r"""Return the fundamental matrices, the weights of the correspondences and what each stage gives.
 
+        Shapes and errors are those of :meth:`~kornia_learnnorm.EightPoint.estimate`, but for those of the scores.
+
         Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`, of any floating-point dtype, that
-                multiply the predicted ones; zero means absent.
-            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows
-                may hold any value, NaN too, and get a gradient of zero; without a mask NaN is an error.
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
+            points2: pixels in the second view.
+            weights: optional; they multiply the predicted ones.
+            mask: optional, true for the rows that are correspondences.
             scores: optional scores of the matches with shape :math:`(B, N)`, 1 minus Lowe's ratio or a matcher's
                 confidence, from 0 to 1, which the networks read.
-            K1: optional cameras of the first view with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
+            K1: optional cameras of the first view.
             K2: optional cameras of the second view; both or none.
 
         Returns:
             the matrices, weights and stages, in the dtype of the points.
 
         Raises:
-            TypeError: if the points are not floating-point tensors of one dtype, weights, scores or cameras not
-                floating-point, or the mask not boolean.
-            ShapeError: if a shape is wrong.
-            ValueError: if there are fewer than eight rows, shapes do not pair up, an unmasked value is not finite, a
-                weight is negative, a score is outside of 0 to 1, or only one camera is given or one is not invertible.
+            TypeError: if the scores are not floating-point.
+            ValueError: if the scores do not have the shape of the matches, or one is outside of 0 to 1.
 
         """
         problem, stages, probability = self._estimate(points1, points2, weights, mask, scores)

@@ -7,7 +7,6 @@ normaliser chooses. :class:`EightPoint` adds masks, cameras, and sets that deter
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import torch
@@ -23,7 +22,7 @@ from kornia_learnnorm.geometry.checks import (
 )
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
-from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
@@ -39,7 +38,6 @@ __all__ = [
     "prepare_problem",
     "solve_linear",
     "solve_undetermined",
-    "solve_where_determined",
 ]
 
 
@@ -115,16 +113,7 @@ def solve_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> Tens
 
 
 class LinearLayer(MatchLayer):
-    r"""The DLT of a model as an nn.Module, with finite outputs and gradients on degenerate sets.
-
-    Args:
-        model: what the matrix is, see :class:`~kornia_learnnorm.models.contract.TwoViewModel`.
-        normalizer: a module or callable ``(points1, points2, weights) -> (T1, T2)``; Hartley's when not given.
-
-    Raises:
-        TypeError: if ``normalizer`` is neither a module nor a function.
-
-    """
+    """The DLT of a model as an nn.Module, with finite outputs and gradients; see :class:`EightPoint`."""
 
     def __init__(self, model: TwoViewModel, normalizer: Normalizer | None = None) -> None:
         super().__init__()
@@ -136,26 +125,7 @@ class LinearLayer(MatchLayer):
     def forward(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
     ) -> Tensor:
-        r"""Return the matrices of the model.
-
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, float32 or float64, at least as many as
-                determine a matrix.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`.
-            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`.
-
-        Returns:
-            matrices with shape :math:`(B, 3, 3)`, in the dtype of the points.
-
-        Raises:
-            TypeError: if the points are not floating-point tensors of one dtype, weights not floating-point, or the
-                mask not boolean.
-            ShapeError: if a shape is wrong.
-            ValueError: if there are too few rows, shapes do not pair up, an unmasked value is not finite, or a weight
-                is negative.
-
-        """
+        """Return the matrices (B, 3, 3); arguments, shapes and errors as for :meth:`EightPoint.estimate`."""
         problem = prepare_problem(self.model, points1, points2, weights, mask)
         (M,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
         return M.to(points1.dtype)
@@ -281,57 +251,6 @@ def prepare_problem(
     return LinearProblem.from_points(points1, points2, weights, model)
 
 
-def solve_where_determined(
-    problem: LinearProblem,
-    solve: Callable[[LinearProblem, Tensor | None], tuple[Tensor, ...]],
-    solve_undetermined: Callable[[LinearProblem], tuple[Tensor, ...]],
-) -> tuple[Tensor, ...]:
-    """Return the solutions of sets of correspondences that determine their matrix, and other ones of those that don't.
-
-    Args:
-        problem: all sets.
-        solve: returns tensors (B', ...) of a problem and the indices of its sets, None for all.
-        solve_undetermined: returns the same tensors of a problem that does not determine its matrices.
-
-    """
-    problem.solve()
-    if problem.all_determined:
-        return solve(problem, None)
-    if problem.all_determined is None:
-        return _solve_traced(problem, solve, solve_undetermined)
-    determined = problem.determined
-    found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
-    with torch.no_grad():
-        others = solve_undetermined(problem.select(rest))
-    solutions = solve(problem.select(found), found)
-    return tuple(
-        value.new_empty(len(determined), *value.shape[1:]).index_copy(0, rest, other).index_copy(0, found, value)
-        for value, other in zip(solutions, others, strict=True)
-    )
-
-
-def _solve_traced(
-    problem: LinearProblem,
-    solve: Callable[[LinearProblem, Tensor | None], tuple[Tensor, ...]],
-    solve_undetermined: Callable[[LinearProblem], tuple[Tensor, ...]],
-) -> tuple[Tensor, ...]:
-    """Return the solutions without data-dependent shapes, as ``torch.compile`` and ``vmap`` need.
-
-    No derivative meets an undetermined set: generic points take its place, and their result is dropped.
-    """
-    rows, points = problem.determined[:, None], (problem.points1, problem.points2)
-    generic = _generic_points(problem.points1)
-    points1, points2 = (torch.where(rows[..., None], p, g) for p, g in zip(points, generic, strict=True))
-    weights = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
-    solutions = solve(LinearProblem.from_points(points1, points2, weights, problem.model), None)
-    with torch.no_grad():
-        others = solve_undetermined(problem)
-    return tuple(
-        torch.where(rows.view(-1, *[1] * (value.ndim - 1)), value, other)
-        for value, other in zip(solutions, others, strict=True)
-    )
-
-
 @torch.no_grad()
 def solve_undetermined(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
     """Return matrices of the model for sets of correspondences that do not determine them, without gradient."""
@@ -351,11 +270,3 @@ def _rescale(weights: Tensor) -> Tensor:
     top = weights.detach().amax(-1, keepdim=True)
     weights = torch.where(top < 1e-30, 0.0, weights)
     return weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)
-
-
-def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return correspondences (B, N, 2) that determine a matrix: multiples of irrational numbers, modulo one."""
-    index = torch.arange(1, like.shape[1] + 1, dtype=like.dtype, device=like.device)[:, None]
-    roots = torch.tensor([2.0, 3.0, 5.0, 7.0], dtype=like.dtype, device=like.device).sqrt()
-    points = (index * roots).frac().expand(like.shape[0], -1, -1)
-    return points[..., :2], points[..., 2:]

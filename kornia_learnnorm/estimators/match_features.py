@@ -22,21 +22,13 @@ MIN_PROBABILITY = 1e-3  # added to the probabilities of inliers in a mean
 
 
 class CommonFrame(NamedTuple):
-    """Both views in one frame: the centroid of all points is the origin, their mean distance from it is one.
+    """Both views in one frame: the centroid of all points is the origin, their mean distance from it is one."""
 
-    Attributes:
-        x1: points of the first view, (B, N, 2).
-        x2: points of the second view, (B, N, 2).
-        T: transform from pixels to the frame, the same for both views, (B, 3, 3).
-        inverse: transform from the frame to pixels, (B, 3, 3).
-        swapped: whether the canonical order of the views is the second before the first, (B,) bool.
-    """
-
-    x1: Tensor
+    x1: Tensor  # points, (B, N, 2)
     x2: Tensor
-    T: Tensor
-    inverse: Tensor
-    swapped: Tensor
+    T: Tensor  # from pixels to the frame, the same for both views, (B, 3, 3)
+    inverse: Tensor  # from the frame to pixels, (B, 3, 3)
+    swapped: Tensor  # whether the canonical order of the views is the second before the first, (B,) bool
 
     @classmethod
     def from_points(cls, points1: Tensor, points2: Tensor, present: Tensor | None) -> CommonFrame:
@@ -87,21 +79,14 @@ def match_features(frame: CommonFrame, scores: Tensor | None, present: Tensor | 
 def residual_features(
     model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, logits: Tensor, present: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    r"""Return the features of correspondences under a matrix, :math:`(B, N, 5)`, and gradient factors, :math:`(B, N)`.
+    """Return the features of correspondences under a matrix, :math:`(B, N, 5)`, and gradient factors, :math:`(B, N)`.
 
     The features are the distance, its ratios to the median and to the geometric mean over the inliers, and the gradient
     factor, all as logarithms, and the logit before. The mean is weighted by the probabilities of the logits.
-
     The gradient factor turns squared algebraic residuals into squared distances; its median is one.
 
-    Args:
-        model: the model of the matrices.
-        x1: homogeneous points of the first view in the frame, :math:`(B, 3, N)`.
-        x2: homogeneous points of the second view in the frame.
-        M: matrices in the frame, :math:`(B, 3, 3)`.
-        logits: logits of the stage before, :math:`(B, N)`.
-        present: one for correspondences that count, zero for others, :math:`(B, N)`; None where all count.
-
+    Points are homogeneous, :math:`(B, 3, N)`, and matrices :math:`(B, 3, 3)`, both in the frame; logits :math:`(B, N)`
+    are those of the stage before. ``present`` is one for correspondences that count, zero for others; None: all.
     """
     squares, factor = model.robust_distance(M / torch.linalg.matrix_norm(M, keepdim=True), x1, x2, present)
     distance = (squares + RESIDUAL_FLOOR**2).log()[..., None] / 2

@@ -14,19 +14,12 @@ __all__ = ["Correspondences", "MatchLayer", "correspondences_from_matches", "ref
 
 
 class Correspondences(NamedTuple):
-    """Padded correspondences of a batch of image pairs.
+    """Padded correspondences of a batch of image pairs."""
 
-    Attributes:
-        points1: pixels in the first images, (B, N, 2).
-        points2: pixels in the second images, (B, N, 2).
-        weights: scores of the matches, zero in padded rows, (B, N), or None.
-        mask: false in padded rows, (B, N) bool.
-    """
-
-    points1: Tensor
+    points1: Tensor  # pixels, (B, N, 2)
     points2: Tensor
-    weights: Tensor | None
-    mask: Tensor
+    weights: Tensor | None  # scores of the matches, zero in padded rows, (B, N)
+    mask: Tensor  # false in padded rows, (B, N)
 
 
 def correspondences_from_matches(
@@ -35,30 +28,10 @@ def correspondences_from_matches(
     matches: Tensor | Sequence[Tensor],
     scores: Tensor | Sequence[Tensor] | None = None,
 ) -> Correspondences:
-    r"""Return the matched keypoints of a batch, padded to one length of at least eight.
+    """Return the matched keypoints of a batch, padded to one length of at least eight.
 
-    Args:
-        keypoints1: pixels in the first images with shape :math:`(B, M_1, 2)`.
-        keypoints2: pixels in the second images with shape :math:`(B, M_2, 2)`.
-        matches: a list of B tensors :math:`(S_i, 2)` of index pairs, as Kornia's LightGlue returns; or one tensor
-            :math:`(B, M_1)` with the index of the match of each keypoint of view 1, negative for no match, as
-            SuperGlue and Transformers (``matches[:, 0]``) return.
-        scores: optional, non-negative: a list of B tensors :math:`(S_i,)`, or one tensor :math:`(B, M_1)`.
-
-    Returns:
-        the correspondences; gradients reach keypoints and scores.
-
-    Raises:
-        TypeError: if keypoints, matches or scores are no tensors, matches not integers, or scores not floating-point.
-        ShapeError: if the keypoints do not have the shape above.
-        ValueError: if the matches do not fit the keypoints, or the scores not the matches.
-
-    Example:
-        >>> keypoints = torch.rand(1, 20, 2)
-        >>> matches = [torch.tensor([[0, 3], [5, 1]])]
-        >>> correspondences_from_matches(keypoints, keypoints, matches).mask
-        tensor([[ True,  True, False, False, False, False, False, False]])
-
+    Arguments and errors are those of :meth:`~kornia_learnnorm.EightPoint.from_matches`. Gradients reach keypoints and
+    scores.
     """
     for name, keypoints in (("keypoints1", keypoints1), ("keypoints2", keypoints2)):
         if not isinstance(keypoints, Tensor):
@@ -94,13 +67,9 @@ def correspondences_from_matches(
 
 
 class MatchLayer(nn.Module):
-    """What all layers have in common: they take the output of matching networks, and refuse ``torch.jit``.
+    """What all layers have in common: they take the output of matching networks, and refuse ``torch.jit``."""
 
-    Attributes:
-        scores_are: what the scores of matches are to :meth:`estimate`, ``"weights"`` or ``"scores"``.
-    """
-
-    scores_are = "weights"
+    scores_are = "weights"  # what the scores of matches are to `estimate`, "weights" or "scores"
     estimate: Callable[..., Any]
 
     def from_matches(
@@ -112,13 +81,16 @@ class MatchLayer(nn.Module):
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> Any:
-        r"""Return the estimate of the matches of a matching network, whose scores get gradients.
+        """Return the estimate of the matches of a matching network, whose scores get gradients.
 
         Args:
             keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`.
             keypoints2: pixels in the second view with shape :math:`(B, M_2, 2)`.
-            matches: see :func:`~kornia_learnnorm.estimators.matches.correspondences_from_matches`.
-            scores: optional, one for each match, non-negative; of a learned layer, from 0 to 1.
+            matches: a list of B tensors :math:`(S_i, 2)` of index pairs, as Kornia's LightGlue returns; or one tensor
+                :math:`(B, M_1)` with the index of the match of each keypoint of view 1, negative for no match, as
+                SuperGlue and Transformers (``matches[:, 0]``) return.
+            scores: optional, non-negative, of a learned layer from 0 to 1: a list of B tensors :math:`(S_i,)`, or one
+                tensor :math:`(B, M_1)`.
             K1: optional cameras of the first view, as for :meth:`estimate`.
             K2: optional cameras of the second view.
 
@@ -126,9 +98,9 @@ class MatchLayer(nn.Module):
             the estimate; pairs with fewer than eight matches are not determined.
 
         Raises:
-            TypeError: if keypoints, matches or scores are not tensors of the right kind.
+            TypeError: if keypoints, matches or scores are no tensors, matches no integers or scores not floating-point.
             ShapeError: if the keypoints do not have the shape above.
-            ValueError: if the matches do not fit the keypoints, or as :meth:`estimate`.
+            ValueError: if the matches do not fit the keypoints, or the scores not the matches, or as :meth:`estimate`.
 
         """
         points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)

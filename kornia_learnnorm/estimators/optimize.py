@@ -31,21 +31,13 @@ DISTANCE_FLOOR = 1e-5  # of the points' unit, added to distances before their lo
 
 
 class RobustCost(NamedTuple):
-    """Sum of losses over the correspondences of each matrix, or over one set that all matrices share.
-
-    Attributes:
-        model: residuals and their derivatives.
-        x1: homogeneous points of view 1, the first two coordinates in pixels, (B or 1, 3, N).
-        x2: homogeneous points of view 2, (B or 1, 3, N).
-        weights: weights of the losses, (B or 1, N).
-        loss: robust loss of squared distances.
-    """
+    """Sum of losses over the correspondences of each matrix, or over one set that all matrices share."""
 
     model: Residuals
-    x1: Tensor
+    x1: Tensor  # homogeneous points, the first two coordinates in pixels, (B or 1, 3, N)
     x2: Tensor
-    weights: Tensor
-    loss: Loss
+    weights: Tensor  # of the losses, (B or 1, N)
+    loss: Loss  # of squared distances
 
     def select(self, rows: Tensor) -> RobustCost:
         """Return the cost of some of the matrices."""
@@ -180,17 +172,8 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
     :math:`p` parameters: a matrix that was fitted to few correspondences leaves distances that are too small. A step is
     taken where it lowers the cost.
 
-    Args:
-        model: the model of the matrices.
-        x1: homogeneous points of the first view with shape :math:`(B, 3, N)`, of about unit size.
-        x2: homogeneous points of the second view.
-        M: matrices with shape :math:`(B, 3, 3)`, any scale but zero.
-        weights: non-negative weights with shape :math:`(B, N)`; zero means absent.
-        steps: number of steps.
-
-    Returns:
-        matrices on the manifold with shape :math:`(B, 3, 3)`.
-
+    Points are homogeneous, :math:`(B, 3, N)`, of about unit size; weights :math:`(B, N)` are zero for absent ones;
+    matrices :math:`(B, 3, 3)` may have any scale but zero.
     """
     total_weight = weights.sum(1, keepdim=True)
     share = weights / (total_weight + (total_weight == 0))

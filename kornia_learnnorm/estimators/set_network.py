@@ -16,25 +16,14 @@ MIN_VARIANCE = 1e-3  # added to the variance of a feature over the set
 
 
 class SetWeightingNetwork(nn.Module):
-    r"""Predict a logit for every correspondence and parameters of the whole set.
+    """Predict a logit for every correspondence and ``outputs`` numbers of the whole set.
 
     Residual blocks in which every correspondence sees the attentive mean, deviation and maximum of the set. The last
     layers start at zero: an untrained network gives all correspondences the same weight and leaves the transforms.
 
-    Args:
-        features: features of a correspondence.
-        width: channels.
-        depth: blocks.
-        outputs: numbers predicted for the set.
-
     Reference:
         W. Sun, W. Jiang, E. Trulls, A. Tagliasacchi, K. M. Yi, ACNe: Attentive context normalization for robust
         permutation-equivariant learning, CVPR 2020.
-
-    Example:
-        >>> logits, params = SetWeightingNetwork(9, width=16, depth=2, outputs=10)(torch.rand(3, 20, 9))
-        >>> logits.shape, params.shape
-        (torch.Size([3, 20]), torch.Size([3, 10]))
 
     """
 
@@ -52,12 +41,9 @@ class SetWeightingNetwork(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, features: Tensor, absent: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return logits with shape :math:`(B, N)` and the outputs of the set with shape :math:`(B, P)`.
+        """Return logits :math:`(B, N)` and the set's outputs :math:`(B, P)` of features :math:`(B, N, C)`.
 
-        Args:
-            features: features of the correspondences with shape :math:`(B, N, C)`.
-            absent: optional mask of the rows that are no correspondences, :math:`(B, N)` bool.
-
+        ``absent`` marks the rows that are no correspondences, :math:`(B, N)` bool.
         """
         hidden = self.stem(features)
         for block in self.blocks:

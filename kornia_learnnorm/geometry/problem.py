@@ -16,7 +16,7 @@ from kornia_learnnorm.geometry.checks import needs_gradient, read_condition, sol
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP, MIN_GAP, nearest_null_vector
 from kornia_learnnorm.geometry.matrices import inverse
 
-__all__ = ["LinearProblem", "hartley_coordinates", "hartley_transform"]
+__all__ = ["LinearProblem", "hartley_coordinates", "hartley_transform", "solve_where_determined"]
 
 
 @dataclass
@@ -124,6 +124,62 @@ class LinearProblem:
         if self.solution is not None:
             problem.solution = function(self.solution[0]), function(self.solution[1])
         return problem
+
+
+def solve_where_determined(
+    problem: LinearProblem,
+    solve: Callable[[LinearProblem, Tensor | None], tuple[Tensor, ...]],
+    solve_undetermined: Callable[[LinearProblem], tuple[Tensor, ...]],
+) -> tuple[Tensor, ...]:
+    """Return the solutions of sets of correspondences that determine their matrix, and other ones of those that don't.
+
+    ``solve`` returns tensors (B', ...) of a problem and the indices of its sets, None for all; ``solve_undetermined``
+    the same tensors of a problem that does not determine its matrices.
+    """
+    problem.solve()
+    if problem.all_determined:
+        return solve(problem, None)
+    if problem.all_determined is None:
+        return _solve_traced(problem, solve, solve_undetermined)
+    determined = problem.determined
+    found, rest = determined.nonzero()[:, 0], (~determined).nonzero()[:, 0]
+    with torch.no_grad():
+        others = solve_undetermined(problem.select(rest))
+    solutions = solve(problem.select(found), found)
+    return tuple(
+        value.new_empty(len(determined), *value.shape[1:]).index_copy(0, rest, other).index_copy(0, found, value)
+        for value, other in zip(solutions, others, strict=True)
+    )
+
+
+def _solve_traced(
+    problem: LinearProblem,
+    solve: Callable[[LinearProblem, Tensor | None], tuple[Tensor, ...]],
+    solve_undetermined: Callable[[LinearProblem], tuple[Tensor, ...]],
+) -> tuple[Tensor, ...]:
+    """Return the solutions without data-dependent shapes, as ``torch.compile`` and ``vmap`` need.
+
+    No derivative meets an undetermined set: generic points take its place, and their result is dropped.
+    """
+    rows, points = problem.determined[:, None], (problem.points1, problem.points2)
+    generic = _generic_points(problem.points1)
+    points1, points2 = (torch.where(rows[..., None], p, g) for p, g in zip(points, generic, strict=True))
+    weights = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
+    solutions = solve(LinearProblem.from_points(points1, points2, weights, problem.model), None)
+    with torch.no_grad():
+        others = solve_undetermined(problem)
+    return tuple(
+        torch.where(rows.view(-1, *[1] * (value.ndim - 1)), value, other)
+        for value, other in zip(solutions, others, strict=True)
+    )
+
+
+def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return correspondences (B, N, 2) that determine a matrix: multiples of irrational numbers, modulo one."""
+    index = torch.arange(1, like.shape[1] + 1, dtype=like.dtype, device=like.device)[:, None]
+    roots = torch.tensor([2.0, 3.0, 5.0, 7.0], dtype=like.dtype, device=like.device).sqrt()
+    points = (index * roots).frac().expand(like.shape[0], -1, -1)
+    return points[..., :2], points[..., 2:]
 
 
 def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:

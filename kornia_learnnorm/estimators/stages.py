@@ -1,0 +1,121 @@
+"""The stages of a learned layer: features, logits, weights and transforms, matrix; refined, the next stage's input."""
+
+from __future__ import annotations
+
+import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from torch import Tensor, nn
+
+from kornia_learnnorm.estimators.linear import solve_in_coordinates
+from kornia_learnnorm.estimators.match_features import CommonFrame, match_features, residual_features
+from kornia_learnnorm.estimators.optimize import refine_unrolled
+from kornia_learnnorm.geometry.checks import weighted_mean
+from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.transforms import spd_transform
+from kornia_learnnorm.models.contract import TwoViewModel
+
+__all__ = ["TRANSFORM_PARAMS", "run_stages"]
+
+EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
+MAX_MINIMAL_DISTANCE = 0.01  # of the frame's unit; quadratic mean that the best fit of `min_points` inliers leaves
+MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
+BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
+TRANSFORM_PARAMS = 5  # of each view's SPD transform
+
+
+def run_stages(
+    model: TwoViewModel,
+    networks: nn.ModuleList,
+    problem: LinearProblem,
+    scores: Tensor | None,
+    learn_transforms: bool,
+    refine_steps: int,
+    detach_stages: bool,
+) -> tuple[Tensor, Tensor]:
+    """Return matrices (B, S, 3, 3) and logits (B, S, N) of the stages, for sets that determine their matrix.
+
+    Unless stages are detached, the refined matrices of the last stage follow. All but the last change of coordinates is
+    the common frame's.
+    """
+    present = problem.present
+    frame = CommonFrame.from_points(problem.points1, problem.points2, present)
+    features, factor = match_features(frame, scores, present), None
+    found: list[tuple[Tensor, Tensor]] = []
+    with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
+        refine = _Refinement(model, problem, frame)
+    dtype = next(networks.parameters()).dtype
+    for network in networks:
+        seen = features
+        if found:
+            with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
+                before = refine(*found[-1], min(EARLY_STEPS, refine_steps))
+                residuals, factor = residual_features(model, refine.x1, refine.x2, *before, present)
+            seen = torch.cat([features, residuals], -1)
+        logits, params = network(seen.to(dtype), None if present is None else present == 0)
+        logits, params = logits.to(problem.x1), params.to(problem.x1)
+        weights = logits.sigmoid() if factor is None else logits.sigmoid() * factor
+        weights = weights if problem.weights is None else weights * problem.weights
+        found.append((_solve_weighted(model, frame, weights, present, params if learn_transforms else None), logits))
+    if not detach_stages:
+        found.append(refine(*found[-1], refine_steps))
+    matrices, all_logits = zip(*found, strict=True)
+    T = frame.T[:, None]
+    return unit_matrix(model.carry(torch.stack(matrices, 1), T, T)), torch.stack(all_logits, 1)
+
+
+def _solve_weighted(
+    model: TwoViewModel, frame: CommonFrame, weights: Tensor, present: Tensor | None, params: Tensor | None
+) -> Tensor:
+    """Return the matrices of the weighted DLT with the predicted transforms, or Hartley's, in the frame."""
+    weights = weights / weights.detach().amax(1, keepdim=True)
+    weights = weights + (MIN_WEIGHT if present is None else MIN_WEIGHT * present)
+    weighted = LinearProblem.from_points(frame.x1, frame.x2, weights, model)
+    if params is None:
+        return solve_in_coordinates(weighted, weighted.T1, weighted.T2)
+    params = torch.unflatten(BOUND * torch.tanh(params / BOUND), -1, (2, TRANSFORM_PARAMS))
+    params = torch.where(frame.swapped[:, None, None], params.flip(1), params)
+    T1, T2 = (spd_transform(params) @ torch.stack([weighted.T1, weighted.T2], 1)).unbind(1)
+    return solve_in_coordinates(weighted, T1, T2)
+
+
+class _Refinement:
+    """Robust refinement of a stage's matrices in the frame; sets of as few as possible matches are solved once."""
+
+    def __init__(self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame) -> None:
+        self.model, self.weights = model, problem.weights
+        self.x1, self.x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
+        self.minimal: Tensor | None = None
+        self.is_minimal: Tensor | None = None
+        if problem.x1.shape[1] > model.min_points and problem.weights is None:
+            return
+        self.minimal = _solve_minimal(model, problem, frame, self.x1, self.x2)
+        if problem.weights is not None:
+            self.is_minimal = ((problem.weights > 0).sum(1) <= model.min_points)[:, None, None]
+
+    def __call__(self, M: Tensor, logits: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Return a stage's matrices after so many steps, and its logits."""
+        if self.minimal is not None and self.x1.shape[-1] == self.model.min_points:
+            # The stage has no effect; through the zero, its network, scores and weights still get a gradient of zero.
+            return self.minimal + 0.0 * M, logits
+        weights = logits.sigmoid() if self.weights is None else logits.sigmoid() * self.weights
+        refined = refine_unrolled(self.model, self.x1, self.x2, M, weights, steps)
+        if self.minimal is not None and self.is_minimal is not None:
+            refined = torch.where(self.is_minimal, self.minimal, refined)
+        return refined, logits
+
+
+def _solve_minimal(model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, x1: Tensor, x2: Tensor) -> Tensor:
+    """Return the matrices, in the frame, of ``min_points`` matches; Hartley's where the best ones don't fit.
+
+    A best fit that leaves large distances is one of outliers. There the optimum of the first-order distances is, on
+    average, worse than the projection in Hartley's coordinates.
+    """
+    T1, T2 = problem.T1 @ frame.inverse, problem.T2 @ frame.inverse
+    best = model.carry(model.solve_minimal(problem), T1, T2)
+    plain = model.carry(model.constrain(problem.null_matrix), T1, T2)
+    squares = model.squares(model.residual(best.detach(), x1, x2))
+    fits = weighted_mean(squares[..., None], problem.present) < MAX_MINIMAL_DISTANCE**2
+    M = torch.where(fits[..., None], best, plain)
+    unit: Tensor = M / torch.linalg.matrix_norm(M, keepdim=True)
+    return unit
