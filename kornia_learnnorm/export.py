@@ -52,12 +52,12 @@ def load_layer(name: str | Path) -> EightPoint | LearnedEightPoint:
         12
 
     """
-    form = weights_format(name)
-    if form is None:
+    file_format = weights_format(name)
+    if file_format is None:
         raise FileNotFoundError(
             f"no weights {str(name)!r}: expected a .safetensors file or one of {', '.join(shipped_weights())}"
         )
-    if form == NORMALIZER_FORMAT:
+    if file_format == NORMALIZER_FORMAT:
         return EightPoint(LearnedNormalizer.from_pretrained(name)).eval()
     return LearnedEightPoint.from_pretrained(name)
 

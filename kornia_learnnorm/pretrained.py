@@ -45,19 +45,7 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 def save_module(path: str | Path, module: nn.Module, file_format: str, architecture: Mapping[str, Any]) -> None:
-    """Write weights, architecture and ``trained_on`` of a module to one file, beside the target and then renamed.
-
-    Args:
-        path: the file to write.
-        module: the module, with the attribute ``trained_on``.
-        file_format: name of the format.
-        architecture: what builds the module again, for JSON.
-
-    Raises:
-        ValueError: if ``path`` does not end in ``.safetensors``.
-        OSError: if it cannot be written.
-
-    """
+    """Write weights, architecture (for JSON) and ``trained_on`` of a module to one ``.safetensors`` file."""
     if Path(path).suffix != ".safetensors":
         raise ValueError(f"weights are written to a .safetensors file, got {str(path)!r}")
     state = {key: value.detach().cpu().contiguous() for key, value in module.state_dict().items()}
@@ -76,19 +64,9 @@ def save_module(path: str | Path, module: nn.Module, file_format: str, architect
 def load_module(name: str | Path, file_format: str, build: Callable[[Path, str], Module]) -> Module:
     """Load a module that :func:`save_module` wrote: one that ships with the package, by name, or a file.
 
-    Args:
-        name: name of shipped weights, or the path of a ``.safetensors`` file.
-        file_format: name of the format that is expected.
-        build: makes the module of the path, for messages, and the architecture as JSON text; called on the device
-            ``meta``, where weights take no memory before their shapes are known to be those in the file.
-
-    Returns:
-        the module, in evaluation mode, in the dtype of its weights.
-
-    Raises:
-        FileNotFoundError: if there are no such weights; the message lists those that ship.
-        ValueError: if the file is not of the format or its tensors do not fit.
-
+    ``build`` makes the module of the path, for messages, and the architecture as JSON text, on the device ``meta``:
+    weights take no memory before their shapes are known to be those in the file. The module is in evaluation mode, in
+    the dtype of its weights. A FileNotFoundError names the weights that ship; a file that does not fit is a ValueError.
     """
     path = weights_path(name)
     if not path.is_file() and Path(name).is_file():
@@ -119,7 +97,13 @@ def load_module(name: str | Path, file_format: str, build: Callable[[Path, str],
         raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
     if any(value.is_meta for value in (*module.parameters(), *module.buffers())):
         raise ValueError(f"{path}: a constructor makes a tensor that state_dict does not hold: register it as a buffer")
-    module.trained_on = _read_names(path, metadata.get("trained_on", "[]"))  # type: ignore[assignment]
+    try:
+        names = json.loads(text := metadata.get("trained_on", "[]"))
+    except ValueError:
+        names = None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{path}: trained_on must be a JSON list of names, got {text[:80]!r}")
+    module.trained_on = tuple(names)  # type: ignore[assignment]
     return module.eval()
 
 
@@ -134,10 +118,7 @@ def shipped_weights(file_format: str | None = None) -> list[str]:
 
 
 def weights_format(name: str | Path) -> str | None:
-    """Return the format of shipped weights by name or of a file; None where there is no such file.
-
-    A file that is none of this package has the format "".
-    """
+    """Return the format of shipped weights or of a file: "" of a file of no format, None where there is no file."""
     path = weights_path(name)
     if not path.is_file():
         return "" if Path(name).is_file() else None
@@ -149,7 +130,7 @@ def weights_format(name: str | Path) -> str | None:
 
 
 def weights_digest(name: str | Path) -> str:
-    """Return what tells files of weights apart, of shipped weights by name or of a file."""
+    """Return a hash of shipped weights, by name, or of a file."""
     return sha256(weights_path(name).read_bytes()).hexdigest()[:16]
 
 
@@ -166,12 +147,7 @@ def check_architecture(*parts: Mapping[str, Any]) -> None:
 
 
 def name_part(part: Any, *modules: Any) -> str:
-    """Return the name of a class or function: its own in one of this package's modules, elsewhere its import path.
-
-    Raises:
-        TypeError: if it cannot be imported by its name.
-
-    """
+    """Return the name of a class or function: its own in one of this package's modules, elsewhere its import path."""
     module, name = getattr(part, "__module__", ""), getattr(part, "__name__", "")
     if any(getattr(known, name, None) is part for known in modules):
         return str(name)
@@ -185,12 +161,7 @@ def name_part(part: Any, *modules: Any) -> str:
 
 
 def describe_part(part: object, *modules: Any) -> dict[str, Any]:
-    """Return the name of a module and its constructor's arguments, kept as attributes of their names.
-
-    Raises:
-        TypeError: if it cannot be imported, or an argument is no attribute, or neither a number nor a text.
-
-    """
+    """Return the name of a module and its constructor's arguments: numbers and texts, kept as attributes."""
     name, arguments = name_part(type(part), *modules), inspect.signature(type(part)).parameters.values()
     # A part without its own constructor shows the `*args, **kwargs` of `nn.Module`.
     keys = [argument.name for argument in arguments if argument.kind is argument.POSITIONAL_OR_KEYWORD]
@@ -204,16 +175,9 @@ def describe_part(part: object, *modules: Any) -> dict[str, Any]:
 
 
 def find_part(name: str, own_modules: Collection[str], *modules: Any) -> Any:
-    """Return the class or function that a file names: a public one of this package, or one of an own module.
+    """Return the class or function that a file names: a public one of ``modules``, or one that an own module defines.
 
-    Args:
-        name: its name, or its import path.
-        own_modules: the modules that may be imported, from the Python path or the working folder.
-        modules: the modules of this package where it can be.
-
-    Raises:
-        ValueError: if there is none, or it is of another module.
-
+    Only ``own_modules`` are imported, from the Python path or the working folder.
     """
     for known in modules:
         if name in known.__all__:
@@ -234,14 +198,3 @@ def find_part(name: str, own_modules: Collection[str], *modules: Any) -> Any:
     if not callable(found) or getattr(found, "__module__", None) != module:
         raise ValueError(f"{name} is not a class or function that {module} defines")
     return found
-
-
-def _read_names(path: Path, text: str) -> tuple[str, ...]:
-    """Return the names in a JSON list."""
-    try:
-        names = json.loads(text)
-    except ValueError:
-        names = None
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{path}: trained_on must be a JSON list of names, got {text[:80]!r}")
-    return tuple(names)

@@ -21,23 +21,20 @@ from tqdm import tqdm
 
 from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.files import atomic_write, short_name
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from lightning_modules.task import EstimatorTask
 
 __all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "WritePredictions"]
 
+MEASURED_STEPS = 10  # steps whose mean time is multiplied, after one that does not count
+
 
 class Checkpoints(ModelCheckpoint):
     """Keep the last checkpoint as ``checkpoints/last.ckpt`` in the trainer's default root directory.
 
-    A training that is interrupted (Ctrl-C) or terminated (SIGTERM) ends after the current step with a checkpoint; a
-    second Ctrl-C ends it at once, and so does SIGTERM during a validation. Several processes end at once, since they
-    would not agree on the step.
-
-    Args:
-        every_n_train_steps: steps between checkpoints.
+    Ctrl-C and SIGTERM end a training after the current step with a checkpoint; a second Ctrl-C ends it at once, and so
+    does SIGTERM during a validation. Several processes end at once, since they would not agree on the step.
     """
 
     def __init__(self, every_n_train_steps: int = 100) -> None:
@@ -101,18 +98,7 @@ class Checkpoints(ModelCheckpoint):
 
 
 class ExpectedTime(Callback):
-    """Print the device, steps and folder of a training, soon how long it will take, and in the end how long it took.
-
-    The command line adds it to every training. Lightning's bar counts the batches of one epoch.
-
-    Args:
-        measured_steps: steps whose mean time is multiplied, after one that does not count.
-    """
-
-    def __init__(self, measured_steps: int = 10) -> None:
-        self.measured_steps = measured_steps
-        self._first = 0
-        self._start = self._begin = 0.0
+    """Print the device, steps and folder of a training, soon how long it will take, and in the end how long it took."""
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Print where and how far the training will go."""
@@ -126,7 +112,7 @@ class ExpectedTime(Callback):
         done, steps = trainer.global_step - self._first, trainer.estimated_stepping_batches - trainer.global_step
         if done == 0:
             self._start = time.monotonic()
-        elif done == self.measured_steps and 0 < steps < float("inf"):
+        elif done == MEASURED_STEPS and 0 < steps < float("inf"):
             seconds = (time.monotonic() - self._start) / done * steps
             _print_above_bar(f"about {_duration(seconds)} for the remaining {steps:.0f} steps, without validation")
 
@@ -150,33 +136,30 @@ def _duration(seconds: float) -> str:
 
 
 class ExportWeights(Callback):
-    """Write the trained module as safetensors when training ends, for its ``from_pretrained``.
+    """Write the trained module to a safetensors file in the trainer's default root directory when training ends.
 
     What cannot be saved and loaded again is refused before the training. The file names the training data: the stores,
     or ``synthetic scenes``; nothing for a source of another class.
-
-    Args:
-        filename: name of the file in the trainer's default root directory.
     """
 
     def __init__(self, filename: str = "weights.safetensors") -> None:
         self.filename = filename
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Save the module to a temporary folder and load it again.
-
-        Raises:
-            TypeError: if the task is none that this callback knows.
-            ValueError: if the module cannot be saved and loaded.
-
-        """
+        """Save the module to a temporary folder and load it again; a ValueError where it does not come back."""
         if not isinstance(pl_module, EstimatorTask):
             raise TypeError(f"expected an EstimatorTask, got {type(pl_module).__name__}")
-        if stage == "fit":
-            try:
-                _check_saving(pl_module.trained)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"the trained weights could not be saved: {error}") from error
+        if stage != "fit":
+            return
+        trained = pl_module.trained
+        try:
+            with TemporaryDirectory() as folder:
+                trained.save_pretrained(path := Path(folder) / "weights.safetensors")
+                if isinstance(trained, LearnedNormalizer):
+                    parts = [trained.transform, *map(type, trained.modules())]
+                    LearnedNormalizer.from_pretrained(path, {part.__module__ for part in parts})
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"the trained weights could not be saved: {error}") from error
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the module; a ValueError in the place of untrained weights."""
@@ -191,16 +174,6 @@ class ExportWeights(Callback):
             print(f"wrote {path}")
 
 
-def _check_saving(trained: LearnedNormalizer | LearnedEightPoint) -> None:
-    """Raise TypeError or ValueError if a module cannot be saved, or its file would not give it back."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "weights.safetensors"
-        trained.save_pretrained(path)
-        if isinstance(trained, LearnedNormalizer):
-            parts = [trained.transform, *map(type, trained.modules())]
-            LearnedNormalizer.from_pretrained(path, {part.__module__ for part in parts})
-
-
 def _names_of(source: Any) -> list[str]:
     """Return the names of the data of a source; nothing where they are not known."""
     if isinstance(source, RandomSets):
@@ -211,11 +184,7 @@ def _names_of(source: Any) -> list[str]:
 
 
 class WritePredictions(Callback):
-    """Write the tensors that ``predict`` returns to one safetensors file.
-
-    Args:
-        filename: name of the file in the trainer's default root directory.
-    """
+    """Write the tensors that ``predict`` returns to one safetensors file in the trainer's default root directory."""
 
     def __init__(self, filename: str = "predictions.safetensors") -> None:
         self.filename = filename

@@ -9,23 +9,17 @@ __all__ = ["config_names", "find_config", "with_config_paths"]
 
 OPTIONS = ("-c", "--config")
 PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
-REPOSITORY = Path(__file__).parents[1] / "configs"  # where a checkout has them
+FOLDER = PACKAGED if PACKAGED.is_dir() else Path(__file__).parents[1] / "configs"  # of the repository
 
 
 def config_names() -> list[str]:
     """Return the names of the configurations, such as ``crossview`` and ``ablations/base``."""
-    folder = _folder()
-    paths = [path.relative_to(folder).with_suffix("") for path in folder.rglob("*.yaml")]
+    paths = [path.relative_to(FOLDER).with_suffix("") for path in FOLDER.rglob("*.yaml")]
     return [path.as_posix() for path in sorted(paths, key=lambda path: (len(path.parts), path))]
 
 
 def find_config(name: str) -> Path:
-    """Return the file of a configuration, which is given by its name or by its path.
-
-    Raises:
-        FileNotFoundError: if there is neither such a file nor such a name.
-
-    """
+    """Return the file of a configuration, which is given by its name or by its path."""
     if Path(name).is_file():
         return Path(name)
     stem = name.removesuffix(".yaml")
@@ -33,7 +27,7 @@ def find_config(name: str) -> Path:
     if stem not in names:
         known = ", ".join(known for known in names if "/" not in known)
         raise FileNotFoundError(f"no configuration {name}: expected a file, or one of {known}, ablations/*, table1/*")
-    return _folder() / f"{stem}.yaml"
+    return FOLDER / f"{stem}.yaml"
 
 
 def with_config_paths(args: Sequence[str]) -> list[str]:
@@ -46,8 +40,3 @@ def with_config_paths(args: Sequence[str]) -> list[str]:
         elif option == "--config" and equals:
             replaced[i] = f"--config={find_config(value)}"
     return replaced
-
-
-def _folder() -> Path:
-    """Return the folder of the configurations; an editable install uses that of the repository."""
-    return PACKAGED if PACKAGED.is_dir() else REPOSITORY

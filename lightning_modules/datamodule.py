@@ -18,23 +18,19 @@ from kornia_learnnorm.data.sources import SEEDS_PER_RUN, BlockSource, block_gene
 
 __all__ = ["BatchLoader", "CorrespondenceDataModule"]
 
-# Far from the seeds of training epochs, since the synthetic source gives the same scenes for the same seed. A generator
-# on the CPU reads 32 bits of it.
-EVALUATION_SEED = 4_000_000_007
+EVALUATION_SEED = 4_000_000_007  # far from the seeds of training epochs, below 2^32 as the generator needs it
 
 
 class BatchLoader:
     """Batches of sets, drawn anew each epoch; the state is the epoch and the batch, so training resumes exactly.
 
-    A block is cut into batches of nearly equal size, so none of its samples is lost or comes twice. The number of
-    batches is the same in every epoch: how many samples the filter keeps is told from the first block of the first
-    epoch, and batches are as much smaller or larger than ``batch_size`` as other blocks differ from it; an epoch ends
-    early where a block has fewer samples than batches. Of several processes each takes its share of every batch, which
-    can be empty.
+    A block is cut into batches of nearly equal size, so none of its samples is lost or comes twice. The first block of
+    the first epoch, after the filter, decides the number of batches in every epoch; where other blocks differ from it,
+    batches are smaller or larger than ``batch_size``. An epoch ends early where a block has fewer samples than batches.
+    Each process takes its share of every batch, which can be empty.
 
-    ``batch_size`` counts the samples of all processes together, or image pairs, each with all its samples, ``by_pair``.
-    With None, each block is a batch as it is. Without ``shuffle`` one draw is kept in order, for evaluation.
-    ``workers`` processes draw the next blocks meanwhile.
+    ``batch_size`` counts the samples of all processes together, or with ``by_pair`` the image pairs, each with all its
+    samples. With None, each block is a batch as it is. Without ``shuffle`` one draw is kept in order, for evaluation.
     """
 
     def __init__(
@@ -120,18 +116,14 @@ class BatchLoader:
 
     def _blocks(self, epoch: int, first: int) -> Iterator[MatchSets]:
         """Yield the blocks of an epoch from ``first`` on."""
-        number = len(self.source.blocks(self._seed(epoch)))
+        number = len(self._sizes(epoch))
         if self.workers and number > first + 1:
             # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
             indices: Any = range(first, number)
-            draw = partial(self.source.draw, self._seed(epoch))
-            loader = DataLoader(
-                indices, batch_size=None, collate_fn=draw, num_workers=self.workers, worker_init_fn=_ignore_interrupts
-            )
-            yield from loader
+            options: dict[str, Any] = {"num_workers": self.workers, "worker_init_fn": _ignore_interrupts}
+            yield from DataLoader(indices, None, collate_fn=partial(self.source.draw, self._seed(epoch)), **options)
         else:
-            for block in range(first, number):
-                yield self._draw(epoch, block)
+            yield from (self._draw(epoch, block) for block in range(first, number))
 
     def _draw(self, epoch: int, block: int) -> MatchSets:
         seed = self._seed(epoch)

@@ -12,12 +12,7 @@ __all__ = ["one_cycle"]
 
 
 def one_cycle(optimizer: Optimizer, trainer: pl.Trainer, warm_up: float) -> OneCycleLR:
-    """Return the cycle over the steps of a training, up to the optimiser's learning rate.
-
-    Raises:
-        ValueError: if the training has no end.
-
-    """
+    """Return the cycle over the steps of a training, up to the optimiser's learning rate."""
     if trainer.estimated_stepping_batches == float("inf"):
         raise ValueError(
             "the learning rate follows one cycle over all steps: give trainer.max_steps or trainer.max_epochs;"
@@ -32,12 +27,7 @@ class OneCycle(OneCycleLR):
     """PyTorch's schedule, which goes on only in a training of as many steps: elsewhere it fails, or ends too early."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load the state of a checkpoint.
-
-        Raises:
-            ValueError: if the checkpoint is of a training of another number of steps.
-
-        """
+        """Load the state of a checkpoint, which must be of a training of as many steps."""
         if state_dict["total_steps"] != self.total_steps:
             raise ValueError(
                 f"the checkpoint is of a training of {state_dict['total_steps']} steps, whose learning rate follows one"

@@ -39,15 +39,12 @@ def _adamw(params: Iterable[nn.Parameter]) -> Optimizer:
 
 
 class SetLoss(nn.Module):
-    """Loss of sets of matches with outliers, of each kind of supervision its own.
-
-    Sets whose ground truth is known have the logarithmic loss of true inliers and the cross-entropy of the logits, the
-    others the bounded loss of all matches: sources with ``labels=False`` train without labels.
+    """Loss of sets of matches with outliers: labelled sets have another loss than those without ground truth.
 
     Args:
-        label_free: loss of the sets without ground truth, times ``label_free_weight``.
-        labelled: loss of the sets with ground truth.
-        inlier_weight: weight of the cross-entropy.
+        label_free: loss of all matches of the sets without ground truth, times ``label_free_weight``.
+        labelled: loss of the true inliers of the sets with ground truth.
+        inlier_weight: weight of the cross-entropy of the logits, which is added to ``labelled``.
         label_free_weight: weight of the label-free loss.
     """
 
@@ -79,14 +76,10 @@ class SetLoss(nn.Module):
 class EstimatorTask(pl.LightningModule):
     """Train an estimator, or the normaliser within it, by back-propagating a loss of its matrices.
 
-    With the default loss, of sets of matches with outliers, validation and test log the median distance of the held-out
-    matches by the size of the sets. With another one, of samples, they log the mean log residual of the samples' own
-    points and the better rates against Hartley and whitening. Prediction returns the matrix and the residual of each
-    set, and the transforms of a normaliser.
-
-    Of several processes, all sets count the same, however they are distributed. Sets with a NaN or infinite coordinate
-    are left out and counted: ``train/left_out``. A step without any other set, or with a gradient that is not finite,
-    leaves the weights and the optimiser as they are, with a warning, and is counted: ``train/skipped``.
+    With :class:`SetLoss`, validation and test log the median distance of the held-out matches by the size of the sets;
+    with another loss, the mean log residual of the samples' own points and the better rates against Hartley and
+    whitening. Sets with a NaN or infinite coordinate are left out and counted: ``train/left_out``. A step without any
+    other set, or with a gradient that is not finite, changes nothing, warns, and is counted: ``train/skipped``.
 
     Args:
         estimator: the estimator to train: a :class:`~kornia_learnnorm.LearnedEightPoint`, or an
@@ -98,8 +91,7 @@ class EstimatorTask(pl.LightningModule):
             up to the optimiser's learning rate.
         warm_up: share of the cycle in which the learning rate rises.
         sample_gradient: largest norm of one set's gradient with respect to the outputs of a network, before the batch's
-            average. Near-degenerate sets have gradients a thousand times the typical one, and a clip of the whole batch
-            would leave only their direction. None leaves all as they are.
+            average, since near-degenerate sets have gradients a thousand times the typical one. None for no limit.
     """
 
     def __init__(
@@ -120,13 +112,10 @@ class EstimatorTask(pl.LightningModule):
         self.loss = loss or SetLoss()
         self.optimizer, self.lr_scheduler = optimizer, lr_scheduler
         self.warm_up, self.sample_gradient = warm_up, sample_gradient
-        metrics: dict[str, Metric] = {
-            name: MeanMetric() for name in ("log_sed", *map("better_than_{}".format, BASELINES))
-        }
+        metrics: dict[str, Metric] = {"left_out": SumMetric(), "log_sed": MeanMetric()}
+        metrics |= {f"better_than_{name}": MeanMetric() for name in BASELINES}
         metrics |= {f"median_{name}": Median() for name in SIZES.values()}
-        self.metrics = nn.ModuleDict({"left_out": SumMetric(), **metrics})
-        for metric in self.metrics.values():
-            cast(Metric, metric).set_dtype(torch.float64)
+        self.metrics = nn.ModuleDict({name: metric.set_dtype(torch.float64) for name, metric in metrics.items()})
         self._sets = 0  # of all processes since the last step
 
     @property
@@ -151,8 +140,7 @@ class EstimatorTask(pl.LightningModule):
         # Without sets, all weights still take part: the other processes wait for their gradients.
         loss = self.compute_loss(batch) if number else 0 * torch.stack([p.sum() for p in self.parameters()]).sum()
         own = torch.stack([number * loss.detach(), loss.new_tensor(left_out), loss.new_tensor(number)])
-        own = own.to(solve_dtype(self.device))
-        total, all_left_out, all_sets = self.trainer.strategy.reduce(own, reduce_op="sum")
+        total, all_left_out, all_sets = self.trainer.strategy.reduce(own.to(solve_dtype(self.device)), reduce_op="sum")
         of_all = int(all_sets)
         self._sets += of_all
         self.log("train/loss", total / max(of_all, 1), prog_bar=True)
@@ -178,8 +166,8 @@ class EstimatorTask(pl.LightningModule):
         with self._limited_gradients(arrived):
             stages = self._stages(*points, batch.scores)
         total = points[0].new_zeros(())
+        of_sets = isinstance(self.loss, SetLoss)
         for number, (F_mat, logits) in enumerate(stages, 1):
-            of_sets = isinstance(self.loss, SetLoss)
             loss = self.loss(batch, F_mat, logits) if of_sets else self.loss(*points, F_mat, *heldout)
             total = total + (1.0 if number == len(stages) else EARLY_STAGE) * loss.mean()
         if total.requires_grad:
@@ -187,10 +175,7 @@ class EstimatorTask(pl.LightningModule):
         return total
 
     def _stages(self, points1: Tensor, points2: Tensor, scores: Tensor | None) -> list[tuple[Tensor, Tensor | None]]:
-        """Return the matrices of each stage, and the logits of the matches where there are some.
-
-        Each stage of a learned estimator is trained by its own losses.
-        """
+        """Return the matrices of each stage, which its own losses train, and the logits where there are some."""
         layer = self.estimator
         if not isinstance(layer, LearnedEightPoint):
             return [(layer(points1, points2), None)]
@@ -204,8 +189,8 @@ class EstimatorTask(pl.LightningModule):
     def _limited_gradients(self, arrived: list[Tensor]) -> Iterator[None]:
         """Attach the limit to the networks' outputs while the block runs.
 
-        Processes, accumulated batches and the scaler of half precision multiply the loss after it is computed. What
-        they make of its gradient arrives in a list, and the limit is multiplied alike.
+        Processes, accumulated batches and the scaler of half precision multiply the loss after it is computed. The
+        gradient of the loss, which arrives in a list, multiplies the limit too.
         """
 
         def limit(gradient: Tensor) -> Tensor:

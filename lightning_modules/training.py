@@ -44,12 +44,7 @@ UNWANTED_WARNINGS = (
 
 
 class TrainingCLI(LightningCLI):
-    """LightningCLI that refuses a missing or foreign checkpoint before anything runs, and always writes the weights.
-
-    Args:
-        command: the command that is run; the options of the others are not made.
-        kwargs: arguments of LightningCLI.
-    """
+    """LightningCLI of one command that refuses a missing or foreign checkpoint, and always writes the weights."""
 
     def __init__(self, command: str, **kwargs: Any) -> None:
         self.command = command
@@ -82,7 +77,12 @@ class TrainingCLI(LightningCLI):
                 callbacks.append(default)
         trainer = super().instantiate_trainer(callbacks=callbacks, **kwargs)
         if self.subcommand == "fit":
-            _check_has_steps(trainer)
+            names = "max_steps", "max_epochs", "limit_train_batches"
+            zero = [name for name in names if getattr(trainer, name) == 0]
+            if any(isinstance(callback, Timer) and not callback.time_remaining() for callback in trainer.callbacks):  # type: ignore[attr-defined]
+                zero.append("max_time")
+            if zero:
+                raise ValueError(f"trainer.{zero[0]} is 0: at least one step of training expected")
         return trainer
 
     def _parse_ckpt_path(self) -> None:
@@ -125,16 +125,6 @@ class TrainingCLI(LightningCLI):
     before_validate = before_test = before_predict = before_fit
 
 
-def _check_has_steps(trainer: pl.Trainer) -> None:
-    """Raise ValueError if a trainer is set to no steps: its weights would be untrained."""
-    names = "max_steps", "max_epochs", "limit_train_batches"
-    zero = [name for name in names if getattr(trainer, name) == 0]
-    if any(isinstance(callback, Timer) and not callback.time_remaining() for callback in trainer.callbacks):  # type: ignore[attr-defined]
-        zero.append("max_time")
-    if zero:
-        raise ValueError(f"trainer.{zero[0]} is 0: at least one step of training expected")
-
-
 def _state_dict(path: str) -> dict[str, Tensor]:
     """Return the tensors of a checkpoint, which must not unfold to more than the file's own size."""
     try:
@@ -155,16 +145,8 @@ def is_first_process() -> bool:
     return bool(rank_zero_only.rank == 0)  # type: ignore[attr-defined]
 
 
-def _is_wanted(record: logging.LogRecord) -> bool:
-    """Return whether a message is a warning, or comes from this package instead of Lightning."""
-    return record.levelno > logging.INFO or Path(record.pathname).parent == Path(__file__).parent
-
-
 def _short_message(error: BaseException) -> str:
-    """Return the options that an error of jsonargparse concerns, and the first message of one line in its causes.
-
-    That is the error of the type that was meant; the messages of many lines list those of all types.
-    """
+    """Return the options that an error of jsonargparse concerns, and the first one-line message among its causes."""
     options: dict[str, None] = {}
     while "\n" in str(error).strip() and error.__cause__ is not None:
         if isinstance(error, ArgumentError):
@@ -176,17 +158,15 @@ def _short_message(error: BaseException) -> str:
 def run(args: list[str]) -> dict[str, float]:
     """Run ``learnnorm fit``, ``validate``, ``test`` or ``predict`` and return the metrics that it logged last.
 
-    Raises:
-        ValueError: if the arguments or a configuration are wrong.
-        KeyboardInterrupt: if the run was interrupted.
-        SystemExit: with the code 143, as of a program that the signal SIGTERM ends, if that signal ended the run.
-
+    Wrong arguments are a ValueError, Ctrl-C is a KeyboardInterrupt, SIGTERM a SystemExit with the code 143.
     """
     command, *options = with_config_paths(args)
     for message in UNWANTED_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
     for name in LOGGERS:
-        logging.getLogger(name).addFilter(_is_wanted)
+        logging.getLogger(name).addFilter(
+            lambda log: log.levelno > logging.INFO or Path(log.pathname).parent == Path(__file__).parent
+        )
     if options and not options[0].startswith("-"):
         raise ValueError(f"an option expected, got {options[0]!r}; a configuration is given by --config {options[0]}")
     if not any(option.startswith(("--config", "-c", "--model", "--help")) for option in options):

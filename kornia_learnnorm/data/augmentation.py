@@ -21,22 +21,15 @@ def augment(sets: MatchSets, generator: Generator) -> MatchSets:
     angle for each view in a tenth. Scales: log-uniform 0.6-1.6 for both, 0.8-1.25 for one, and as much for the aspect
     of both. Half of the sets are mirrored, in half the views are swapped. In half of the sets up to 40 % of the matches
     get a wrong partner: another match's, or their own shifted by 5-150 px in any direction.
-
-    Args:
-        sets: the sets.
-        generator: source of all randomness.
-
     """
-    batch_size = len(sets.points1)
-    A1, A2 = _maps(batch_size, generator)
-    centre = sets.points1.mean(1)
-    A1, A2 = A1.to(centre), A2.to(centre)
+    batch_size, centre = len(sets.points1), sets.points1.mean(1)
+    A1, A2 = (A.to(centre) for A in _maps(batch_size, generator))
     points1, heldout1 = (transform_points(p - centre[:, None], A1) for p in (sets.points1, sets.heldout1))
     points2, heldout2 = (transform_points(p - centre[:, None], A2) for p in (sets.points2, sets.heldout2))
     swap = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
     points1, points2 = torch.where(swap, points2, points1), torch.where(swap, points1, points2)
     heldout1, heldout2 = torch.where(swap, heldout2, heldout1), torch.where(swap, heldout1, heldout2)
-    share = (uniform((batch_size, 1), -0.4, 0.4, generator)).clamp(min=0.0)
+    share = uniform((batch_size, 1), -0.4, 0.4, generator).clamp(min=0.0)
     replaced = uniform(tuple(points1.shape[:2]), 0.0, 1.0, generator) < share
     points2 = torch.where(replaced[..., None], _wrong_partners(points2, generator), points2)
     inliers = None if sets.inliers is None else torch.where(replaced, 0.0, sets.inliers)

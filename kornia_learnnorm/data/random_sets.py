@@ -33,18 +33,12 @@ class SetSource(Protocol):
 class StoreSets:
     """Random sets of matches of the image pairs of stores; half of the draws with the ratio test.
 
-    Pairs without ground truth are supervised by their own matches, see :class:`~kornia_learnnorm.BoundedEpipolarLoss`.
-
     Args:
-        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
-            ``$LEARNNORM_DATA`` are filled in.
+        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables are filled in.
         num_heldout: further matches of the pair.
         max_ratios: limits of Lowe's ratio, of which each draw takes one; None for no limit.
-        labels: use the ground truth where there is one; without, all pairs are supervised by their own matches.
-
-    Raises:
-        ValueError: if no path is given, an environment variable is not set, or no pair can be used.
-        FileNotFoundError: if there is no such store.
+        labels: use the ground truth where there is one; without, all pairs are supervised by their own matches, as
+            pairs without ground truth always are, see :class:`~kornia_learnnorm.BoundedEpipolarLoss`.
     """
 
     def __init__(
@@ -75,11 +69,11 @@ class StoreSets:
 
 
 class _Pair(NamedTuple):
-    """The matches of one image pair: points (M, 4), ratios (M,), distances from the true lines (M,), NaN if unknown."""
+    """The matches of one image pair."""
 
-    points: Tensor
-    ratio: Tensor
-    distance: Tensor
+    points: Tensor  # (M, 4), pixels in both views
+    ratio: Tensor  # (M,), Lowe's ratio
+    distance: Tensor  # (M,), pixels from the true epipolar lines, NaN if unknown
 
     def passing(self, max_ratio: float | None) -> Tensor:
         """Return the indices of the matches that pass the ratio test."""
@@ -138,9 +132,7 @@ class SyntheticSets:
         matches: Callable[[int, int, int, Generator], SyntheticMatches] = random_matches,
         labels: bool = True,
     ) -> None:
-        self.num_heldout = num_heldout
-        self.matches = matches
-        self.labels = labels
+        self.num_heldout, self.matches, self.labels = num_heldout, matches, labels
 
     def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
         """Return the matches of new scenes."""
@@ -152,17 +144,14 @@ class SyntheticSets:
         total = num_points + self.num_heldout
         found = self.matches(num_sets, total, 1, generator)
         order = torch.randperm(total, generator=generator)
-        points1, points2, scores = (value[:, order].float() for value in found[:3])
-        own, rest = slice(num_points), slice(num_points, None)
-        inliers = torch.full_like(scores[:, own], torch.nan)
-        points = points1[:, own], points2[:, own], points1[:, rest], points2[:, rest]
-        return MatchSets(*points, pair, scores[:, own], inliers, labelled)
+        parts = [value[:, order].float().tensor_split([num_points], 1) for value in found[:3]]
+        (points1, heldout1), (points2, heldout2), (scores, _) = parts
+        inliers = torch.full_like(scores, torch.nan)
+        return MatchSets(points1, points2, heldout1, heldout2, pair, scores, inliers, labelled)
 
 
 class RandomSets:
-    """Batches of random sets, each of one source and one size, for training on matches with outliers.
-
-    Each block is a batch, so ``data.batch_size`` is null. It depends on the seed and its number alone.
+    """Batches of random sets, each of one source and one size; each block is a batch, so ``data.batch_size`` is null.
 
     Args:
         sources: sources of sets.
@@ -173,9 +162,6 @@ class RandomSets:
         augmented: share of the batches that are augmented.
         scored: share of the batches that have scores.
         batches: batches in an epoch.
-
-    Raises:
-        ValueError: if there is no source, the shares do not fit the sources, or a number is out of range.
     """
 
     def __init__(
@@ -191,13 +177,14 @@ class RandomSets:
     ) -> None:
         if not sources:
             raise ValueError("sources is empty: give at least one source of sets")
-        if shares is not None and (len(shares) != len(sources) or min(shares) < 0 or not sum(shares) > 0):
+        shares = [1.0] * len(sources) if shares is None else list(shares)
+        if len(shares) != len(sources) or min(shares) < 0 or not sum(shares) > 0:
             raise ValueError(f"shares must be one non-negative number for each of {len(sources)} sources, got {shares}")
         if not 8 <= sizes[0] <= sizes[1]:
             raise ValueError(f"sizes must be a range of at least 8 matches, got {sizes}")
         if batches < 1:
             raise ValueError(f"batches must be at least 1, got {batches}")
-        self.sources, self.shares = list(sources), [1.0] * len(sources) if shares is None else list(shares)
+        self.sources, self.shares = list(sources), shares
         self.sizes, self.correspondences, self.max_sets = tuple(sizes), correspondences, max_sets
         self.augmented, self.scored, self.batches = augmented, scored, batches
 

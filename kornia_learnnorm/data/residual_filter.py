@@ -19,13 +19,9 @@ from kornia_learnnorm.normalizers.identity import Identity
 
 __all__ = ["cached_mask", "plain_residual"]
 
-BATCH_SIZE = 8192  # samples solved at once, which bounds the memory
 
-
-def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = BATCH_SIZE) -> Tensor:
+def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = 8192) -> Tensor:
     """Return the mean symmetric epipolar distance of each sample under the un-normalised eight-point algorithm.
-
-    Fan et al. drop samples of 60 px and more (section 4, training procedure).
 
     Args:
         points1: pixels in the first view with shape (S, N, 2).
@@ -33,7 +29,7 @@ def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = BATCH_SIZ
         batch_size: samples solved at once, which bounds the memory.
 
     Returns:
-        pixels with shape (S,), float64.
+        pixels with shape (S,), float64. Fan et al. drop samples of 60 px and more (section 4, training procedure).
 
     """
     identity, residuals = Identity(), []
@@ -44,24 +40,18 @@ def plain_residual(points1: Tensor, points2: Tensor, batch_size: int = BATCH_SIZ
 
 
 def cached_mask(
-    folder: Path | None, about: Sequence[Any], points1: Tensor, points2: Tensor, max_residual: float
+    folder: Path | None, key: Sequence[Any], points1: Tensor, points2: Tensor, max_residual: float
 ) -> Tensor:
-    """Return which samples (S,) have a residual below a limit, from a file of the folder where it was computed before.
+    """Return which samples (S, N, 2) have a residual below a limit in pixels, (S,) bool; with a folder, cached there.
 
-    Args:
-        folder: folder of the cache; None for no cache.
-        about: what the samples depend on, for JSON: the key of the file.
-        points1: pixels in the first view with shape (S, N, 2).
-        points2: pixels in the second view with shape (S, N, 2).
-        max_residual: pixels.
+    The file is named by the hash of ``key``, which holds what the samples depend on, for JSON.
     """
-    if folder is None:
-        return plain_residual(points1, points2) < max_residual
-    path = folder / f"{sha256(json.dumps(about).encode()).hexdigest()[:32]}.npy"
-    if path.is_file():
+    path = folder and folder / f"{sha256(json.dumps(key).encode()).hexdigest()[:32]}.npy"
+    if path and path.is_file():
         return torch.from_numpy(np.load(path))
     kept = plain_residual(points1, points2) < max_residual
-    folder.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as temporary:
-        np.save(temporary, kept.numpy())
+    if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as temporary:
+            np.save(temporary, kept.numpy())
     return kept

@@ -1,4 +1,4 @@
-r"""Sets of correspondences of image pairs: samples of eight, or matches with outliers, and what supervises them."""
+"""Sets of correspondences of image pairs: samples of eight, or matches with outliers, and what supervises them."""
 
 from __future__ import annotations
 
@@ -15,28 +15,16 @@ __all__ = ["MatchSets", "draw_samples"]
 
 
 class MatchSets(NamedTuple):
-    """Sets of N correspondences each, and further correspondences of the same image pairs.
+    """Sets of N correspondences each, and further correspondences of the same image pairs, all in pixels."""
 
-    Attributes:
-        points1: pixels in the first view, (B, N, 2).
-        points2: pixels in the second view, (B, N, 2).
-        heldout1: pixels in the first view of correspondences held out of the set, (B, M, 2); M may be 0. They are true
-            inliers where the ground truth is known.
-        heldout2: pixels in the second view of correspondences held out of the set, (B, M, 2).
-        pair: index of the image pair in its source, (B,) int64.
-        scores: a score for each match, 1 minus Lowe's ratio, (B, N), or None.
-        inliers: one for inliers, zero for outliers, NaN where that is not known, (B, N), or None.
-        labelled: whether the ground truth is known, (B,) bool, or None where it is known of no set.
-    """
-
-    points1: Tensor
-    points2: Tensor
-    heldout1: Tensor
-    heldout2: Tensor
-    pair: Tensor
-    scores: Tensor | None = None
-    inliers: Tensor | None = None
-    labelled: Tensor | None = None
+    points1: Tensor  # (B, N, 2)
+    points2: Tensor  # (B, N, 2)
+    heldout1: Tensor  # (B, M, 2), not in the set; true inliers where the ground truth is known; M may be 0
+    heldout2: Tensor  # (B, M, 2)
+    pair: Tensor  # (B,) int64, index of the image pair in its source
+    scores: Tensor | None = None  # (B, N), 1 minus Lowe's ratio
+    inliers: Tensor | None = None  # (B, N), one for inliers, zero for outliers, NaN where that is not known
+    labelled: Tensor | None = None  # (B,) bool, whether the ground truth is known; None where it is known of no set
 
     def select(self, rows: Tensor) -> MatchSets:
         """Return the sets of the given rows (indices or mask)."""
@@ -58,25 +46,13 @@ def draw_samples(
 ) -> MatchSets:
     """Draw samples: shuffle the correspondences of each pair and split them into sets of ``size``, without the rest.
 
-    Held-out correspondences come from the same pair, are not in the sample and pass the ratio test of 0.8, whatever
-    ``max_ratio`` is.
-
-    Args:
-        store: correspondences of image pairs.
-        generator: source of all randomness; equal states give equal samples.
-        size: correspondences per sample, at least 8.
-        max_ratio: keep correspondences with Lowe's ratio below this; None keeps all.
-        num_heldout: held-out correspondences per sample, drawn with replacement.
-        max_residual: drop samples whose :func:`~kornia_learnnorm.data.residual_filter.plain_residual` is at least this
-            many pixels; None keeps all.
-        require_heldout: refuse a store in which a pair has no correspondence to hold out; if False, the held-out points
-            of such a pair's samples are NaN.
-
-    Returns:
-        samples in the order of the pairs, float32.
+    The samples are float32, in the order of the pairs. ``max_ratio`` and ``max_residual`` (pixels) are exclusive; None
+    keeps all. The ``num_heldout`` correspondences of a sample are drawn with replacement from its pair; they are not in
+    the sample and pass the ratio test of 0.8, whatever ``max_ratio`` is.
 
     Raises:
-        ValueError: if ``size`` is below 8, no pair fills a sample, or a pair has no correspondence to hold out.
+        ValueError: if ``size`` is below 8, no pair fills a sample, or, with ``require_heldout``, a pair has no
+            correspondence to hold out; without, the held-out points of its samples are NaN.
 
     """
     if size < 8:
@@ -96,9 +72,10 @@ def draw_samples(
     sample_pair, passes = pair[rows[:, 0]], ratio < RATIO
     passing = torch.bincount(pair[passes], minlength=len(store))[sample_pair]
     if num_heldout and require_heldout and int(passing.min()) <= size:
-        few = int(passing.min())
-        expected = f"expected more than the {size} of a sample"
-        raise ValueError(f"held-out correspondences: a pair has only {few} with ratio below {RATIO}, {expected}")
+        raise ValueError(
+            f"held-out correspondences: a pair has only {int(passing.min())} with ratio below {RATIO}, expected more"
+            f" than the {size} of a sample"
+        )
     cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
     drawable = passing > size
     rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]

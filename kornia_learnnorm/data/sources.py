@@ -1,4 +1,4 @@
-r"""Sources of samples for training: stores on disk and synthetic scenes.
+"""Sources of samples for training: stores on disk and synthetic scenes.
 
 The samples of an epoch, a draw, are made in blocks; one block is in memory at once. A block depends only on the seed of
 the draw and its own number, so blocks can be drawn in any order, by any process.
@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 SCENES_PER_BLOCK = 8192
-SEEDS_PER_RUN = 1_000_003  # of draws; the epochs of a training take one after the other
+SEEDS_PER_RUN = 1_000_003  # seeds that a run can draw from: one for each epoch
 
 
 class Block(NamedTuple):
@@ -61,25 +61,16 @@ def block_generator(*key: int) -> torch.Generator:
 
 
 class StoreSamples:
-    """Samples from stores on disk; each image pair is used once per ratio test.
-
-    Each draw distributes the pairs to blocks at random.
+    """Samples from stores on disk; a draw uses each image pair once per ratio test, in a random block.
 
     Args:
-        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables such as
-            ``$LEARNNORM_DATA`` are filled in.
+        paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables are filled in.
         max_ratios: limits of Lowe's ratio; 0.8 gives filtered samples, None unfiltered ones, both a mix.
         size: correspondences per sample; with a range ``(low, high)`` each block draws one size, ends included.
         num_heldout: held-out correspondences per sample.
-        max_residual: drop samples whose :func:`~kornia_learnnorm.data.residual_filter.plain_residual` is at least this
-            many pixels; None keeps all.
+        max_residual: drop samples whose ``plain_residual`` is at least this many pixels; None keeps all.
         block_pairs: largest number of image pairs in a block.
         cache: folder for the results of the residual filter, so that a draw is filtered once; None for no cache.
-
-    Raises:
-        ValueError: if no path is given, an environment variable is not set, a number is out of range, or no pair fills
-            a sample.
-        FileNotFoundError: if there is no such store.
     """
 
     def __init__(
@@ -99,12 +90,9 @@ class StoreSamples:
             got = f"size={size}, block_pairs={block_pairs}"
             raise ValueError(f"a sample needs at least 8 correspondences, a block at least one pair, got {got}")
         check_draws(num_heldout, max_ratios)
-        self.paths = tuple(paths)
+        self.paths, self.max_ratios = tuple(paths), tuple(max_ratios)
         self.stores = [StoreReader(expand_path(path)) for path in paths]
-        self.max_ratios = tuple(max_ratios)
-        self.num_heldout = num_heldout
-        self.max_residual = max_residual
-        self.block_pairs = block_pairs
+        self.num_heldout, self.max_residual, self.block_pairs = num_heldout, max_residual, block_pairs
         self.cache = None if cache is None else Path(cache)
         self._first = np.cumsum([0, *map(len, self.stores)])
         self._passing = [np.concatenate([store.passing(ratio) for store in self.stores]) for ratio in self.max_ratios]
@@ -113,7 +101,7 @@ class StoreSamples:
             raise ValueError(f"no pair of {stores} has {self.sizes[1]} correspondences that pass the ratio test")
 
     def blocks(self, seed: int) -> list[Block]:
-        """Return the size of each block of a draw before the residual filter."""
+        """Return the sizes of the blocks before the residual filter."""
         found = []
         for number, pairs in enumerate(self._pairs(seed)):
             size = self._size(block_generator(seed, number))
@@ -123,9 +111,8 @@ class StoreSamples:
 
     def draw(self, seed: int, block: int) -> MatchSets:
         """Return the samples of a block; ``pair`` counts the pairs of all stores in their order."""
-        generator = block_generator(seed, block)
+        generator, pairs = block_generator(seed, block), self._pairs(seed)[block]
         size = self._size(generator)
-        pairs = self._pairs(seed)[block]
         points, heldout = torch.zeros(0, size, 2), torch.zeros(0, self.num_heldout, 2)
         parts = [MatchSets(points, points, heldout, heldout, torch.zeros(0, dtype=torch.int64))]
         for store, first, stop in zip(self.stores, self._first, self._first[1:], strict=False):
@@ -138,21 +125,15 @@ class StoreSamples:
         samples = MatchSets(*(torch.cat([part[field] for part in parts]) for field in range(5)))  # type: ignore[misc]
         if self.max_residual is None:
             return samples
-        about = [*self._about, seed, block]
-        return samples.select(cached_mask(self.cache, about, samples.points1, samples.points2, self.max_residual))
-
-    @property
-    def _about(self) -> list[object]:
-        """What a draw depends on but its seed."""
         files = [(str(s.path.resolve()), s.path.stat().st_mtime_ns, s.offsets[[0, -1]].tolist()) for s in self.stores]
-        return [files, self.max_ratios, self.sizes, self.num_heldout, self.max_residual, self.block_pairs]
+        options = self.max_ratios, self.sizes, self.num_heldout, self.max_residual, self.block_pairs
+        key = [files, *options, seed, block]
+        return samples.select(cached_mask(self.cache, key, samples.points1, samples.points2, self.max_residual))
 
     def _pairs(self, seed: int) -> list[NDArray[np.int64]]:
         """Return the sorted indices of the image pairs of each block."""
-        number = int(self._first[-1])
-        blocks = -(-number // self.block_pairs)
-        order = np.random.default_rng(seed).permutation(number)
-        return [np.sort(part) for part in np.array_split(order, blocks)]
+        order = np.random.default_rng(seed).permutation(int(self._first[-1]))
+        return [np.sort(part) for part in np.array_split(order, -(-len(order) // self.block_pairs))]
 
     def _size(self, generator: torch.Generator) -> int:
         low, high = self.sizes
@@ -166,13 +147,9 @@ class SyntheticSamples:
         number: scenes per draw, before the residual filter.
         size: correspondences per sample.
         num_heldout: held-out correspondences per sample, inliers and outliers.
-        max_residual: drop samples whose :func:`~kornia_learnnorm.data.residual_filter.plain_residual` is at least this
-            many pixels; None keeps all.
+        max_residual: drop samples whose ``plain_residual`` is at least this many pixels; None keeps all.
         scenes: function of the number of scenes, the points per scene and a generator, for example one of
             :mod:`kornia_learnnorm.data.synthetic`.
-
-    Raises:
-        ValueError: if ``number`` is not positive or ``size`` is below 8.
     """
 
     def __init__(
@@ -185,14 +162,11 @@ class SyntheticSamples:
     ) -> None:
         if number < 1 or size < 8:
             raise ValueError(f"number must be positive and size at least 8, got {number} and {size}")
-        self.number = number
-        self.size = size
-        self.num_heldout = num_heldout
-        self.max_residual = max_residual
-        self.scenes = scenes
+        self.number, self.size, self.num_heldout = number, size, num_heldout
+        self.max_residual, self.scenes = max_residual, scenes
 
     def blocks(self, seed: int) -> list[Block]:
-        """Return the size of each block of a draw before the residual filter."""
+        """Return the sizes of the blocks before the residual filter."""
         sizes = [min(SCENES_PER_BLOCK, self.number - first) for first in range(0, self.number, SCENES_PER_BLOCK)]
         return [Block(size, size) for size in sizes]
 
@@ -200,9 +174,8 @@ class SyntheticSamples:
         """Return the samples of a block; each is a pair of its own."""
         number = self.blocks(seed)[block].samples
         scenes = self.scenes(number, self.size + self.num_heldout, block_generator(seed, block))
-        sizes = [self.size, self.num_heldout]
-        points1, heldout1 = torch.split(scenes.points1.float(), sizes, 1)
-        points2, heldout2 = torch.split(scenes.points2.float(), sizes, 1)
+        points1, heldout1 = scenes.points1.float().tensor_split([self.size], 1)
+        points2, heldout2 = scenes.points2.float().tensor_split([self.size], 1)
         pair = block * SCENES_PER_BLOCK + torch.arange(number)
         return MatchSets(points1, points2, heldout1, heldout2, pair).with_residual_below(self.max_residual)
 

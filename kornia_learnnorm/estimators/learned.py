@@ -95,20 +95,8 @@ class LearnedLayer(MatchLayer):
         )
 
     @classmethod
-    def from_pretrained(cls, name: str | Path = "robust-synthetic") -> Self:
-        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
-
-        Args:
-            name: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
-
-        Returns:
-            the estimator, in evaluation mode.
-
-        Raises:
-            FileNotFoundError: if there are no such weights; the message lists those that ship.
-            ValueError: if the file is not an estimator of this package or its tensors do not fit.
-
-        """
+    def from_pretrained(cls, name: str | Path) -> Self:
+        """Load a trained estimator: one that ships with the package, by name, or a safetensors file."""
 
         def build(path: Path, text: str) -> LearnedLayer:
             try:
@@ -235,6 +223,23 @@ class LearnedEightPoint(LearnedLayer):
     ) -> None:
         super().__init__(Fundamental(rank2), width, depth, stages, learn_transforms, refine_steps)
         self.rank2 = rank2
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:
+        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
+
+        Args:
+            name: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
+
+        Returns:
+            the estimator, in evaluation mode.
+
+        Raises:
+            FileNotFoundError: if there are no such weights; the message lists those that ship.
+            ValueError: if the file is not an estimator of this package or its tensors do not fit.
+
+        """
+        return super().from_pretrained(name)  # configurations need the name of the class, not Self
 
     def extra_repr(self) -> str:
         """Return the parameters."""
