@@ -67,10 +67,10 @@ class Spoil(pl.Callback):
 
 
 class BlowUp(pl.Callback):
-    """Make the gradient of the second step infinite, in the last process."""
+    """Make the gradient of the fifth step infinite, in the last process."""
 
     def on_before_backward(self, trainer, pl_module, loss):
-        if trainer.global_rank == trainer.world_size - 1 and trainer.global_step == 1:
+        if trainer.global_rank == trainer.world_size - 1 and trainer.global_step == 4:
             loss.register_hook(lambda gradient: torch.inf * gradient)
 
 
@@ -147,7 +147,7 @@ def run(case, processes, folder):
         callbacks = [Checkpoints(every_n_train_steps=1), Stop(3, kill=case == "killed")]
         with contextlib.suppress(InterruptedError):
             make_trainer(folder, callbacks, **options).fit(*task_and_data(case))
-    watch, more = Watch(), {"spoiled": [Spoil()], "infinite": [BlowUp()]}.get(case, [])
+    watch, more = Watch(), [Spoil(), BlowUp()] if case == "spoiled" else []
     resume = last.exists()
     more += [Checkpoints(every_n_train_steps=1)] if resume else []
     trainer = make_trainer(folder, [watch, *more, WritePredictions()], enable_checkpointing=resume, **options)

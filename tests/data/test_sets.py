@@ -7,16 +7,12 @@ from kornia_learnnorm.data.residual_filter import plain_residual
 from kornia_learnnorm.data.sets import draw_samples
 
 
-def test_every_correspondence_is_used_at_most_once(store, rows_of):
-    samples = draw_samples(store, seeded(), max_ratio=None)
+def test_every_correspondence_is_used_at_most_once_and_passes_the_ratio_test(store, rows_of):
+    samples, filtered = (draw_samples(store, seeded(), max_ratio=ratio) for ratio in (None, 0.8))
     rows, pairs = rows_of(samples.points1, samples.points2)
     assert rows.size == len(np.unique(rows)) == 9 * (101 // 8) * 8
     assert (pairs == samples.pair.numpy()[:, None]).all()
-
-
-def test_ratio_test(store, rows_of):
-    samples = draw_samples(store, seeded(), max_ratio=0.8)
-    assert store.ratio[rows_of(samples.points1, samples.points2)[0]].max() < 0.8
+    assert store.ratio[rows_of(filtered.points1, filtered.points2)[0]].max() < 0.8
 
 
 def test_heldout_are_others_of_the_pair_that_pass_the_ratio_test(store, rows_of):

@@ -39,9 +39,6 @@ def test_synthetic_source():
     assert [*samples.pair, *rest.pair] == list(range(9000))
     assert not torch.equal(samples.points1[:808], rest.points1)
     assert torch.equal(samples.points2, source.draw(0, 0).points2)
-    filtered = SyntheticSamples(number=500).draw(0, 0)
-    assert 0 < len(filtered.pair) < 500
-    assert plain_residual(filtered.points1, filtered.points2).max() < 60
     with pytest.raises(ValueError, match="number must be positive"):
         SyntheticSamples(number=0)
 

@@ -61,13 +61,12 @@ def test_sets_lower_the_loss(make, labels, steps, least, tmp_path):
     task, data = make(), make_sets(labels)
     batch = SyntheticSets(32, labels=labels).draw(64, 32, block_generator(9))
     before = task.compute_loss(batch).item()
-    trainer = make_trainer(tmp_path, [ExportWeights()], max_steps=steps, gradient_clip_val=1.0, limit_val_batches=4)
+    trainer = make_trainer(
+        tmp_path, max_steps=steps, enable_checkpointing=False, gradient_clip_val=1.0, limit_val_batches=4
+    )
     trainer.fit(task, data)
     assert task.compute_loss(batch).item() < before - least
     assert {"val/median_32", "val/median_256"} <= {*trainer.callback_metrics}
-    loaded = type(task.trained).from_pretrained(tmp_path / "weights.safetensors")
-    assert loaded.trained_on == ("synthetic scenes",)
-    torch.testing.assert_close(loaded.state_dict(), task.trained.state_dict(), rtol=0, atol=0)
 
 
 def test_a_loss_leaves_the_estimator_as_it_was():
@@ -128,6 +127,7 @@ def test_export_and_predictions(make, tmp_path):
     trainer.fit(task, data)
     exported = type(task.trained).from_pretrained(tmp_path / "weights.safetensors")
     assert exported.trained_on == ("synthetic scenes",)
+    torch.testing.assert_close(exported.state_dict(), task.trained.state_dict(), rtol=0, atol=0)
     layer = kln.EightPoint(exported) if make is normaliser_task else exported
     trainer.predict(task, data)
     written = load_file(tmp_path / "predictions.safetensors")
@@ -155,7 +155,7 @@ def test_heldout_loss_and_epoch_schedule(tmp_path):
     assert trainer.optimizers[0].param_groups[0]["lr"] == pytest.approx(1e-3 * 0.8**epochs)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3, 20])
+@pytest.mark.parametrize("steps", [1, 2, 3])
 def test_every_number_of_steps_has_a_schedule(tmp_path, steps):
     trainer = make_trainer(tmp_path, max_steps=steps, limit_val_batches=0, enable_checkpointing=False)
     trainer.fit(layer_task(), make_sets(correspondences=32))
