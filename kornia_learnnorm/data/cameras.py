@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.kitti import read_calibration
-from kornia_learnnorm.data.exif import focal_length_35mm
-from kornia_learnnorm.data.images import image_size, open_image
+from kornia_learnnorm.data.images import focal_length_35mm, image_size
 
 __all__ = ["exif_camera", "read_camera"]
 
@@ -26,16 +25,7 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
             ``P0`` counts, the camera of ``image_0``; or ``exif``.
         image: the photograph that ``exif`` is read from, see :func:`exif_camera`.
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the text is none of these, or the numbers are not those of a camera.
-
-    Example:
-        >>> read_camera("700,700,320,240")
-        array([[700.,   0., 320.],
-               [  0., 700., 240.],
-               [  0.,   0.,   1.]])
-
+    FileNotFoundError if there is no such file; ValueError if the numbers are not those of a camera.
     """
     if text == "exif":
         if image is None:
@@ -69,14 +59,13 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
 def exif_camera(path: str | Path) -> NDArray[np.float64]:
     """Return the camera matrix (3, 3), pixels, that the EXIF data of a photograph suggest; wrong for cropped ones.
 
-    The focal length is EXIF's equivalent on 35 mm film, by the images' diagonals; the principal point is the centre.
-    A file without such a focal length is a ValueError.
+    The focal length is EXIF's equivalent on 35 mm film, by the images' diagonals; the principal point is the centre. A
+    file without such a focal length is a ValueError.
     """
     size = image_size(path)
     if size == (0, 0):
         raise ValueError(f"camera exif: {path} is not an image")
-    with open_image(Path(path)) as image:
-        focal = focal_length_35mm(image)
+    focal = focal_length_35mm(Path(path))
     if not 0 < focal < math.inf:
         raise ValueError(f"camera exif: {path} has no focal length on 35 mm film; give --K fx,fy,cx,cy")
     pixels = focal * math.hypot(*size) / FILM_DIAGONAL

@@ -20,10 +20,7 @@ def read_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
     a pair, ``NAME0/NAME1`` with ``-`` for the slashes in names, with ``matches0`` (N,), an index or -1 for each
     keypoint of image 0, and ``matching_scores0`` (N,). The ratio is 1 - score; K, R, t and F are NaN.
 
-    Raises:
-        FileNotFoundError: if a file is missing.
-        ValueError: if a file is not HDF5, holds no pair, or lacks the image or a dataset of a pair.
-
+    FileNotFoundError if a file is missing; ValueError if it is not HDF5, holds no pair, or lacks data of a pair.
     """
 
     def values(group: Any, name: str) -> Any:

@@ -1,7 +1,6 @@
 """Reading image files as grey values or colours of eight bits, reduced to a size.
 
-Pillow decodes; it comes with the ``images`` extra and is imported on use. Pixels follow OpenCV: the centre of the top
-left pixel is (0, 0).
+Pillow, of the extra ``images``, is imported on use. The centre of the top left pixel is (0, 0), as in OpenCV.
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.exif import QUARTER_TURNS, orientation, turn_upright
 from kornia_learnnorm.optional import import_extra
 
 __all__ = ["Size", "image_size", "import_cv2", "open_image", "read_colour", "read_image", "resize_image", "scaling"]
-__all__ += ["check_grey", "reduced_size", "scale_points"]
+__all__ += ["check_grey", "focal_length_35mm", "reduced_size", "scale_points"]
 
 Size = tuple[int, int]  # width and height, pixels
 
@@ -29,6 +27,11 @@ Size = tuple[int, int]  # width and height, pixels
 # of libpng, so that a PNG has the grey values that OpenCV reads.
 LUMA = (9797 / 32768, 19234 / 32768, 3737 / 32768, -0.5)
 REDUCING_GAP = 2.0  # the last step of reducing, which is filtered, is by this factor or more, where there are others
+# EXIF 2.32, sections 4.6.3 to 4.6.5
+ORIENTATION, EXIF_IFD, FOCAL_LENGTH_35MM = 0x0112, 0x8769, 0xA405  # tags
+QUARTER_TURNS = (5, 6, 7, 8)  # orientations that swap width and height
+# Names in PIL.Image.Transpose of the turns that undo the orientations from 2 on.
+TURNS = ("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90")
 
 
 def import_cv2() -> Any:
@@ -60,12 +63,9 @@ def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint
         max_size: largest number of pixels on the longer side; a larger image is reduced, its outer edges in place,
             and a JPEG decoded at a fraction of its size. None keeps the size of the file, as :func:`image_size` has it.
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is no image, is truncated, corrupt, larger than twice ``PIL.Image.MAX_IMAGE_PIXELS`` or of
-            another kind of pixels, as floating-point numbers; or if ``max_size`` is below 1.
-        ImportError: if Pillow is not installed.
-
+    FileNotFoundError if there is no such file; ValueError if it is no image, is truncated, corrupt, larger than twice
+    ``PIL.Image.MAX_IMAGE_PIXELS`` or of another kind of pixels, as floating-point numbers, or if ``max_size`` is below
+    1.
     """
     return _read(Path(path), "L", max_size)
 
@@ -106,7 +106,7 @@ def _decode(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
     with open_image(path) as image:
         image.verify()  # the checksums of a PNG, which decoding skips
     with open_image(path) as image:
-        turn = orientation(image)
+        turn = _orientation(image)
         width, height = size = reduced_size(image.size, max_size)
         # for a grey image a JPEG gives its luma channel, without a way through RGB
         drafted = image.draft(mode, None if size == image.size else (2 * width, 2 * height))
@@ -115,12 +115,27 @@ def _decode(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
             size = reduced_size(image.size, max_size)  # again, since loading turns a TIFF
         box = drafted[1] if drafted else (0, 0, *image.size)  # a JPEG at an eighth has a part of a last pixel
         image = _eight_bits(image)
-    image = turn_upright(image if size == image.size else _reduce(image, size, box), turn)
+    image = image if size == image.size else _reduce(image, size, box)
+    if 2 <= turn <= 8:
+        image = image.transpose(import_pillow().Transpose[TURNS[turn - 2]])
     if image.mode == "RGBA":  # over black
         image = import_pillow().fromarray(np.asarray(image.convert("RGBa"))[..., :3])
     if (image.mode, mode) == ("RGB", "L"):
         image = image.convert("L", LUMA)
     return np.array(image.convert(mode))
+
+
+def _orientation(image: Any) -> int:
+    """Return the EXIF orientation of an image that Pillow opened, 1 if it has none; Pillow itself turns a TIFF."""
+    if "exif" not in image.info:  # getexif() would decode a whole PNG
+        return 1
+    return int(image.getexif().get(ORIENTATION) or 1)
+
+
+def focal_length_35mm(path: Path) -> float:
+    """Return a photograph's equivalent focal length on film of 36 x 24 mm, millimetres, by EXIF; 0 for unknown."""
+    with open_image(path) as image:
+        return float(image.getexif().get_ifd(EXIF_IFD).get(FOCAL_LENGTH_35MM, 0))
 
 
 def _eight_bits(image: Any) -> Any:
@@ -159,19 +174,13 @@ def image_size(path: str | Path) -> Size:
     try:
         with open_image(path) as image:
             width, height = image.size
-            return (height, width) if orientation(image) in QUARTER_TURNS else (width, height)
+            return (height, width) if _orientation(image) in QUARTER_TURNS else (width, height)
     except Exception:  # a broken header can end in nearly any error of Pillow's parsers
         return 0, 0
 
 
 def reduced_size(size: Size, max_size: int | None) -> Size:
-    """Return (width, height) with at most ``max_size`` pixels on the longer side, each side rounded.
-
-    Example:
-        >>> reduced_size((1000, 601), 500), reduced_size((1000, 601), 1000), reduced_size((1000, 601), None)
-        ((500, 300), (1000, 601), (1000, 601))
-
-    """
+    """Return (width, height) with at most ``max_size`` pixels on the longer side, each side rounded."""
     if max_size is not None and max_size < 1:
         raise ValueError(f"max_size must be a number of pixels, 1 or more, or None for all, got {max_size}")
     longest = max(size)
@@ -202,13 +211,6 @@ def scaling(size_from: Size, size_to: Size) -> Tensor:
 
 
 def scale_points(points: NDArray[Any], size_from: Size, size_to: Size) -> NDArray[np.float64]:
-    """Return pixels :math:`(*, 2)` of an image of one (width, height) in it at another, by :func:`scaling`.
-
-    Example:
-        >>> scale_points(np.array([[0.0, 0.0], [99.0, 99.0]]), (100, 100), (400, 200))
-        array([[  1.5,   0.5],
-               [397.5, 198.5]])
-
-    """
+    """Return pixels :math:`(*, 2)` of an image of one (width, height) in it at another, by :func:`scaling`."""
     factors = scaling(size_from, size_to).diagonal()[:2].numpy()
     return np.asarray((np.asarray(points, np.float64) + 0.5) * factors - 0.5)

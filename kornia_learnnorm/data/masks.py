@@ -33,22 +33,11 @@ def read_mask(path: str | Path, size: Size, max_size: int | None = None) -> NDAr
 
 
 def content_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-    """Return which pixels lie inside of a black frame, as of a letterbox; None if there is no frame.
+    """Return which pixels are inside of a black frame, (H, W) bool; None if there is no frame.
 
     The frame is made of the outermost rows and columns with grey values of at most 2, of which 95 % or more are equal.
     The rows and columns of a dark photograph have noise and are kept. An image that is black all over has no frame.
-
-    ``image`` has grey values, uint8 (H, W), as the mask, bool: true in a rectangle, false in the frame around it. Other
-    arrays are a TypeError or a ValueError.
-
-    Example:
-        >>> image = np.pad(np.full((2, 3), 90, np.uint8), ((1, 1), (0, 1)))
-        >>> content_mask(image).astype(int)
-        array([[0, 0, 0, 0],
-               [1, 1, 1, 0],
-               [1, 1, 1, 0],
-               [0, 0, 0, 0]])
-
+    Other arrays than grey values in uint8 are a TypeError or a ValueError.
     """
     check_grey(image)
     inside = [np.flatnonzero(~_black_rows(lines)) for lines in (image, image.T)]

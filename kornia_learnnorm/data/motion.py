@@ -9,16 +9,10 @@ __all__ = ["fundamental_from_motion"]
 
 
 def fundamental_from_motion(K1: Tensor, K2: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    r"""Return the fundamental matrix of a motion :math:`X_2 = R X_1 + t`.
-
-    .. math:: F = K_2^{-\top} [t]_\times R K_1^{-1}, \quad \lVert F \rVert = 1, \quad x_2^\top F x_1 = 0
+    r"""Return :math:`F = K_2^{-\top} [t]_\times R K_1^{-1}` with unit norm, for a motion :math:`X_2 = R X_1 + t`.
 
     The cameras, pixels, and the rotations have shape :math:`(*, 3, 3)`, the translations :math:`(*, 3)`. The result is
-    NaN where :math:`t = 0`, a camera matrix is singular or an argument is NaN.
-
-    Reference:
-        R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2nd edition, equations 9.2 and 9.12.
-
+    NaN where :math:`t = 0`, a camera matrix is singular or an argument is NaN (Hartley and Zisserman, equation 9.12).
     """
     F_mat: Tensor = fundamental_from_essential(cross_product_matrix(t) @ R, K1, K2)
     scale: Tensor = F_mat.norm(dim=(-2, -1), keepdim=True)

@@ -96,36 +96,21 @@ def _check_range(first: int, stop: int, number: int, path: str = "") -> None:
 
 
 def read_store(path: str | Path) -> CorrespondenceStore:
-    """Return a store of correspondences, or some of its pairs, after checking the file.
+    """Return a store of correspondences, after checking the file; ``file.h5@3:10`` for its pairs 3 to 9.
 
-    Args:
-        path: an HDF5 file in the format that this module describes; ``file.h5@3:10`` for its pairs 3 to 9.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is not a store of this version or is truncated, if its arrays do not fit together or
-            are not finite, or if it lacks the pairs.
-
+    FileNotFoundError if there is no such file; ValueError if it is not a store of this version or is truncated, its
+    arrays do not fit together or are not finite, or it lacks the pairs.
     """
     reader = StoreReader(path)
     return reader.read(range(len(reader)))
 
 
 class StoreReader:
-    """A store on disk that is read a few pairs at a time.
+    """A store on disk that is read a few pairs at a time, with the paths and the errors of :func:`read_store`.
 
-    The file is open only during a call, so that a reader can be pickled and sent to other processes.
-
-    Args:
-        path: as for :func:`read_store`; with a range of pairs, index 0 is its first pair.
-
-    Attributes:
-        path: the file.
-        offsets: pair ``i`` owns ``offsets[i + 1] - offsets[i]`` correspondences, (P + 1,) int64.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: as for :func:`read_store`; whether points and ratios are finite is checked by :meth:`read`.
+    The file is open only during a call, so that a reader can be pickled and sent to other processes. ``offsets``, (P +
+    1,) int64, are those of the pairs of ``path``: pair ``i`` has ``offsets[i + 1] - offsets[i]`` correspondences.
+    Whether points and ratios are finite is checked by :meth:`read`.
     """
 
     def __init__(self, path: str | Path) -> None:

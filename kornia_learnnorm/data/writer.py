@@ -29,10 +29,7 @@ PAIRS_PER_CHUNK = 16  # pairs in a chunk of HDF5; few, since each part of an unf
 
 
 def write_store(path: str | Path, store: CorrespondenceStore) -> None:
-    """Write a store to an HDF5 file, completely or not at all; an existing file is replaced.
-
-    The error is an OSError if the folder does not exist or cannot be written, or the disk is full.
-    """
+    """Write a store to an HDF5 file, completely or not at all, and replace an existing one; OSError if that fails."""
     join_stores(path, [store], store.provenance)
 
 
@@ -89,10 +86,10 @@ def check_target(path: str | Path) -> None:
 class StoreWriter:
     """Write the pairs of a store one by one, in any order.
 
-    Each pair becomes a store of its own, a part, in the folder ``<path>.parts``. A later run finds the parts of a run
-    that was killed; parts, or a complete store, of other options or of another program are a ValueError.
-    :meth:`finish` joins the parts in the order of their places and removes the folder. The options are all that the
-    store depends on, values of JSON's types. ``skipped`` has the pairs that are not in a complete store, and why.
+    Each pair becomes a store of its own, a part, in the folder ``<path>.parts``, which a later run finds if this one is
+    killed; :meth:`finish` joins the parts by their places. The ``options`` are all that the store depends on, values of
+    JSON's types; parts, or a complete store, of other options or of another program are a ValueError. ``skipped`` has
+    the pairs that are not in a complete store, and why.
     """
 
     def __init__(self, path: str | Path, options: dict[str, Any]) -> None:
@@ -135,10 +132,7 @@ class StoreWriter:
         write_store(self.folder / f"{place:08d}.h5", pair)
 
     def finish(self, provenance: dict[str, Any]) -> None:
-        """Write the store and remove the parts, which stay if it cannot be written.
-
-        ``provenance`` gives versions and skipped pairs, values of JSON's types; the options are added.
-        """
+        """Write the store, with versions and skipped pairs as its provenance, and only then remove the parts."""
         join_stores(self.path, map(read_store, self._parts()), {**provenance, "options": self.options})
         shutil.rmtree(self.folder)
 

@@ -15,23 +15,14 @@ __all__ = ["read_cambridge"]
 
 
 def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
-    """Return the frames of a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015).
+    """Return the frames of a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015), each folder a sequence.
 
-    Focal lengths are those of the scene's reconstruction by VisualSFM, ``reconstruction.nvm``; the principal point is
-    the centre of the image. The reconstruction's radial distortion is not applied.
-
-    Args:
-        root: the scene's folder, with ``dataset_train.txt`` and ``dataset_test.txt``: camera centres, approximately in
-            metres, and quaternions from world to camera.
-        split: ``train`` or ``test``; None for both.
-
-    Returns:
-        the frames by name, each folder a sequence; cameras are NaN where image or reconstruction do not give them.
-
-    Raises:
-        FileNotFoundError: if a list is missing, or an image that it lists.
-        ValueError: if the split is unknown, a line is malformed, or a list is empty or has an image twice.
-
+    ``root`` has ``dataset_train.txt`` and ``dataset_test.txt``, camera centres, approximately in metres, and
+    quaternions from world to camera; ``split`` is ``train``, ``test`` or None for both. Focal lengths are those of
+    ``reconstruction.nvm`` (VisualSFM), whose radial distortion is not applied; the principal point is the centre of the
+    image. Cameras are NaN where image or reconstruction do not give them. FileNotFoundError if a list or one of its
+    images is missing; ValueError if the split is unknown, a line is malformed, or a list is empty or has an image
+    twice.
     """
     root = Path(root)
     if split not in (None, "train", "test"):

@@ -1,7 +1,4 @@
-r"""COLMAP models: their frames, and the pairs of frames that see the same points.
-
-pycolmap reads the model. It comes with the ``colmap`` extra and is imported only when a function here is called.
-"""
+"""COLMAP models: their frames, and the pairs of frames that see the same points. pycolmap is imported on use."""
 
 from __future__ import annotations
 
@@ -26,25 +23,15 @@ FIRST_DISTORTION = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADI
 
 
 def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
-    """Return the frames of a COLMAP model (https://colmap.github.io/format.html).
+    """Return the frames of a COLMAP model (https://colmap.github.io/format.html) by name, each folder a sequence.
 
-    Each folder of images is a sequence. The centre of the top left pixel is (0.5, 0.5) in COLMAP and (0, 0) in a frame.
-    COLMAP ignores the EXIF orientation of an image, so an image that EXIF turns by a quarter does not have its camera's
-    size and is refused.
+    ``model`` is the folder with cameras, images and points3D, as ``.bin`` or ``.txt``, of any unit of length; the
+    images' names start from the folder ``images``. The centre of the top left pixel is (0.5, 0.5) in COLMAP and (0, 0)
+    in a frame. COLMAP ignores EXIF orientations, so an image that EXIF turns by a quarter does not have its camera's
+    size and is refused. Poses are NaN where the model has none.
 
-    Args:
-        model: folder with cameras, images and points3D, as ``.bin`` or ``.txt``; its unit of length is arbitrary.
-        images: the folder that the images' names start from.
-
-    Returns:
-        the frames by folder and name; poses are NaN where the model has none.
-
-    Raises:
-        FileNotFoundError: if a file of the model is missing, or an image.
-        ValueError: if the model is malformed or empty, a camera has distortion other than k1, k2, p1, p2, or an image
-            does not have its camera's size.
-        ImportError: if pycolmap or Pillow is not installed.
-
+    FileNotFoundError if a file of the model or an image is missing; ValueError if the model is malformed or empty, a
+    camera has distortion other than k1, k2, p1, p2, or an image does not have its camera's size.
     """
     images, reconstruction = Path(images), _reconstruction(Path(model))
     found = sorted(reconstruction.images.values(), key=lambda image: (image.name.rpartition("/")[0], image.name))

@@ -21,20 +21,12 @@ Array = NDArray[np.float64]
 def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera: str = "image_0") -> list[Frame]:
     """Return the frames of the KITTI odometry benchmark (A. Geiger et al., CVPR 2012; conventions of its devkit).
 
-    Args:
-        root: folder with ``sequences/SS/calib.txt``, ``sequences/SS/image_N/*.png`` and ``poses/SS.txt``, metres.
-        sequences: names ``SS`` in the order to read; None for all.
-        camera: ``image_0`` and ``image_1`` are grey, ``image_2`` and ``image_3`` colour, left and right.
+    ``root`` has ``sequences/SS/calib.txt``, ``sequences/SS/image_N/*.png`` and ``poses/SS.txt``, metres. ``sequences``
+    are names ``SS`` in the order to read, None for all; of the cameras ``image_0`` and ``image_1`` are grey,
+    ``image_2`` and ``image_3`` colour, left and right. Poses are NaN for a sequence without a file of poses (11 to 21).
 
-    Returns:
-        the frames, sequence after sequence; poses are NaN for a sequence without a file of poses (11 to 21).
-
-    Raises:
-        FileNotFoundError: if a folder, an image of a sequence or a ``calib.txt`` is missing.
-        ValueError: if a sequence or camera is unknown, a line is malformed, a frame lacks its pose, or the name of an
-            image is not a number.
-        TypeError: if ``sequences`` is a string.
-
+    FileNotFoundError if a folder, an image or a ``calib.txt`` is missing; ValueError if a sequence or camera is
+    unknown, a line is malformed, a frame lacks its pose, or the name of an image is not a number.
     """
     root = Path(root)
     if camera not in {f"image_{number}" for number in range(4)}:

@@ -28,24 +28,19 @@ KINECTS: dict[str, tuple[tuple[float, float, float, float], tuple[float, ...]]] 
 
 
 def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_difference: float = 0.02) -> list[Frame]:
-    """Return the frames of the TUM RGB-D benchmark (J. Sturm et al., IROS 2012; conventions of its file formats page).
+    """Return the frames of the TUM RGB-D benchmark (J. Sturm et al., IROS 2012), by sequence and time.
 
-    Args:
-        root: a sequence's folder, with ``rgb.txt`` and ``groundtruth.txt``, metres, or a folder of sequences.
-        sequences: names of folders in the order to read; None for all.
-        max_difference: largest difference in time between a frame and its pose, seconds. A frame gets the nearest
-            pose, the earlier one of a tie.
+    ``root`` is a sequence's folder, with ``rgb.txt`` and ``groundtruth.txt``, metres, or a folder of sequences, of
+    which
+    ``sequences`` are names in the order to read, None for all. A frame gets the nearest pose, the earlier one of a tie,
+    or
+    NaN if there is none within ``max_difference`` seconds. Cameras are NaN unless the folder's name has ``freiburg1``
+    to
+    ``freiburg3`` or ``fr1`` to ``fr3`` in it.
 
-    Returns:
-        the frames, sequence after sequence, by time. Cameras are NaN unless the folder's name has ``freiburg1`` to
-        ``freiburg3`` or ``fr1`` to ``fr3`` in it; poses are NaN without ``groundtruth.txt`` or beyond
-        ``max_difference``.
-
-    Raises:
-        FileNotFoundError: if there is no sequence, or an image that ``rgb.txt`` lists is missing.
-        ValueError: if a sequence is unknown, a line malformed, a file is empty or ``max_difference`` is negative.
-        TypeError: if ``sequences`` is a string.
-
+    FileNotFoundError if there is no sequence, or an image that ``rgb.txt`` lists is missing; ValueError if a sequence
+    is
+    unknown, a line malformed, a file is empty or ``max_difference`` is negative.
     """
     root = Path(root)
     if not max_difference >= 0:

@@ -1,7 +1,6 @@
-"""Local features of an image: keypoints and descriptors.
+"""Local features of an image: OpenCV's SIFT (extra ``images``) and Kornia's learned detectors.
 
-SIFT is OpenCV's (extra ``images``). The learned detectors are Kornia's; they load their weights through
-:mod:`torch.hub`, from its cache or from the internet.
+The latter load their weights through :mod:`torch.hub`, from its cache or from the internet.
 """
 
 from __future__ import annotations
@@ -25,38 +24,18 @@ MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is
 
 
 class Features(NamedTuple):
-    """Features of one image.
+    """Features of one image."""
 
-    Attributes:
-        points: pixels ``(x, y)`` with shape :math:`(N, 2)`, float32.
-        descriptors: one row a feature, :math:`(N, D)`; rows are compared by their Euclidean distance.
-        size: (width, height) of the image, pixels.
-
-    """
-
-    points: NDArray[np.float32]
-    descriptors: NDArray[Any]
-    size: tuple[int, int]
+    points: NDArray[np.float32]  # pixels (x, y), (N, 2)
+    descriptors: NDArray[Any]  # one row a feature, (N, D), compared by their Euclidean distance
+    size: tuple[int, int]  # (width, height) of the image, pixels
 
 
 def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Return the strongest SIFT features; several at a pixel where a keypoint has several orientations.
+    """Return the strongest SIFT features, with those that tie with the weakest; descriptors uint8, 128 columns.
 
-    Args:
-        image: grey values with shape :math:`(H, W)`, uint8.
-        num_features: largest number of features to keep; ties with the weakest of them are kept too.
-
-    Returns:
-        the features; descriptors uint8 with 128 columns.
-
-    Raises:
-        TypeError: if the image is not an array of uint8.
-        ValueError: if the image does not have two dimensions, or ``num_features`` is below 2.
-        ImportError: if OpenCV is not installed.
-
-    References:
-        D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004.
-
+    ``image`` has grey values :math:`(H, W)`, uint8; TypeError or ValueError for others, or if ``num_features`` is below
+    2. A pixel has several features where its keypoint has several orientations (D. Lowe, IJCV 2004).
     """
     _check(image, num_features)
     keypoints, descriptors = import_cv2().SIFT_create(num_features).detectAndCompute(image, None)
@@ -67,25 +46,16 @@ def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
 
 
 def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Return the features of :func:`detect_sift` with square roots of descriptors of unit sum (RootSIFT), float32.
-
-    References:
-        R. Arandjelovic and A. Zisserman, Three things everyone should know to improve object retrieval, CVPR 2012.
-
-    """
+    """Return :func:`detect_sift` with RootSIFT descriptors, float32 (R. Arandjelovic and A. Zisserman, CVPR 2012)."""
     features = detect_sift(image, num_features)
     rows = features.descriptors.astype(np.float32)
     return features._replace(descriptors=np.sqrt(rows / np.maximum(rows.sum(1, keepdims=True), 1.0)))
 
 
 def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Return the features of Kornia's DISK, trained with depth; descriptors float32 with 128 columns.
+    """Return the features of Kornia's DISK (M. Tyszkiewicz et al., NeurIPS 2020), 128 columns of float32.
 
     Arguments and errors are those of :func:`detect_sift`, and OSError if the weights cannot be loaded.
-
-    References:
-        M. Tyszkiewicz, P. Fua and E. Trulls, DISK: learning local features with policy gradient, NeurIPS 2020.
-
     """
     _check(image, num_features)
     with torch.inference_mode():
@@ -97,10 +67,8 @@ def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
 def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
     """Return the features of Kornia's KeyNet, AffNet and HardNet; otherwise as :func:`detect_disk`.
 
-    References:
-        A. Barroso-Laguna et al., Key.Net, ICCV 2019; D. Mishkin et al., AffNet, ECCV 2018; A. Mishchuk et al.,
-        HardNet, NeurIPS 2017.
-
+    A. Barroso-Laguna et al., Key.Net, ICCV 2019; D. Mishkin et al., AffNet, ECCV 2018; A. Mishchuk et al., HardNet,
+    NIPS 2017.
     """
     _check(image, num_features)
     with torch.inference_mode():
@@ -114,8 +82,8 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
 def keep_features(features: Features, mask: NDArray[np.bool_]) -> Features:
     """Return the features whose pixels count and are more than 8 rows or columns away from those that do not.
 
-    ``mask`` is true for the pixels that count, (H, W) bool, see :mod:`kornia_learnnorm.data.masks`; a TypeError or
-    ValueError for other arrays. The border of the image itself drops nothing.
+    ``mask`` is true for the pixels that count, (H, W) bool; TypeError or ValueError for other arrays. The border of the
+    image itself drops nothing.
     """
     if not isinstance(mask, np.ndarray) or mask.dtype != bool:
         raise TypeError(f"a mask must be an array of bool, got {getattr(mask, 'dtype', type(mask))}")

@@ -1,7 +1,6 @@
 """Matching all pairs of frames into a store, on all cores or on many machines.
 
-The features of a frame are computed once and stay on disk until the frame's last pair is matched, so memory does not
-grow with the number of pairs.
+The features of a frame stay on disk until its last pair is matched, so memory does not grow with the number of pairs.
 """
 
 from __future__ import annotations
@@ -103,21 +102,13 @@ def collect_matches(
 ) -> dict[str, str]:
     """Match all pairs into a store, with a progress bar; a run that was stopped continues where it was.
 
-    Args:
-        pairs: pairs of frames, in the order of the store.
-        path: the store to write. Until it is complete, its pairs are in ``<path>.parts``.
-        options: options of matching; None for the default ones.
-        about: ``dataset`` and ``pairs`` of the store.
-        jobs: processes on this machine; -1 for as many as it has cores.
-        dask: address of a Dask scheduler whose workers match instead; they need the images under the same paths.
+    Until the store is complete, its pairs are in ``<path>.parts``. ``about`` gives its ``dataset`` and ``pairs``,
+    ``jobs`` is a number of processes on this machine, -1 for one a core, and ``dask`` the address of a scheduler whose
+    workers match instead; they need the images under the same paths.
 
-    Returns:
-        the pairs that could not be matched, ``"name1 name2"``, and why; the store lists them.
-
-    Raises:
-        ValueError: if there are no pairs, none of them could be matched, or ``path`` holds another store.
-        OSError: if a file cannot be written, another process writes it, or workers crash repeatedly.
-
+    Returns the pairs that could not be matched, ``"name1 name2"``, and why; the store lists them. ValueError if there
+    are no pairs, none could be matched, or ``path`` holds another store; OSError if a file cannot be written, another
+    process writes it, or workers crash repeatedly.
     """
     options, about = options or MatchOptions(), about or {}
     if not pairs:

@@ -20,27 +20,20 @@ __all__ = ["MATCHERS", "Matches", "match_both_ways", "match_images", "match_ligh
 
 
 class Matches(NamedTuple):
-    """Correspondences of two images, one row per match.
+    """Correspondences of two images, one row per match."""
 
-    Attributes:
-        points1: pixels ``(x, y)`` in image 1 with shape :math:`(N, 2)`, float32.
-        points2: pixels of their matches in image 2 with shape :math:`(N, 2)`, float32.
-        ratio: distance of the nearest over that of the second-nearest descriptor with shape :math:`(N,)`, float32, in
-            :math:`[0, 1]`; a small ratio is a distinctive match (D. Lowe, Distinctive image features from
-            scale-invariant keypoints, IJCV 2004, section 7.1).
-
-    """
-
-    points1: Tensor
-    points2: Tensor
+    points1: Tensor  # pixels (x, y) in image 1, (N, 2), float32
+    points2: Tensor  # pixels of their matches in image 2, (N, 2), float32
+    # Distance of the nearest over that of the second-nearest descriptor, in [0, 1], (N,), float32. A small ratio is a
+    # distinctive match (D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004, section 7.1).
     ratio: Tensor
 
 
 def match_nearest(features1: Features, features2: Features) -> Matches:
     """Match each feature of image 1 to its nearest neighbour in image 2, by brute force.
 
-    All matches are returned: keep ``ratio < 0.8`` for Lowe's ratio test. Several features of image 1 may share one
-    feature of image 2. An image of fewer than two features, as a blank one, is a ValueError.
+    All matches are returned: keep ``ratio < 0.8`` for Lowe's ratio test. Several may share a feature of image 2. An
+    image of fewer than two features, as a blank one, is a ValueError.
     """
     _check(features1, features2)
     index2, ratio = _nearest(features1, features2)
@@ -60,7 +53,7 @@ def match_both_ways(features1: Features, features2: Features) -> tuple[Matches, 
 
 
 def _nearest(features1: Features, features2: Features) -> tuple[NDArray[np.int64], Tensor]:
-    """Return the nearest neighbour in image 2 of each feature of image 1, (N,), and the ratios of distances, (N,)."""
+    """Return the nearest neighbours of features of image 1 in image 2, (N,), and the ratios of distances, (N,)."""
     descriptors1, descriptors2 = (features.descriptors.astype(np.float32) for features in (features1, features2))
     pairs = import_cv2().BFMatcher().knnMatch(descriptors1, descriptors2, k=2)
     index2 = np.array([nearest.trainIdx for nearest, _ in pairs])
@@ -70,15 +63,10 @@ def _nearest(features1: Features, features2: Features) -> tuple[NDArray[np.int64
 
 
 def match_lightglue(features1: Features, features2: Features) -> Matches:
-    """Match DISK features with Kornia's LightGlue; ``ratio`` is 1 - score, so the limit of 0.8 keeps scores above 0.2.
+    """Match DISK features with Kornia's LightGlue (P. Lindenberger et al., ICCV 2023); ``ratio`` is 1 - score.
 
-    Raises:
-        ValueError: if an image has fewer than two features, or the descriptors are not of 128 columns of float32.
-        OSError: if the weights cannot be loaded.
-
-    References:
-        P. Lindenberger, P.-E. Sarlin and M. Pollefeys, LightGlue: local feature matching at light speed, ICCV 2023.
-
+    So the limit of 0.8 keeps scores above 0.2. An image of fewer than two features, or descriptors other than 128
+    columns of float32, are a ValueError; weights that cannot be loaded an OSError.
     """
     _check(features1, features2)
     for features in (features1, features2):
@@ -107,22 +95,11 @@ def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_featu
 
 
 def one_to_one(points1: Tensor, points2: Tensor, ratio: Tensor) -> Tensor:
-    """Return the indices, int64, of matches that share no point, sorted by ratio.
+    """Return the indices, int64, of matches (N, 2), (N, 2), (N,) that share no point, sorted by ratio.
 
-    A match is dropped if it shares a pixel, in image 1 or in image 2, with a kept match of a smaller ratio.
-    Coordinates decide between equal ratios, so the order of the matches has no effect on which are kept, and a limit on
-    the ratio can be applied before or after.
-
-    Args:
-        points1: pixels in image 1 with shape :math:`(N, 2)`.
-        points2: pixels in image 2 with shape :math:`(N, 2)`.
-        ratio: nearest over second-nearest descriptor distance, or another cost, with shape :math:`(N,)`.
-
-    Example:
-        >>> points = torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
-        >>> one_to_one(points, points[[0, 0, 2]], torch.tensor([0.7, 0.5, 0.6]))
-        tensor([1, 2])
-
+    A match is dropped if it shares a pixel, in image 1 or in image 2, with a kept match of a smaller ratio (or another
+    cost). Coordinates decide between equal ratios, so the order of the matches has no effect on which are kept, and a
+    limit on the ratio can be applied before or after.
     """
     KORNIA_CHECK_SHAPE(points1, ["N", "2"])
     KORNIA_CHECK_SHAPE(points2, [str(len(points1)), "2"])

@@ -33,8 +33,7 @@ class Workers:
     def results(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Iterator[Any]]:
         """Yield an iterator over the results in order; leaving the context cancels the remaining calls.
 
-        The function is one of a module, so that a process can import it. Its arguments are consumed as processes
-        become free.
+        A process imports the function from its module. The arguments are consumed as processes become free.
         """
         from joblib import Parallel, delayed
 
@@ -52,9 +51,9 @@ class Workers:
 def restart_crashed(
     run: Callable[[], Generator[Result, None, None]], log: Callable[[str], Any]
 ) -> Generator[Result, None, None]:
-    """Yield the results of ``run()``, which is called again, for the results that are left, after a worker crashed.
+    """Yield the results of ``run()``, called again for the rest after a worker crashed.
 
-    The error is an OSError if workers crash again and again without a result between.
+    OSError if workers crash again and again without a result between.
     """
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
@@ -83,7 +82,7 @@ def check_jobs(jobs: int) -> None:
 def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
     """Yield worker processes on this machine, -1 for as many as it has cores, or those of a Dask scheduler's address.
 
-    The error is an OSError if the cluster cannot be reached, or Dask gives up a task that killed several workers.
+    OSError if the cluster cannot be reached, or Dask gives up a task that killed several workers.
     """
     joblib = import_extra("joblib", "images", "matching many pairs")
     check_jobs(jobs)

@@ -10,15 +10,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.data.synthetic.draws import (
-    log_uniform,
-    normal,
-    random_cameras,
-    spread_points,
-    student_t,
-    uniform,
-    viewing_rays,
-)
+from kornia_learnnorm.data.synthetic import draws
 from kornia_learnnorm.data.synthetic.scenes import (
     TwoViewScene,
     forward_driving,
@@ -47,26 +39,17 @@ class SyntheticMatches(NamedTuple):
 
 
 def random_matches(batch_size: int, num_points: int, num_exact: int, generator: Generator) -> SyntheticMatches:
-    r"""Draw matches of varied scenes.
+    """Draw matches of varied scenes.
 
     All scenes of a call are of one kind: random (:func:`~kornia_learnnorm.data.synthetic.scenes.random_scenes`),
     driving, hand-held, orbit or :func:`wide_baseline`. The noise is Gaussian or, in half of the scenes, Student-t with
     three degrees of freedom; its scale is log-uniform in 0.05-1 px and varies between the points of a scene by a
     log-normal factor. A quarter of the scenes has some radial distortion. Half of the scenes have up to 20 % outliers,
     the others 20 to 90 %: two fifths anywhere in the other image, the rest at the partner of another point, often of
-    one of a few, or shifted by 4-150 px. In a quarter of the scenes, with 10 to 50 % outliers, the shifts are one,
-    as of an object that moves. Outliers are neighbours in a third of the scenes.
+    one of a few, or shifted by 4-150 px. In a quarter of the scenes, with 10 to 50 % outliers, the shifts are one, as
+    of an object that moves. Outliers are neighbours in a third of the scenes.
 
-    Args:
-        batch_size: number of scenes :math:`B`.
-        num_points: matches per scene :math:`N`.
-        num_exact: further correspondences without noise :math:`M`.
-        generator: source of all randomness.
-
-    Example:
-        >>> random_matches(4, 24, 8, torch.Generator().manual_seed(0)).points1.shape
-        torch.Size([4, 24, 2])
-
+    A scene has ``num_points`` matches and ``num_exact`` further correspondences without noise.
     """
     kind = int(torch.randint(KINDS, (), generator=generator, device=generator.device))
     total = num_points + num_exact
@@ -81,15 +64,18 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     points2, exact2 = torch.split(scene.points2, [num_points, num_exact], 1)
     shown = scene.inliers[:, :num_points]
 
-    scale = log_uniform((batch_size, 1, 1), 0.05, 1.0, generator)
-    heavy = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
-    uneven = (0.6 * normal((batch_size, num_points, 1), generator)).exp()  # features of different sizes
+    scale = draws.log_uniform((batch_size, 1, 1), 0.05, 1.0, generator)
+    heavy = draws.uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
+    uneven = (0.6 * draws.normal((batch_size, num_points, 1), generator)).exp()  # features of different sizes
     points1, points2 = (
-        p + scale * uneven * torch.where(heavy, 0.6 * student_t(p.shape, generator), normal(tuple(p.shape), generator))
+        p
+        + scale
+        * uneven
+        * torch.where(heavy, 0.6 * draws.student_t(p.shape, generator), draws.normal(tuple(p.shape), generator))
         for p in (points1, points2)
     )
-    clean, common = (uniform((batch_size, 1), 0.0, 1.0, generator) < share for share in (0.5, 0.25))
-    share = uniform((batch_size, 1), 0.0, 1.0, generator)
+    clean, common = (draws.uniform((batch_size, 1), 0.0, 1.0, generator) < share for share in (0.5, 0.25))
+    share = draws.uniform((batch_size, 1), 0.0, 1.0, generator)
     share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, 0.2 + 0.7 * share))
     outliers = _choose_outliers(points1, share, generator)
     wrong = _wrong_partners(points2, scene.image_size, common, generator)
@@ -104,24 +90,24 @@ def wide_baseline(batch_size: int, num_points: int, generator: Generator) -> Two
 
     Half of the scenes are a slanted plane with a relief of up to 20 % of its distance.
     """
-    size, K = random_cameras(batch_size, generator)
-    points1 = spread_points(size, 2 * num_points + 16, generator, clustered=0.5)
-    rays = viewing_rays(points1, K)
-    median = log_uniform((batch_size, 1), 4.0, 40.0, generator)
-    slope = 0.4 * normal((batch_size, 2, 1), generator)
+    size, K = draws.random_cameras(batch_size, generator)
+    points1 = draws.spread_points(size, 2 * num_points + 16, generator, clustered=0.5)
+    rays = draws.viewing_rays(points1, K)
+    median = draws.log_uniform((batch_size, 1), 4.0, 40.0, generator)
+    slope = 0.4 * draws.normal((batch_size, 2, 1), generator)
     plane = 1 / (1 + (rays[..., :2] @ slope)[..., 0]).clamp(min=0.4)
-    relief = log_uniform((batch_size, 1), 0.01, 0.2, generator) * normal(tuple(plane.shape), generator)
-    free = log_uniform(tuple(plane.shape), 0.5, 2.0, generator)
-    flat = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
+    relief = draws.log_uniform((batch_size, 1), 0.01, 0.2, generator) * draws.normal(tuple(plane.shape), generator)
+    free = draws.log_uniform(tuple(plane.shape), 0.5, 2.0, generator)
+    flat = draws.uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
     depths = median * torch.where(flat, plane * (1 + relief).clamp(min=0.3), free)
 
     shape = (batch_size, ORBIT_CANDIDATES)
-    axes = normal((*shape, 3), generator) * size.new_tensor([0.4, 1.0, 0.3])
-    angle = log_uniform((*shape, 1), math.radians(5.0), math.radians(45.0), generator)
+    axes = draws.normal((*shape, 3), generator) * size.new_tensor([0.4, 1.0, 0.3])
+    angle = draws.log_uniform((*shape, 1), math.radians(5.0), math.radians(45.0), generator)
     R = axis_angle_to_rotation_matrix(angle * normalize(axes, dim=-1))
-    aside = axis_angle_to_rotation_matrix(0.1 * normal((*shape, 3), generator))
+    aside = axis_angle_to_rotation_matrix(0.1 * draws.normal((*shape, 3), generator))
     centre = torch.stack([torch.zeros_like(median), torch.zeros_like(median), median], -1)
-    distance = log_uniform((*shape, 1), 0.7, 1.4, generator)
+    distance = draws.log_uniform((*shape, 1), 0.7, 1.4, generator)
     t = distance * centre - (R @ centre[..., None]).squeeze(-1)
     return two_views(points1, depths, K, aside @ R, (aside @ t[..., None]).squeeze(-1), size, num_points)
 
@@ -129,8 +115,8 @@ def wide_baseline(batch_size: int, num_points: int, generator: Generator) -> Two
 def _distort(scene: TwoViewScene, generator: Generator) -> TwoViewScene:
     """Return the scenes with some radial distortion in both images, in a quarter of them."""
     batch_size = len(scene.F_mat)
-    some = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.25
-    strength = torch.where(some, 0.01 * normal((batch_size, 1, 1), generator), 0.0)
+    some = draws.uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.25
+    strength = torch.where(some, 0.01 * draws.normal((batch_size, 1, 1), generator), 0.0)
     centre = scene.image_size[:, None] / 2
     radius = centre.norm(dim=-1, keepdim=True)
     moved = []
@@ -143,10 +129,10 @@ def _distort(scene: TwoViewScene, generator: Generator) -> TwoViewScene:
 def _choose_outliers(points1: Tensor, share: Tensor, generator: Generator) -> Tensor:
     """Return a mask (B, N) of a share (B, 1) of the points; neighbours of one point first in a third of the scenes."""
     batch_size, num_points = points1.shape[:2]
-    order = uniform((batch_size, num_points), 0.0, 1.0, generator)
+    order = draws.uniform((batch_size, num_points), 0.0, 1.0, generator)
     near = (points1 - points1[:, :1]).norm(dim=-1)
     near = near / near.amax(1, keepdim=True)
-    together = uniform((batch_size, 1), 0.0, 1.0, generator) < 1 / 3
+    together = draws.uniform((batch_size, 1), 0.0, 1.0, generator) < 1 / 3
     rank = torch.where(together, near + 0.3 * order, order).argsort(1).argsort(1)
     return rank < (share * num_points).round()
 
@@ -154,26 +140,26 @@ def _choose_outliers(points1: Tensor, share: Tensor, generator: Generator) -> Te
 def _wrong_partners(points2: Tensor, size: Tensor, common: Tensor, generator: Generator) -> Tensor:
     """Return wrong partners (B, N, 2) of all points, of three kinds; scenes marked ``common`` (B, 1) have one shift."""
     shape = tuple(points2.shape[:2])
-    anywhere = (size[:, None] - 1) * uniform((*shape, 2), 0.0, 1.0, generator)
-    popular = uniform((shape[0], 1), 0.0, 1.0, generator) < 0.5
-    index = uniform(shape, 0.0, 1.0, generator)
+    anywhere = (size[:, None] - 1) * draws.uniform((*shape, 2), 0.0, 1.0, generator)
+    popular = draws.uniform((shape[0], 1), 0.0, 1.0, generator) < 0.5
+    index = draws.uniform(shape, 0.0, 1.0, generator)
     index = (torch.where(popular, index**4, index) * shape[1]).long().clamp(max=shape[1] - 1)
     another = points2.gather(1, index[..., None].expand(-1, -1, 2))
-    angle = uniform((*shape, 1), 0.0, 2 * math.pi, generator)
-    length = log_uniform((*shape, 1), 4.0, 150.0, generator)
+    angle = draws.uniform((*shape, 1), 0.0, 2 * math.pi, generator)
+    length = draws.log_uniform((*shape, 1), 4.0, 150.0, generator)
     # An object that moves: one shift for all, but for a little.
     angle = torch.where(common[..., None], angle[:, :1] + 0.02 * angle, angle)
     length = torch.where(common[..., None], length[:, :1] * (1 + 0.0002 * length), length)
     shifted = points2 + length * torch.cat([angle.cos(), angle.sin()], -1)
-    kind = uniform((*shape, 1), 0.0, 3.0, generator)
+    kind = draws.uniform((*shape, 1), 0.0, 3.0, generator)
     return torch.where(kind < 1.2, anywhere, torch.where(kind < 2, another, shifted))
 
 
 def _scores(inliers: Tensor, clean: Tensor, generator: Generator) -> Tensor:
     """Return scores (B, N) such as 1 minus Lowe's ratio has; sets marked ``clean`` (B, 1) have passed a ratio test."""
     shape = tuple(inliers.shape)
-    exponent = log_uniform((shape[0], 1), 0.4, 1.2, generator)
-    good = uniform(shape, 0.02, 0.95, generator) ** exponent
-    bad = 1 - 0.3 * uniform(shape, 0.0, 1.0, generator) ** 3
+    exponent = draws.log_uniform((shape[0], 1), 0.4, 1.2, generator)
+    good = draws.uniform(shape, 0.02, 0.95, generator) ** exponent
+    bad = 1 - 0.3 * draws.uniform(shape, 0.0, 1.0, generator) ** 3
     ratio = torch.where(inliers, good, bad)
     return 1 - torch.where(clean, 0.8 * ratio, ratio)

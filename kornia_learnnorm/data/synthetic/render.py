@@ -1,8 +1,7 @@
-r"""A rendered image pair with an exact fundamental matrix: two views of a room made of textured planes.
+"""A rendered image pair with an exact fundamental matrix: two views of a room made of textured planes.
 
 For a first run without a data set; use real images to compare methods. A back wall, a floor and slanted boards are
-warped into each view by the homographies of their planes, from back to front. The scene is far from planar, so
-:math:`F` is well determined. Images need OpenCV (the extra ``images``), which is imported on use.
+warped into each view by the homographies of their planes, from back to front. OpenCV is imported on use.
 """
 
 from __future__ import annotations
@@ -189,10 +188,7 @@ def expose(image: Texture, rng: Random) -> NDArray[np.uint8]:
 def correspondences(
     planes: Sequence[Plane], K: Array, R: Array, t: Array, size: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """Return exact correspondences, pixels ``(M, 2)``, of a grid of pixels of the first image.
-
-    Points that the second image does not show, or that another plane hides there, are left out.
-    """
+    """Return exact correspondences, pixels ``(M, 2)``, of a grid of image 1: those that image 2 shows unhidden."""
     step = max(1, size[0] // GRID)
     x, y = np.meshgrid(np.arange(step // 2, size[0], step), np.arange(step // 2, size[1], step))
     points1 = np.stack([x.ravel(), y.ravel()], -1).astype(float)

@@ -17,19 +17,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.data.motion import fundamental_from_motion
-from kornia_learnnorm.data.synthetic.draws import (
-    draw_depths,
-    fixed_camera,
-    log_uniform,
-    motions,
-    normal,
-    random_cameras,
-    random_motions,
-    spread_points,
-    student_t,
-    uniform,
-    viewing_rays,
-)
+from kornia_learnnorm.data.synthetic import draws
 
 __all__ = ["TwoViewScene", "forward_driving", "handheld", "orbit", "random_scenes", "random_views", "two_views"]
 
@@ -51,46 +39,31 @@ class TwoViewScene(NamedTuple):
 
 
 def random_scenes(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
-    r"""Draw varied scenes for training.
+    """Draw varied scenes for training.
 
     Images are 400-1,400 px wide and 0.3-0.8 as high, focal lengths 0.5-1.3 widths. Points are uniform, or in half of
     the scenes clustered; depths log-uniform in 3-75, with about 40 % of the points on a ground plane. A third of the
     motions drives forward and turns by up to 0.06 rad, the rest go anywhere and turn by up to 0.24 rad, doubled in a
     third of these; the baseline is log-uniform in 1-40 % of the median depth. Noise in both views is Student-t with
     three degrees of freedom, its scale per scene log-uniform in 0.1-1.5 px. Half of the scenes have up to 30 % gross
-    outliers, uniform in the second image.
-
-    Args:
-        batch_size: number of scenes :math:`B`.
-        num_points: correspondences per scene :math:`N`.
-        generator: source of all randomness.
-
-    Raises:
-        TypeError: if ``generator`` is not a ``torch.Generator``.
-        ValueError: if ``batch_size`` or ``num_points`` is below one.
-
-    Example:
-        >>> scene = random_scenes(4, 24, torch.Generator().manual_seed(0))
-        >>> scene.points1.shape, scene.F_mat.shape
-        (torch.Size([4, 24, 2]), torch.Size([4, 3, 3]))
-
+    outliers, uniform in the second image. Arguments and errors are those of :func:`forward_driving`.
     """
     scene = random_views(batch_size, num_points, generator)
-    scale = log_uniform((batch_size, 1, 1), 0.1, 1.5, generator)
-    noise1, noise2 = (scale * student_t(scene.points1.shape, generator) for _ in range(2))
-    contaminated = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
-    share = torch.where(contaminated, uniform((batch_size, 1), 0.0, 0.3, generator), 0.0)
+    scale = draws.log_uniform((batch_size, 1, 1), 0.1, 1.5, generator)
+    noise1, noise2 = (scale * draws.student_t(scene.points1.shape, generator) for _ in range(2))
+    contaminated = draws.uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
+    share = torch.where(contaminated, draws.uniform((batch_size, 1), 0.0, 0.3, generator), 0.0)
     return _corrupt(scene, noise1, noise2, share, generator)
 
 
 def random_views(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
     """Draw the scenes of :func:`random_scenes` without noise and outliers; the arguments and errors are the same."""
     _check_arguments(batch_size, num_points, generator)
-    size, K = random_cameras(batch_size, generator)
-    points1 = spread_points(size, _num_candidates(num_points), generator, clustered=0.5)
-    height = log_uniform((batch_size, 1), 1.2, 4.0, generator)
-    depths = draw_depths(points1, K, 3.0, 75.0, height, generator, tilt=0.1)
-    R, t = random_motions(depths.median(dim=1, keepdim=True).values, generator)
+    size, K = draws.random_cameras(batch_size, generator)
+    points1 = draws.spread_points(size, 2 * num_points + 16, generator, clustered=0.5)
+    height = draws.log_uniform((batch_size, 1), 1.2, 4.0, generator)
+    depths = draws.draw_depths(points1, K, 3.0, 75.0, height, generator, tilt=0.1)
+    R, t = draws.random_motions(depths.median(dim=1, keepdim=True).values, generator)
     return two_views(points1, depths, K, R, t, size, num_points)
 
 
@@ -99,34 +72,30 @@ def forward_driving(
 ) -> TwoViewScene:
     """Draw scenes of a car that drives forward: KITTI's camera, a road, about a metre between the images; in metres.
 
+    A. Geiger, P. Lenz, R. Urtasun, Are we ready for autonomous driving? The KITTI benchmark suite, CVPR 2012.
+
     Args:
         batch_size: number of scenes :math:`B`.
         num_points: correspondences per scene :math:`N`.
-        generator: source of all randomness.
+        generator: source of all randomness; a TypeError for anything but a ``torch.Generator``.
         noise: standard deviation of the Gaussian noise, pixels per coordinate, in both views.
         outliers: share of gross outliers, whose second point is uniform in the image.
-
-    Raises:
-        TypeError: if ``generator`` is not a ``torch.Generator``.
-        ValueError: if a number is out of its range.
-
-    Reference:
-        A. Geiger, P. Lenz, R. Urtasun, Are we ready for autonomous driving? The KITTI benchmark suite, CVPR 2012.
 
     Example:
         >>> scene = forward_driving(2, 100, torch.Generator().manual_seed(0))
         >>> scene.image_size[0]
         tensor([1241., 376.], dtype=torch.float64)
-
     """
     _check_arguments(batch_size, num_points, generator, noise, outliers)
-    size, K = fixed_camera(batch_size, (1241.0, 376.0), 718.856, (607.1928, 185.2157), generator)
-    points1 = spread_points(size, _num_candidates(num_points), generator)
-    depths = draw_depths(points1, K, 4.0, 75.0, torch.full_like(size[:, :1], 1.65), generator)
-    forward = normal((batch_size, 1, 3), generator) * size.new_tensor([0.03, 0.01, 0.0]) + size.new_tensor([0.0, 0, 1])
-    axes = normal((batch_size, 1, 3), generator) * size.new_tensor([0.2, 1.0, 0.2])
-    baseline = uniform((batch_size, 1), 0.6, 1.4, generator)
-    R, t = motions(axes, log_uniform((batch_size, 1), 0.002, 0.05, generator), forward, baseline)
+    size, K = draws.fixed_camera(batch_size, (1241.0, 376.0), 718.856, (607.1928, 185.2157), generator)
+    points1 = draws.spread_points(size, 2 * num_points + 16, generator)
+    depths = draws.draw_depths(points1, K, 4.0, 75.0, torch.full_like(size[:, :1], 1.65), generator)
+    forward = draws.normal((batch_size, 1, 3), generator) * size.new_tensor([0.03, 0.01, 0.0]) + size.new_tensor(
+        [0.0, 0, 1]
+    )
+    axes = draws.normal((batch_size, 1, 3), generator) * size.new_tensor([0.2, 1.0, 0.2])
+    baseline = draws.uniform((batch_size, 1), 0.6, 1.4, generator)
+    R, t = draws.motions(axes, draws.log_uniform((batch_size, 1), 0.002, 0.05, generator), forward, baseline)
     scene = two_views(points1, depths, K, R, t, size, num_points)
     return _corrupt_evenly(scene, noise, outliers, generator)
 
@@ -137,21 +106,15 @@ def handheld(
     """Draw scenes of a camera in a hand: VGA, a room of 1-6 m with a floor, a step in any direction.
 
     Arguments, units and errors are those of :func:`forward_driving`.
-
-    Example:
-        >>> scene = handheld(2, 100, torch.Generator().manual_seed(0), outliers=0.2)
-        >>> scene.inliers.sum(-1)
-        tensor([80, 80])
-
     """
     _check_arguments(batch_size, num_points, generator, noise, outliers)
-    size, K = fixed_camera(batch_size, (640.0, 480.0), 535.0, (319.5, 239.5), generator)
-    points1 = spread_points(size, _num_candidates(num_points), generator)
-    depths = draw_depths(points1, K, 1.0, 6.0, torch.full_like(size[:, :1], 1.3), generator, tilt=0.2)
-    angle = log_uniform((batch_size, 1), 0.01, 0.12, generator)
-    baseline = log_uniform((batch_size, 1), 0.03, 0.15, generator) * depths.median(dim=1, keepdim=True).values
-    axes, direction = (normal((batch_size, 1, 3), generator) for _ in range(2))
-    R, t = motions(axes, angle, direction, baseline)
+    size, K = draws.fixed_camera(batch_size, (640.0, 480.0), 535.0, (319.5, 239.5), generator)
+    points1 = draws.spread_points(size, 2 * num_points + 16, generator)
+    depths = draws.draw_depths(points1, K, 1.0, 6.0, torch.full_like(size[:, :1], 1.3), generator, tilt=0.2)
+    angle = draws.log_uniform((batch_size, 1), 0.01, 0.12, generator)
+    baseline = draws.log_uniform((batch_size, 1), 0.03, 0.15, generator) * depths.median(dim=1, keepdim=True).values
+    axes, direction = (draws.normal((batch_size, 1, 3), generator) for _ in range(2))
+    R, t = draws.motions(axes, angle, direction, baseline)
     scene = two_views(points1, depths, K, R, t, size, num_points)
     return _corrupt_evenly(scene, noise, outliers, generator)
 
@@ -159,25 +122,17 @@ def handheld(
 def orbit(
     batch_size: int, num_points: int, generator: Generator, noise: float = 0.5, outliers: float = 0.0
 ) -> TwoViewScene:
-    r"""Draw scenes of a camera that circles an object and keeps looking at it: VGA, 4 m away, 4-15 degrees.
+    """Draw scenes of a camera that circles an object and keeps looking at it: VGA, 4 m away, 4-15 degrees.
 
-    The second camera is the first one, rotated about the object's centre :math:`c`: :math:`t = c - R c`.
-
-    Arguments, units and errors are those of :func:`forward_driving`.
-
-    Example:
-        >>> scene = orbit(2, 100, torch.Generator().manual_seed(0), noise=0.0)
-        >>> from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-        >>> bool(symmetric_epipolar_distance(scene.points1, scene.points2, scene.F_mat).max() < 1e-9)
-        True
-
+    The second camera is the first one, rotated about the object's centre :math:`c`: :math:`t = c - R c`. Arguments,
+    units and errors are those of :func:`forward_driving`.
     """
     _check_arguments(batch_size, num_points, generator, noise, outliers)
-    size, K = fixed_camera(batch_size, (640.0, 480.0), 535.0, (319.5, 239.5), generator)
-    points1 = spread_points(size, _num_candidates(num_points), generator)
-    depths = uniform(points1.shape[:2], 3.0, 5.0, generator)
-    axes = normal((batch_size, 1, 3), generator) * size.new_tensor([0.2, 1.0, 0.1])
-    angle = torch.deg2rad(uniform((batch_size, 1, 1), 4.0, 15.0, generator))
+    size, K = draws.fixed_camera(batch_size, (640.0, 480.0), 535.0, (319.5, 239.5), generator)
+    points1 = draws.spread_points(size, 2 * num_points + 16, generator)
+    depths = draws.uniform(points1.shape[:2], 3.0, 5.0, generator)
+    axes = draws.normal((batch_size, 1, 3), generator) * size.new_tensor([0.2, 1.0, 0.1])
+    angle = torch.deg2rad(draws.uniform((batch_size, 1, 1), 4.0, 15.0, generator))
     R = axis_angle_to_rotation_matrix(angle * normalize(axes, dim=-1))
     centre = size.new_tensor([0.0, 0.0, 4.0])
     scene = two_views(points1, depths, K, R, centre - R @ centre, size, num_points)
@@ -198,11 +153,6 @@ def _check_arguments(
         raise ValueError(f"outliers must be a share between 0 and 1, got {outliers}")
 
 
-def _num_candidates(num_points: int) -> int:
-    """Return how many candidate points to draw so that the second view shows at least ``num_points``."""
-    return 2 * num_points + 16
-
-
 def two_views(
     points1: Tensor, depths: Tensor, K: Tensor, R: Tensor, t: Tensor, size: Tensor, num_points: int
 ) -> TwoViewScene:
@@ -211,7 +161,7 @@ def two_views(
     The motion is the first that shows half of the candidate points, or else the one that shows most. If it shows fewer
     than ``num_points``, the missing points are outliers; fewer than one point in a thousand is.
     """
-    X = (viewing_rays(points1, K) * depths[..., None]).mT.contiguous()
+    X = (draws.viewing_rays(points1, K) * depths[..., None]).mT.contiguous()
     probe = _project(X[..., : X.shape[-1] // 2], K, R, t, size)[1]  # half of the points, to save time
     motion = probe.sum(-1).clamp(max=(probe.shape[-1] + 1) // 2).argmax(1)
     row = torch.arange(len(K), device=K.device)
@@ -227,16 +177,16 @@ def two_views(
 def _corrupt(scene: TwoViewScene, noise1: Tensor, noise2: Tensor, share: Tensor, generator: Generator) -> TwoViewScene:
     """Return the scenes with noise ``(B, N, 2)`` added and a share ``(B, 1)`` of points2 at random pixels."""
     shape = scene.inliers.shape
-    rank = uniform(shape, 0.0, 1.0, generator).argsort(1)
+    rank = draws.uniform(shape, 0.0, 1.0, generator).argsort(1)
     inliers = scene.inliers & (rank >= (share * shape[1]).round())
-    anywhere = (scene.image_size[:, None] - 1) * uniform((*shape, 2), 0.0, 1.0, generator)
+    anywhere = (scene.image_size[:, None] - 1) * draws.uniform((*shape, 2), 0.0, 1.0, generator)
     points2 = torch.where(inliers[..., None], scene.points2 + noise2, anywhere)
     return scene._replace(points1=scene.points1 + noise1, points2=points2, inliers=inliers)
 
 
 def _corrupt_evenly(scene: TwoViewScene, noise: float, outliers: float, generator: Generator) -> TwoViewScene:
     """Return the scenes with Gaussian noise (standard deviation in pixels) and the same share of gross outliers."""
-    noise1, noise2 = (noise * normal(scene.points1.shape, generator) for _ in range(2))
+    noise1, noise2 = (noise * draws.normal(scene.points1.shape, generator) for _ in range(2))
     return _corrupt(scene, noise1, noise2, torch.full_like(scene.t[:, :1], outliers), generator)
 
 

@@ -31,12 +31,6 @@ def synthetic_store(
 
     Noise is in pixels, ``outliers`` the share of gross outliers. Lowe's ratio is drawn so that the ratio test of 0.8
     keeps all inliers and half of the outliers.
-
-    Example:
-        >>> store = synthetic_store(pairs=2, points=30, scenes=["orbit"])
-        >>> len(store), len(store.ratio)
-        (2, 60)
-
     """
     if pairs < 1 or points < 8:
         raise ValueError(f"at least 1 pair of each scene and 8 points are needed, got {pairs} and {points}")

@@ -13,7 +13,7 @@ def clean(make, monkeypatch, batch_size=64, num_points=24, seed=0):
     """Scenes without noise or gross outliers."""
     if make is not random_scenes:
         return make(batch_size, num_points, seeded(seed), noise=0.0)
-    monkeypatch.setattr(scenes, "student_t", lambda shape, generator: torch.zeros(shape, dtype=torch.float64))
+    monkeypatch.setattr(draws, "student_t", lambda shape, generator: torch.zeros(shape, dtype=torch.float64))
     return make(batch_size, num_points, seeded(seed))
 
 
