@@ -42,7 +42,13 @@ def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provena
     with atomic_write(path) as temporary:
         try:
             with h5py.File(temporary, "w") as file:
-                _append_all(h5py, file, stores)
+                for store in stores:
+                    if "offsets" not in file:
+                        _create(h5py, file, store)
+                    _append(file["offsets"], store.offsets[1:] + file["offsets"][-1])
+                    _append(file["names"], np.array(store.names, dtype=h5py.string_dtype()))
+                    for name in LAYOUT:
+                        _append(file[name], getattr(store, name))
                 if "offsets" not in file:
                     raise ValueError(f"no pairs to write to {path}: one store or more expected, got none")
                 file.attrs.update({"format": FORMAT, "version": VERSION, "provenance": json.dumps(provenance)})
@@ -51,19 +57,13 @@ def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provena
             raise OSError(f"cannot write {path}: {os.strerror(number) if number else error}") from error
 
 
-def _append_all(h5py: Any, file: h5py.File, stores: Iterable[CorrespondenceStore]) -> None:
-    for store in stores:
-        if "offsets" not in file:
-            file.attrs.update({key: getattr(store, key) for key in ("dataset", "pairs", "detector")})
-            file.create_dataset("offsets", (1,), np.int64, maxshape=(None,), chunks=(128,))
-            file.create_dataset("names", (0, 2), h5py.string_dtype(), maxshape=(None, 2), chunks=(64, 2))
-            for name, (tail, dtype, axis) in LAYOUT.items():
-                rows = ROWS_PER_CHUNK if axis == "M" else PAIRS_PER_CHUNK
-                file.create_dataset(name, (0, *tail), dtype, maxshape=(None, *tail), chunks=(rows, *tail))
-        _append(file["offsets"], store.offsets[1:] + file["offsets"][-1])
-        _append(file["names"], np.array(store.names, dtype=h5py.string_dtype()))
-        for name in LAYOUT:
-            _append(file[name], getattr(store, name))
+def _create(h5py: Any, file: h5py.File, store: CorrespondenceStore) -> None:
+    file.attrs.update({key: getattr(store, key) for key in ("dataset", "pairs", "detector")})
+    file.create_dataset("offsets", (1,), np.int64, maxshape=(None,), chunks=(128,))
+    file.create_dataset("names", (0, 2), h5py.string_dtype(), maxshape=(None, 2), chunks=(64, 2))
+    for name, (tail, dtype, axis) in LAYOUT.items():
+        rows = ROWS_PER_CHUNK if axis == "M" else PAIRS_PER_CHUNK
+        file.create_dataset(name, (0, *tail), dtype, maxshape=(None, *tail), chunks=(rows, *tail))
 
 
 def _append(dataset: h5py.Dataset, rows: NDArray[Any]) -> None:

@@ -1,7 +1,3 @@
-"""Camera matrices from numbers, files and photographs."""
-
-from __future__ import annotations
-
 import math
 
 import numpy as np

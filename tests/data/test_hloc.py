@@ -1,7 +1,5 @@
 """The files of hloc, written here as its extract_features.py and match_features.py write them."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 import pytest

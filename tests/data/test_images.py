@@ -1,14 +1,11 @@
 """Images of every kind as eight bits, turned and reduced, beside what OpenCV reads."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from make_sequences import blobs, centroids, texture
@@ -23,7 +20,6 @@ from kornia_learnnorm.data.images import (
     scale_points,
     scaling,
 )
-from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
@@ -251,20 +247,6 @@ class TestScaling:
         there = scale_points(points, size, other)
         assert np.allclose(np.append(points, 1) @ scaling(size, other).numpy().T, np.append(there, 1), rtol=1e-9)
         assert np.allclose(scale_points(there, other, size), points, rtol=1e-9, atol=1e-6)
-
-    def test_fundamental_matrix_of_the_full_images(self):
-        rng = np.random.default_rng(0)
-        full, small = ((4001, 2999), (3000, 2000)), ((1000, 750), (999, 666))
-        F_small = torch.from_numpy(rng.normal(size=(3, 3)))
-        F_full = transform_fundamental(F_small, *(scaling(*sizes) for sizes in zip(full, small, strict=True)))
-        points = [rng.uniform(0, 2000, (20, 2)) for _ in range(2)]
-        reduced = [scale_points(p, *sizes) for p, *sizes in zip(points, full, small, strict=True)]
-        # the values of the bilinear form, coordinate by coordinate
-        before, after = (
-            np.einsum("ni,ij,nj->n", np.c_[p2, np.ones(20)], F.numpy(), np.c_[p1, np.ones(20)])
-            for (p1, p2), F in ((points, F_full), (reduced, F_small))
-        )
-        assert np.allclose(before, after)
 
     @pytest.mark.parametrize("sizes", [((0, 0), (3, 4)), ((3, 4), (3, 0))])
     def test_no_size(self, sizes):

@@ -1,7 +1,3 @@
-"""Masks from files, and of black frames."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from make_sequences import texture

@@ -1,8 +1,7 @@
-"""Sets of matches and their augmentation."""
-
-from __future__ import annotations
+from dataclasses import replace
 
 import h5py
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -14,6 +13,8 @@ from kornia_learnnorm.data.augmentation import augment
 from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.synthetic.random_matches import random_matches, wide_baseline
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 
 
 def assert_equal(first: MatchSets, second: MatchSets) -> None:
@@ -54,18 +55,11 @@ class TestStoreSets:
         """Two pairs: one with ground truth and 60 matches, one without and 80; a quarter of the ratios are 0.9."""
         path = tmp_path / "pairs.h5"
         found = [scenes("handheld", 1, number, seed=number, noise=0.1, outliers=0.1) for number in (60, 80)]
-        offsets = [0, 60, 140]
-        F = torch.cat([found[0].F_mat, torch.full((1, 3, 3), torch.nan)])
-        with h5py.File(path, "w") as file:
-            file.attrs.update(format="correspondences", version=1, dataset="test", pairs="two", detector="none")
-            for name in ("points1", "points2"):
-                file[name] = torch.cat([getattr(scene, name)[0] for scene in found]).float().numpy()
-            file["ratio"] = torch.where(torch.arange(140) % 4 == 0, 0.9, 0.5).float().numpy()
-            file["offsets"] = offsets
-            file["image_size"] = torch.tensor([[[640, 480]] * 2] * 2).int().numpy()
-            file["names"] = [["a", "b"]] * 2
-            file["F"], file["K"] = F.numpy(), torch.eye(3).double().expand(2, 2, 3, 3).numpy()
-            file["R"], file["t"] = torch.eye(3).double().expand(2, 3, 3).numpy(), torch.ones(2, 3).double().numpy()
+        points = {p: torch.cat([getattr(s, p)[0] for s in found]).float().numpy() for p in ("points1", "points2")}
+        ratio = np.where(np.arange(140) % 4 == 0, 0.9, 0.5).astype(np.float32)
+        F = np.stack([found[0].F_mat[0].numpy(), np.full((3, 3), np.nan)])
+        made = synthetic_store(2, 70, scenes=["orbit"])
+        write_store(path, replace(made, **points, ratio=ratio, offsets=np.array([0, 60, 140]), F=F))
         return path
 
     def test_labelled(self, store):

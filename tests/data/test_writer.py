@@ -1,7 +1,3 @@
-"""Writing a store pair by pair, in any order, with crashes between."""
-
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -35,11 +35,14 @@ def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera:
     for name, folder in choose_sequences("kitti", root, sequences).items():
         K, shift = read_calibration(folder / "calib.txt", f"P{camera[-1]}")
         path = root / "poses" / f"{name}.txt"
-        poses = _poses(path) if path.exists() else None
+        poses = {}
+        for line in text_lines(path, "poses") if path.exists() else ():
+            rows = line.numbers(line.text.split(), 12, "the 12 numbers of a pose").reshape(3, 4)
+            poses[line.number - 1] = rigid_motion(rows[:, :3], rows[:, 3])
         for number, image in _images(folder / camera):
-            if poses is not None and number not in poses:
+            if path.exists() and number not in poses:
                 raise ValueError(f"{path} has no line {number + 1}, the pose of {image}")
-            pose = np.full((4, 4), np.nan) if poses is None else poses[number] @ shift
+            pose = poses[number] @ shift if path.exists() else np.full((4, 4), np.nan)
             frames.append(Frame(image, image.relative_to(root).as_posix(), name, image_size(image), K, pose))
     return frames
 
@@ -58,14 +61,6 @@ def read_calibration(path: Path, key: str) -> tuple[Array, Array]:
                 raise line.error("a camera matrix and a fourth column")
             return K, rigid_motion(np.eye(3), np.asarray(-np.linalg.solve(K, b)[:, 0], np.float64))
     raise ValueError(f"{path} has no line '{key}: 12 numbers'")
-
-
-def _poses(path: Path) -> dict[int, Array]:
-    poses = {}
-    for line in text_lines(path, "poses"):
-        rows = line.numbers(line.text.split(), 12, "the 12 numbers of a pose").reshape(3, 4)
-        poses[line.number - 1] = rigid_motion(rows[:, :3], rows[:, 3])
-    return poses
 
 
 def _images(folder: Path) -> list[tuple[int, Path]]:

@@ -47,7 +47,9 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
         raise ValueError(f"max_difference must be zero or more seconds, got {max_difference}")
     frames = []
     for name, folder in choose_sequences("tum", root, sequences).items():
-        K, distortion = _camera(name)
+        kinect = re.search(r"(?<![a-z])fr(?:eiburg)?([1-3])(?!\d)", name)
+        focal, distortion = KINECTS[kinect[1]] if kinect else (None, ())
+        K = camera_matrix(*focal) if focal else np.full((3, 3), np.nan)
         times, poses = _trajectory(folder / "groundtruth.txt")
         for time, listed in _images(folder):
             # Stamps have microseconds; at 1e9 s float64 resolves a quarter of one, which must not decide on ties.
@@ -57,15 +59,6 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
             image, short = folder / listed, str(PurePosixPath(folder.relative_to(root), listed))
             frames.append(Frame(image, short, name, image_size(image), K, pose, distortion))
     return frames
-
-
-def _camera(name: str) -> tuple[Array, tuple[float, ...]]:
-    """Return the camera matrix (3, 3) and the distortion of a sequence; NaN and empty if its name does not tell."""
-    kinect = re.search(r"(?<![a-z])fr(?:eiburg)?([1-3])(?!\d)", name)
-    if kinect is None:
-        return np.full((3, 3), np.nan), ()
-    focal, distortion = KINECTS[kinect[1]]
-    return camera_matrix(*focal), distortion
 
 
 def _images(folder: Path) -> list[tuple[float, str]]:

@@ -125,7 +125,9 @@ def collect_matches(
             if not writer.done():
                 first = next(iter(skipped.values()))
                 raise ValueError(f"none of the {len(pairs)} pairs could be matched; reason for the first: {first}")
-            writer.finish({"versions": _versions(), "skipped": skipped})
+            versions = {name: version(name) for name in ("kornia_learnnorm", "numpy", "h5py")}
+            versions["opencv"] = str(import_cv2().__version__)
+            writer.finish({"versions": versions, "skipped": skipped})
     return skipped
 
 
@@ -140,11 +142,6 @@ def _digest(pairs: Sequence[FramePair]) -> str:
     return digest.hexdigest()
 
 
-def _versions() -> dict[str, str]:
-    packages = {name: version(name) for name in ("kornia_learnnorm", "numpy", "h5py")}
-    return {**packages, "opencv": str(import_cv2().__version__)}
-
-
 def _match_all(
     pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: Mapping[str, Any], workers: Workers
 ) -> dict[str, str]:
@@ -156,7 +153,9 @@ def _match_all(
         todo = [place for place in range(len(pairs)) if place not in done]
         return _match_some(pairs, todo, writer.folder, options, workers)
 
-    with _progress(len(pairs), len(done)) as bar:
+    tqdm = import_extra("tqdm", "images", "matching many pairs").tqdm
+    often = {} if sys.stderr.isatty() else {"mininterval": LOG_INTERVAL, "maxinterval": LOG_INTERVAL}
+    with tqdm(total=len(pairs), initial=len(done), unit="pair", **often) as bar:
         log = partial(bar.write, file=sys.stderr)
         with closing(restart_crashed(match_rest, log)) as results:
             for place, result in results:
@@ -167,13 +166,6 @@ def _match_all(
                 done.add(place)
                 bar.update()
     return skipped
-
-
-def _progress(total: int, done: int) -> Any:
-    """Return a progress bar on stderr, which writes a line now and then to a log file."""
-    tqdm = import_extra("tqdm", "images", "matching many pairs").tqdm
-    often = {} if sys.stderr.isatty() else {"mininterval": LOG_INTERVAL, "maxinterval": LOG_INTERVAL}
-    return tqdm(total=total, initial=done, unit="pair", **often)
 
 
 def _match_some(
@@ -209,10 +201,8 @@ def _match(
     pair: FramePair, features1: Features | str, features2: Features | str, options: MatchOptions, place: int
 ) -> CorrespondenceStore | str:
     """Return the store of a pair, or the reason why there is none."""
-    if isinstance(features1, str):
-        return features1
-    if isinstance(features2, str):
-        return features2
+    if isinstance(features1, str) or isinstance(features2, str):
+        return features1 if isinstance(features1, str) else str(features2)
     import_cv2().setNumThreads(1)
     try:
         return match_frames(pair, features1, features2, options, place)

@@ -1,7 +1,5 @@
 """Copies of the sequences on disk, to be changed."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

@@ -1,7 +1,5 @@
 """Cambridge Landmarks, against the layout that make_sequences.py writes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from make_sequences import FOCAL, FRAMES, SIZE, STEP, edit, moved, rotated

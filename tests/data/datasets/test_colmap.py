@@ -1,9 +1,4 @@
-"""COLMAP models, read by pycolmap."""
-
-from __future__ import annotations
-
 import shutil
-import sys
 
 import numpy as np
 import pytest
@@ -128,11 +123,6 @@ class TestReadColmap:
             (colmap / "model" / f"{name}.txt").write_text("")
         with pytest.raises(ValueError, match=r"the model .*model has no images"):
             read(colmap)
-
-    def test_without_pycolmap(self, model, monkeypatch):
-        monkeypatch.setitem(sys.modules, "pycolmap", None)
-        with pytest.raises(ImportError, match=r"pip install '\.\[colmap\]'"):
-            read(model)
 
 
 class TestCovisiblePairs:

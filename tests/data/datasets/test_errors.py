@@ -1,18 +1,12 @@
 """What the readers say about wrong arguments and files: the file, the line, what came and what was expected."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest
 from make_sequences import FR1, FR3, edit
 
-from kornia_learnnorm.data.datasets.cambridge import read_cambridge
-from kornia_learnnorm.data.datasets.folder import read_folder
-from kornia_learnnorm.data.datasets.kitti import read_kitti
-from kornia_learnnorm.data.datasets.tum import read_tum
+from kornia_learnnorm.data.datasets.reading import read_dataset
 
-READERS = {"kitti": read_kitti, "tum": read_tum, "cambridge": read_cambridge, "folder": read_folder}
 WHOLE = 0  # in place of the number of a line
 
 
@@ -69,7 +63,7 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
     else:
         (root / file).unlink()
     with pytest.raises(error, match=message):
-        READERS[dataset](root)
+        read_dataset(dataset, root)
 
 
 @pytest.mark.parametrize(
@@ -85,8 +79,13 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
         ("tum", "none", {}, FileNotFoundError, r"no folder at .*none"),
         ("cambridge", "cambridge", {"split": "val"}, ValueError, "'train', 'test' or None for both, got 'val'"),
         ("folder", "none", {}, FileNotFoundError, r"no folder at .*none"),
+        ("kiti", "", {}, ValueError, "must be one of kitti, tum, cambridge, folder, colmap, got 'kiti'"),
+        ("kitti", "kitti", {"colour": True}, ValueError, "colour is for no dataset, got kitti"),
+        ("kitti", "kitti", {"split": "val"}, ValueError, "a split of kitti must be one of train, test, got 'val'"),
+        ("tum", f"tum/{FR3}", {"split": "train"}, FileNotFoundError, f"expected others than {FR3}, got {FR3}"),
+        ("tum", f"tum/{FR1}", {"split": "val"}, FileNotFoundError, f"no val sequence of tum .*: expected {FR3}, got"),
     ],
 )
 def test_wrong_arguments(written, dataset, root, arguments, error, message):
     with pytest.raises(error, match=message):
-        READERS[dataset](written / root, **arguments)
+        read_dataset(dataset, written / root, **arguments)

@@ -1,7 +1,3 @@
-"""Folders of images."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from make_sequences import SIZE, names

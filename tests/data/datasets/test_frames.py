@@ -1,7 +1,3 @@
-"""Frames, their cameras and pairs of them."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,13 +74,6 @@ class TestFramePair:
         assert np.linalg.norm(pair.F) == pytest.approx(1)
         assert abs(np.linalg.det(pair.F)) < 1e-12
 
-    def test_sideways_by_hand(self):
-        # R = I, t = (-1, 0, 0): x2^T [t]x x1 = y1 - y2 up to scale.
-        shifted = np.eye(4)
-        shifted[0, 3] = 1.0
-        F = FramePair(frame(camera=np.eye(3), pose=np.eye(4)), frame(camera=np.eye(3), pose=shifted)).F
-        assert np.allclose(F, np.array([[0, 0, 0], [0, 0, 1], [0, -1, 0]]) / np.sqrt(2))
-
     @pytest.mark.parametrize("missing", ["camera", "pose"])
     @pytest.mark.parametrize("which", ["frame1", "frame2"])
     def test_unknown(self, missing, which):
@@ -102,13 +91,6 @@ class TestFramePair:
                 assert np.isnan(FramePair(pair.frame1, still).F).all()
 
 
-class TestResizeFrames:
-    @pytest.mark.parametrize("size", [(0, 5), (5, -1)])
-    def test_wrong_size(self, size):
-        with pytest.raises(ValueError, match=f"positive width and height, got {size[0]} x {size[1]}"):
-            resize_frames([frame()], size)
-
-
 def frame_of(path: Path, image: np.ndarray, **known) -> Frame:
     cv2.imwrite(str(path), image)
     return Frame(path, path.name, "", image.shape[::-1], **known)
@@ -116,6 +98,11 @@ def frame_of(path: Path, image: np.ndarray, **known) -> Frame:
 
 class TestReadFrame:
     GRID = np.stack(np.meshgrid(np.arange(40.0, 210, 40), np.arange(40.0, 150, 33)), -1).reshape(-1, 2)
+
+    @pytest.mark.parametrize("size", [(0, 5), (5, -1)])
+    def test_wrong_size(self, size):
+        with pytest.raises(ValueError, match=f"positive width and height, got {size[0]} x {size[1]}"):
+            resize_frames([frame()], size)
 
     def test_as_it_is(self, tmp_path):
         image = texture()

@@ -1,7 +1,3 @@
-"""KITTI odometry, against the layout that make_sequences.py writes."""
-
-from __future__ import annotations
-
 import shutil
 
 import numpy as np

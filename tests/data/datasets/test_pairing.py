@@ -1,7 +1,3 @@
-"""Pairs of frames: neighbours and listed ones."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Reading datasets by their names, and the ground truth of real and written ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from make_sequences import FR1, FR3, STEP
@@ -34,22 +32,6 @@ def test_splits_and_ground_truth(written, dataset, options, sequence):
     assert [frame.sequence for frame in frames] == [sequence] * 4
     if dataset != "tum":  # its wall is turned
         assert all(epipoles_agree(pair) for pair in pair_frames(frames))
-
-
-@pytest.mark.parametrize(
-    ("dataset", "folder", "options", "error", "message"),
-    [
-        ("kiti", "", {}, ValueError, "must be one of kitti, tum, cambridge, folder, colmap, got 'kiti'"),
-        ("kitti", "kitti", {"colour": True}, ValueError, "colour is for no dataset, got kitti"),
-        ("kitti", "kitti", {"split": "val"}, ValueError, "a split of kitti must be one of train, test, got 'val'"),
-        ("tum", f"tum/{FR3}", {"split": "train"}, FileNotFoundError, f"expected others than {FR3}, got {FR3}"),
-        ("tum", f"tum/{FR1}", {"split": "val"}, FileNotFoundError, f"no val sequence of tum .*: expected {FR3}, got"),
-        ("folder", "none", {}, FileNotFoundError, r"no folder at .*none"),
-    ],
-)
-def test_wrong_arguments(written, dataset, folder, options, error, message):
-    with pytest.raises(error, match=message):
-        read_dataset(dataset, written / folder, **options)
 
 
 @pytest.mark.parametrize(

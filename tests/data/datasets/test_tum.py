@@ -1,7 +1,3 @@
-"""TUM RGB-D, against the layout that make_sequences.py writes."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from make_sequences import FR1, FR3, FRAMES, STEP, TUM_START, moved, rotated

@@ -1,7 +1,3 @@
-"""Matching images."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -17,14 +13,6 @@ cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
 
 class TestMatchImages:
-    def test_shift_is_found(self):
-        image = texture(width=260, height=200)
-        matches = match_images(image[20:, 10:].copy(), image[:-20, :-10].copy())
-        good = matches.ratio < 0.6
-        assert good.sum() > 50
-        offset = (matches.points2 - matches.points1)[good].median(0).values
-        assert torch.allclose(offset, torch.tensor([10.0, 20.0]), atol=0.1)
-
     def test_neighbours_and_ratio_match_numpy(self):
         image1, image2 = texture(0), texture(0)[:, 15:].copy()
         matches = match_images(image1, image2, num_features=100)

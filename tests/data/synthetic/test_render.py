@@ -1,5 +1,4 @@
 import json
-import sys
 from unittest.mock import patch
 
 import numpy as np
@@ -117,12 +116,3 @@ def test_write_pair(tmp_path):
 def test_bad_values(values):
     with pytest.raises(ValueError, match=" x ".join(map(str, values.values()))):
         render_pair(**values)
-
-
-def test_opencv_is_asked_for_by_name(monkeypatch, tmp_path):
-    pair = render_pair(width=96, height=72)
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    for use in (render_pair, lambda: write_pair(tmp_path / "pair", pair)):
-        with pytest.raises(ImportError, match=r"pip install '\.\[images\]'"):
-            use()
-    assert not (tmp_path / "pair").exists()
