@@ -68,6 +68,17 @@ def shaken_estimator(seed: int = 0, **options) -> LearnedEightPoint:
     return layer.eval()
 
 
+LAYERS = {
+    "hartley": lambda: kln.EightPoint(),
+    "optimal": lambda: kln.EightPoint(rank2="optimal"),
+    "whitening": lambda: kln.EightPoint(kln.Whitening()),
+    "reweighted": lambda: kln.EightPoint(kln.ReweightedWhitening()),
+    "learned": lambda: kln.EightPoint(shaken()),
+    "shipped": lambda: kln.EightPoint(kln.LearnedNormalizer.from_pretrained()),
+    "estimator": shaken_estimator,
+}
+
+
 def rewrite_weights(file, change) -> None:
     """Change the tensors and metadata of a file of weights in place, by a function of both."""
     with safe_open(file, "pt") as opened:

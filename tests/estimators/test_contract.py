@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
 from scenes import (
@@ -139,6 +139,7 @@ def test_order_does_not_matter(name, scenes, bound, seed, num_points, random, da
 
 
 @pytest.mark.parametrize("name", [name for name in CONTRACT if name != "projection"])
+@settings(max_examples=10)
 @given(log_scale=st.floats(-3, 3), num_points=st.sampled_from([8, 15]))
 def test_moves_with_the_scale_of_the_pixels(name, log_scale, num_points):
     points, scale = correspondences("orbit", 4, num_points), 10**log_scale

@@ -10,12 +10,12 @@ import pytest
 import torch
 from pairwise import pairwise
 from scenes import (
+    LAYERS,
     check_gradients,
     correspondences,
     derivative,
     scenes,
     shaken,
-    shaken_estimator,
     signless,
     uniform,
     unit,
@@ -27,15 +27,6 @@ from torch.utils.checkpoint import checkpoint
 import kornia_learnnorm as kln
 from kornia_learnnorm import EightPoint, Hartley, ReweightedWhitening, Whitening, find_fundamental
 
-LAYERS = {
-    "hartley": lambda: EightPoint(),
-    "optimal": lambda: EightPoint(rank2="optimal"),
-    "whitening": lambda: EightPoint(Whitening()),
-    "reweighted": lambda: EightPoint(ReweightedWhitening()),
-    "learned": lambda: EightPoint(shaken()),
-    "shipped": lambda: EightPoint(kln.LearnedNormalizer.from_pretrained()),
-    "estimator": shaken_estimator,
-}
 SLOW = ["reweighted", "learned", "estimator"]  # to compile
 
 
@@ -64,10 +55,7 @@ class TestEightPoint:
         assert torch.equal(EightPoint(normalizer)(*points, weights), projection)
         assert torch.equal(EightPoint(normalizer, "optimal")(*points, weights), optimal)
         assert not torch.equal(projection, optimal)
-
-    def test_default_is_hartley(self, device, dtype):
-        points = [p.to(device, dtype) for p in correspondences()]
-        assert torch.equal(EightPoint()(*points), find_fundamental(*points, normalizer=Hartley()))
+        assert torch.equal(EightPoint()(*points), find_fundamental(*points))
 
     def test_owns_its_normalizer(self):
         normalizer = shaken()
@@ -289,7 +277,7 @@ class TestGradients:
 
         check_gradients(numbers, *correspondences("handheld", 2, num_points), eps=1e-6, atol=1e-4)
 
-    @pytest.mark.parametrize("name", ["hartley", "whitening", "learned"])
+    @pytest.mark.parametrize("name", ["whitening", "learned"])
     def test_second(self, name):
         layer = LAYERS[name]().double()
         gradient = derivative(lambda *points: signless(layer(*points)))
@@ -328,8 +316,8 @@ class TestPrecision:
         assert up_to_sign(F_mat, EightPoint()(*points, weights)) < 0.5
 
 
+@pytest.mark.long
 class TestBackEnds:
-    @pytest.mark.long
     @pytest.mark.parametrize(
         ("name", "num_points"),
         [

@@ -62,6 +62,8 @@ def gauss_newton(R, t, points1, points2, K1, K2, iterations: int = 100) -> float
         H = J.T @ J
         new = q - np.linalg.solve(H + damping * np.diag(H.diagonal()), J.T @ d)
         new_cost = (distances(new) ** 2).sum()
+        if abs(new_cost - cost) < 1e-13 * cost:
+            break
         q, cost, damping = (new, new_cost, damping / 5) if new_cost < cost else (q, cost, damping * 5)
     return cost
 

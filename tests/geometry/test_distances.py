@@ -86,6 +86,7 @@ class TestAll:
         assert torch.equal(found, expected)
         assert torch.equal(*(torch.autograd.grad(v.clamp(max=1e4).sum(), points1)[0] for v in (found, expected)))
 
+    @pytest.mark.long
     def test_compiles_as_one_graph(self, distance):
         points1, points2 = correspondences("driving", 3, 20)
         F_mat = find_fundamental(points1, points2)

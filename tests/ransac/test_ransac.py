@@ -9,7 +9,7 @@ from itertools import count
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.geometry import ransac as kornia_ransac
@@ -150,6 +150,7 @@ class TestAccuracy:
         errors = [epipolar_distances(points1[true], points2[true], F_mat).mean() for F_mat in (refined, plain)]
         assert errors[0] < errors[1]
 
+    @pytest.mark.long
     @pytest.mark.parametrize("name", ["kitti_06", "tum_fr3_office"])
     def test_level_with_kornia(self, real_data, name):
         store = read_store(real_data / "correspondences" / f"{name}.h5")
@@ -252,6 +253,7 @@ class TestHardInput:
     def test_what_determines_no_matrix(self, arguments, normalizer):
         assert failed(RANSAC(seed=0, normalizer=normalizer, max_samples=2000)(*arguments))
 
+    @pytest.mark.long
     def test_many(self):
         points1, points2, _, true = pair(num_points=100_000, outliers=0.3)
         F_mat, inliers = RANSAC(seed=0)(points1.float(), points2.float())
@@ -304,6 +306,7 @@ class TestHardInput:
         order = true.long().argsort()
         assert RANSAC(seed=0)(points1[order], points2[order])[1][true[order]].float().mean() > 0.95
 
+    @pytest.mark.long
     @pytest.mark.parametrize(("size", "dtype"), [((256, 256), torch.float32), ((320, 240), torch.float64)])
     def test_dense_matches_in_the_order_of_the_rows(self, size, dtype):
         rows, columns = torch.meshgrid(*map(torch.arange, size), indexing="ij")
@@ -376,7 +379,9 @@ class TestHardInput:
         assert torch.equal(more, torch.cat([inliers, torch.zeros(5, dtype=torch.bool)]))
 
 
+@pytest.mark.long
 class TestInvariances:
+    @settings(max_examples=8)
     @given(seed=st.integers(0, 20))
     def test_swapping_the_views_transposes(self, seed):
         points1, points2, _, _ = pair("driving", 100, seed=seed)
@@ -386,6 +391,7 @@ class TestInvariances:
         errors = [epipolar_distances(points1[inliers], points2[inliers], F).mean() for F in (F_mat, swapped.mT)]
         assert errors[0] == pytest.approx(errors[1], rel=0.05, abs=1e-3)
 
+    @settings(max_examples=8)
     @given(scale=st.floats(0.1, 10), x=st.floats(-1e4, 1e4), y=st.floats(-1e4, 1e4))
     def test_similarities_of_the_pixels(self, scale, x, y):
         points1, points2, _, _ = pair("orbit", 100)
@@ -394,6 +400,7 @@ class TestInvariances:
         _, same = RANSAC(inl_th=scale, seed=0)(*moved)
         assert (inliers == same).float().mean() > 0.98
 
+    @settings(max_examples=8)
     @given(order=st.permutations(range(100)))
     def test_the_order_of_the_rows_does_not_count(self, order):
         points1, points2, _, _ = pair("handheld", 100, noise=0.1)

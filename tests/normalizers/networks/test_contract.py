@@ -6,7 +6,7 @@ import copy
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
 from scenes import DTYPES, numpy_hartley, numpy_whitening, prepared, shaken, uniform
@@ -63,6 +63,7 @@ def test_untrained_can_start_to_learn(name):
     assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters())
 
 
+@settings(max_examples=12)
 @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.booleans(), st.randoms(), st.sampled_from([*UNTRAINED]))
 def test_order_does_not_matter(seed, num_points, weighted, random, name):
     case, order = Case(name), random.sample(range(num_points), num_points)
