@@ -18,33 +18,19 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.normalizer import Normalizer, normalizing_transforms
 
-__all__ = [
-    "Diagnostics",
-    "condition_number",
-    "diagnose",
-    "diagnose_in_coordinates",
-    "normalized_distance",
-    "singularity_ratio",
-]
+__all__ = ["Diagnostics", "condition_number", "diagnose", "normalized_distance", "singularity_ratio"]
 
 
 class Diagnostics(NamedTuple):
-    r"""One number per sample, each with shape :math:`(B,)`.
+    """One number per sample, (B,) each."""
 
-    Attributes:
-        condition_number: of the design matrix, see :func:`condition_number`.
-        singularity_ratio: of the DLT's matrix before the projection, see :func:`singularity_ratio`.
-        distance1: mean normalised distance from the origin in the first view, see :func:`normalized_distance`.
-        distance2: the same in the second view.
-        rank2_share: share of the mean symmetric epipolar distance that the projection adds,
-            :math:`1 - e_{DLT} / e`. With eight points the DLT has no error and the share is one; it is negative where
-            the projection lowers the distance, and meaningless where both distances are rounding errors.
-    """
-
-    condition_number: Tensor
-    singularity_ratio: Tensor
-    distance1: Tensor
-    distance2: Tensor
+    condition_number: Tensor  # of the design matrix
+    singularity_ratio: Tensor  # of the DLT's matrix before the projection to rank 2
+    distance1: Tensor  # mean normalised distance from the origin in the first view
+    distance2: Tensor  # the same in the second view
+    # Share of the mean symmetric epipolar distance that the projection adds, 1 - e_DLT / e: one with eight points,
+    # where the DLT has no error; negative where the projection lowers the distance; meaningless where both distances
+    # are rounding errors.
     rank2_share: Tensor
 
 
@@ -59,12 +45,6 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
     Returns:
         the diagnostics, float64 where the device has it.
 
-    Raises:
-        TypeError: if the points are not floating-point tensors of one dtype.
-        ShapeError: if a shape is wrong.
-        ValueError: if there are fewer than eight correspondences, a value is not finite, or the normaliser does not
-            return two finite transforms :math:`(B, 3, 3)`.
-
     Reference:
         Fan et al., sections 3 and 4, and their figures of normalised distances, condition numbers and :math:`\rho`.
 
@@ -73,7 +53,6 @@ def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagno
         >>> _ = torch.manual_seed(0)
         >>> diagnose(torch.rand(2, 8, 2), torch.rand(2, 8, 2), Hartley()).distance1
         tensor([1.4142, 1.4142], dtype=torch.float64)
-
     """
     check_correspondences(points1, points2)
     problem = LinearProblem.from_points(points1, points2, None, Fundamental())

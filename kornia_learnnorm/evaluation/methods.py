@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -29,20 +30,7 @@ from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.optional import working_folder_importable
 from kornia_learnnorm.pretrained import WEIGHTS, shipped_weights, weights_format
 
-__all__ = [
-    "CLOSED_FORMS",
-    "KEPT_METHODS",
-    "OPTIMAL",
-    "REFINED",
-    "SHIPPED",
-    "Method",
-    "base_name",
-    "default_methods",
-    "find_method",
-    "identify_method",
-    "short_name_of",
-    "short_names",
-]
+__all__ = ["Method", "default_methods", "find_method"]
 
 CLOSED_FORMS: dict[str, Callable[[], Normalizer]] = {
     "none": Identity,
@@ -60,8 +48,7 @@ KEPT_METHODS = ("Hartley+optimal", "Hartley+LM", "crossview+LM")  # further defa
 def default_methods(weights: Sequence[str] = (), *, kept: bool = False) -> tuple[str, ...]:
     """Return the names of the default methods: closed forms, weights, and the search as the limit of them all.
 
-    Of two weights that have one name in tables, ``weights`` replace the shipped ones. A run that is ``kept`` has
-    :data:`KEPT_METHODS` too.
+    Of two weights that have one name in tables, ``weights`` replace the shipped ones; ``kept`` adds ``KEPT_METHODS``.
     """
     *closed_forms, search = CLOSED_FORMS
     given = {short_name_of(name) for name in weights}
@@ -91,20 +78,14 @@ class Method(NamedTuple):
 
 
 def find_method(name: str) -> Method:
-    """Return a method by its name.
+    """Return a method by its name; raise ValueError or FileNotFoundError, which say what is wrong, if there is none.
 
     Args:
         name: ``none``, ``Hartley``, ``whitening``, ``reweighted`` or ``searched``; weights that ship or the path of a
             ``.safetensors`` file, ``module:FILE.safetensors`` where it names parts of that module of your own; or the
             import path of a normaliser class or function, ``package.module:Name``. Modules are looked for in the
-            current folder last. With ``+LM``, the result is refined by Levenberg-Marquardt on the
-            Sampson distance; with ``+optimal``, the covariance-weighted correction takes the place of the projection to
-            rank 2.
-
-    Raises:
-        ValueError: if there is no such class or function, the class needs arguments, or the weights are of a layer.
-        FileNotFoundError: if there is no such normalisation and there are no such weights.
-
+            current folder last. With ``+LM``, Levenberg-Marquardt refines the result on the Sampson distance; with
+            ``+optimal``, the covariance-weighted correction takes the place of the projection to rank 2.
     """
     base = base_name(name)
     normalizer = _find_normalizer(base)
@@ -126,15 +107,15 @@ def _find_normalizer(name: str) -> Normalizer:
         return LearnedNormalizer.from_pretrained(path, [module])
     if ":" in name:
         return _own_normalizer(name)
-    shipped = shipped_weights(FORMAT)
+    shipped, suffix = shipped_weights(FORMAT), Path(name).suffix
     if weights_format(name) == LAYER_FORMAT:
         raise ValueError(
             f"{name} holds the weights of a LearnedEightPoint, expected those of a LearnedNormalizer, such as"
             f" {', '.join(shipped)}; learnnorm robust STORE --out RUN --estimators learned:{name} evaluates them"
         )
-    if Path(name).suffix == ".ckpt":
+    if suffix == ".ckpt":
         raise FileNotFoundError(f"{name} is a checkpoint: learnnorm fit writes weights.safetensors beside its folder")
-    if name not in shipped and Path(name).suffix != ".safetensors":
+    if name not in shipped and suffix != ".safetensors":
         raise FileNotFoundError(
             f"no weights {name!r} and no such normalisation: expected {', '.join([*CLOSED_FORMS, *shipped])}, a"
             f" .safetensors file or module:Name, each without suffix or with {REFINED} or {OPTIMAL}"
@@ -149,24 +130,27 @@ def _own_weights(name: str) -> tuple[str, str]:
 
 
 def _own_normalizer(name: str) -> Normalizer:
-    """Return a user's normaliser, an instance if it is a class; its errors become a ValueError with its name."""
+    """Return a user's normaliser; its errors become a ValueError with its name."""
     found = _import(name)
-    try:
+    with _explained(f"{name!r} cannot be made without arguments, as the class of a method must"):
         made = found() if isinstance(found, type) else found
-    except Exception as error:  # of code that is not ours
-        text = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{name!r} cannot be made without arguments, as the class of a method must: {text}") from error
     if not callable(made):
         raise ValueError(f"{name!r} is not a normaliser: it cannot be called")
 
     def normalize(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        try:
+        with _explained(f"{name} failed, called with points1, points2 and weights"):
             return normalizing_transforms(made, LinearProblem.from_points(points1, points2, weights, Fundamental()))
-        except Exception as error:
-            text = f"{type(error).__name__}: {error}"
-            raise ValueError(f"{name} failed, called with points1, points2 and weights: {text}") from error
 
     return normalize
+
+
+@contextmanager
+def _explained(message: str) -> Iterator[None]:
+    """Raise a ValueError with a message for any exception of code that is not ours."""
+    try:
+        yield
+    except Exception as error:
+        raise ValueError(f"{message}: {type(error).__name__}: {error}") from error
 
 
 def _import(name: str) -> Any:
@@ -174,12 +158,8 @@ def _import(name: str) -> Any:
     module, _, attribute = name.partition(":")
     if not module or not attribute:
         raise ValueError(f"no normaliser at {name!r}: expected module:Name")
-    try:
-        with working_folder_importable():
-            return getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # importing runs code that is not ours
-        text = f"{type(error).__name__}: {error}"
-        raise ValueError(f"no normaliser at {name!r}, looked for in {Path.cwd()} too: {text}") from error
+    with _explained(f"no normaliser at {name!r}, looked for in {Path.cwd()} too"), working_folder_importable():
+        return getattr(importlib.import_module(module), attribute)
 
 
 def identify_method(name: str) -> str:
@@ -190,19 +170,13 @@ def identify_method(name: str) -> str:
     module, path = _own_weights(base)
     if module:
         files = [Path(path), Path(_import(f"{module}:__file__"))]
-    elif ":" in base:
-        files = _source_files(base)
+    elif ":" in base:  # the module in the import path, and the one that defines the class or function
+        found = _import(base)
+        parts = (sys.modules[base.partition(":")[0]], inspect.getmodule(found), inspect.getmodule(type(found)))
+        files = sorted({Path(file) for part in parts if (file := getattr(part, "__file__", None))})
     else:
         files = [Path(base) if Path(base).is_file() else WEIGHTS / f"{base}.safetensors"]
     return f"{name} {sha256(b''.join(path.read_bytes() for path in files)).hexdigest()[:16]}"
-
-
-def _source_files(name: str) -> list[Path]:
-    """Return the files of the module in an import path, and of the module that defines the class or function."""
-    found = _import(name)
-    parts = (sys.modules[name.partition(":")[0]], inspect.getmodule(found), inspect.getmodule(type(found)))
-    files = {getattr(part, "__file__", None) for part in parts}
-    return sorted(Path(file) for file in files if file)
 
 
 def short_name_of(name: str) -> str:

@@ -37,16 +37,6 @@ class SearchedNormalizer(ProblemNormalizer):
         num_parameters: parameters per view :math:`P`, as the builder wants them.
         steps: steps of the search.
         learning_rate: first step length; it falls to zero as half a cosine.
-
-    Raises:
-        ValueError: if ``steps`` or ``learning_rate`` is not positive.
-
-    Example:
-        >>> _ = torch.manual_seed(0)
-        >>> T1, T2 = SearchedNormalizer(steps=5)(torch.rand(2, 8, 2), torch.rand(2, 8, 2))
-        >>> T1.shape
-        torch.Size([2, 3, 3])
-
     """
 
     min_points = 8

@@ -11,19 +11,11 @@ from typing import Any, NamedTuple
 from kornia_learnnorm.files import short_name
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["MIN_P_VALUE", "Cell", "Number", "Table", "format_table", "names_of", "tables_as_json"]
-
 MIN_P_VALUE = 1e-3  # the smallest p-value that the resamples of a report can resolve
 
 
 class Number(NamedTuple):
-    """A number and what stands beside it.
-
-    Example:
-        >>> str(Number(1.52, ".1f", (1.2, 2.0), 0.0004)), str(Number(99.9, ".1f", trained_on=True))
-        ('1.5 [1.2, 2.0], < 0.001', '99.9 *')
-
-    """
+    """A number and what stands beside it."""
 
     value: float
     spec: str = ".3f"  # format of the value, the interval and the standard deviation
@@ -67,15 +59,7 @@ class Table(NamedTuple):
     rows: list[list[Cell]]
 
     def known_parts(self) -> Table | None:
-        """Return the table without the columns and rows that have no number; None if there is none at all.
-
-        The first column has names.
-
-        Example:
-            >>> Table("", "", ["method", "own", "truth"], [["a", 1, ""], ["b", "", "-"]]).known_parts().rows
-            [['a', 1]]
-
-        """
+        """Return the table without rows, and columns after the first, that have no number; None if none is left."""
         known = [row for row in self.rows if any(map(_is_known, row[1:]))]
         places = [0, *(i for i in range(1, len(self.header)) if any(_is_known(row[i]) for row in known))]
         rows = [[row[i] for i in places] for row in known]
@@ -92,47 +76,23 @@ def tables_as_json(command: str, tables: Sequence[Table]) -> str:
     Each table has ``title``, ``text`` and ``rows``, objects by the names of the columns. A cell is a number; an object
     with ``value`` and, where the table has them, ``low`` and ``high`` (interval), ``p``, ``std`` and ``trained_on``;
     null where the table is empty or has ``-``; otherwise its text. Numbers are rounded as in the printed table.
-
-    Example:
-        >>> rows = [["mine", Number(1.52, ".1f", (1.2, 2.0))]]
-        >>> print(tables_as_json("learnnorm ...", [Table("A", "", ["method", "px"], rows)]))
-        {"command": "learnnorm ...",... "rows": [{"method": "mine", "px": {"value": 1.5, "low": 1.2, "high": 2.0}}]}]}
-
     """
 
     def value(cell: Cell) -> Any:
         return cell.as_json() if isinstance(cell, Number) else cell if _is_known(cell) else None
 
-    content = {
-        "command": command,
-        "version": importlib.metadata.version("kornia_learnnorm"),
-        "tables": [
-            {
-                "title": table.title,
-                "text": table.text,
-                "rows": [dict(zip(table.header, map(value, row), strict=True)) for row in table.rows],
-            }
-            for table in tables
-        ],
-    }
+    found = [
+        {"title": t.title, "text": t.text, "rows": [dict(zip(t.header, map(value, r), strict=True)) for r in t.rows]}
+        for t in tables
+    ]
+    content = {"command": command, "version": importlib.metadata.version("kornia_learnnorm"), "tables": found}
     return json.dumps(content, allow_nan=False)
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[Cell]], form: str = "pipe", **options: Any) -> str:
-    """Format a table with padded columns, the first aligned left and the others right.
+    """Return a table with padded columns, the first aligned left and the others right, as Markdown by default.
 
-    Args:
-        header: names of the columns.
-        rows: cells.
-        form: form of the table for ``tabulate``; the default is Markdown.
-        options: further options of ``tabulate``.
-
-    Example:
-        >>> print(format_table(["method", "px"], [["Hartley", "1.5"]]))
-        | method   |   px |
-        |:---------|-----:|
-        | Hartley  |  1.5 |
-
+    ``form`` and ``options`` are for ``tabulate``.
     """
     tabulate = import_extra("tabulate", "images", "printing tables").tabulate
     options |= {"colalign": ("left", *["right"] * (len(header) - 1)), "disable_numparse": True}

@@ -10,19 +10,12 @@ __all__ = ["BetterRate", "better_rate", "comparable", "count_better"]
 
 
 class BetterRate(NamedTuple):
-    """How often one method's residual is below another's.
+    """How often one method's residual is below another's."""
 
-    Attributes:
-        rate: share of the compared samples with a strictly smaller residual.
-        ties: number of equal pairs, counted as not better.
-        degenerate: number of samples left out because a residual is NaN or both are infinite.
-        compared: number of samples compared.
-    """
-
-    rate: float
-    ties: int
-    degenerate: int
-    compared: int
+    rate: float  # share of the compared samples with a strictly smaller residual
+    ties: int  # equal pairs, counted as not better
+    degenerate: int  # samples left out because a residual is NaN or both are infinite
+    compared: int  # samples compared
 
 
 def better_rate(residual: Tensor, baseline: Tensor) -> BetterRate:

@@ -64,53 +64,26 @@ def bootstrap_means(values: Tensor, groups: Tensor, draws: int = 2000, seed: int
 
 
 class PairedDifference(NamedTuple):
-    """How far the mean of one method is above another's on the same samples.
+    """How far the mean of one method is above another's on the same samples."""
 
-    Attributes:
-        mean: mean of ``values - baseline`` over samples.
-        low: lower end of its bootstrap interval.
-        high: upper end.
-        p_value: two-sided p-value of no difference.
-    """
-
-    mean: float
-    low: float
-    high: float
-    p_value: float
+    mean: float  # of values - baseline over samples
+    low: float  # lower end of its bootstrap interval
+    high: float  # upper end
+    p_value: float  # two-sided, of no difference
 
 
 def paired_bootstrap(
     values: Tensor, baseline: Tensor, groups: Tensor, level: float = 0.95, draws: int = 2000, seed: int = 0
 ) -> PairedDifference:
-    r"""Compare the means of two methods on the same samples by drawing whole image pairs with replacement.
+    r"""Compare the means of two methods on the same samples, (S,) each, by drawing whole image pairs with replacement.
 
     The p-value is that of the percentile interval which just reaches zero: with :math:`\bar d^*` the mean difference of
-    a draw, :math:`p = 2 (1 + \min(|\{\bar d^* \le 0\}|, |\{\bar d^* \ge 0\}|)) / (1 + \text{draws})`, at most one. No
-    number of draws makes it smaller than ``2 / (1 + draws)``.
-
-    Args:
-        values: one number per sample with shape (S,), or per image pair.
-        baseline: numbers of the other method for the samples with shape (S,).
-        groups: index of each sample's image pair with shape (S,), integers.
-        level: as for :func:`bootstrap_interval`, as are ``draws`` and ``seed``.
-        draws: number of draws.
-        seed: seed of the draws.
-
-    Returns:
-        the mean difference, its interval of :func:`bootstrap_interval`, and the p-value.
-
-    Raises:
-        ValueError: if the shapes differ, a difference is not finite (drop such samples of both methods and count them),
-            there are fewer than two groups, or ``level`` is not between 0 and 1.
+    a draw, :math:`p = 2 (1 + \min(|\{\bar d^* \le 0\}|, |\{\bar d^* \ge 0\}|)) / (1 + \text{draws})`, at most one. The
+    other arguments and errors are those of :func:`bootstrap_interval`; also raises ValueError if a difference is not
+    finite: drop such samples of both methods and count them.
 
     Reference:
         A. Davison, D. Hinkley, Bootstrap Methods and their Application, 1997, chapters 4 and 5.
-
-    Example:
-        >>> values, groups = torch.tensor([0.9, 0.8, 0.7, 0.9]), torch.arange(4)
-        >>> paired_bootstrap(values, values - 0.25, groups)
-        PairedDifference(mean=0.25, low=0.25, high=0.25, p_value=0.00099...)
-
     """
     if values.shape != baseline.shape or values.ndim != 1:
         raise ValueError(f"values must be two (S,) tensors, got {[*values.shape]} and {[*baseline.shape]}")

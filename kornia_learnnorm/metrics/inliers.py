@@ -65,25 +65,11 @@ def f1_score(
     r"""Return the harmonic mean of precision and recall between the inliers of an estimate and of the ground truth.
 
     :math:`2 |A \cap B| / (|A| + |B|)` with :math:`A = \{i : d_i(F) < \tau\}` and the same :math:`B` of the true matrix.
-
-    Args:
-        points1: as for :func:`inlier_share`, which raises the same errors.
-        points2: as for :func:`inlier_share`.
-        F_mat: estimated fundamental matrices with shape :math:`(*, 3, 3)`, any scale.
-        F_true: true fundamental matrices with shape :math:`(*, 3, 3)`, any scale; NaN where unknown.
-        threshold: symmetric epipolar distance :math:`\tau` that an inlier stays below, pixels.
-        mask: as for :func:`inlier_share`.
+    The arguments and errors are those of :func:`inlier_share`, with true matrices ``F_true`` :math:`(*, 3, 3)`, NaN
+    where unknown.
 
     Returns:
         scores with shape :math:`(*)`; zero where the sets do not meet, NaN where the ground truth has no inliers.
-
-    Example:
-        >>> F_true = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # lines are rows
-        >>> F_mat = F_true + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # one row further down
-        >>> points1, points2 = torch.tensor([[5.0, 1.0], [5.0, 2.0]]), torch.tensor([[9.0, 1.5], [9.0, 2.0]])
-        >>> f1_score(points1, points2, F_mat, F_true, threshold=1.5)  # precision 1, recall 1/2
-        tensor(0.6667)
-
     """
     masks = (_inliers(points1, points2, matrix, threshold, mask) for matrix in (F_mat, F_true))
     return f1_from_masks(*masks).to(points1.dtype)
@@ -96,29 +82,13 @@ def f1_from_masks(inliers: Tensor, true: Tensor) -> Tensor:
 
 
 def epipolar_error(
-    points1: Tensor,
-    points2: Tensor,
-    F_mat: Tensor,
-    F_true: Tensor,
-    threshold: float = 1.0,
-    mask: Tensor | None = None,
+    points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tensor, threshold: float = 1.0, mask: Tensor | None = None
 ) -> Tensor:
     r"""Return the mean symmetric epipolar distance of the ground truth's inliers under an estimate, in pixels.
 
     :math:`\frac{1}{|B|} \sum_{i \in B} d_i(F)` with :math:`B = \{i : d_i(F_{true}) < \tau\}`, whatever threshold the
-    other metrics are taken at. The arguments and errors are those of :func:`f1_score`.
-
-    Returns:
-        errors in pixels with shape :math:`(*)`; infinite for a failed estimate, NaN where the ground truth has no
-        inliers.
-
-    Example:
-        >>> F_true = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # lines are rows
-        >>> F_mat = F_true + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # one row further down
-        >>> points1, points2 = torch.tensor([[5.0, 1.0], [5.0, 2.0]]), torch.tensor([[9.0, 1.0], [9.0, 9.0]])
-        >>> epipolar_error(points1, points2, F_mat, F_true)
-        tensor(2.)
-
+    other metrics are taken at. The arguments and errors are those of :func:`f1_score`. The errors, :math:`(*)`, are
+    infinite for a failed estimate and NaN where the ground truth has no inliers.
     """
     true = _inliers(points1, points2, F_true, threshold, mask)
     distance = finite_distance(points1, points2, F_mat)

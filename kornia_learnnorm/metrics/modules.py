@@ -1,8 +1,4 @@
-"""The better rate as a ``torchmetrics`` class, which collects over batches and processes; needs the extra ``train``.
-
-It reports a dictionary of scalars. Samples that cannot be compared are left out and counted; without any other sample,
-the rate is NaN.
-"""
+"""The better rate as a ``torchmetrics`` class, which collects over batches and processes; needs the extra ``train``."""
 
 from __future__ import annotations
 
@@ -20,16 +16,8 @@ __all__ = ["BetterRateMetric"]
 class BetterRateMetric(Metric):
     """Share of samples with a residual below the baseline's; see :mod:`~kornia_learnnorm.metrics.better_rate`.
 
-    Args:
-        kwargs: options of ``torchmetrics.Metric``.
-
-    Example:
-        >>> metric = BetterRateMetric()
-        >>> metric.update(torch.tensor([1.0, 2.0]), torch.tensor([2.0, 2.0]))
-        >>> metric.update(torch.tensor([3.0, torch.nan]), torch.tensor([1.0, 2.0]))
-        >>> {name: round(value.item(), 3) for name, value in metric.compute().items()}
-        {'better_rate': 0.333, 'ties': 1, 'degenerate': 1, 'compared': 3}
-
+    It reports a dictionary of scalars. Samples that cannot be compared are left out and counted; without any other
+    sample, the rate is NaN. The keywords are those of ``torchmetrics.Metric``.
     """
 
     is_differentiable = False

@@ -21,25 +21,10 @@ __all__ = ["mean_average_accuracy", "pose_auc", "pose_error", "rotation_error", 
 
 
 def rotation_error(R: Tensor, R_true: Tensor) -> Tensor:
-    r"""Return the angle between two rotations, in degrees.
+    r"""Return the angle between rotations (*, 3, 3), degrees from 0 to 180, with shape (*); NaN where a rotation is.
 
     :math:`\operatorname{atan2}(\|\Delta - \Delta^\top\|_F / \sqrt 2, \operatorname{tr} \Delta - 1)` of
     :math:`\Delta = R R_{true}^\top`; an arc cosine of the trace would lose half of the digits near 0 and 180.
-
-    Args:
-        R: rotations with shape :math:`(*, 3, 3)`.
-        R_true: rotations with shape :math:`(*, 3, 3)`.
-
-    Returns:
-        angles from 0 to 180 with shape :math:`(*)`; NaN where a rotation is.
-
-    Raises:
-        ShapeError: if a shape is wrong.
-
-    Example:
-        >>> rotation_error(torch.eye(3), torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
-        tensor(90.)
-
     """
     KORNIA_CHECK_SHAPE(R, ["*", "3", "3"])
     KORNIA_CHECK_SHAPE(R_true, ["*", "3", "3"])
@@ -50,26 +35,11 @@ def rotation_error(R: Tensor, R_true: Tensor) -> Tensor:
 
 
 def translation_error(t: Tensor, t_true: Tensor) -> Tensor:
-    r"""Return the angle between two directions, in degrees, with their signs.
+    r"""Return the angle between directions (*, 3) with their signs, degrees from 0 to 180; NaN for a zero vector.
 
     :math:`2 \operatorname{atan2}(\|t - t_{true}\|, \|t + t_{true}\|)` of unit vectors. Opposite directions are 180
     degrees apart, as in NG-RANSAC: the points in front of the cameras decide the sign. SuperGlue's evaluation and the
     Image Matching Benchmark leave the sign open, which is ``torch.minimum(error, 180 - error)``.
-
-    Args:
-        t: translations with shape :math:`(*, 3)`, any length.
-        t_true: translations with shape :math:`(*, 3)`, any length.
-
-    Returns:
-        angles from 0 to 180 with shape :math:`(*)`; NaN where a translation is NaN or zero and has no direction.
-
-    Raises:
-        ShapeError: if a shape is wrong.
-
-    Example:
-        >>> translation_error(torch.tensor([0.0, 0.0, 1.0]), torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, -5.0]]))
-        tensor([  0., 180.])
-
     """
     KORNIA_CHECK_SHAPE(t, ["*", "3"])
     KORNIA_CHECK_SHAPE(t_true, ["*", "3"])
@@ -105,29 +75,13 @@ def pose_error(R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> Tensor:
 
 
 def pose_auc(errors: Tensor, thresholds: Sequence[float] = (5, 10, 20)) -> tuple[float, ...]:
-    r"""Return the area under the recall curve of pose errors up to each threshold, as a share.
+    r"""Return the area under the recall curve of pose errors (P,), degrees, up to each threshold, as a share.
 
     The curve joins (0, 0) and :math:`(e_i, i / P)` of the sorted errors below the threshold :math:`\tau` by straight
-    lines and is level from the last to :math:`\tau`. Its trapezoids add up to
-    :math:`(\sum_{e_i < \tau} (\tau - e_i) + \max_{e_i < \tau} e_i / 2) / (P \tau)`.
-
-    Args:
-        errors: one pose error per image pair with shape :math:`(P,)`, degrees; infinite for a failure.
-        thresholds: largest errors, degrees.
-
-    Returns:
-        areas from 0 to 1, one per threshold.
-
-    Raises:
-        ValueError: if there are no errors, one is NaN or negative, or a threshold is not positive.
+    lines and is level from the last to :math:`\tau`. A failure has an infinite error.
 
     Reference:
         P.-E. Sarlin et al., SuperGlue: Learning Feature Matching with Graph Neural Networks, CVPR 2020.
-
-    Example:
-        >>> pose_auc(torch.tensor([0.0, 2.0, torch.inf]), thresholds=(4, 8))
-        (0.583..., 0.625)
-
     """
     if not all(threshold > 0 for threshold in thresholds):
         raise ValueError(f"thresholds must be positive, got {[*thresholds]}")
@@ -136,29 +90,11 @@ def pose_auc(errors: Tensor, thresholds: Sequence[float] = (5, 10, 20)) -> tuple
 
 
 def mean_average_accuracy(errors: Tensor, limit: int = 10) -> float:
-    r"""Return the share of image pairs with a pose error below 1, 2, ... degrees, averaged: mAA(10).
-
-    :math:`\frac{1}{L} \sum_{k=1}^{L} |\{i : e_i < k\}| / P`, with the larger of rotation and translation error as
-    :math:`e_i`, see :func:`pose_error`.
-
-    Args:
-        errors: one pose error per image pair with shape :math:`(P,)`, degrees; infinite for a failure.
-        limit: the last threshold :math:`L`, whole degrees.
-
-    Returns:
-        the average, from 0 to 1.
-
-    Raises:
-        ValueError: if there are no errors, one is NaN or negative, or the limit is below one.
+    """Return the share of pose errors (P,) below 1, 2, ..., ``limit`` degrees, averaged: mAA(10).
 
     Reference:
         Y. Jin et al., Image Matching across Wide Baselines: From Paper to Practice, IJCV 2021. Its histogram also
         counts an error of exactly 10 degrees.
-
-    Example:
-        >>> mean_average_accuracy(torch.tensor([0.5, 5.5, torch.inf]))
-        0.5
-
     """
     errors = _checked(errors)
     if limit < 1:

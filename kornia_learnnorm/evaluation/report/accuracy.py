@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.numbers import (
-    BASELINE,
-    MIN_DISTANCE,
-    POSE_HEADER,
-    RESAMPLES,
-    better_share,
-    mean_share,
-    median_number,
-    number,
-    paired_change,
-    pose_numbers,
-)
+from kornia_learnnorm.evaluation.report import numbers
+from kornia_learnnorm.evaluation.report.numbers import BASELINE, better_share, median_number, number
 from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.evaluation.tables import Cell, Table
@@ -37,10 +28,7 @@ MOTIONS = {
 
 
 def report_tables(run: Run) -> list[Table]:
-    """Return all tables of a run with predictions of Hartley's normalisation in every store and protocol.
-
-    Numbers that need a ground truth are empty cells where it is not known.
-    """
+    """Return all tables of a run with Hartley's normalisation; numbers without a ground truth are empty cells."""
     tables = rate_tables(run)
     for cell in run.cells:
         tables += [_accuracy(cell), _consensus(cell, run), _tests(cell)]
@@ -52,34 +40,23 @@ def report_tables(run: Run) -> list[Table]:
 
 
 def _accuracy(cell: RunCell) -> Table:
-    """Return the table of errors, poses and diagnostics by method."""
     header = ["method", "fit px", "held out px", "truth px", f"truth: better than {BASELINE} %"]
-    header += ["rotation deg", "translation deg", *POSE_HEADER, "condition number", "rho", "distance 1", "distance 2"]
-    header.append("error due to rank 2 %")
+    header += ["rotation deg", "translation deg", *numbers.POSE_HEADER, "condition number", "rho"]
+    header += ["distance 1", "distance 2", "error due to rank 2 %"]
     posed, rows = _posed(cell), list[list[Cell]]()
     for name, p in cell.predictions.items():
-        rate: Cell = "-" if name == BASELINE else better_share(cell, name, BASELINE, "truth")
         angles = [p[key] for key in ("rotation_error", "translation_error")]
-        diagnostics = (p[key] for key in ("condition_number", "rho", "distance1", "distance2"))
-        rows.append(
-            [
-                name,
-                *(median_number(p[key]) for key in ("own", "heldout", "truth")),
-                rate,
-                *(median_number(angle, ".2f") for angle in angles),
-                *pose_numbers(*(angle.nan_to_num(math.inf)[posed] for angle in angles)),
-                *(median_number(values, ".4g") for values in diagnostics),
-                median_number(100 * p["rank2_share"], "z.0f"),
-            ]
-        )
-    return Table(f"Fit and accuracy: {cell.title}", _accuracy_text(cell, int(posed.sum())), header, rows)
-
-
-def _accuracy_text(cell: RunCell, posed: int) -> str:
-    """Return what the table of errors shows, of which the samples of ``posed`` have a ground-truth pose."""
+        row = [name, *(median_number(p[key]) for key in ("own", "heldout", "truth"))]
+        row.append("-" if name == BASELINE else better_share(cell, name, BASELINE, "truth"))
+        row += [median_number(angle, ".2f") for angle in angles]
+        row += numbers.pose_numbers(*(angle.nan_to_num(math.inf)[posed] for angle in angles))
+        row += [median_number(p[key], ".4g") for key in ("condition_number", "rho", "distance1", "distance2")]
+        rows.append([*row, median_number(100 * p["rank2_share"], "z.0f")])
     truth = int(_with_truth(cell).sum())
-    known = f"of which {truth} have ground-truth inliers and {posed} a ground-truth pose" if truth else "without truth"
-    return (
+    known = "without truth"
+    if truth:
+        known = f"of which {truth} have ground-truth inliers and {int(posed.sum())} a ground-truth pose"
+    text = (
         f"Medians over {len(cell.pair)} samples, {known}, of symmetric epipolar distances: `fit` is the mean of the "
         "sample's own points, `held out` the median of 16 other matches of the pair, some of which may be wrong, "
         "`truth` that of the pair's ground-truth inliers. Angles are errors of the relative pose, summarised by AUC "
@@ -89,23 +66,19 @@ def _accuracy_text(cell: RunCell, posed: int) -> str:
         "less the larger it is. Distances: mean ones of the normalised points from the origin. Error due to rank 2: "
         "share of the fit."
     )
+    return Table(f"Fit and accuracy: {cell.title}", text, header, rows)
 
 
 def _consensus(cell: RunCell, run: Run) -> Table:
-    """Return the table of inlier shares and F1 of the matrices of samples.
-
-    Samples without ground truth are left out, unless no sample has one.
-    """
+    """Return the table of inlier shares and F1; samples without ground truth are left out, unless none has one."""
     header = ["method", *(f"{name} @{threshold:g} px" for threshold in THRESHOLDS for name in ("inliers %", "F1 %"))]
     known = next(iter(cell.predictions.values()))["f1"].isfinite()
     kept, rows = known | ~known.any(0), list[list[Cell]]()
     for name, prediction in cell.predictions.items():
-        cells = [
-            mean_share(prediction[key][keep, place], cell.pair[keep])
-            for place, keep in enumerate(kept.T)
-            for key in ("inliers", "f1")
-        ]
-        rows.append([name, *cells])
+        row: list[Cell] = [name]
+        for (place, keep), key in product(enumerate(kept.T), ("inliers", "f1")):
+            row.append(numbers.mean_share(prediction[key][keep, place], cell.pair[keep]))
+        rows.append(row)
     truth = bool(known.any())
     dropped = " and ".join(f"{int((~keep).sum())} at {t:g} px" for t, keep in zip(THRESHOLDS, known.T, strict=True))
     text = (
@@ -134,29 +107,22 @@ def _posed(cell: RunCell) -> Tensor:
 
 
 def _tests(cell: RunCell) -> Table:
-    """Return the table of paired tests of each distance against the baseline."""
-    quantities = {"own": "fit", "heldout": "held out", "truth": "truth"}
+    quantities, baseline = {"own": "fit", "heldout": "held out", "truth": "truth"}, cell.predictions[BASELINE]
     header = ["method", *(f"{name}: change %, p" for name in quantities.values())]
-    logs = {
-        name: {key: p[key].clamp(min=MIN_DISTANCE).log() for key in quantities} for name, p in cell.predictions.items()
-    }
-    rows: list[list[Cell]] = [
-        [name, *(paired_change(log[key], logs[BASELINE][key], cell.pair, logarithms=True) for key in quantities)]
-        for name, log in logs.items()
-        if name != BASELINE
-    ]
+    rows = list[list[Cell]]()
+    for name, p in cell.predictions.items():
+        if name != BASELINE:
+            logs = ([q[key].clamp(min=numbers.MIN_DISTANCE).log() for key in quantities] for q in (p, baseline))
+            both = zip(*logs, strict=True)
+            rows.append([name, *(numbers.paired_change(a, b, cell.pair, logarithms=True) for a, b in both)])
+    truth = cell.pair[_with_truth(cell)]
+    used, known = (f"{len(pair)} samples of {len(torch.unique(pair))} pairs" for pair in (cell.pair, truth))
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "
-        f"p-value of a paired bootstrap of {RESAMPLES:,} resamples. Negative is better. `fit` and "
-        f"`held out` use {_count(cell.pair)}"
+        f"p-value of a paired bootstrap of {numbers.RESAMPLES:,} resamples. Negative is better. `fit` and "
+        f"`held out` use {used}{f', `truth` uses {known}' if len(truth) else ''}."
     )
-    truth = cell.pair[_with_truth(cell)]
-    text += f", `truth` uses {_count(truth)}." if len(truth) else "."
     return Table(f"Paired tests: {cell.title}", text, header, rows)
-
-
-def _count(pair: Tensor) -> str:
-    return f"{len(pair)} samples of {len(torch.unique(pair))} pairs"
 
 
 def by_motion(cell: RunCell, run: Run, learned: str) -> Table:
@@ -172,9 +138,7 @@ def by_motion(cell: RunCell, run: Run, learned: str) -> Table:
         text = _distinct(middle, values)
         for half, chosen in ((f"up to {text}", values <= middle), (f"above {text}", values > middle)):
             inside = chosen[cell.pair]
-            rates = [
-                better_share(cell, learned, BASELINE, quantity, inside) for quantity in ("own", "heldout", "truth")
-            ]
+            rates = [better_share(cell, learned, BASELINE, key, inside) for key in ("own", "heldout", "truth")]
             counts = [int(chosen.sum()), int(inside.sum()), int((inside & truth).sum())]
             rows.append([name, half, *counts, *rates])
     header = ["motion", "half", "pairs", "samples", "with truth", "fit: better %", "held out: better %"]
@@ -215,8 +179,8 @@ def _worst_failures(cell: RunCell, run: Run, learned: str) -> Table:
     pairs, rows = run.pairs[cell.store], list[list[Cell]]()
     for row in worst[ratio[worst] > 0].tolist():
         pair = int(cell.pair[row])
-        numbers = (mine["truth"][row], other["truth"][row], ratio[row], mine["own"][row], other["own"][row])
-        cells = [number(float(one), ".2f") for one in numbers]
+        errors = (mine["truth"][row], other["truth"][row], ratio[row], mine["own"][row], other["own"][row])
+        cells = [number(float(error), ".2f") for error in errors]
         condition, parallax = float(mine["condition_number"][row]), float(pairs["parallax"][pair])
         rows.append([str(pairs["names"][pair]), *cells, number(condition, ".3g"), number(parallax, ".1f")])
     text = (

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from kornia_learnnorm.evaluation.methods import REFINED
+from kornia_learnnorm.evaluation.report import style
 from kornia_learnnorm.evaluation.report.rates import papers_data
-from kornia_learnnorm.evaluation.report.style import (
-    INK,
-    ReportPicture,
-    is_learned,
-    line_style,
-    make_figure,
-    make_picture,
-    method_colors,
-    report_style,
-)
+from kornia_learnnorm.evaluation.report.style import INK, ReportPicture, line_style, make_figure, make_picture
 from kornia_learnnorm.evaluation.runs.example import TRIALS
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.evaluation.runs.results_store import Arrays
@@ -30,6 +22,7 @@ from kornia_learnnorm.two_view.drawing import INLIER, WIDE, draw_line, draw_matc
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+DOTS: dict[str, Any] = {"marker": "o", "markersize": 3}
 NUM_LINES = 5  # epipolar lines of each matrix
 LINE_METHODS = ("Hartley", "crossview")
 TRUTH = "ground truth"  # name of its epipolar lines
@@ -39,23 +32,23 @@ NORMALISATIONS = ("none", "Hartley", "whitening", "reweighted", "paper", "crossv
 BUILT_IN = {*NORMALISATIONS, "crossview-synthetic"}
 
 
-@report_style()
+@style.report_style()
 def report_figures(run: Run) -> list[ReportPicture]:
     """Draw all pictures of a run; those of samples use the first store with filtered samples."""
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
-    colors = method_colors(run.about["methods"])
-    first = [_per_frame(cell, colors), _distribution(cell, colors), _distances(cell, colors)]
+    colors = style.method_colors(run.about["methods"])
+    pictures = [(cell.store, draw(cell, colors)) for draw in (_per_frame, _distribution, _distances)]
     example = [*draw_example(run, colors), *([_by_size(run, colors)] if run.sizes else [])]
-    last = [_conditions(cell, colors), *([_rho(cell, colors)] if len(cell.pair) >= RHO_WINDOW else [])]
-    store = str(run.example.get("store", cell.store))
-    return [*_numbered(first, run, cell.store), *_numbered(example, run, store), *_numbered(last, run, cell.store)]
-
-
-def _numbered(pictures: list[ReportPicture], run: Run, store: str) -> list[ReportPicture]:
-    """Return pictures of a store with the numbers of Fan et al. in their titles, where it has their test data."""
-    if not papers_data(run.about["stores"][store]):
-        return pictures
-    return [p._replace(title=f"{p.title} (Figure {p.name.removeprefix('figure-')})") for p in pictures]
+    pictures += [(str(run.example["store"]), picture) for picture in example]
+    last = [_conditions, _rho] if len(cell.pair) >= RHO_WINDOW else [_conditions]
+    pictures += [(cell.store, draw(cell, colors)) for draw in last]
+    # The numbers of Fan et al. are in the titles where a store has their test data.
+    return [
+        p._replace(title=f"{p.title} (Figure {p.name.removeprefix('figure-')})")
+        if papers_data(run.about["stores"][store])
+        else p
+        for store, p in pictures
+    ]
 
 
 def _per_frame(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
@@ -66,14 +59,11 @@ def _per_frame(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     for name in chosen:
         own = cell.predictions[name]["own"].numpy()
         means = [own[(pair == frame) & np.isfinite(own)].mean() for frame in frames]
-        style = "--" if name.endswith(REFINED) else "-"
-        axes.plot(frames, means, style, color=colors[name], label=name, marker="o", markersize=3)
+        dashes = "--" if name.endswith(REFINED) else "-"
+        axes.plot(frames, means, dashes, color=colors[name], label=name, **DOTS)
     axes.set(xlabel="image pair", ylabel="mean error of a pair's samples, px", yscale="log")
     axes.locator_params(axis="x", integer=True)
-    text = (
-        f"Mean symmetric epipolar distance of the samples of each of the first {len(frames)} image pairs of "
-        f"{cell.store}."
-    )
+    text = f"Mean symmetric epipolar distance of a pair's samples, first {len(frames)} image pairs of {cell.store}."
     if any(name.endswith(REFINED) for name in chosen):
         text += " Dashed: with non-linear refinement."
     return make_picture(figure, "figure-4a", "Error by frame", text)
@@ -113,11 +103,10 @@ def _by_size(run: Run, colors: dict[str, str]) -> ReportPicture:
     titles = {"own": "the sample's points", "truth": "ground-truth inliers"}
     for axes, (key, title) in zip(panels, titles.items(), strict=True):
         for name, sizes in run.sizes.items():
-            axes.plot(sizes["size"], sizes[key], color=colors[name], label=name, marker="o", markersize=3)
+            axes.plot(sizes["size"], sizes[key], color=colors[name], label=name, **DOTS)
         axes.set(xscale="log", yscale="log", xlabel="correspondences in a sample")
         axes.set(ylabel=f"median error of {title}, px")
-        ticks = [8, 16, 32, 64, 128, 256]
-        axes.set_xticks(ticks, [str(tick) for tick in ticks])
+        axes.set_xticks(ticks := [8, 16, 32, 64, 128, 256], map(str, ticks))
         axes.minorticks_off()
     pair = run.example
     outliers = 1 - float(example_inliers(pair).mean())
@@ -125,9 +114,8 @@ def _by_size(run: Run, colors: dict[str, str]) -> ReportPicture:
         f"Median of {TRIALS:,} random samples of one random image pair, {' and '.join(pair['names'])} of "
         f"{pair['store']}, against the number of correspondences in a sample. They are drawn from the "
         f"{len(pair['points1'])} matches that pass the ratio test, of which {100 * outliers:.0f} % are outliers, "
-        f"farther than {INLIER_THRESHOLD:g} px from the ground truth. Larger samples contain more outliers, and least "
-        "squares does not reject them: so errors of ground-truth inliers can grow with the size of the sample. Errors "
-        "of the sample's own points grow too, because fewer points can be fitted more closely."
+        f"farther than {INLIER_THRESHOLD:g} px from the ground truth. Least squares does not reject outliers, so "
+        "errors of ground-truth inliers can grow with the size of the sample."
     )
     return make_picture(figure, "figure-11", "Number of correspondences", text)
 
@@ -143,10 +131,7 @@ def _conditions(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     axes.set_yticks(range(len(names)), names)
     axes.set(xscale="log", xlabel="condition number of the design matrix (no unit)")
     axes.set_ylim(-0.6, len(names) - 0.2)
-    text = (
-        "Condition number of the design matrix, its largest over its eighth singular value, by normalisation. Dot: "
-        f"median over samples; bar: quartiles. {cell.title}."
-    )
+    text = f"Largest over eighth singular value of the design matrix. Dot: median; bar: quartiles. {cell.title}."
     return make_picture(figure, "figure-12", "Condition numbers", text, legend=False)
 
 
@@ -157,19 +142,17 @@ def _rho(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
         rho = cell.predictions[name]["rho"].numpy()
         means = [np.mean(rho[i : i + RHO_WINDOW]) for i in range(0, len(rho) - RHO_WINDOW + 1, RHO_WINDOW)]
         places = np.arange(len(means)) * RHO_WINDOW
-        axes.plot(places, means, line_style(name), color=colors[name], label=name, marker="o", markersize=3)
+        axes.plot(places, means, line_style(name), color=colors[name], label=name, **DOTS)
     axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {RHO_WINDOW} samples (no unit)")
     text = (
-        "Singularity ratio rho before the projection to rank 2: the second over the third singular value of the "
-        f"normalised matrix. The larger it is, the less the projection changes. Means of {RHO_WINDOW} successive "
-        f"samples, {cell.title}.{_dashes(names)}"
+        "Second over third singular value of the normalised matrix before the projection to rank 2, which changes the "
+        f"less the larger it is. Means of {RHO_WINDOW} successive samples, {cell.title}.{_dashes(names)}"
     )
     return make_picture(figure, "figure-13", "Singularity ratio", text)
 
 
 def _dashes(names: list[str]) -> str:
-    """Return what dashed lines are, for the text of a picture; empty where no method is learned."""
-    return " Dashed: learned." if any(map(is_learned, names)) else ""
+    return " Dashed: learned." if "--" in map(line_style, names) else ""
 
 
 def _present(cell: RunCell, *names: str) -> list[str]:
@@ -208,7 +191,7 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[ReportPicture]:
 
 
 def example_inliers(pair: Arrays) -> NDArray[np.bool_]:
-    """Return a mask of the matches of the example image pair within 1 px of the ground truth, boolean (M,)."""
+    """Return a mask of the matches of the example within 1 px of the ground truth, (M,)."""
     points1, points2, F_mat = (torch.from_numpy(pair[key]) for key in ("points1", "points2", "F"))
     near: NDArray[np.bool_] = (symmetric_epipolar_distance(points1, points2, F_mat) < INLIER_THRESHOLD).numpy()
     return near
@@ -220,9 +203,9 @@ def _draw_lines(axes: Axes, pair: Arrays, near: NDArray[np.bool_], matrices: Arr
     points = np.pad(pair["points1"][chosen], ((0, 0), (0, 1)), constant_values=1.0)
     for order, (name, F_mat) in enumerate(matrices.items()):
         # Ever thinner lines, so that lines that coincide remain visible.
-        style = {"linestyle": "--" if name == TRUTH else "-", "color": colors[name], "linewidth": 3.2 / (1 + order)}
+        look = {"linestyle": "--" if name == TRUTH else "-", "color": colors[name], "linewidth": 3.2 / (1 + order)}
         for place, line in enumerate(points @ F_mat.T):
-            draw_line(axes, line, label=name if place == 0 else None, **style)
+            draw_line(axes, line, label=name if place == 0 else None, **look)
     axes.plot(*pair["points2"][chosen].T, "o", color=INLIER, markersize=5, markeredgecolor=INK)
     _frame(axes, pair["size"][1], "view 2")
 

@@ -37,23 +37,15 @@ def median_number(values: Tensor, spec: str = ".3f") -> Cell:
 
 
 def mean_share(values: Tensor, pair: Tensor) -> Cell:
-    """Return the mean of shares (S,) with its 95 % bootstrap interval over image pairs, %.
-
-    NaN is left out. There is no interval of fewer than :data:`MIN_BOOTSTRAP_PAIRS` pairs.
-
-    Example:
-        >>> str(mean_share(torch.tensor([1.0, 0.0]), torch.tensor([0, 1])))
-        '50.0'
-        >>> str(mean_share(torch.ones(8), torch.arange(8)))
-        '100.0 [100.0, 100.0]'
-
-    """
+    """Return the mean of shares (S,) with its 95 % bootstrap interval over enough image pairs, %; NaN is left out."""
     values, pair = values[~values.isnan()], pair[~values.isnan()]
     if len(values) == 0:
         return ""
-    enough = len(torch.unique(pair)) >= MIN_BOOTSTRAP_PAIRS
-    low, high = bootstrap_interval(values, pair) if enough else (0, 0)
-    return Number(100 * values.mean().item(), ".1f", (100 * low, 100 * high) if enough else None)
+    found = Number(100 * values.mean().item(), ".1f")
+    if len(torch.unique(pair)) < MIN_BOOTSTRAP_PAIRS:
+        return found
+    low, high = bootstrap_interval(values, pair)
+    return found._replace(interval=(100 * low, 100 * high))
 
 
 def better_share(cell: RunCell, name: str, baseline: str, quantity: str, rows: Tensor | None = None) -> Cell:
@@ -68,8 +60,7 @@ def paired_change(values: Tensor, baseline: Tensor, pair: Tensor | None = None, 
     """Return the mean difference of two methods with its 95 % interval and p-value, from a paired bootstrap over pairs.
 
     Without ``pair`` each number is of its own pair. Differences of ``logarithms`` become changes of the geometric mean,
-    %. The number is unknown if no pair has a finite difference, and the mean alone if fewer than
-    :data:`MIN_BOOTSTRAP_PAIRS` have.
+    %. The number is unknown if no pair has a finite difference, and the mean alone if too few have.
     """
     pair = torch.arange(len(values)) if pair is None else pair
     valid = (values - baseline).isfinite()

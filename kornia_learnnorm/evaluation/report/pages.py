@@ -69,13 +69,13 @@ def write_report(folder: str | Path) -> Report:
     if robust is None or read_section(folder, "evaluate") is not None:
         run = with_baseline(read_run(folder))
         summary += run_summary(run)
-        about += [*_commands(run.about), _about_run(run)]
+        about += _about_run(run)
         tables += report_tables(run)
         pictures += report_figures(run)
         missing += run.missing
     if robust is not None:
         summary += robust_summary(robust)
-        about += [*_commands(robust.about), _about_robust(robust)]
+        about += _about_robust(robust)
         tables += robust_tables(robust)
         missing += robust.missing
     for picture in pictures:
@@ -88,58 +88,43 @@ def write_report(folder: str | Path) -> Report:
     return Report(summary, tables, missing)
 
 
-def _commands(about: dict[str, Any]) -> list[str]:
-    """Return the commands that made a run with their dates; none where it was made from Python."""
-    return [f"{date}: `{command}`" for command, date in about["commands"].items()]
-
-
-def _about_run(run: Run) -> str:
-    """Return what a run of predictions consists of."""
+def _about_run(run: Run) -> list[str]:
+    """Return when and by what commands a run of predictions was made, and what it consists of."""
     about = run.about
     most = about["max_samples"]
     samples = "All samples" if most is None else f"At most {most} random samples"
-    papers = any(map(papers_data, about["stores"].values()))
-    numbers = " Numbers of tables and figures are those of Fan et al." if papers else ""
-    return (
-        f"Stores: {_stores(about)}. Methods: {', '.join(about['methods'])}. {samples} of each store, filtered and "
-        f"unfiltered, seed {about['seed']}. {', '.join(_versions(about))}.{numbers}{_missing(run.missing)}"
-    )
+    text = f"Methods: {', '.join(about['methods'])}. {samples} of each store, filtered and unfiltered, seed "
+    text += f"{about['seed']}. {', '.join(map(' '.join, about['versions'].items()))}."
+    if any(map(papers_data, about["stores"].values())):
+        text += " Numbers of tables and figures are those of Fan et al."
+    return _described(run, f"Stores: {{}}. {text}")
 
 
-def _about_robust(run: RobustRun) -> str:
-    """Return what a run of robust estimators consists of."""
+def _about_robust(run: RobustRun) -> list[str]:
+    """Return the same of a run of robust estimators."""
     about = run.about
     identities: dict[str, str | None] = about["estimators"]
     absent = [name for name, identity in identities.items() if identity is None]
     peers = {identity for name, identity in identities.items() if identity and " " in identity and ":" not in name}
-    versions = ", ".join(dict.fromkeys([*_versions(about), *sorted(peers)]))
-    not_installed = f" Left out, since not installed: {', '.join(absent)}." if absent else ""
-    return (
-        f"Robust estimation: {_stores(about)}; {_pairs(about['pairs'])} of each store, {about['seeds']} runs on each "
-        f"pair from seed {about['seed']} ({about['slow_seeds']} of the slow estimators); "
-        f"PyTorch on {about['threads']} threads; {versions}.{not_installed}"
-        f"{_missing(run.missing)}"
+    versions = ", ".join(dict.fromkeys([*map(" ".join, about["versions"].items()), *sorted(peers)]))
+    pairs = f"at most {about['pairs']} evenly spaced image pairs" if about["pairs"] else "all image pairs"
+    text = (
+        f"{pairs} of each store, {about['seeds']} runs on each pair from seed {about['seed']} ({about['slow_seeds']} "
+        f"of the slow estimators); PyTorch on {about['threads']} threads; {versions}."
     )
+    text += f" Left out, since not installed: {', '.join(absent)}." if absent else ""
+    return _described(run, f"Robust estimation: {{}}; {text}")
 
 
-def _stores(about: dict[str, Any]) -> str:
-    return "; ".join(f"`{name}`: {text}" for name, text in about["stores"].items())
-
-
-def _versions(about: dict[str, Any]) -> list[str]:
-    return [f"{name} {version}" for name, version in about["versions"].items()]
-
-
-def _pairs(number: int) -> str:
-    return f"at most {number} evenly spaced image pairs" if number else "all image pairs"
-
-
-def _missing(missing: Sequence[str]) -> str:
-    return f" Not there yet, so left out: {'; '.join(missing)}." if missing else ""
+def _described(run: Run | RobustRun, text: str) -> list[str]:
+    """Return the commands that made a run with their dates, none from Python, and a text with its stores."""
+    stores = "; ".join(f"`{name}`: {about}" for name, about in run.about["stores"].items())
+    missing = f" Not there yet, so left out: {'; '.join(run.missing)}." if run.missing else ""
+    commands = [f"{date}: `{command}`" for command, date in run.about["commands"].items()]
+    return [*commands, text.replace("{}", stores, 1) + missing]
 
 
 def _markdown(summary: list[str], about: list[str], tables: list[Table], pictures: list[ReportPicture]) -> str:
-    """Return the report as Markdown."""
     titles = ["Data and methods", *(table.title for table in tables), *(picture.title for picture in pictures)]
     parts = ["# Evaluation", "## Summary", "\n".join(f"- {text}" for text in summary), "## Contents"]
     parts += ["\n".join(f"- [{title}](#{_anchor(title)})" for title in titles), "## Data and methods", *about]
@@ -149,7 +134,6 @@ def _markdown(summary: list[str], about: list[str], tables: list[Table], picture
 
 
 def _html(markdown: str, pictures: list[ReportPicture]) -> str:
-    """Return a report in Markdown as a self-contained page."""
     parser = import_extra("markdown_it", "report", "writing a report").MarkdownIt("commonmark").enable("table")
     tokens = parser.parse(markdown)
     for token, content in pairwise(tokens):
@@ -168,7 +152,7 @@ def _anchor(title: str) -> str:
 
 
 def print_summary(summary: Sequence[str]) -> None:
-    """Print the summary of a report as plain text."""
+    """Print a summary as plain text."""
     for text in summary:
         print(text.replace("**", "").replace("`", ""), end="\n\n")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -16,15 +17,8 @@ from kornia_learnnorm.metrics.better_rate import better_rate, comparable
 from kornia_learnnorm.protocol import PROTOCOLS
 
 # Columns of the table that learnnorm evaluate prints.
-HEADER = (
-    "method",
-    "better than Hartley %",
-    "than whitening %",
-    "mean px",
-    "median px",
-    "truth: median px",
-    "truth: better than Hartley %",
-)
+HEADER: tuple[str, ...] = ("method", "better than Hartley %", "than whitening %", "mean px", "median px")
+HEADER += ("truth: median px", "truth: better than Hartley %")
 
 # Fan et al., Table 1: better than Hartley % by training set, on the data of PAPERS_DATA.
 PRINTED: dict[str, dict[str, float]] = {
@@ -54,25 +48,15 @@ def with_baseline(run: Run) -> Run:
 
 def rate_tables(run: Run) -> list[Table]:
     """Return the tables of rates against Hartley and, where the run has it, whitening."""
-    parts = [
-        ([cell for cell in run.cells if cell.protocol == protocol and baseline in cell.predictions], baseline)
-        for baseline in (BASELINE, "whitening")
-        for protocol in PROTOCOLS
-    ]
-    return [_better_rates(run, cells, baseline) for cells, baseline in parts if cells]
+    tables = []
+    for baseline, protocol in product((BASELINE, "whitening"), PROTOCOLS):
+        if cells := [cell for cell in run.cells if cell.protocol == protocol and baseline in cell.predictions]:
+            tables.append(_better_rates(run, cells, baseline))
+    return tables
 
 
 def papers_data(description: str) -> str:
-    """Return the part of the paper's test data that a store has, KITTI or TUM; empty for other data.
-
-    Args:
-        description: of the store in a run: its dataset, then its numbers of pairs and matches.
-
-    Example:
-        >>> papers_data("KITTI odometry 06, 51 pairs, 90000 matches"), papers_data("KITTI odometry 00, 9 pairs")
-        ('KITTI', '')
-
-    """
+    """Return the part of the paper's test data, KITTI or TUM, that a description of a store names; empty for other."""
     return next((name for name, pattern in PAPERS_DATA.items() if re.match(pattern, description)), "")
 
 

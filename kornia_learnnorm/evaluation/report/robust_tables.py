@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report.numbers import (
-    POSE_HEADER,
-    median_number,
-    number,
-    paired_change,
-    pose_numbers,
-)
+from kornia_learnnorm.evaluation.report import numbers
+from kornia_learnnorm.evaluation.report.numbers import median_number
 from kornia_learnnorm.evaluation.report.rates import papers_data
 from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
@@ -45,18 +38,15 @@ SCALES = {"inliers": 100.0, "f1": 100.0, "error": 1.0}  # shares are printed in 
 
 
 def robust_tables(run: RobustRun) -> list[Table]:
-    """Return all tables of robust estimators of a run.
-
-    Numbers that need a ground truth are empty cells where it is not known.
-    """
-    cells = [_without_unknown_truth(cell) for cell in run.cells if cell.estimates]
-    return [table for cell in cells for table in (_agreement(cell, run), _pose_and_time(cell), *_tests(cell))]
-
-
-def _without_unknown_truth(cell: RobustCell) -> RobustCell:
-    """Return a cell without the estimator that is the ground truth where that is not known."""
-    known = any(bool(pairs_with_truth(cell, threshold).any()) for threshold in THRESHOLDS)
-    return replace(cell, estimates={name: e for name, e in cell.estimates.items() if known or name != TRUTH})
+    """Return all tables of robust estimators of a run; numbers without a ground truth are empty cells."""
+    tables = []
+    for cell in run.cells:
+        if cell.estimates:
+            known = any(bool(pairs_with_truth(cell, threshold).any()) for threshold in THRESHOLDS)
+            estimates = {name: found for name, found in cell.estimates.items() if known or name != TRUTH}
+            known_cell = cell._replace(estimates=estimates)
+            tables += [_agreement(known_cell, run), _pose_and_time(known_cell), *_tests(known_cell)]
+    return tables
 
 
 def pairs_with_truth(cell: RobustCell, threshold: float) -> Tensor:
@@ -72,7 +62,6 @@ def _kept(cell: RobustCell, threshold: float) -> Tensor:
 
 
 def _agreement(cell: RobustCell, run: RobustRun) -> Table:
-    """Return the table of inlier share, F1 and epipolar error."""
     names = ("inliers %", "F1 %", "error px")
     header = ["estimator", *(f"{name} @{t:g} px" for t in THRESHOLDS for name in names), "median error px @1 px"]
     known = {threshold: pairs_with_truth(cell, threshold) for threshold in THRESHOLDS}
@@ -84,7 +73,7 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
             inliers, f1, error = (by_threshold[threshold][key][_kept(cell, threshold)] for key in SCALES)
             error = error.clamp(max=MAX_ERROR)
             cells += [_mean(100 * inliers, 2), _mean(100 * f1, 2), _mean(error, 3)]
-        rows.append([name, *cells, median_number(error.flatten())])
+        rows.append([name, *cells, median_number(error)])
     printed = PRINTED.get((papers_data(run.about["stores"][cell.store]), cell.protocol), {})
     for name, values in printed.items():
         a, b, c, d = ("" if value is None else Number(value, ".2f") for value in values)
@@ -101,8 +90,8 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
         f"{agreement if truth else 'There is no ground truth: more inliers do not prove a more accurate matrix.'} "
         "`RANSAC`, `learned:` and `guided:` are the package's own; all run with their defaults."
     )
-    number = TABLE_NUMBER[cell.protocol] if printed else ""
-    return Table(f"Robust estimation: {cell.title}{number}", text, header, rows)
+    title = f"Robust estimation: {cell.title}{TABLE_NUMBER[cell.protocol] if printed else ''}"
+    return Table(title, text, header, rows)
 
 
 def _mean(values: Tensor, digits: int) -> Cell:
@@ -114,16 +103,15 @@ def _mean(values: Tensor, digits: int) -> Cell:
 
 
 def _pose_and_time(cell: RobustCell) -> Table:
-    """Return the table of relative poses, time and number of samples."""
-    names = (*POSE_HEADER, "ms", "samples")
+    names = (*numbers.POSE_HEADER, "ms", "samples")
     header = ["estimator", *(f"{name} @{threshold:g} px" for threshold in THRESHOLDS for name in names)]
     rows: list[list[Cell]] = []
     for name, by_threshold in cell.estimates.items():
         cells: list[Cell] = []
         for results in by_threshold.values():
-            cells += pose_numbers(results["rotation_error"], results["translation_error"])
-            cells.append(median_number(1000 * results["seconds"].flatten(), ".1f"))
-            cells.append(number(results["samples"].mean().item(), ".0f"))
+            cells += numbers.pose_numbers(results["rotation_error"], results["translation_error"])
+            cells.append(median_number(1000 * results["seconds"], ".1f"))
+            cells.append(numbers.number(results["samples"].mean().item(), ".0f"))
         rows.append([name, *cells])
     posed = any(row[1] for row in rows)
     poses = (
@@ -153,4 +141,4 @@ def _tests(cell: RobustCell) -> list[Table]:
 def _test(cell: RobustCell, name: str, threshold: float, key: str) -> Cell:
     both = [cell.estimates[n][threshold][key][_kept(cell, threshold)] for n in (name, BASELINE)]
     runs = min(values.shape[1] for values in both)
-    return paired_change(*(values[:, :runs].clamp(max=MAX_ERROR).mean(1) * SCALES[key] for values in both))
+    return numbers.paired_change(*(values[:, :runs].clamp(max=MAX_ERROR).mean(1) * SCALES[key] for values in both))

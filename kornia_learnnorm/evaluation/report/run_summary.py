@@ -10,14 +10,8 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.methods import SHIPPED, base_name
-from kornia_learnnorm.evaluation.report.numbers import (
-    BASELINE,
-    MIN_BOOTSTRAP_PAIRS,
-    MIN_DISTANCE,
-    RESAMPLES,
-    median_number,
-    percent_change,
-)
+from kornia_learnnorm.evaluation.report import numbers
+from kornia_learnnorm.evaluation.report.numbers import BASELINE, MIN_BOOTSTRAP_PAIRS, median_number
 from kornia_learnnorm.evaluation.report.robust_tables import MAX_ERROR, pairs_with_truth
 from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
@@ -32,6 +26,7 @@ ERRORS = {
     "heldout": "error on held-out matches",
     "own": "error of the fit (there are neither held-out matches nor a ground truth)",
 }
+AT_INLIERS = THRESHOLDS.index(INLIER_THRESHOLD)
 
 
 class _Ranking(NamedTuple):
@@ -42,7 +37,8 @@ class _Ranking(NamedTuple):
     level: list[str]  # whose difference from the winner has a 95 % interval that includes zero
     ahead: list[str]  # whose mean score is below the winner's, with the whole 95 % interval
     against: dict[str, PairedDifference]  # the winner's difference from each other method; empty for too few pairs
-    pairs: int  # number of image pairs
+    samples: int  # compared
+    pairs: int  # their image pairs
 
 
 def run_summary(run: Run) -> list[str]:
@@ -60,34 +56,28 @@ def robust_summary(run: RobustRun) -> list[str]:
 def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> _Ranking:
     """Rank methods by their values, and compare the mean score of the winner with each other one's.
 
-    Args:
-        values: what the summary quotes of each method, less is better; NaN comes last.
-        scores: a score of each sample by method, (S,) each; those count that all methods have.
-        pair: image pair of each sample, (S,).
+    ``values`` are what the summary quotes, less is better; NaN comes last. ``scores`` (S,) of each method and ``pair``
+    (S,), the image pair of each sample, are for the comparison; the samples count that all methods have.
     """
     valid = torch.stack([*scores.values()]).isfinite().all(0)
     winner, *others = sorted(values, key=lambda name: math.inf if math.isnan(values[name]) else values[name])
-    differences = {}
-    pairs = len(torch.unique(pair[valid]))
-    if pairs >= MIN_BOOTSTRAP_PAIRS:
-        mine = scores[winner][valid]
-        differences = {
-            name: paired_bootstrap(mine, scores[name][valid], pair[valid], draws=RESAMPLES) for name in others
-        }
+    differences, pair = {}, pair[valid]
+    pairs = len(torch.unique(pair))
+    for name in others if pairs >= MIN_BOOTSTRAP_PAIRS else []:
+        both = scores[winner][valid], scores[name][valid]
+        differences[name] = paired_bootstrap(*both, pair, draws=numbers.RESAMPLES)
     level = [name for name, found in differences.items() if found.low <= 0 <= found.high]
     ahead = [name for name, found in differences.items() if found.low > 0]
-    return _Ranking(winner, others[0] if others else "", level, ahead, differences, pairs)
+    return _Ranking(winner, others[0] if others else "", level, ahead, differences, len(pair), pairs)
 
 
 def _about_methods(cell: RunCell, own: list[str]) -> str:
     """Return which method has the smallest median error, as the table shows it, beside others: the user's own too."""
     key = next((key for key in ERRORS if not cell.predictions[BASELINE][key].isnan().all()), "own")
-    logs = {name: p[key].clamp(min=MIN_DISTANCE).log() for name, p in cell.predictions.items()}
+    logs = {name: p[key].clamp(min=numbers.MIN_DISTANCE).log() for name, p in cell.predictions.items()}
     ranking = _rank({name: median(p[key]).item() for name, p in cell.predictions.items()}, logs, cell.pair)
     winner, best = ranking.winner, cell.predictions[ranking.winner]
-    used = cell.pair[torch.stack([*logs.values()]).isfinite().all(0)]
-    size = f"{len(used):,} samples of {len(torch.unique(used))} image pairs"
-    text = f"**{cell.title}** ({size}): "
+    text = f"**{cell.title}** ({ranking.samples:,} samples of {ranking.pairs} image pairs): "
     text += f"`{winner}` has the smallest {ERRORS[key]}, median {median_number(best[key])} px"
     text += f"{_compared(cell, ranking, key)}.{_level(ranking)}"
     for name in own:
@@ -96,7 +86,8 @@ def _about_methods(cell: RunCell, own: list[str]) -> str:
     if ranking.ahead:
         text += f" The geometric mean of the errors is smaller for {_names(ranking.ahead)}."
     if key != "truth" and "inliers" in best:
-        shares = [_inlier_share(cell, name) for name in dict.fromkeys((winner, BASELINE))]
+        means = {n: cell.predictions[n]["inliers"][:, AT_INLIERS].nanmean().item() for n in (winner, BASELINE)}
+        shares = [f"`{name}` {100 * mean:.1f} %" for name, mean in means.items()]
         text += f" Share of the matches within {INLIER_THRESHOLD:g} px: {', '.join(shares)}. No ground truth is known."
     return text
 
@@ -111,14 +102,9 @@ def _compared(cell: RunCell, ranking: _Ranking, key: str) -> str:
     text = f"; next is `{other}` with {error} px" if won else f"; {other} has {error} px"
     if found := ranking.against.get(other):
         logs = (-found.mean, -found.high, -found.low) if won else (found.mean, found.low, found.high)
-        mean, low, high = map(percent_change, logs)
+        mean, low, high = map(numbers.percent_change, logs)
         text += f" (change of the geometric mean {mean:+.1f} % [{low:+.1f}, {high:+.1f}])"
     return text
-
-
-def _inlier_share(cell: RunCell, name: str) -> str:
-    share = cell.predictions[name]["inliers"][:, THRESHOLDS.index(INLIER_THRESHOLD)]
-    return f"`{name}` {100 * share.nanmean().item():.1f} %"
 
 
 def _level(ranking: _Ranking) -> str:
@@ -126,9 +112,8 @@ def _level(ranking: _Ranking) -> str:
     if not ranking.second:
         return " There is nothing to test it against."
     if not ranking.against:
-        count = f"{ranking.pairs} image pair{'s' * (ranking.pairs != 1)}"
-        verb = "is" if ranking.pairs == 1 else "are"
-        return f" Not tested: there {verb} {count}, a test needs {MIN_BOOTSTRAP_PAIRS}."
+        count = "is 1 image pair" if ranking.pairs == 1 else f"are {ranking.pairs} image pairs"
+        return f" Not tested: there {count}, a test needs {MIN_BOOTSTRAP_PAIRS}."
     return f" Level with it: {_names(ranking.level)}." if ranking.level else ""
 
 

@@ -39,7 +39,7 @@ SETTINGS: dict[str, Any] = {
 
 
 class ReportPicture(NamedTuple):
-    """A picture of a report."""
+    """A picture and its caption."""
 
     name: str  # of the file, without suffix
     title: str
@@ -49,7 +49,7 @@ class ReportPicture(NamedTuple):
 
 @contextmanager
 def report_style() -> Iterator[None]:
-    """Apply the Matplotlib settings of a report to the figures that are made and saved inside, and restore them."""
+    """Apply the Matplotlib settings of a report to the figures made inside, and restore them."""
     with import_matplotlib().rc_context(SETTINGS):
         yield
 
@@ -60,14 +60,9 @@ def method_colors(names: Iterable[str]) -> dict[str, str]:
     return {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(names)}
 
 
-def is_learned(name: str) -> bool:
-    """Return whether a method has weights: it is no closed form and no ``module:Name``."""
-    return base_name(name) not in CLOSED_FORMS and ":" not in name
-
-
 def line_style(name: str) -> str:
-    """Return the Matplotlib line style of a method: dashed for a learned one, which often lies on a closed form."""
-    return "--" if is_learned(name) else "-"
+    """Return the line style of a method: dashed for one with weights, which often lies on a closed form."""
+    return "-" if base_name(name) in CLOSED_FORMS or ":" in name else "--"
 
 
 def make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, list[Axes]]:

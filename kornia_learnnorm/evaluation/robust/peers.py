@@ -1,12 +1,13 @@
 """Robust estimators of other packages, with their defaults except for the threshold and the seed.
 
 Each estimator takes its package, points in pixels (N, 2), the (width, height) of both images (2, 2), a seed and a
-threshold in pixels, and those with the suffix ``-calibrated`` also the matrices of both cameras (2, 3, 3). It returns a
-fundamental matrix (3, 3), or None for a failure. Each package applies the threshold to a different distance.
+threshold in pixels, and those with the suffix ``-calibrated`` also the finite matrices of both cameras (2, 3, 3). It
+returns a fundamental matrix (3, 3), or None for a failure. Each package applies the threshold to a different distance.
 """
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 from collections.abc import Callable
 from functools import partial
@@ -43,16 +44,12 @@ def _poselib(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, thresh
 
 
 def _opencv_calibrated(cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array) -> Any:
-    if not np.isfinite(K).all():
-        return None
     options = {"method": cv2.USAC_MAGSAC, "threshold": threshold}
     E = cv2.findEssentialMat(x1, x2, K[0], None, K[1], None, **options)[0]
     return None if E is None or E.shape != (3, 3) else _to_pixels(E, K)
 
 
 def _poselib_calibrated(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array) -> Any:
-    if not np.isfinite(K).all():
-        return None
     cameras = [
         {"model": "PINHOLE", "width": w, "height": h, "params": [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]}
         for k, (w, h) in zip(K, sizes.tolist(), strict=True)
@@ -62,7 +59,6 @@ def _poselib_calibrated(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: 
 
 
 def _to_pixels(E: Array, K: Array) -> Array:
-    """Return the fundamental matrix of an essential one."""
     inverse1, inverse2 = np.linalg.inv(K)
     F: Array = inverse2.T @ E @ inverse1
     return F / np.linalg.norm(F)
@@ -111,18 +107,15 @@ PEERS = {
 }
 
 
-def _import(name: str) -> Any:
-    return import_extra(PEERS[name].module, PEERS[name].extra, f"the estimator {name}")
-
-
 def find_peer(name: str) -> Peer:
     """Return an estimator of another package by its name in ``PEERS``."""
-    return partial(PEERS[name].estimate, _import(name))
+    module = import_extra(PEERS[name].module, PEERS[name].extra, f"the estimator {name}")
+    return partial(PEERS[name].estimate, module)
 
 
 def peer_version(name: str) -> str:
     """Return the package of an estimator and its version."""
     package = PEERS[name].distribution
     if package == "opencv":  # several distributions provide the module
-        return f"opencv {_import(name).__version__}"
+        return f"opencv {importlib.import_module('cv2').__version__}"
     return f"{package} {importlib.metadata.version(package)}"

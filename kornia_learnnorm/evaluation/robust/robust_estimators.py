@@ -32,10 +32,7 @@ DEFAULT_ESTIMATORS = (
     *(name for name in PEERS if not name.endswith(CALIBRATED)),
     DEFAULTS,
     f"{DEFAULTS}:crossview",
-    f"{LEARNED}robust",
-    f"{LEARNED}robust-synthetic",
-    f"{GUIDED}robust",
-    f"{GUIDED}robust-synthetic",
+    *(kind + weights for kind in (LEARNED, GUIDED) for weights in ("robust", "robust-synthetic")),
     TRUTH,
 )
 
@@ -60,8 +57,8 @@ class Estimate(NamedTuple):
     samples: float  # number of minimal samples solved; NaN if unknown
 
 
-# Pair, seed and threshold in pixels, to a matrix, None for a failure, and a number of minimal samples.
-Estimator = Callable[[EvaluatedPair, int, float], tuple[Tensor | None, float]]
+Found = tuple[Tensor | None, float]  # a matrix, None for a failure, and the number of minimal samples
+Estimator = Callable[[EvaluatedPair, int, float], Found]  # of a pair, a seed and a threshold in pixels
 
 
 @torch.no_grad()
@@ -70,12 +67,11 @@ def run_estimator(estimator: Estimator, pair: EvaluatedPair, seed: int, threshol
     start = time.perf_counter()
     F_mat, samples = (None, 0.0) if len(pair.points1) < SAMPLE_SIZE else estimator(pair, seed, threshold)
     seconds = time.perf_counter() - start
-    failure = torch.full((3, 3), torch.nan, dtype=torch.float64)
-    return Estimate(failure if F_mat is None else F_mat, seconds, samples)
+    return Estimate(torch.full((3, 3), torch.nan).double() if F_mat is None else F_mat, seconds, samples)
 
 
 def find_estimator(name: str) -> Estimator:
-    """Return a robust estimator by its name.
+    """Return a robust estimator by its name; raise ValueError, FileNotFoundError or ImportError if there is none.
 
     Args:
         name: one of
@@ -88,12 +84,6 @@ def find_estimator(name: str) -> Estimator:
             - ``RANSAC-calibrated``, RANSAC with the cameras of the store;
             - ``RANSAC:METHOD``, RANSAC with another normaliser and at most 20,000 samples;
             - ``ground-truth``, the true matrix, which shows how far the metrics can be trusted.
-
-    Raises:
-        ValueError: if there is no estimator of this name.
-        FileNotFoundError: if there are no weights of this name.
-        ImportError: if the package of the estimator is not installed.
-
     """
     kind, method = _split(name)
     if name in PEERS:
@@ -109,8 +99,7 @@ def find_estimator(name: str) -> Estimator:
         return partial(_guided, LearnedEightPoint.from_pretrained(method))
     if kind and method:
         if method.endswith(REFINED):
-            wanted = f"expected {base_name(method)!r} without {REFINED}, got {method!r}"
-            raise ValueError(f"RANSAC refines by itself: {wanted}")
+            raise ValueError(f"RANSAC refines by itself: expected {base_name(method)!r}, got {method!r}")
         rank2 = {"rank2": "optimal"} if method.endswith(OPTIMAL) else {}
         options = {"normalizer": find_method(method).normalizer, "max_samples": MAX_SAMPLES, **rank2}
         return partial(_ransac, options, False)
@@ -120,10 +109,9 @@ def find_estimator(name: str) -> Estimator:
     )
 
 
-def _peer(
-    peer: Peer, calibrated: bool, pair: EvaluatedPair, seed: int, threshold: float
-) -> tuple[Tensor | None, float]:
-    """Run an estimator of another package, with the cameras if it is calibrated."""
+def _peer(peer: Peer, calibrated: bool, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
+    if calibrated and not bool(pair.K.isfinite().all()):
+        return None, math.nan
     cameras = [pair.K.numpy()] if calibrated else []
     F_mat = peer(pair.points1.numpy(), pair.points2.numpy(), pair.size, seed, threshold, *cameras)
     # OpenCV stacks up to three matrices if there are only seven points.
@@ -133,8 +121,7 @@ def _peer(
 
 def _ransac(
     options: dict[str, Any], calibrated: bool, pair: EvaluatedPair, seed: int, threshold: float, **more: Any
-) -> tuple[Tensor | None, float]:
-    """Run RANSAC; if it is calibrated, with the cameras, and it fails on pairs of unknown cameras."""
+) -> Found:
     if calibrated and not bool(pair.K.isfinite().all()):
         return None, 0.0
     cameras = {"K1": pair.K[0], "K2": pair.K[1]} if calibrated else {}
@@ -142,10 +129,7 @@ def _ransac(
     return found.F_mat if bool(found.F_mat.any()) else None, found.num_samples
 
 
-def _learned(
-    layer: LearnedEightPoint, refined: bool, pair: EvaluatedPair, seed: int, threshold: float
-) -> tuple[Tensor, float]:
-    """Run a learned estimator, which has no threshold, and robust refinement at the threshold if wanted."""
+def _learned(layer: LearnedEightPoint, refined: bool, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
     points1, points2 = pair.points1[None], pair.points2[None]
     F_mat = layer(points1, points2)
     if refined:
@@ -153,8 +137,7 @@ def _learned(
     return F_mat[0], math.nan
 
 
-def _guided(layer: LearnedEightPoint, pair: EvaluatedPair, seed: int, threshold: float) -> tuple[Tensor | None, float]:
-    """Run RANSAC whose samples follow the probabilities of a learned estimator."""
+def _guided(layer: LearnedEightPoint, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
     weights = layer.estimate(pair.points1[None], pair.points2[None]).weights[0]
     return _ransac({}, False, pair, seed, threshold, weights=weights)
 

@@ -1,45 +1,26 @@
 """Results of robust estimators on stores, computed once and kept in a folder: what ``learnnorm robust`` makes.
 
-Those of an estimator are in ``robust/STORE/PROTOCOL/THRESHOLD/ESTIMATOR.npz``. The folder may also hold a run of
-``learnnorm evaluate``.
+The folder may also hold a run of ``learnnorm evaluate``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.evaluation.robust import robust_estimators
 from kornia_learnnorm.evaluation.robust.peers import PEERS
-from kornia_learnnorm.evaluation.robust.robust_estimators import (
-    DEFAULT_ESTIMATORS,
-    Estimator,
-    EvaluatedPair,
-    estimator_names,
-    find_estimator,
-    identify_estimator,
-    is_slow,
-    run_estimator,
-)
-from kornia_learnnorm.evaluation.runs.results_store import (
-    About,
-    Arrays,
-    Job,
-    begin_section,
-    file_name,
-    read_arrays,
-    read_section,
-    record,
-    result_files,
-    run_folder,
-)
+from kornia_learnnorm.evaluation.robust.robust_estimators import Estimator, EvaluatedPair, run_estimator
+from kornia_learnnorm.evaluation.runs import results_store
+from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, file_name, read_arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
@@ -55,8 +36,7 @@ DEFAULT_OPTIONS = {
 Results = dict[str, Tensor]
 
 
-@dataclass(frozen=True)
-class RobustCell:
+class RobustCell(NamedTuple):
     """The results of one store and protocol."""
 
     store: str  # its name
@@ -69,8 +49,7 @@ class RobustCell:
         return f"{self.store}, {self.protocol}"
 
 
-@dataclass(frozen=True)
-class RobustRun:
+class RobustRun(NamedTuple):
     """A run of robust estimation."""
 
     about: About  # what the run was computed from, its section of run.json
@@ -81,7 +60,7 @@ class RobustRun:
 def record_robust(
     folder: str | Path,
     stores: Mapping[str, str],
-    estimators: Sequence[str] = DEFAULT_ESTIMATORS,
+    estimators: Sequence[str] = robust_estimators.DEFAULT_ESTIMATORS,
     options: Mapping[str, int] | None = None,
     redo: Sequence[str] = (),
     command: str = "",
@@ -98,20 +77,20 @@ def record_robust(
             raise ValueError(f"{name.replace('_', '-')} must be {least} or more, got {value}")
     if unknown := {*redo} - {*estimators}:
         raise ValueError(f"--redo {' '.join(sorted(unknown))}: not among the estimators of this command")
-    names = estimator_names(estimators)
+    names = robust_estimators.estimator_names(estimators)
     found = {names[name]: _find(name) for name in estimators}
     read = {name: read_store(path) for name, path in stores.items()}
-    identities = {names[name]: found[names[name]] and identify_estimator(name) for name in estimators}
+    identities = {names[name]: found[names[name]] and robust_estimators.identify_estimator(name) for name in estimators}
     about: About = {"estimators": identities, **options, "threads": torch.get_num_threads()}
     redone = [names[name] for name in redo]
     installed = {name: estimator for name, estimator in found.items() if estimator is not None}
-    with run_folder(folder):
-        before = begin_section(folder, "robust", read, about, redone, command)
-        for path in result_files(folder, "robust", redone):
+    with results_store.run_folder(folder):
+        before = results_store.begin_section(folder, "robust", read, about, redone, command)
+        for path in results_store.result_files(folder, "robust", redone):
             path.unlink()
         total = len(read) * len(PROTOCOLS) * len(THRESHOLDS) * len(installed)
         known = before.get("estimators", {}).keys() - {*redone}
-        failed = record(folder, "robust", _jobs(folder, read, installed, options), total, known)
+        failed = results_store.record(folder, "robust", _jobs(folder, read, installed, options), total, known)
     if failed:
         raise ValueError(f"{failed}. All others are in {folder}")
     return [name for name, estimator in found.items() if estimator is None]
@@ -120,7 +99,7 @@ def record_robust(
 def _find(name: str) -> Estimator | None:
     """Return an estimator; None if it is from another package that is not installed."""
     try:
-        return find_estimator(name)
+        return robust_estimators.find_estimator(name)
     except ImportError:
         if name in PEERS:
             return None
@@ -128,15 +107,11 @@ def _find(name: str) -> Estimator | None:
 
 
 def _jobs(
-    folder: Path,
-    stores: Mapping[str, CorrespondenceStore],
-    estimators: Mapping[str, Estimator],
-    options: Mapping[str, int],
+    folder: Path, stores: Stores, estimators: Mapping[str, Estimator], options: Mapping[str, int]
 ) -> Iterator[Job]:
-    """Give the files of the estimators."""
     for store, protocol, name, threshold in product(stores, PROTOCOLS, estimators, THRESHOLDS):
         pairs = even_pairs(len(stores[store]), options["pairs"])
-        seeds = min(options["seeds"], options["slow_seeds"]) if is_slow(name) else options["seeds"]
+        seeds = min(options["seeds"], options["slow_seeds"]) if robust_estimators.is_slow(name) else options["seeds"]
         draw = partial(shuffled_pair, stores[store], protocol=protocol, seed=options["seed"])
         compute = partial(_estimates, estimators[name], draw, threshold, pairs, seeds)
         yield Job(name, estimate_path(folder, store, protocol, threshold, name), compute)
@@ -185,14 +160,13 @@ def measure(pair: EvaluatedPair, F_mat: Tensor, threshold: float) -> dict[str, f
     pose = relative_pose(F_mat[None], pair.K[:1], pair.K[1:], x1[None], x2[None], near[None])
     known = bool((rotation_error(pair.R, pair.R) + translation_error(pair.t, pair.t)).isfinite())
     found = rotation_error(pose[0][0], pair.R), translation_error(pose[1][0], pair.t)
-    angles = [angle.nan_to_num(nan=torch.inf) if known else angle * torch.nan for angle in found]
     results = {
         "inliers": inlier_share(x1, x2, F_mat, threshold),
         "f1": f1_score(x1, x2, F_mat, pair.F_mat, threshold),
         "error": epipolar_error(x1, x2, F_mat, pair.F_mat),
-        "rotation_error": angles[0],
-        "translation_error": angles[1],
     }
+    for name, angle in zip(("rotation_error", "translation_error"), found, strict=True):
+        results[name] = angle.nan_to_num(nan=torch.inf) if known else angle * torch.nan
     return {name: float(value) for name, value in results.items()}
 
 
@@ -204,7 +178,7 @@ def estimate_path(folder: Path, store: str, protocol: str, threshold: float, nam
 def read_robust(folder: str | Path) -> RobustRun | None:
     """Read a run of robust estimation, None where the folder has none; raise ValueError if it is damaged."""
     folder = Path(folder)
-    about, missing = read_section(folder, "robust"), list[str]()
+    about, missing = results_store.read_section(folder, "robust"), list[str]()
     if about is None:
         return None
     cells = []

@@ -15,7 +15,7 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import RATIO
 
-# Arrays in the files; read by name, so that a damaged file is recognised before it is used.
+# Arrays in the files.
 EXAMPLE = ("store", "pair", "names", "points1", "points2", "truth", "F", "size")
 SWEEP = ("size", "own", "truth")
 SIZES = (8, 9, 10, 12, 16, 24, 32, 64, 128, 256)  # correspondences in a sample
@@ -37,16 +37,9 @@ def random_pair(stores: Mapping[str, CorrespondenceStore], seed: int) -> Arrays:
         raise ValueError(f"no pair of {name} has {SIZES[-1]} matches that pass the ratio test and a ground truth")
     pair = int(np.random.default_rng(seed).choice(suitable))
     points1, points2 = pair_matches(store, pair, RATIO)
-    return {
-        "store": np.array(name),
-        "pair": np.array(pair),
-        "names": np.array(store.names[pair]),
-        "points1": points1.numpy(),
-        "points2": points2.numpy(),
-        "truth": truth[pair].numpy(),
-        "F": store.F[pair],
-        "size": store.image_size[pair],
-    }
+    names, F_mat, size = store.names[pair], store.F[pair], store.image_size[pair]
+    values = (name, pair, names, points1.numpy(), points2.numpy(), truth[pair].numpy(), F_mat, size)
+    return {key: np.array(value) for key, value in zip(EXAMPLE, values, strict=True)}
 
 
 @torch.no_grad()

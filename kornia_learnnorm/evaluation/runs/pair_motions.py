@@ -29,8 +29,7 @@ def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None)
 def ground_truth_inliers(store: CorrespondenceStore) -> Tensor:
     """Return each pair's matches that pass the ratio test and lie within 1 px of their ground-truth epipolar lines.
 
-    They are points (x1, y1, x2, y2), (P, 200, 4) float64, padded with NaN; all NaN for a pair without ground truth or
-    with fewer than 16 inliers.
+    They are points (x1, y1, x2, y2), (P, 200, 4) float64, padded with NaN; all NaN for a pair with fewer than 16.
     """
     result = torch.full((len(store), MAX_INLIERS, 4), torch.nan, dtype=torch.float64)
     for pair, F_mat in enumerate(torch.from_numpy(store.F)):
@@ -43,10 +42,7 @@ def ground_truth_inliers(store: CorrespondenceStore) -> Tensor:
 
 
 def median_distance(points: Tensor, F_mat: Tensor) -> Tensor:
-    """Return the median symmetric epipolar distance (S,) of each set of correspondences (S, N, 4), pixels.
-
-    Rows of NaN are left out; the median of an empty set is NaN.
-    """
+    """Return the median symmetric epipolar distance (S,) of sets (S, N, 4), pixels; rows of NaN are left out."""
     known = points.nan_to_num()
     distance = symmetric_epipolar_distance(known[..., :2], known[..., 2:], F_mat)
     distance[points.isnan().any(-1)] = torch.nan
@@ -68,7 +64,6 @@ def pair_motions(store: CorrespondenceStore) -> Arrays:
 
 
 def _motion(store: CorrespondenceStore, pair: int) -> dict[str, float]:
-    """Return what is known of a pair's motion."""
     x1, x2 = pair_matches(store, pair, RATIO)
     F_mat, R, t, K = (torch.from_numpy(part[pair]) for part in (store.F, store.R, store.t, store.K))
     if not bool(F_mat.isfinite().all()) or len(x1) == 0:

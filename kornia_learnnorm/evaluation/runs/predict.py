@@ -46,10 +46,7 @@ class SampleOptions:
             raise ValueError(f"max_samples must be 1 or more, or None for all, got {self.max_samples}")
 
     def draw(self, store: CorrespondenceStore, max_ratio: float | None) -> MatchSets:
-        """Return samples of a store, before the filter on the residual.
-
-        The held-out points are NaN for the samples of pairs that have no match to hold out.
-        """
+        """Return samples before the filter on the residual; held-out points of pairs without any are NaN."""
         generator = torch.Generator().manual_seed(self.seed)
         samples = draw_samples(store, generator, self.size, max_ratio, NUM_HELDOUT, require_heldout=False)
         if self.max_samples is None or len(samples.pair) <= self.max_samples:
@@ -64,8 +61,7 @@ def predict(
 ) -> Arrays:
     """Return a method's matrices of the samples of a store, their errors and diagnostics, arrays (S, ...).
 
-    Their names are those in :data:`ERRORS`, and in :data:`AGREEMENT` where wanted, for which only matches with Lowe's
-    ratio below ``max_ratio`` count.
+    They are named as in ``ERRORS``, and ``AGREEMENT`` where wanted, on matches with Lowe's ratio below ``max_ratio``.
     """
     truth = ground_truth_inliers(store)
     parts = [
@@ -99,8 +95,7 @@ def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStor
 def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
     """Return ``inliers``, a share, and ``f1``, (S, thresholds), of matrices (S, 3, 3) on all matches of their pairs.
 
-    The distances are computed once for all :data:`~kornia_learnnorm.protocol.THRESHOLDS`. F1 is NaN where the ground
-    truth has no inliers.
+    F1 is NaN where the ground truth has no inliers.
     """
     inliers = F_mat.new_full((len(F_mat), len(THRESHOLDS)), torch.nan)
     f1 = inliers.clone()

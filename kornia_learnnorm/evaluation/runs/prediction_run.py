@@ -1,7 +1,6 @@
 """Predictions of methods on stores, computed once and kept in a folder: what ``learnnorm evaluate`` makes.
 
-Each store has a folder with the motion of its pairs and the protocols, in each of which are the samples and a file per
-method with arrays in the order of the samples.
+Each store has a folder with the motion of its pairs, and for each protocol the samples and a file per method.
 """
 
 from __future__ import annotations
@@ -21,25 +20,15 @@ from kornia_learnnorm.data.residual_filter import plain_residual
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.runs import results_store
 from kornia_learnnorm.evaluation.runs.example import EXAMPLE, SWEEP, random_pair, sweep
 from kornia_learnnorm.evaluation.runs.pair_motions import PAIRS, pair_motions
 from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS, SampleOptions, predict
-from kornia_learnnorm.evaluation.runs.results_store import (
-    About,
-    Arrays,
-    Job,
-    begin_section,
-    file_name,
-    once,
-    read_arrays,
-    read_section,
-    record,
-    run_folder,
-    write_arrays,
-)
+from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, file_name, once, read_arrays
 from kornia_learnnorm.protocol import PROTOCOLS
 
 SAMPLES = ("pair", "plain_residual")  # arrays in the file of samples
+KEYS = (ERRORS, (*ERRORS, *AGREEMENT))  # arrays in the file of a method's predictions, without and with agreement
 
 
 @dataclass(frozen=True)
@@ -104,27 +93,23 @@ def record_run(
         "methods": {names[name]: identify_method(name) for name in methods},
         "trained_on": {name: list(method.trained_on) for name, method in found.items()},
     }
-    with run_folder(folder):
-        before = begin_section(folder, "evaluate", read, about, command=command)
+    with results_store.run_folder(folder):
+        before = results_store.begin_section(folder, "evaluate", read, about, command=command)
         no_example = _record_example(folder, read, options.seed) if complete else ""
         jobs = _jobs(folder, read, found, options, complete)
         swept = sum(map(_is_swept, found)) if complete and not no_example else 0
         total = len(read) * len(PROTOCOLS) * len(found) + swept
-        failed = record(folder, "evaluate", jobs, total, before.get("methods", ()))
+        failed = results_store.record(folder, "evaluate", jobs, total, before.get("methods", ()))
     if failed:
         raise ValueError(failed + (f". All others are in {folder}" if complete else ""))
     return no_example
 
 
 def _jobs(
-    folder: Path,
-    stores: Mapping[str, CorrespondenceStore],
-    methods: Mapping[str, Method],
-    options: SampleOptions,
-    complete: bool,
+    folder: Path, stores: Stores, methods: Mapping[str, Method], options: SampleOptions, complete: bool
 ) -> Iterator[Job]:
     """Make the files of the stores' motions and samples, and give those of the methods to make."""
-    keys = _keys(complete)
+    keys = KEYS[complete]
     for name, store in stores.items():
         once(_path(folder, name, "pairs"), partial(pair_motions, store), PAIRS, len(store))
         for protocol, max_ratio in PROTOCOLS.items():
@@ -144,11 +129,6 @@ def _path(folder: Path, *names: str) -> Path:
     """Return a file of a run."""
     *parents, last = map(file_name, names)
     return folder.joinpath(*parents, f"{last}.npz")
-
-
-def _keys(complete: bool) -> tuple[str, ...]:
-    """Return the names of the arrays in the file of a method's predictions."""
-    return (*ERRORS, *AGREEMENT) if complete else ERRORS
 
 
 def _is_swept(method: str) -> bool:
@@ -175,12 +155,12 @@ def _samples(
     return drawn.select(torch.from_numpy(found["plain_residual"] < limit))
 
 
-def _record_example(folder: Path, stores: Mapping[str, CorrespondenceStore], seed: int) -> str:
+def _record_example(folder: Path, stores: Stores, seed: int) -> str:
     """Write the example of a pair, or return why there is none."""
     path = folder / "example.npz"
     if not path.is_file():
         try:
-            write_arrays(path, random_pair(stores, seed))
+            results_store.write_arrays(path, random_pair(stores, seed))
         except ValueError as error:
             return str(error)
     return ""
@@ -189,7 +169,7 @@ def _record_example(folder: Path, stores: Mapping[str, CorrespondenceStore], see
 def read_run(folder: str | Path, complete: bool = True) -> Run:
     """Read what there is of a run; raise FileNotFoundError for a folder without one, ValueError if it is damaged."""
     folder = Path(folder)
-    about, missing = read_section(folder, "evaluate"), list[str]()
+    about, missing = results_store.read_section(folder, "evaluate"), list[str]()
     if about is None:
         raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
     cells, pairs = [], {}
@@ -217,7 +197,7 @@ def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, c
     pair = torch.from_numpy(samples["pair"])[kept]
     paths = {name: _path(folder, store, protocol, name) for name in about["methods"]}
     predictions = {
-        name: {key: torch.from_numpy(value) for key, value in read_arrays(path, _keys(complete), len(pair)).items()}
+        name: {key: torch.from_numpy(value) for key, value in read_arrays(path, KEYS[complete], len(pair)).items()}
         for name, path in paths.items()
         if path.is_file()
     }

@@ -1,8 +1,7 @@
 """The results of a run, kept in a folder, which is the only thing that recording and reporting share.
 
 ``run.json`` says what the run was computed from, in a section for ``evaluate`` and one for ``robust``; NumPy archives
-hold its arrays. A file that exists is read, to know that it is whole, and not computed again; a run of other options is
-refused. A method that fails is left out of the run, all others go on.
+hold its arrays. A file that exists is read, to know that it is whole, and not computed again.
 """
 
 from __future__ import annotations
@@ -42,6 +41,7 @@ RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{device}{i}" for device in ("COM", "
 
 About = dict[str, Any]
 Arrays = dict[str, NDArray[Any]]
+Stores = Mapping[str, CorrespondenceStore]  # by their names in tables
 
 
 class Job(NamedTuple):
@@ -67,7 +67,7 @@ def run_folder(folder: Path) -> Iterator[None]:
 def record(folder: Path, section: str, jobs: Iterable[Job], total: int, known: Collection[str]) -> str:
     """Do the jobs whose files are missing, with a bar of ``total`` jobs; return why methods failed, empty if none has.
 
-    Methods that failed leave the run, unless they are ``known``: the run had them before.
+    Methods that failed leave the run, with their files, unless they are ``known``: the run had them before.
     """
     tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
     failed = dict[str, str]()
@@ -82,20 +82,15 @@ def record(folder: Path, section: str, jobs: Iterable[Job], total: int, known: C
                 except ValueError as error:
                     failed[job.method] = str(error)
             bar.update()
-    _forget(folder, section, failed.keys() - {*known})
+    about, forgotten = read_section(folder, section) or {}, failed.keys() - {*known}
+    for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
+        about[key] = {name: value for name, value in about[key].items() if name not in forgotten}
+    _write(folder, section, about)
+    for path in result_files(folder, section, forgotten):
+        path.unlink()
     # A normaliser of the user's own is named in its message already.
     named = {text if text.startswith(name.partition("+")[0]) else f"{name}: {text}" for name, text in failed.items()}
     return "; ".join(sorted(named))
-
-
-def _forget(folder: Path, section: str, names: Collection[str]) -> None:
-    """Remove methods from a section, with their files: their code will be another when they come again."""
-    about = read_section(folder, section) or {}
-    for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
-        about[key] = {name: value for name, value in about[key].items() if name not in names}
-    _write(folder, section, about)
-    for path in result_files(folder, section, names):
-        path.unlink()
 
 
 def result_files(folder: Path, section: str, names: Iterable[str]) -> list[Path]:
@@ -104,7 +99,7 @@ def result_files(folder: Path, section: str, names: Iterable[str]) -> list[Path]
 
 
 def read_section(folder: Path, section: str) -> About | None:
-    """Return the options of a section, ``evaluate`` or ``robust``, and what its parts are; None if it has none."""
+    """Return what a section, ``evaluate`` or ``robust``, says of a run; None if it has none."""
     about = _read(folder).get(section)
     if about is None:
         return None
@@ -119,12 +114,7 @@ def read_section(folder: Path, section: str) -> About | None:
 
 
 def begin_section(
-    folder: Path,
-    section: str,
-    stores: Mapping[str, CorrespondenceStore],
-    about: About,
-    redo: Collection[str] = (),
-    command: str = "",
+    folder: Path, section: str, stores: Stores, about: About, redo: Collection[str] = (), command: str = ""
 ) -> About:
     """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
 
@@ -142,27 +132,21 @@ def begin_section(
     before = read_section(folder, section) or {}
     joined, had = JOINED[section], before or about
     differ = [f"{key} {had[key]!r}, now {about[key]!r}" for key in OPTIONS[section] if had[key] != about[key]]
-    differ += [text for key in joined for text in _changes(had[key], about[key], redo)]
+    # A package that is or was not installed is no change.
+    differ += [
+        f"{name} {had[key][name]!r}, now {value!r}"
+        for key in joined
+        for name, value in about[key].items()
+        if name not in redo and had[key].get(name, value) != value and None not in (had[key][name], value)
+    ]
     if differ:
         raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
     dates = {command: datetime.now().astimezone().date().isoformat()} if command else {}
     about["commands"] = {**had.get("commands", {}), **dates}
-    _write(folder, section, about | {key: _join(had[key], about[key]) for key in joined})
+    for key in joined:  # what is not installed now stays as it was
+        about[key] = had[key] | {name: v for name, v in about[key].items() if v is not None or name not in had[key]}
+    _write(folder, section, about)
     return before
-
-
-def _changes(had: About, now: About, redo: Collection[str]) -> list[str]:
-    """Return what is described otherwise than before; a package that is or was not installed is no change."""
-    return [
-        f"{name} {had[name]!r}, now {value!r}"
-        for name, value in now.items()
-        if name in had and name not in redo and had[name] != value and None not in (had[name], value)
-    ]
-
-
-def _join(had: About, now: About) -> About:
-    """Return what was there, then what is new; a package that is not installed now stays as it was."""
-    return had | {name: value for name, value in now.items() if value is not None or name not in had}
 
 
 def _read(folder: Path) -> dict[str, Any]:
@@ -194,11 +178,6 @@ def file_name(name: str) -> str:
 
     It is the name itself, unless that is not a file's name on Linux, macOS and Windows alike, or longer than
     ``MAX_NAME``: then it has a part of a hash of the name, so that no two names have one file.
-
-    Example:
-        >>> file_name("Hartley+LM"), file_name("tum@0:9"), file_name("con")
-        ('Hartley+LM', 'tum_0_9-62e87db9', '_con-1143da2b')
-
     """
     safe = re.sub(r"[^A-Za-z0-9+_.-]", "_", name)[:MAX_NAME]
     if name.partition(".")[0].upper() in RESERVED or name.startswith("."):
@@ -222,7 +201,7 @@ def once(path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: i
 
 
 def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> Arrays:
-    """Return the arrays in a file of a run; raise ValueError if it lacks ``keys``, or these have not ``rows`` rows."""
+    """Return the arrays of a file; raise ValueError if it is damaged, lacks ``keys`` or these have not ``rows``."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing: call the command that began the run again, it completes it")
     try:
