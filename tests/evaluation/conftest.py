@@ -12,6 +12,7 @@ from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.runs import example
 
+METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
 ESTIMATORS = ["opencv-usac", "RANSAC", "RANSAC:whitening", "ground-truth"]
 
 
@@ -23,14 +24,9 @@ def store(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def methods():
-    return ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
-
-
-@pytest.fixture(scope="session")
-def command(store, methods):
+def command(store):
     """The command that makes the run, without its folder."""
-    return ["evaluate", str(store), "--methods", *methods, "--out"]
+    return ["evaluate", str(store), "--methods", *METHODS, "--out"]
 
 
 @pytest.fixture(scope="session")
@@ -64,7 +60,6 @@ def robust_store(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def robust_command(robust_store):
-    """The command of a run, without its folder."""
     return ["robust", str(robust_store), "--pairs", "2", "--seeds", "2", "--estimators", *ESTIMATORS, "--out"]
 
 

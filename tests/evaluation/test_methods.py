@@ -48,11 +48,7 @@ def test_refined_is_the_better_fit(scene):
     [
         ("nothing", FileNotFoundError, "no weights 'nothing'"),
         ("robust", ValueError, "robust STORE --out RUN --estimators learned:robust evaluates them"),
-        (
-            str(WEIGHTS / "robust.safetensors"),
-            ValueError,
-            "of a LearnedEightPoint, expected those of a LearnedNormalizer",
-        ),
+        (str(WEIGHTS / "robust.safetensors"), ValueError, "of a LearnedEightPoint, expected those of a LearnedNorm"),
         ("hartley+LM", FileNotFoundError, r"expected none, Hartley, .*paper, .*module:Name, .*\+LM or \+optimal"),
         ("Hartley+foo", FileNotFoundError, r"no weights 'Hartley\+foo'"),
         ("Hartley+optimal+LM", FileNotFoundError, "expected none, Hartley"),
@@ -94,13 +90,8 @@ class TestTrainedOn:
         assert find_method(name).trained_on == find_method(f"{name}+LM").trained_on == tuple(names_of(paths).values())
 
     def test_shipped_weights(self):
-        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {
-            *SHIPPED,
-            "crossview-sets",
-            "robust",
-            "robust-synthetic",
-            "robust-tiny",
-        }
+        others = {"crossview-sets", "robust", "robust-synthetic", "robust-tiny"}
+        assert {path.stem for path in WEIGHTS.glob("*.safetensors")} == {*SHIPPED, *others}
         assert find_method("crossview-synthetic").trained_on == ("synthetic scenes",)
 
     def test_without_weights_or_without_names(self, tmp_path):

@@ -52,7 +52,6 @@ def test_exceptions(steps, learning_rate):
 
 
 def test_one_step_is_exactly_the_base(dtype):
-    """The first transforms tried are the base's own."""
     points = [p.to(dtype) for p in correspondences("handheld", 5)]
     expected = Hartley()(*(p.double() for p in points))
     for T, H in zip(SearchedNormalizer(Hartley(), steps=1)(*points), expected, strict=True):
@@ -84,16 +83,7 @@ class TestSearch:
             p1, p2 = (p.expand(1500, 8, 2) for p in (p1, p2))
             assert least < epipolar_distances(p1, p2, eight_point(p1, p2, T1, T2)).mean(1).min()
 
-    def test_more_steps_find_less(self):
-        points = correspondences("handheld", 30)
-        means = [
-            np.log(mean_distances(*points, SearchedNormalizer(Hartley(), steps=steps))).mean() for steps in (1, 10, 60)
-        ]
-        assert means == sorted(means, reverse=True)
-        assert means[-1] < means[0] - 0.2
-
     def test_steps_that_are_too_long_do_no_harm(self):
-        """The best parameters met are kept, not the last."""
         points = correspondences("handheld", 12)
         found = mean_distances(*points, SearchedNormalizer(ReweightedWhitening(), steps=4, learning_rate=0.5))
         assert (found <= mean_distances(*points, ReweightedWhitening()) * (1 + 1e-6)).all()
@@ -129,7 +119,6 @@ class TestSearch:
             np.testing.assert_allclose(gram[:, 0, 1], 0 if transform is paper_transform else gram[:, 1, 0], atol=1e-9)
 
     def test_the_result_is_built_from_parameters_and_base(self):
-        """Transforms of the five parameters: symmetric positive definite linear parts, upon the base."""
         points, transforms, *_ = searched("hartley", "handheld", 8)
         for T, H in zip(transforms, Hartley()(*points), strict=True):
             linear = (T.numpy() @ np.linalg.inv(H.numpy()))[:, :2, :2]
@@ -147,7 +136,6 @@ class TestInvariances:
 
     @pytest.mark.parametrize("num_points", [8, 20])
     def test_samples_do_not_influence_each_other(self, num_points):
-        """Alone, or beside a degenerate one."""
         points, normalizer = correspondences("handheld", 6, num_points), SearchedNormalizer(steps=10)
         together = normalizer(*points)
         for k in range(6):
@@ -213,12 +201,9 @@ class TestGradients:
             assert not torch.allclose(T, H)
 
     def test_the_matrix_still_depends_on_the_points(self):
-        """With the transforms held, the eight-point algorithm has its derivatives."""
         points = [p.requires_grad_() for p in correspondences("handheld", 3)]
         find_fundamental(*points, normalizer=SearchedNormalizer(steps=2)).sum().backward()
-        for p in points:
-            assert torch.isfinite(p.grad).all()
-            assert p.grad.count_nonzero() > 0
+        assert all(p.grad.isfinite().all() and p.grad.count_nonzero() > 0 for p in points)
 
 
 LINE = uniform(4, 20, 1, high=600) * torch.tensor([1.0, 0.5])

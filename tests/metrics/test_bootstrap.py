@@ -35,11 +35,6 @@ def interval(values, groups, **options):
     return np.array(bootstrap_interval(torch.tensor(values), torch.tensor(groups), **options))
 
 
-def width(*args, **options):
-    low, high = interval(*args, **options)
-    return high - low
-
-
 class TestBootstrapInterval:
     """Ends scatter by about 0.04 standard errors at 4,000 draws."""
 
@@ -48,9 +43,8 @@ class TestBootstrapInterval:
         values, groups = uneven_groups()
         means = resampled_means(values, groups)
         expected = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-        np.testing.assert_allclose(
-            interval(values, groups, level=level, draws=4000), expected, atol=0.2 * np.std(means)
-        )
+        found = interval(values, groups, level=level, draws=4000)
+        np.testing.assert_allclose(found, expected, atol=0.2 * np.std(means))
 
     @pytest.mark.parametrize("level", [0.5, 0.9, 0.99])
     def test_independent_samples_follow_the_normal_law(self, level):
@@ -70,8 +64,8 @@ class TestBootstrapInterval:
         """Eight equal samples are worth one: the interval is wider by the root of eight."""
         values, groups = np.repeat(np.random.default_rng(3).normal(size=100), 8), np.repeat(np.arange(100), 8)
         mixed = np.random.default_rng(4).permutation(values)
-        ratio = width(values, groups, draws=4000) / width(mixed, groups, draws=4000)
-        assert ratio == pytest.approx(np.sqrt(8), rel=0.2)
+        widths = [np.ptp(interval(v, groups, draws=4000)) for v in (values, mixed)]
+        assert widths[0] / widths[1] == pytest.approx(np.sqrt(8), rel=0.2)
 
     def test_seed_decides(self):
         values, groups = uneven_groups()
@@ -109,19 +103,13 @@ class TestBootstrapInterval:
         assert found == bootstrap_interval(values.double(), groups)
         assert [type(end) for end in found] == [float, float]
 
-    def test_equal_values_leave_no_width(self):
-        assert bootstrap_interval(torch.full((6,), 0.5), torch.tensor([0, 0, 0, 1, 1, 2])) == (0.5, 0.5)
-
     @pytest.mark.parametrize(
         ("values", "groups", "level", "message"),
         [
             (torch.rand(3), torch.arange(4), 0.95, r"two \(S,\) tensors, got \[3\] and \[4\]"),
             (torch.rand(2, 2), torch.ones(2, 2).long(), 0.95, r"two \(S,\) tensors, got \[2, 2\] and \[2, 2\]"),
             (torch.tensor(1.0), torch.tensor(1), 0.95, r"two \(S,\) tensors, got \[\] and \[\]"),
-            (torch.rand(3), torch.arange(3), 0.0, r"level must be between 0 and 1, got 0\.0"),
-            (torch.rand(3), torch.arange(3), 1.0, r"level must be between 0 and 1, got 1\.0"),
-            (torch.rand(3), torch.arange(3), 95, "level must be between 0 and 1, got 95"),
-            (torch.rand(3), torch.arange(3), NAN, "level must be between 0 and 1, got nan"),
+            *((torch.rand(3), torch.arange(3), n, f"between 0 and 1, got {n}") for n in (0.0, 1.0, 95, NAN)),
             (torch.rand(3), torch.full((3,), 7), 0.95, "at least two groups are needed, got 1"),
             (torch.rand(0), torch.arange(0), 0.95, "at least two groups are needed, got 0"),
         ],

@@ -10,13 +10,8 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
-from kornia_learnnorm.metrics.poses import (
-    mean_average_accuracy,
-    pose_auc,
-    pose_error,
-    rotation_error,
-    translation_error,
-)
+from kornia_learnnorm.metrics.poses import mean_average_accuracy as maa
+from kornia_learnnorm.metrics.poses import pose_auc, pose_error, rotation_error, translation_error
 
 INF, NAN = float("inf"), float("nan")
 
@@ -68,15 +63,10 @@ class TestAngles:
 
     def test_exceptions(self):
         R, t = torch.eye(3), torch.ones(3)
-        for call in (
-            lambda: rotation_error(R[:2], R),
-            lambda: rotation_error(R, R[:, :2]),
-            lambda: translation_error(t[:2], t),
-            lambda: translation_error(t, t[:2]),
-            lambda: pose_error(R, t[:2], R, t),
-        ):
+        pairs = [(rotation_error, R[:2], R), (rotation_error, R, R[:, :2]), (translation_error, t[:2], t)]
+        for function, *values in (*pairs, (translation_error, t, t[:2]), (pose_error, R, t[:2], R, t)):
             with pytest.raises(ShapeError):
-                call()
+                function(*values)
 
 
 class TestPoseError:
@@ -153,22 +143,22 @@ class TestMeanAverageAccuracy:
         [([0.0], 1.0), ([0.99], 1.0), ([1.0], 0.9), ([9.5], 0.1), ([10.0], 0.0), ([INF], 0.0), ([0.0, INF], 0.5)],
     )
     def test_by_hand(self, errors, expected, dtype, device):
-        found = mean_average_accuracy(torch.tensor(errors, dtype=dtype, device=device))
+        found = maa(torch.tensor(errors, dtype=dtype, device=device))
         assert found == pytest.approx(expected)
         assert type(found) is float
 
     @given(ERRORS, st.integers(1, 25))
     def test_counting(self, errors, limit):
         expected = np.mean([np.mean([error < degrees for error in errors]) for degrees in range(1, limit + 1)])
-        assert mean_average_accuracy(torch.tensor(errors, dtype=torch.float64), limit) == pytest.approx(expected)
+        assert maa(torch.tensor(errors, dtype=torch.float64), limit) == pytest.approx(expected)
 
     @pytest.mark.parametrize("limit", [0, -3])
     def test_limit(self, limit):
         with pytest.raises(ValueError, match=f"limit must be one degree or more, got {limit}"):
-            mean_average_accuracy(torch.ones(3), limit)
+            maa(torch.ones(3), limit)
 
 
-@pytest.mark.parametrize("summary", [pose_auc, mean_average_accuracy])
+@pytest.mark.parametrize("summary", [pose_auc, maa])
 @pytest.mark.parametrize(
     ("errors", "message"),
     [

@@ -119,12 +119,8 @@ def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_r
         assert not [name for name in table.header if "truth" in name or "F1" in name], title
     rows = {row[0]: row for row in as_text(tables["Inliers: scenes, filtered"].rows)}
     assert rows["whitening"][2].startswith(f"{100 * shares[:, 1].mean():.1f} [")
-    assert tables["Fit and accuracy: scenes, filtered"].header[:4] == [
-        "method",
-        "fit px",
-        "held out px",
-        "condition number",
-    ]
+    header = tables["Fit and accuracy: scenes, filtered"].header[:4]
+    assert header == ["method", "fit px", "held out px", "condition number"]
     assert not any("By motion" in title or "Worst" in title for title in tables)
 
 

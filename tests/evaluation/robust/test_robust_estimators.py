@@ -8,15 +8,8 @@ import torch
 from scenes import shaken_estimator
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.evaluation.robust import peers
-from kornia_learnnorm.evaluation.robust.robust_estimators import (
-    DEFAULT_ESTIMATORS,
-    estimator_names,
-    find_estimator,
-    identify_estimator,
-    is_slow,
-    run_estimator,
-)
+from kornia_learnnorm.evaluation.robust import peers, robust_estimators
+from kornia_learnnorm.evaluation.robust.robust_estimators import DEFAULT_ESTIMATORS, find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import measure
 
 KNOWN_CAMERAS = ["RANSAC-calibrated", "poselib-calibrated", "opencv-usac-magsac-calibrated"]
@@ -50,7 +43,8 @@ def test_known_cameras(name, matches):
     assert measure(drawn, found.F_mat, 1.0)["rotation_error"] < 1
     assert run_estimator(estimator, drawn._replace(K=drawn.K * torch.nan), 0, 1.0).F_mat.isnan().all()
     assert name not in DEFAULT_ESTIMATORS
-    assert identify_estimator(name) == name or identify_estimator(name).startswith(("poselib ", "opencv "))
+    identity = robust_estimators.identify_estimator(name)
+    assert identity == name or identity.startswith(("poselib ", "opencv "))
 
 
 @pytest.mark.parametrize("name", ["learned:{}", "learned:{}+LM", "guided:{}"])
@@ -67,7 +61,7 @@ def test_learned_weights_in_a_file(name, matches, tmp_path):
     if name.startswith("guided"):
         expected = kln.RANSAC(seed=0)(drawn.points1, drawn.points2, weights[0])[0][None]
     assert torch.allclose(found.F_mat, expected[0], rtol=1e-6, atol=1e-12)
-    assert file.name in identify_estimator(name.format(file))
+    assert file.name in robust_estimators.identify_estimator(name.format(file))
 
 
 def test_the_seed_decides(matches):
@@ -107,8 +101,8 @@ def test_names(tmp_path):
     path = str(tmp_path / "mine" / "weights.safetensors")
     names = [f"learned:{path}", f"RANSAC:{path}", "RANSAC", "poselib", "RANSAC:kornia_learnnorm:Whitening"]
     short = ["learned:mine", "RANSAC:mine", "RANSAC", "poselib", "RANSAC:kornia_learnnorm:Whitening"]
-    assert [*estimator_names(names).values()] == short
+    assert [*robust_estimators.estimator_names(names).values()] == short
     with pytest.raises(ValueError, match="same name"):
-        estimator_names(["RANSAC", "RANSAC"])
-    slow = [name for name in ("poselib", "RANSAC:crossview", "learned:robust", "opencv-lmeds") if is_slow(name)]
-    assert slow == ["poselib", "RANSAC:crossview"]
+        robust_estimators.estimator_names(["RANSAC", "RANSAC"])
+    kinds = ("poselib", "RANSAC:crossview", "learned:robust", "opencv-lmeds")
+    assert [*filter(robust_estimators.is_slow, kinds)] == ["poselib", "RANSAC:crossview"]
