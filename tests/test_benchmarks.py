@@ -245,7 +245,7 @@ def test_two_fifths_of_larger_sets_are_outliers(benchmark):
 
 
 @pytest.mark.parametrize("kind", ["solver", "training"])
-def test_shares_of_the_time(benchmark, kind, monkeypatch):
+def test_shares_of_the_time(benchmark, kind, program, monkeypatch):
     profile = benchmark("profile_time")
     monkeypatch.setattr(profile, "CALLS", 2)
     if kind == "training":
