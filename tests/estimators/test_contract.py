@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -73,9 +74,12 @@ def test_smoke(name, batch_size, num_points, weighted, dtype, device):
     assert torch.isfinite(F_mat).all()
 
 
-@pairwise(name=LINEAR, num_points=[8, 20, 50])
-def test_finds_the_truth_without_noise(name, num_points):
-    scene = scenes("orbit", 50, num_points, noise=0.0)
+@pytest.mark.parametrize(
+    ("name", "num_points", "kind"),
+    [*product(LINEAR, [8, 20, 50], ["orbit"]), ("projection", 50, "driving"), ("projection", 50, "handheld")],
+)
+def test_finds_the_truth_without_noise(name, num_points, kind):
+    scene = scenes(kind, 50, num_points, noise=0.0)
     F_mat = ALL[name](scene.points1, scene.points2)
     assert up_to_sign(F_mat, scene.F_mat) < 1e-7
     assert hartley_difference(F_mat, scene.F_mat, *scene[:2]) < 1e-7
