@@ -101,6 +101,16 @@ def unit(F: np.ndarray) -> np.ndarray:
     return F / np.linalg.norm(F, axis=(-2, -1), keepdims=True)
 
 
+def cross(t) -> np.ndarray:
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
+def true_essential(scene) -> Tensor:
+    """[t]_x R of unit norm, (B, 3, 3)."""
+    E = [cross(t) @ R for R, t in zip(scene.R.numpy(), scene.t.numpy(), strict=True)]
+    return torch.from_numpy(unit(np.stack(E)))
+
+
 def null_matrices(points1, points2, T1, T2, weights=None) -> np.ndarray:
     """The last right singular vectors of the design matrices in the coordinates of the transforms."""
     T1, T2 = (np.asarray(T, dtype=np.float64).swapaxes(-1, -2) for T in (T1, T2))

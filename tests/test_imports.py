@@ -31,18 +31,8 @@ CORE_NEEDS = {"filelock", "kornia", "kornia_learnnorm", "numpy", "safetensors", 
 # cli/main.py names Lightning only to say which extra brings it.
 PLACES = {"argparse": {"cli"}, "pytorch_lightning": {"lightning_modules", "cli"}}
 EXTRA = {"kornia_learnnorm.metrics.modules": {"torchmetrics"}}
-HEAVY = [
-    "pytorch_lightning",
-    "lightning",
-    "cv2",
-    "h5py",
-    "matplotlib",
-    "jsonargparse",
-    "torchmetrics",
-    "tabulate",
-    "bokeh",
-]
-HEAVY.append("huggingface_hub")
+HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "tabulate"]
+HEAVY += ["bokeh", "huggingface_hub"]
 
 
 def room_of(name: str) -> str:

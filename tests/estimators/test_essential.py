@@ -6,23 +6,13 @@ import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
-from scenes import homogeneous, scenes, uniform, unit, up_to_sign
+from scenes import cross, homogeneous, scenes, true_essential, uniform, up_to_sign
 
 from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, squared_loss
 from kornia_learnnorm.geometry.minimal import solve_calibrated_samples
 
 NAN = float("nan")
-
-
-def cross(t) -> np.ndarray:
-    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-
-
-def true_essential(scene) -> torch.Tensor:
-    """[t]_x R of unit norm, (B, 3, 3)."""
-    E = [cross(t) @ R for R, t in zip(scene.R.numpy(), scene.t.numpy(), strict=True)]
-    return torch.from_numpy(unit(np.stack(E)))
 
 
 def disturbed(E, size: float = 0.02) -> torch.Tensor:
