@@ -5,8 +5,6 @@ further to the right, and cameras and poses are exact (but for the distortion of
 drawn).
 """
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import pairwise
 from pathlib import Path

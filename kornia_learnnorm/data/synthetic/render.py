@@ -59,11 +59,6 @@ def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedP
 
     The second camera is about half a metre to the side of and ahead of the first one and turned a little. A seed below
     0 and a height below 64 pixels or above the width are a ValueError.
-
-    Example:
-        >>> pair = render_pair(seed=0, width=320, height=240)
-        >>> pair.image1.shape, pair.image1.dtype
-        ((240, 320), dtype('uint8'))
     """
     check_size(seed, width, height)
     cv2 = import_cv2()

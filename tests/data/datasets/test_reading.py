@@ -24,6 +24,7 @@ def epipoles_agree(pair: FramePair) -> bool:
         ("kitti", {"split": "test"}, "06"),
         ("tum", {"split": "train"}, FR1),
         ("tum", {"split": "val"}, FR3),
+        ("cambridge", {"split": "train"}, "seq1"),
         ("cambridge", {"split": "test"}, "seq2"),
     ],
 )
