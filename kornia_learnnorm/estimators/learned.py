@@ -140,25 +140,16 @@ class LearnedLayer(MatchLayer):
 
 
 class LearnedEstimate(NamedTuple):
-    r"""Fundamental matrices of a batch of image pairs, and what the layer makes of their correspondences.
+    """Fundamental matrices of a batch of image pairs, and what the layer makes of their correspondences."""
 
-    Attributes:
-        F_mat: fundamental matrices of rank 2 and unit Frobenius norm, :math:`x_2^\top F x_1 = 0`, (B, 3, 3).
-        E_mat: :math:`K_2^\top F K_1` with unit Frobenius norm, (B, 3, 3), or None without cameras.
-        determined: whether the correspondences determine a matrix; see
-            :class:`~kornia_learnnorm.estimators.linear.TwoViewEstimate`.
-        gap: relative gap of the design matrix that ``determined`` is decided on, (B,).
-        weights: probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that
-            do not determine their matrix.
-        stages: what each stage gives, before its refinement, the last one last.
-    """
-
-    F_mat: Tensor
-    E_mat: Tensor | None
-    determined: Tensor
-    gap: Tensor
+    F_mat: Tensor  # of rank 2 and unit Frobenius norm, x2^T F x1 = 0, (B, 3, 3)
+    E_mat: Tensor | None  # K2^T F K1 with unit Frobenius norm, (B, 3, 3), or None without cameras
+    determined: Tensor  # whether the correspondences determine a matrix, (B,) bool; see TwoViewEstimate
+    gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
+    # Probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that do not
+    # determine their matrix.
     weights: Tensor
-    stages: tuple[StageEstimate, ...]
+    stages: tuple[StageEstimate, ...]  # what each stage gives, before its refinement, the last one last
 
 
 class LearnedEightPoint(LearnedLayer):

@@ -1,9 +1,4 @@
-r"""Linear estimation: the DLT of a model in the coordinates of a normaliser, as a function and as a layer.
-
-A pair of point sets goes from pixels to a fundamental matrix in :func:`find_fundamental`: checked, normalised and
-solved once as a :class:`~kornia_learnnorm.geometry.problem.LinearProblem`, then given rank 2 in the coordinates that a
-normaliser chooses. :class:`EightPoint` adds masks, cameras, and sets that determine no matrix.
-"""
+"""Linear estimation: the DLT of a model in the coordinates of a normaliser, as a function and as a layer."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
 __all__ = ["Correspondences", "MatchLayer", "correspondences_from_matches", "refuse_jit"]
@@ -54,7 +55,8 @@ def correspondences_from_matches(
     present = torch.tensor([len(pairs) for pairs in matches], device=index.device)
     mask = torch.arange(length, device=index.device) < present[:, None]
     points1, points2 = (
-        _at_least_one(keypoints).gather(1, index[..., k : k + 1].expand(-1, -1, 2))
+        # A view without any keypoint gets one at the origin: padded rows take the first.
+        pad(keypoints, (0, 0, 0, int(keypoints.shape[1] == 0))).gather(1, index[..., k : k + 1].expand(-1, -1, 2))
         for k, keypoints in enumerate((keypoints1, keypoints2))
     )
     if scores is None:
@@ -114,11 +116,6 @@ class MatchLayer(nn.Module):
 def refuse_jit() -> NoReturn:
     """Raise a TypeError that says what to use instead of ``torch.jit``."""
     raise TypeError("this layer cannot be compiled by torch.jit, use torch.compile or torch.export")
-
-
-def _at_least_one(keypoints: Tensor) -> Tensor:
-    """Return the keypoints, or one at the origin for a view without any: padded rows take the first."""
-    return keypoints if keypoints.shape[1] else keypoints.new_zeros(len(keypoints), 1, 2)
 
 
 def _pairs_of_matches(

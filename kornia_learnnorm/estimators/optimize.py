@@ -1,8 +1,4 @@
-r"""Robust Levenberg-Marquardt over a model's manifold, batched: to convergence, or a fixed number of steps.
-
-:func:`minimize` runs to convergence, with a damping of its own for every matrix; its gradient is implicit, by
-:func:`attach_gradient`. :func:`refine_unrolled` takes the same number of steps for all sets in one graph, as a layer
-needs that is compiled or mapped.
+"""Robust Levenberg-Marquardt over a model's manifold, batched: to convergence, or a fixed number of steps.
 
 Matrices move in coordinates that are Hartley's up to the scale of homogeneous vectors: pixels from the centroid, and a
 third coordinate as large as they are. Distances in them are those in pixels.
@@ -74,7 +70,10 @@ class Optimum(NamedTuple):
 
 
 def minimize(cost: RobustCost, state: State, max_iterations: int, tolerance: float) -> tuple[Tensor, Optimum]:
-    """Return the costs at the states and the best found from there, on the manifold that the states belong to."""
+    """Return the costs at the states and the best found from there, on the manifold that the states belong to.
+
+    It runs to convergence, with a damping of its own for every matrix; its gradient is that of :func:`attach_gradient`.
+    """
     # What a step computes of so many correspondences stays in the cache of a CPU: 2.5 times faster than all at once.
     matrices = state.matrix()
     size = max(1, (2**14 if matrices.device.type == "cpu" else 2**24) // cost.x1.shape[-1])

@@ -12,7 +12,7 @@ from kornia_learnnorm.estimators.optimize import RobustCost, attach_gradient, mi
 from kornia_learnnorm.estimators.robust_losses import Loss, squared_loss
 from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, check_matrices, solve_dtype
 from kornia_learnnorm.geometry.matrices import unit_matrix
-from kornia_learnnorm.geometry.problem import hartley_transform
+from kornia_learnnorm.geometry.problem import hartley_coordinates
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.essential import Essential
@@ -24,31 +24,19 @@ Distance = Literal["sampson", "symmetric"]
 
 
 class Refinement(NamedTuple):
-    """Refined fundamental matrices and how they were reached.
+    """Refined fundamental matrices and how they were reached."""
 
-    Attributes:
-        F_mat: fundamental matrices of rank 2 and unit Frobenius norm, (B, 3, 3).
-        cost_before: weighted sum of the losses in square pixels at the given matrices, projected to rank 2, (B,).
-        cost: weighted sum of the losses at ``F_mat``, never larger, (B,).
-        iterations: steps tried, (B,) int64.
-        converged: whether the gradient vanishes, up to ``tolerance`` of what its terms could sum to, (B,) bool.
-    """
-
-    F_mat: Tensor
-    cost_before: Tensor
-    cost: Tensor
-    iterations: Tensor
-    converged: Tensor
+    F_mat: Tensor  # of rank 2 and unit Frobenius norm, (B, 3, 3)
+    cost_before: Tensor  # weighted sum of the losses in square pixels at the given matrices, projected to rank 2, (B,)
+    cost: Tensor  # weighted sum of the losses at `F_mat`, never larger, (B,)
+    iterations: Tensor  # steps tried, (B,) int64
+    converged: Tensor  # whether the gradient vanishes, up to `tolerance` of what its terms could sum to, (B,) bool
 
 
 class EssentialRefinement(NamedTuple):
-    """Refined essential matrices, and :class:`Refinement`'s fields of the fundamental matrices of the same poses.
+    """Refined essential matrices, and :class:`Refinement`'s fields of the fundamental matrices of the same poses."""
 
-    Attributes:
-        E_mat: essential matrices of unit Frobenius norm, singular values (s, s, 0), (B, 3, 3).
-    """
-
-    E_mat: Tensor
+    E_mat: Tensor  # of unit Frobenius norm, singular values (s, s, 0), (B, 3, 3)
     F_mat: Tensor
     cost_before: Tensor
     cost: Tensor
@@ -150,35 +138,28 @@ def refine_essential(
     .. math:: \min_{E = U \mathrm{diag}(1, 1, 0) V^\top / \sqrt 2} \sum_i w_i\, \rho(d_i^2), \quad
               d_i \text{ the distance in pixels under } F = K_2^{-\top} E K_1^{-1}
 
-    over rotations :math:`U` and :math:`V`, which have five parameters in :math:`E`: those of a relative pose. Each
-    element of the batch has its own damping; a step is taken where it lowers the cost and refused where it does not or
-    cannot be computed. The steps are computed in float64. There are no gradients: the result carries none. Use
-    :func:`~kornia_learnnorm.refine_fundamental` where gradients are needed or the cameras are not known.
+    over rotations :math:`U` and :math:`V`, which have five parameters in :math:`E`: those of a relative pose. The steps
+    are those of :func:`~kornia_learnnorm.refine_fundamental`, in float64. There are no gradients: the result carries
+    none. Use :func:`~kornia_learnnorm.refine_fundamental` where gradients are needed or the cameras are not known.
 
     Args:
-        points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 5`, float32 or float64; with shape
-            :math:`(1, N, 2)`, all matrices share them.
+        points1: pixels in the first image with shape :math:`(B, N, 2)` or :math:`(1, N, 2)`, :math:`N \ge 5`.
         points2: pixels in the second image with the same shape.
         E_mat: where to start, with shape :math:`(B, 3, 3)`, any scale but zero; the nearest essential matrix is taken.
         K1: cameras of the first images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
         K2: cameras of the second images with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
-        weights: optional non-negative weights of the losses, :math:`(B, N)` or :math:`(1, N)` as the points; zero means
-            absent.
-        loss: :math:`\rho` of squared distances, as for :func:`~kornia_learnnorm.refine_fundamental`.
-        distance: the distance :math:`d`: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
+        weights: this and all that follow as for :func:`~kornia_learnnorm.refine_fundamental`.
+        loss: :math:`\rho` of squared distances.
+        distance: the distance :math:`d`: ``"sampson"`` or ``"symmetric"``.
         max_iterations: largest number of steps tried.
-        tolerance: largest cosine between the distances and their derivatives at which a matrix has converged.
+        tolerance: largest cosine at which a matrix has converged.
 
     Returns:
         the matrices with their costs, in the dtype of the points.
 
     Raises:
-        TypeError: if an argument is not a floating-point tensor, the points are not of one dtype, ``loss`` cannot be
-            called or ``max_iterations`` is not a whole number.
-        ShapeError: if a shape is wrong.
-        ValueError: if there are fewer than five correspondences, shapes do not pair up, a value is not finite, a matrix
-            is zero, a camera is not invertible, there is no distance of that name, or ``max_iterations`` or
-            ``tolerance`` is negative.
+        TypeError, ShapeError, ValueError: as :func:`~kornia_learnnorm.refine_fundamental`, but five points
+            are enough; a ValueError too if a camera is not invertible.
 
     Reference:
         R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, sections 9.6 and 11.4.3; V. Larsson, PoseLib,
@@ -237,6 +218,6 @@ def _cost(
     weights = torch.ones_like(x1[..., 0]) if weights is None else weights.to(dtype)
     with torch.no_grad():
         # Pixels from the centroid, and a third coordinate as large as they are: distances are those in pixels.
-        T1, T2 = (T / T[:, :1, :1] for T in (hartley_transform(x1, weights), hartley_transform(x2, weights)))
+        T1, T2 = (T / T[:, :1, :1] for T in (hartley_coordinates(x, weights)[1] for x in (x1, x2)))
     x1, x2 = (T @ convert_points_to_homogeneous(x).mT for T, x in ((T1, x1), (T2, x2)))
     return RobustCost(model, x1, x2, weights, loss), T1, T2

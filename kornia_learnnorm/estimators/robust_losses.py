@@ -44,10 +44,7 @@ class Huber(_RobustLoss):
     r"""Huber's loss of squared distances :math:`s`: :math:`s` up to :math:`c^2`, :math:`2 c \sqrt s - c^2` beyond.
 
     Args:
-        scale: :math:`c` in pixels.
-
-    Raises:
-        ValueError: if the scale is not positive.
+        scale: :math:`c` in pixels, positive or it is a ValueError.
 
     Example:
         >>> Huber(1.0)(torch.tensor([0.25, 4.0]))
@@ -66,10 +63,7 @@ class Cauchy(_RobustLoss):
     r"""Cauchy's loss of squared distances :math:`s`: :math:`c^2 \log(1 + s / c^2)`.
 
     Args:
-        scale: :math:`c` in pixels.
-
-    Raises:
-        ValueError: if the scale is not positive.
+        scale: :math:`c` in pixels, positive or it is a ValueError.
 
     Example:
         >>> Cauchy(2.0)(torch.tensor([0.0, 4.0]))
@@ -87,10 +81,7 @@ class GemanMcClure(_RobustLoss):
     r"""Geman and McClure's loss of squared distances :math:`s`: :math:`s / (1 + s / c^2)`, bounded by :math:`c^2`.
 
     Args:
-        scale: :math:`c` in pixels.
-
-    Raises:
-        ValueError: if the scale is not positive.
+        scale: :math:`c` in pixels, positive or it is a ValueError.
 
     Example:
         >>> GemanMcClure(2.0)(torch.tensor([0.0, 4.0]))
@@ -108,10 +99,7 @@ class Truncated(_RobustLoss):
     r"""The truncated squares of MSAC: squared distances :math:`s` up to :math:`c^2`, and :math:`c^2` beyond.
 
     Args:
-        scale: :math:`c` in pixels.
-
-    Raises:
-        ValueError: if the scale is not positive.
+        scale: :math:`c` in pixels, positive or it is a ValueError.
 
     Reference:
         P. Torr, A. Zisserman, MLESAC: a new robust estimator with application to estimating image geometry, CVIU 2000.

@@ -1,9 +1,7 @@
-r"""Reweighted least squares under the singularity constraint: a fast way to a robust optimum.
+"""Reweighted least squares under the singularity constraint: a fast way to a robust optimum.
 
-Each step holds the weights, which turn squared algebraic residuals into losses of distances, and solves one linear
-system for the matrix at which the sum of losses is stationary on the linearised constraint. It is a fraction of a step
-of Levenberg-Marquardt, and with a robust loss ends at an optimum too. Nothing holds it there: of least squares with
-outliers, it may not converge.
+Each step solves one linear system, a fraction of a step of Levenberg-Marquardt, and with a robust loss ends at an
+optimum too. Nothing holds it there: of least squares with outliers, it may not converge.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-r"""Many minimal samples of eight correspondences, or of five with known cameras, at once and without derivatives.
+"""Many minimal samples of eight correspondences, or of five with known cameras, at once and without derivatives.
 
-:func:`~kornia_learnnorm.find_fundamental` with ``rank2="optimal"`` corrects the same null vectors in other coordinates.
-Its matrices agree to second order in the correction, and have the same residuals in the median. It also serves more
-points, weights, any normaliser and gradients, and takes several times as long.
+:func:`~kornia_learnnorm.find_fundamental` with ``rank2="optimal"`` agrees to second order in the correction. It also
+serves more points, weights, any normaliser and gradients, and takes several times as long.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from kornia_learnnorm.geometry.checks import needs_gradient, read_condition, sol
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP, MIN_GAP, nearest_null_vector
 from kornia_learnnorm.geometry.matrices import inverse
 
-__all__ = ["LinearProblem", "hartley_coordinates", "hartley_transform", "solve_where_determined"]
+__all__ = ["LinearProblem", "hartley_coordinates", "solve_where_determined"]
 
 
 @dataclass
@@ -182,17 +182,12 @@ def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:
     return points[..., :2], points[..., 2:]
 
 
-def hartley_transform(points: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return the similarities :math:`(*, 3, 3)` that centre points and make their mean distance :math:`\sqrt 2`.
-
-    Coincident points keep their scale (R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; Fan et al.,
-    Eq. 4). Points are :math:`(*, N, 2)`, optional weights :math:`(*, N)`.
-    """
-    return hartley_coordinates(points, weights)[1]
-
-
 def hartley_coordinates(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return homogeneous points :math:`(*, N, 3)` in Hartley's coordinates, and :func:`hartley_transform`.
+    r"""Return homogeneous points :math:`(*, N, 3)` in Hartley's coordinates, and the transforms :math:`(*, 3, 3)`.
+
+    They centre points :math:`(*, N, 2)` with optional weights :math:`(*, N)` and make their mean distance from the
+    centroid :math:`\sqrt 2` (R. Hartley, In defense of the eight-point algorithm, TPAMI 1997; Fan et al., Eq. 4).
+    Coincident points keep their scale.
 
     The points come transposed in memory: on a CPU, one coordinate of all points is a longer run than all of one point.
     """

@@ -24,13 +24,9 @@ Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
 
 class ProblemNormalizer(nn.Module):
-    """Base of the normalisers that compute their transforms from a linear problem.
+    """Base of the normalisers that compute their transforms from a linear problem."""
 
-    Attributes:
-        min_points: smallest number of correspondences.
-    """
-
-    min_points = 1
+    min_points = 1  # smallest number of correspondences
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         r"""Return the transforms of both views.
@@ -54,12 +50,7 @@ class ProblemNormalizer(nn.Module):
         return T1.to(points1.dtype), T2.to(points1.dtype)
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
-        """Return the transforms :math:`(B, 3, 3)` of both views.
-
-        Args:
-            problem: the correspondences, checked.
-
-        """
+        """Return the transforms :math:`(B, 3, 3)` of both views, of checked correspondences."""
         raise NotImplementedError
 
 
@@ -83,17 +74,7 @@ class PerView(nn.Module):
         self.normalize = normalize
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        r"""Return the callable's transforms of both views.
-
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, handed on unchecked.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            weights: optional weights with shape :math:`(B, N)`.
-
-        Returns:
-            two transforms with shape :math:`(B, 3, 3)`.
-
-        """
+        """Return the callable's transforms of both views; points are handed on unchecked."""
         kwargs = {} if weights is None else {"weights": weights}
         return self.normalize(points1, **kwargs)[1], self.normalize(points2, **kwargs)[1]
 
@@ -114,19 +95,10 @@ def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tenso
 
 
 def normalizing_transforms(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:
-    """Call a normaliser, which may be the user's own, and check what it returns.
+    """Return the transforms of a normaliser, which may be the user's own, in the dtype of the problem.
 
-    Args:
-        normalizer: a module or function.
-        problem: the correspondences.
-
-    Returns:
-        two transforms with shape :math:`(B, 3, 3)` in the dtype of the problem.
-
-    Raises:
-        TypeError: if it cannot be called.
-        ValueError: if it does not return two finite and invertible transforms :math:`(B, 3, 3)`.
-
+    Anything but two finite and invertible transforms :math:`(B, 3, 3)` is a ValueError, and what cannot be called a
+    TypeError.
     """
     result = transforms_of(normalizer, problem)
     expected = (problem.points1.shape[0], 3, 3)

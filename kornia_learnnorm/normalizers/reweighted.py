@@ -1,12 +1,9 @@
-r"""Whitening with weights taken from the epipolar geometry: the closed-form way to a good rank-2 projection.
+r"""Whitening reweighted by the epipolar geometry: the closed-form way to a good rank-2 projection.
 
-Eight points have an exact null vector :math:`F_0`, whatever the normalisation. Projecting it to rank 2 in normalised
-coordinates subtracts a matrix of rank one, :math:`F = F_0 - \sigma\, a b^\top`, so correspondence :math:`i` is left
-with the residual :math:`\sigma\, (a^\top x_{2,i}) (b^\top x_{1,i})`. The normalisation chooses the lines :math:`a` and
-:math:`b`, and nothing else. Given :math:`a`, the best :math:`b` is a weighted least-squares problem with the normal
-matrix :math:`S_1 = \sum_i \omega_i x_{1,i} x_{1,i}^\top`, and the same for :math:`a`; the two hold together where
-:math:`a` and :math:`b` are singular vectors of :math:`F_0` in the coordinates whitened by :math:`S_1` and :math:`S_2`.
-So alternating least squares is iterated whitening.
+Projected to rank 2, the null vector of eight points loses :math:`\sigma\, a b^\top`, which leaves correspondence
+:math:`i` the residual :math:`\sigma\, (a^\top x_{2,i}) (b^\top x_{1,i})`. The normalisation chooses the lines :math:`a`
+and :math:`b`, and nothing else. Given one, the best other one is weighted least squares; both hold together where they
+are singular vectors in whitened coordinates. So alternating least squares is iterated whitening.
 """
 
 from __future__ import annotations
@@ -153,15 +150,10 @@ def _products(points: Tensor) -> Tensor:
 
 
 def _best_line(products: Tensor, w: Tensor, target: Tensor, minors: Tensor, entries: Tensor) -> Tensor:
-    r"""Return the line :math:`S^{-1} t` of unit norm, ``(3, *)``, with the second moments :math:`S` of weighted points.
+    """Return the line :math:`S^{-1} t` of unit norm, ``(3, *)``, with the second moments :math:`S` of weighted points.
 
-    Args:
-        products: the points' coordinates' products, ``(N, 6, *)``.
-        w: weights, ``(N, *)``.
-        target: the other view's line by the inverse of ``F0``, ``(3, *)``.
-        minors: the indices ``MINORS`` on the device.
-        entries: the indices ``ENTRIES`` on the device.
-
+    Of the points' products ``(N, 6, *)``, weights ``(N, *)`` and the other view's line by the inverse of ``F0``,
+    ``(3, *)``; the last two are the indices ``MINORS`` and ``ENTRIES`` on the device.
     """
     moments = (products * w[:, None]).sum(0)
     p, q, r, s = torch.unflatten(moments.index_select(0, minors), 0, (4, 6)).unbind(0)

@@ -6,32 +6,26 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from numbers import Integral, Real
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.linear import solve_linear
-from kornia_learnnorm.geometry.checks import check_cameras, check_pairs, check_tensor, solve_dtype
+from kornia_learnnorm.geometry.checks import check_cameras, solve_dtype
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.geometry.matrices import unit_matrix
-from kornia_learnnorm.geometry.minimal import are_independent
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
+from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
 from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
+from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
-from kornia_learnnorm.ransac.scoring import (
-    MAX_MEDIAN_DISTANCES,
-    PRESCORED,
-    Hypotheses,
-    PairScorer,
-    finite_and_bounded,
-)
+from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, PRESCORED, Hypotheses, PairScorer, finite_and_bounded
 from kornia_learnnorm.ransac.threads import one_thread
 
 __all__ = ["RANSAC", "RansacResult"]
@@ -40,28 +34,18 @@ FIRST_BATCH = 64  # samples in the first batch; each batch is four times as larg
 MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
 POOL_SIZE = 8  # best hypotheses of a batch, which local optimisation fits
-MIN_SAMPLE_SHIFT = 0.01  # thresholds; a sample that a shift of a point by less makes degenerate is dropped
-
 Cameras = tuple[Tensor, Tensor]
 
 
 class RansacResult(NamedTuple):
-    r"""Result of RANSAC on one image pair.
+    """Result of RANSAC on one image pair; matrices are zeros where none was found."""
 
-    Attributes:
-        F_mat: fundamental matrix of rank 2 and unit Frobenius norm, (3, 3); zeros where none was found.
-        inliers: which correspondences are inliers, (N,) bool.
-        num_samples: minimal samples drawn.
-        score: MSAC score of ``F_mat``, the sum of :math:`\max(0, 1 - d_i^2 / \tau^2)` over the correspondences.
-        E_mat: essential matrix of unit Frobenius norm, singular values (s, s, 0), nearest to :math:`K_2^\top F K_1`,
-            (3, 3); that is :math:`F = K_2^{-\top} E K_1^{-1}` up to scale, but where the correspondences contradict the
-            cameras. Zeros where none was found, None without cameras.
-    """
-
-    F_mat: Tensor
-    inliers: Tensor
-    num_samples: int
-    score: float
+    F_mat: Tensor  # of rank 2 and unit Frobenius norm, (3, 3)
+    inliers: Tensor  # which correspondences are inliers, (N,) bool
+    num_samples: int  # minimal samples drawn
+    score: float  # MSAC score of `F_mat`, the sum of max(0, 1 - d^2 / threshold^2) over the correspondences
+    # Of unit norm, singular values (s, s, 0), nearest to K2^T F K1, (3, 3); with it F = K2^-T E K1^-1 up to scale, but
+    # where the correspondences contradict the cameras. None without cameras.
     E_mat: Tensor | None = None
 
 
@@ -145,7 +129,7 @@ class RANSAC(nn.Module):
         model: TwoViewModel | None = None,
     ) -> None:
         super().__init__()
-        _check_numbers(inl_th, max_samples, max_seconds, confidence, seed)
+        check_numbers(inl_th, max_samples, max_seconds, confidence, seed)
         if normalizer is not None:
             check_normalizer(normalizer)
         if not callable(sampler):
@@ -162,8 +146,7 @@ class RANSAC(nn.Module):
     def extra_repr(self) -> str:
         """Return the parameters."""
         names = ("inl_th", "max_samples", "max_seconds", "confidence", "distance", "rank2", "refine", "sampler", "seed")
-        values = {name: getattr(self, name) for name in names}
-        return ", ".join(f"{name}={getattr(value, '__name__', repr(value))}" for name, value in values.items())
+        return ", ".join(f"{n}={getattr(getattr(self, n), '__name__', repr(getattr(self, n)))}" for n in names)
 
     def forward(
         self,
@@ -173,10 +156,7 @@ class RANSAC(nn.Module):
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        r"""Return the matrix :math:`(3, 3)` and the inliers :math:`(N,)` of one pair, as Kornia's RANSAC.
-
-        Arguments, shapes and errors are those of :meth:`estimate`.
-        """
+        """Return matrix and inliers of one pair, as Kornia's RANSAC; arguments and errors as for :meth:`estimate`."""
         F_mat, inliers, *_ = self.estimate(kp1, kp2, weights, K1, K2)
         return F_mat, inliers
 
@@ -218,7 +198,8 @@ class RANSAC(nn.Module):
         """
         check_cameras(K1, K2)
         cameras = None if K1 is None or K2 is None else (K1, K2)
-        _check_matches(points1, points2, weights, self._sample_size(cameras))
+        size = self.model.sample_size if cameras is None else Essential.sample_size
+        check_matches(points1, points2, weights, size)
         device = points1.device.type
         with ExitStack() as stack:
             if device == "cpu":
@@ -227,12 +208,12 @@ class RANSAC(nn.Module):
                 stack.enter_context(torch.autocast(device, enabled=False))
             # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
             stack.enter_context(torch.inference_mode() if self.normalizer is None else torch.no_grad())
-            result = self._estimate(points1, points2, weights, cameras)
+            result = self._estimate(points1, points2, weights, cameras, size)
         E_mat = None if result.E_mat is None else result.E_mat.clone()
         return result._replace(F_mat=result.F_mat.clone(), inliers=result.inliers.clone(), E_mat=E_mat)
 
     def _estimate(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, size: int
     ) -> RansacResult:
         """Estimate from the matches that count: finite, bounded, and one on each point."""
         kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
@@ -240,19 +221,21 @@ class RANSAC(nn.Module):
             kept = finite_and_bounded(points1, points2, self.inl_th)
         best = distinct_points(points1[kept], points2[kept], None if weights is None else weights[kept])
         kept = kept.masked_scatter(kept, best)
-        result = self._estimate_kept(points1[kept], points2[kept], None if weights is None else weights[kept], cameras)
+        weights = None if weights is None else weights[kept]
+        result = self._estimate_kept(points1[kept], points2[kept], weights, cameras, size)
         return result._replace(inliers=torch.zeros_like(kept).masked_scatter(kept, result.inliers))
 
     def _estimate_kept(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, size: int
     ) -> RansacResult:
-        size = self._sample_size(cameras)
         if (len(points1) if weights is None else int((weights > 0).sum())) < size:
             return _failure(points1, 0, cameras)
         x1, x2 = (points.to(solve_dtype(points.device)) for points in (points1, points2))
-        generator = torch.Generator(x1.device)
-        generator.manual_seed(int(torch.randint(2**62, ())) if self.seed is None else self.seed)
-        sampler = UniformSampler(len(x1), x1.device, size) if weights is None else self._sampler(weights.to(x1), size)
+        seed = int(torch.randint(2**62, ())) if self.seed is None else self.seed
+        generator = torch.Generator(x1.device).manual_seed(seed)
+        sampler: Sampler = UniformSampler(len(x1), x1.device, size)
+        if weights is not None:
+            sampler = self.sampler(weights.to(x1), **({} if size == SAMPLE_SIZE else {"size": size}))
         scored: Tensor | slice = slice(None)
         if len(x1) >= 2 * PRESCORED:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:MAX_SCORED]
@@ -266,21 +249,13 @@ class RANSAC(nn.Module):
             return _failure(points1, drawn, cameras)
         F = state.matrix()
         distances = scorer.distances(F[0])
-        inliers = distances <= self.inl_th
-        if int(inliers.sum()) <= size:
+        if int((inliers := distances <= self.inl_th).sum()) <= size:
             return _failure(points1, drawn, cameras)
         score = float((1 - (distances / self.inl_th).square()).clamp(min=0).nansum())
         F_mat = unit_matrix(scorer.to_pixels(F)[0]).to(points1.dtype)
-        E_mat = None
-        if isinstance(scorer.model, Essential):
-            E_mat = scorer.model.state(F).essential()[0].to(points1.dtype)
+        model = scorer.model
+        E_mat = model.state(F).essential()[0].to(points1.dtype) if isinstance(model, Essential) else None
         return RansacResult(F_mat, inliers, drawn, score, E_mat)
-
-    def _sample_size(self, cameras: Cameras | None) -> int:
-        return self.model.sample_size if cameras is None else Essential.sample_size
-
-    def _sampler(self, weights: Tensor, size: int) -> Sampler:
-        return self.sampler(weights) if size == SAMPLE_SIZE else self.sampler(weights, size=size)
 
     def _search(self, scorer: PairScorer, sampler: Sampler, generator: torch.Generator) -> tuple[Hypotheses, int]:
         """Return the best hypotheses that enough minimal samples give, best first, and the number of samples."""
@@ -291,7 +266,7 @@ class RANSAC(nn.Module):
                 break
             rows = sampler.draw(min(batch, needed - drawn), generator)
             drawn, batch = drawn + len(rows), min(4 * batch, MAX_BATCH)
-            F_mat = self._solve(scorer, rows)
+            F_mat = solve_minimal_samples(scorer, rows, self.model, self.normalizer)
             found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL_SIZE)
             pool = pool.join(found, POOL_SIZE)
             needed = self._samples_needed(pool, scorer, sampler)
@@ -301,38 +276,13 @@ class RANSAC(nn.Module):
                 needed = self._samples_needed(pool, scorer, sampler)
         return pool, drawn
 
-    def _solve(self, scorer: PairScorer, rows: Tensor) -> Tensor:
-        """Return the matrices of the non-degenerate minimal samples (K, S), or of all where every one is degenerate.
-
-        Matches on one line give none.
-        """
-        model, shift = scorer.model, MIN_SAMPLE_SHIFT * scorer.threshold
-        x1, x2 = scorer.samples(rows)
-        if self.normalizer is None or model.sample_size < model.min_points:
-            M = model.solve_samples(x1, x2, shift)
-            if len(M) or model.sample_size < model.min_points:
-                return M
-            determined = torch.zeros_like(rows[:, 0], dtype=torch.bool)
-        else:
-            determined = are_independent(model.rows(x1, x2), x1, x2, shift)
-        if bool(determined.any()):
-            rows = rows[determined]
-        elif any(_on_a_line(points, shift) for points in scorer.pixels):
-            return x1.new_zeros(0, 3, 3)
-        points1, points2 = (points[rows] for points in scorer.pixels)
-        return self._solve_linearly(scorer, points1, points2, None)
-
     def _optimize(self, scorer: PairScorer, M: Tensor) -> Hypotheses:
         """Return the best of the matrices fitted to their inliers, the first of them also by the normaliser."""
         if self.normalizer is not None and scorer.model is self.model:
             points1, points2 = (points[None, scorer.rows] for points in scorer.pixels)
-            M = torch.cat([self._solve_linearly(scorer, points1, points2, scorer.inliers(M[:1]).to(M)), M])
+            problem = LinearProblem.from_points(points1, points2, scorer.inliers(M[:1]).to(M), self.model)
+            M = torch.cat([scorer.from_pixels(solve_linear(problem, self.normalizer)), M])
         return optimize_locally(scorer, M, POOL_SIZE)
-
-    def _solve_linearly(self, scorer: PairScorer, points1: Tensor, points2: Tensor, weights: Tensor | None) -> Tensor:
-        """Return the matrices of sets of pixels (K, M, 2) by the normaliser, in the scorer's coordinates."""
-        problem = LinearProblem.from_points(points1, points2, weights, self.model)
-        return scorer.from_pixels(solve_linear(problem, self.normalizer))
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
@@ -344,53 +294,7 @@ class RANSAC(nn.Module):
         return math.ceil(min(self.max_samples, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
 
 
-def _on_a_line(points: Tensor, shift: float) -> bool:
-    """Return whether points (N, 2) are less than ``shift`` pixels from one line, in root mean square."""
-    distance = torch.linalg.svdvals(points - points.mean(0))[1] / len(points) ** 0.5
-    return bool(distance < shift)
-
-
 def _failure(points: Tensor, drawn: int, cameras: Cameras | None) -> RansacResult:
     inliers = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     E_mat = None if cameras is None else points.new_zeros(3, 3)
     return RansacResult(points.new_zeros(3, 3), inliers, drawn, 0.0, E_mat)
-
-
-def _check_numbers(
-    inl_th: float, max_samples: int, max_seconds: float | None, confidence: float, seed: int | None
-) -> None:
-    for name, value in {"inl_th": inl_th, "confidence": confidence, "max_seconds": max_seconds}.items():
-        if (isinstance(value, bool) or not isinstance(value, Real)) and (value is not None or name != "max_seconds"):
-            raise TypeError(f"{name} must be a number, got {value!r}")
-    if not 1e-12 <= inl_th <= 1e12:
-        raise ValueError(f"inl_th must be a positive number of pixels, from 1e-12 to 1e12, got {inl_th}")
-    if not _is_whole(max_samples) or max_samples < 1:
-        raise ValueError(f"max_samples must be a whole number of samples, at least 1, got {max_samples}")
-    if max_seconds is not None and not max_seconds > 0:
-        raise ValueError(f"max_seconds must be positive or None, got {max_seconds}")
-    if not 0 < confidence <= 1:
-        raise ValueError(f"confidence must lie in (0, 1], got {confidence}")
-    if seed is not None and not _is_whole(seed):
-        raise TypeError(f"seed must be a whole number or None, got {seed!r}")
-    if seed is not None and not 0 <= seed < 2**63:
-        raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool)
-
-
-def _check_matches(points1: Tensor, points2: Tensor, weights: Tensor | None, min_points: int) -> None:
-    check_pairs(points1, points2, ["N", "2"])
-    if len(points1) < min_points:
-        raise ValueError(f"at least {min_points} correspondences are needed, got {len(points1)}")
-    if weights is None:
-        return
-    if isinstance(weights, Tensor) and weights.dtype == torch.bool:
-        raise TypeError("weights must be a floating-point tensor, got torch.bool; select the rows of a boolean mask")
-    check_tensor("weights", weights)
-    if weights.shape != points1.shape[:1]:
-        raise ValueError(f"weights must have shape {[*points1.shape[:1]]}, got {[*weights.shape]}")
-    known = weights[(points1.isfinite() & points2.isfinite()).all(-1)]
-    if not bool(known.isfinite().all()) or bool((known < 0).any()):
-        raise ValueError("weights must be finite and not negative where the points are finite")

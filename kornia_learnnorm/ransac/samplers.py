@@ -44,14 +44,7 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
 
 
 class UniformSampler:
-    """Uniform samples.
-
-    Args:
-        total: number of correspondences, at least those of a sample.
-        device: where indices are drawn.
-        size: correspondences in a sample.
-
-    """
+    """Uniform samples of so many correspondences."""
 
     def __init__(self, total: int, device: torch.device, size: int = SAMPLE_SIZE) -> None:
         self.total, self.device, self.size = total, device, size

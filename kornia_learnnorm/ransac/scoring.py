@@ -21,15 +21,10 @@ PRESCORED = 512  # correspondences on which hypotheses are scored first
 
 
 class Hypotheses(NamedTuple):
-    """Fundamental matrices, highest score first.
+    """Fundamental matrices, highest score first."""
 
-    Attributes:
-        F_mat: matrices in the scorer's coordinates, (K, 3, 3).
-        score: MSAC scores, positive, (K,).
-    """
-
-    F_mat: Tensor
-    score: Tensor
+    F_mat: Tensor  # in the scorer's coordinates, (K, 3, 3)
+    score: Tensor  # MSAC scores, positive, (K,)
 
     def join(self, other: Hypotheses, number: int) -> Hypotheses:
         """Return the best of both, at most so many; ``other`` comes first in ties."""
@@ -48,21 +43,11 @@ class PairScorer:
 
     All matrices are in coordinates of which the first two are pixels from the points' median, and the third is the
     median of their absolute values, or the threshold where that is larger. They are conditioned like Hartley's,
-    whatever the outliers, and distances in them are those in pixels.
+    whatever the outliers, and distances in them are those in pixels: ``x1``, ``x2`` are all correspondences in them,
+    (3, N), ``T1``, ``T2`` the transforms from pixels, (3, 3).
 
-    Args:
-        points1: pixels in the first image with shape :math:`(N, 2)`, :math:`N \ge 8`, :func:`finite_and_bounded`.
-        points2: pixels in the second image with shape :math:`(N, 2)`.
-        threshold: largest distance :math:`\tau` of an inlier, pixels.
-        model: the model of the matrices.
-        rows: the correspondences that count in scores, those that count in :meth:`shortlist` first; all by default.
-
-    Attributes:
-        x1: all correspondences in the coordinates of view 1, (3, N).
-        x2: all correspondences in the coordinates of view 2.
-        T1: from pixels of view 1 to its coordinates, (3, 3).
-        T2: from pixels of view 2 to its coordinates, (3, 3).
-
+    Points are pixels (N, 2), :func:`finite_and_bounded`. ``rows`` are the correspondences that count in scores, those
+    that count in :meth:`shortlist` first; all by default.
     """
 
     def __init__(

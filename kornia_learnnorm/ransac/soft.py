@@ -72,17 +72,11 @@ def sample_minimal_sets(logits: Tensor, count: int, generator: Generator | None 
 
 
 class SoftChoice(NamedTuple):
-    """Expected loss of the chosen hypothesis, with all hypotheses and their probabilities.
+    """Expected loss of the chosen hypothesis, with all hypotheses and their probabilities."""
 
-    Attributes:
-        loss: expected loss, (B,).
-        F_mat: fundamental matrices of the samples, (B, K, 3, 3).
-        probability: probability of each to be chosen, (B, K).
-    """
-
-    loss: Tensor
-    F_mat: Tensor
-    probability: Tensor
+    loss: Tensor  # expected loss, (B,)
+    F_mat: Tensor  # of the samples, (B, K, 3, 3)
+    probability: Tensor  # of each to be chosen, (B, K)
 
 
 def expected_loss(

@@ -25,15 +25,6 @@ def one_thread() -> Iterator[None]:
     than the work itself. The number of threads belongs to the process: other threads that run meanwhile are held to one
     too, and the last caller that leaves restores the number. A thread that uses PyTorch for the first time meanwhile
     keeps to one thread until it sets the number itself.
-
-    Example:
-        >>> before = torch.get_num_threads()
-        >>> with one_thread():
-        ...     torch.get_num_threads()
-        1
-        >>> torch.get_num_threads() == before
-        True
-
     """
     with _Held.lock:
         if _Held.callers == 0:

@@ -147,17 +147,7 @@ def _epipolar_features(
 class SetNetwork(nn.Module):
     """Residual layers over the points of a set, with the set's maximum as context; permutation invariant.
 
-    Args:
-        point_features: features of a point.
-        set_features: features of the set.
-        width: channels.
-        depth: residual layers.
-        outputs: numbers predicted per set.
-
-    Example:
-        >>> SetNetwork(4, 9, width=16, depth=2, outputs=5)(torch.rand(3, 8, 4), torch.rand(3, 9)).shape
-        torch.Size([3, 5])
-
+    It reads ``point_features`` numbers of each point and ``set_features`` of the set, and predicts ``outputs``.
     """
 
     def __init__(self, point_features: int, set_features: int, width: int, depth: int, outputs: int) -> None:
@@ -171,13 +161,9 @@ class SetNetwork(nn.Module):
         self.head = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), last)
 
     def forward(self, points: Tensor, set_features: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Return the outputs with shape :math:`(B, P)`.
+        """Return the outputs :math:`(B, P)` of features of points :math:`(B, N, C)` and sets :math:`(B, D)`.
 
-        Args:
-            points: features of the points with shape :math:`(B, N, C)`.
-            set_features: features of the sets with shape :math:`(B, D)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-
+        Optional weights :math:`(B, N)` are not negative; zero means absent.
         """
         # Without gradients, in parts that stay in the processor's cache.
         part = max(1, MAX_POINTS // points.shape[1])

@@ -64,15 +64,12 @@ class PaperNetwork(nn.Module):
         self.head = nn.Sequential(nn.Linear(features, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), last)
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the parameters of both views.
+        """Return the parameters :math:`(B, P)` of both views, in the dtype of the points.
 
         Args:
             points1: points of the first view in base coordinates with shape :math:`(B, N, 2)`.
-            points2: points of the second view in base coordinates with shape :math:`(B, N, 2)`.
+            points2: points of the second view.
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-
-        Returns:
-            parameters with shape :math:`(B, P)` of view 1 and view 2, in the dtype of the points.
 
         """
         dtype = self.stem.weight.dtype
@@ -85,16 +82,7 @@ class PaperNetwork(nn.Module):
         return params1, params2
 
     def global_features(self, points: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Return the normalised maxima over the points before the first block and after each.
-
-        Args:
-            points: points of one view with shape :math:`(B, N, 2)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-
-        Returns:
-            features with shape :math:`(B, D + 1, C)` for depth :math:`D` and width :math:`C`.
-
-        """
+        """Return the normalised maxima over the points before the first block and after each, :math:`(B, D + 1, C)`."""
         w = None if weights is None else weights.T[..., None]
         absent = None if w is None else w <= 0
         # Points come first: statistics over them are then sums of whole rows, which is what a processor likes.

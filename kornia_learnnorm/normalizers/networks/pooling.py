@@ -9,16 +9,10 @@ __all__ = ["set_maximum"]
 
 
 def set_maximum(features: Tensor, absent: Tensor | None, dim: int, keepdim: bool = False) -> Tensor:
-    """Return the maximum over the present points, zero where all are absent.
+    """Return the maximum over the present points along ``dim``, zero where all are absent.
 
-    The gradient goes to one point for each maximum.
-
-    Args:
-        features: features of the points, the points along ``dim``.
-        absent: optional mask of the rows that are no points, broadcast to ``features``, bool.
-        dim: dimension of the points.
-        keepdim: keep that dimension, with one entry.
-
+    ``absent`` marks the rows that are no points and broadcasts to the features. The gradient goes to one point for each
+    maximum.
     """
     if absent is not None:
         features = torch.where(absent, -torch.inf, features)
