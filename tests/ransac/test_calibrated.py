@@ -143,6 +143,7 @@ class TestAccuracy:
         known, unknown = np.median(errors, 0)
         assert known < unknown
 
+    @pytest.mark.long
     def test_many_matches_and_few_inliers(self):
         points, cameras, E, true = pair(num_points=2000, outliers=0.85)
         found = estimate(points, cameras)
