@@ -41,7 +41,7 @@ class TestSetMaximum:
     def test_gradient(self, features, absent):
         assert torch.autograd.gradcheck(lambda h: set_maximum(h, absent, 1), features.requires_grad_())
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.filterwarnings("ignore")  # Inductor's own
     def test_gradient_of_compiled_bfloat16(self, features):
         features = features.bfloat16().requires_grad_()
