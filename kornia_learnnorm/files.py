@@ -14,27 +14,10 @@ __all__ = ["atomic_write", "exclusive", "short_name", "write_text"]
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Give a temporary file beside ``path`` to write; it takes the place of ``path`` only if the block succeeds.
+    """Give a temporary file beside ``path``, of its suffix, which takes its place only if the block succeeds.
 
-    Args:
-        path: the file to write or to replace.
-
-    Yields:
-        the path of the temporary file, with the suffix of ``path``.
-
-    Raises:
-        FileNotFoundError: if the folder of ``path`` does not exist.
-        PermissionError: if the folder is not writable.
-        ValueError: if ``path`` is a folder or a device.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with atomic_write(Path(folder) / "note.txt") as temporary:
-        ...         _ = temporary.write_text("whole")
-        ...     (Path(folder) / "note.txt").read_text()
-        'whole'
-
+    Raises OSError before the block if the folder of ``path`` does not exist or is not writable, ValueError if ``path``
+    is a folder or a device.
     """
     path = Path(path)
     if not path.parent.is_dir():
@@ -70,22 +53,7 @@ def exclusive(path: str | Path) -> Iterator[None]:
 
     The system releases the lock when the process ends, however it ends. The lock is a file, ``.lock`` in the folder or
     ``.NAME.lock`` beside the file, which is there while the lock is held; a killed process leaves it, without effect.
-
-    Args:
-        path: a folder, or the file to write, which need not exist.
-
-    Raises:
-        BlockingIOError: if another run holds the lock; the message names its process.
-        OSError: if the lock cannot be written, or the folder of the file does not exist.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder, exclusive(folder):
-        ...     with exclusive(folder):
-        ...         pass
-        Traceback (most recent call last):
-        BlockingIOError: ... is in use by process ...: wait for it to end, or write elsewhere
-
+    Raises BlockingIOError with the name of the process that holds the lock, OSError if it cannot be written.
     """
     from filelock import FileLock, Timeout  # a requirement of torch
 
@@ -121,10 +89,7 @@ def _holder(file: Path) -> str:
 
 
 def short_name(path: str | Path) -> str:
-    """Return a file's name for tables, without its suffix; for ``weights.safetensors``, the name of its folder.
-
-    Args:
-        path: a store, ``FILE.h5@FIRST:STOP`` for some of its pairs, or a file of weights.
+    """Return the name of a store or of weights for tables; of ``weights.safetensors``, the name of its folder.
 
     Example:
         >>> short_name("data/tum.h5@0:9"), short_name("runs/mine/weights.safetensors")

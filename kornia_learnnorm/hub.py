@@ -86,19 +86,13 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
         return super().generate_model_card(*args, **{**words, **kwargs})
 
     def _save_pretrained(self, save_directory: Path) -> None:
-        """Write the weights, with the architecture, and the name of the class."""
         self.layer.save_pretrained(save_directory / WEIGHTS_FILE)
         text = json.dumps({"class_name": type(self.layer).__name__}, indent=2)
         (save_directory / CONFIG_FILE).write_text(text + "\n", encoding="utf-8")
 
     @classmethod
     def _from_pretrained(cls, *, model_id: str, config: dict[str, Any] | None = None, **download: Any) -> HubModel:
-        """Load the layer of a local folder or of a repository; ``download`` are options of ``hf_hub_download``.
-
-        Raises:
-            ValueError: if ``config.json`` is missing or names no layer of this package.
-
-        """
+        """Load the layer of a local folder or of a repository; ``download`` are options of ``hf_hub_download``."""
         local = Path(model_id)
         path = local / WEIGHTS_FILE if local.is_dir() else Path(hf_hub_download(model_id, WEIGHTS_FILE, **download))
         name = (config or {}).get("class_name")

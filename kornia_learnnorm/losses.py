@@ -109,11 +109,8 @@ class EpipolarLoss(nn.Module):
         return ((1 - self.heldout_weight) * loss + self.heldout_weight * heldout).to(F_mat.dtype)
 
     def _residuals(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-        """Return residuals up to the ceiling.
-
-        In float64: next to an epipole, the square of a line's normal leaves the range of float32, and what is zero
-        above the ceiling would be zero times infinity below.
-        """
+        # In float64: next to an epipole, the square of a line's normal leaves the range of float32, and what is zero
+        # above the ceiling would be zero times infinity below.
         dtype = solve_dtype(F_mat.device)
         return self.residual(points1.to(dtype), points2.to(dtype), F_mat.to(dtype)).clamp(max=self.ceiling)
 

@@ -13,18 +13,7 @@ __all__ = ["import_extra", "working_folder_importable"]
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Import a module of a package that the core does not need.
-
-    Args:
-        module: name of the module.
-        extra: the extra of this package that installs it.
-        purpose: what needs it, the start of the message.
-
-    Returns:
-        the module.
-
-    Raises:
-        ImportError: if it is not installed; the message names the extra and how to install it.
+    """Return a module of a package that the core does not need; without it, say which extra brings it and for what.
 
     Example:
         >>> import_extra("no_such_module", "images", "reading images")
@@ -35,9 +24,8 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(
-            f"{purpose} needs {module}: run pip install '.[{extra}]' in a checkout of kornia_learnnorm"
-        ) from error
+        text = f"{purpose} needs {module}: run pip install '.[{extra}]' in a checkout of kornia_learnnorm"
+        raise ImportError(text) from error
 
 
 @contextmanager

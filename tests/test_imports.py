@@ -18,7 +18,7 @@ FLOORS = [
     {"normalizers", "metrics", "losses"},
     {"estimators"},
     {"ransac"},
-    {"data", "export", "hub"},
+    {"data", "layer_export", "hub"},
     {"two_view"},
     {"evaluation", "lightning_modules"},
     {"demo"},

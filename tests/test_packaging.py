@@ -47,20 +47,15 @@ def test_the_wheel_has_configurations_and_weights(wheels):
     tops = {name.partition("/")[0] for name in names}
     information = f"kornia_learnnorm-{kln.__version__}.dist-info"
     assert tops == {"kornia_learnnorm", "lightning_modules", "kornia_learnnorm_command.py", information}
-
-
-def test_the_command_starts_where_an_interrupted_import_is_caught(wheels):
-    name = next(name for name in zipfile.ZipFile(wheels[0]).namelist() if name.endswith("entry_points.txt"))
-    assert "learnnorm = kornia_learnnorm_command:main" in zipfile.ZipFile(wheels[0]).read(name).decode()
+    entry_points = zipfile.ZipFile(wheels[0]).read(f"{information}/entry_points.txt").decode()
+    assert "learnnorm = kornia_learnnorm_command:main" in entry_points  # where an interrupted import is caught
 
 
 def test_the_wheel_finds_its_configurations_in_any_folder(wheels, tmp_path):
     zipfile.ZipFile(wheels[0]).extractall(tmp_path / "site")
     command = [sys.executable, "-m", "kornia_learnnorm.cli.main", "config", "crossview"]
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
-    found = subprocess.run(
-        command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True, timeout=120
-    )
+    options = {"env": {**os.environ, "PYTHONPATH": str(tmp_path / "site")}, "text": True, "timeout": 120}
+    found = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, **options)
     assert found.stdout == (ROOT / "configs/crossview.yaml").read_text(encoding="utf-8")
 
 
@@ -76,9 +71,8 @@ def test_every_extra_is_checked():
 def test_services_call_targets_of_the_makefile(path):
     content = yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
     jobs = content.get("jobs", {}).values()
-    commands = (
-        content["build"]["commands"] if "build" in content else [s.get("run", "") for j in jobs for s in j["steps"]]
-    )
+    steps = [step.get("run", "") for job in jobs for step in job["steps"]]
+    commands = content["build"]["commands"] if "build" in content else steps
     called = [command.removeprefix("make ") for command in commands if command.startswith("make ")]
     matrix = [target for job in jobs for target in job.get("strategy", {}).get("matrix", {}).get("target", [])]
     targets = [*matrix, *(target for target in called if "{" not in target)]

@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--port: a number from 1 to 65535 expected, got {args.port}")
     for module in ("bokeh", "cv2", "PIL"):
         import_extra(module, "demo", "the page")
-    from kornia_learnnorm.demo.server import make_server
+    from kornia_learnnorm.demo.page import make_server
 
     try:
         server = make_server(args.port)

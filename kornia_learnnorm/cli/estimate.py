@@ -51,11 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     camera = "one or two of fx,fy,cx,cy, a file of 4 or 9 numbers, KITTI's calib.txt, exif; adds E, R, t"
     add("--K", metavar="CAMERA", nargs="+", default=[], help=camera)
     add = parser.add_argument_group("matching").add_argument
-    for option, known, chosen in (
-        ("--detector", DETECTORS, options.detector),
-        ("--matcher", MATCHERS, options.matcher),
-    ):
-        add(option, metavar="NAME", choices=known, default=chosen, help=f"{', '.join(known)} {default}")
+    for name, known in (("detector", DETECTORS), ("matcher", MATCHERS)):
+        text = f"{', '.join(known)} {default}"
+        add(f"--{name}", metavar="NAME", choices=known, default=getattr(options, name), help=text)
     add("--ratio", type=float, default=options.ratio, help=f"ratio test {default}")
     size = f"reduce images to this longer side {default}"
     add("--max-size", metavar="PX", type=int, default=options.max_size, help=size)
@@ -68,7 +66,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _seed(text: str) -> int:
-    """Return a seed of the command line."""
     if not text.isdecimal() or int(text) >= 2**63:
         raise argparse.ArgumentTypeError(f"a whole number from 0 to 2^63 - 1 expected, got {text}")
     return int(text)

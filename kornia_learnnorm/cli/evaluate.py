@@ -30,47 +30,23 @@ TRUTH = "truth: of the ground-truth inliers of its pair, the accuracy; a better 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm evaluate`` to a parser."""
-    parser.add_argument(
-        "stores", metavar="STORE", nargs="+", help="stores of correspondences (.h5); FILE.h5@3:10 for some pairs"
-    )
-    parser.add_argument(
-        "--methods",
-        metavar="NAME",
-        nargs="+",
-        help="normalisers or weights, with +LM or +optimal or without; module:Name for your own (default: none,"
-        f" Hartley, whitening, reweighted, {', '.join(SHIPPED)}, searched)",
-    )
-    parser.add_argument(
-        "--weights",
-        metavar="NAME_OR_PATH",
-        nargs="+",
-        help="further weights; the methods or their default stay",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
-    parser.add_argument(
-        "--max-residual",
-        type=float,
-        metavar="PX",
-        default=SampleOptions.max_residual,
-        help="leave out samples whose mean symmetric epipolar distance under the un-normalised eight-point algorithm is"
-        " this or larger (default: %(default)g; inf: none)",
-    )
-    parser.add_argument(
-        "--max-samples",
-        metavar="N",
-        type=int,
-        default=SampleOptions.max_samples,
-        help="at most so many samples of each store and protocol, at random (default: %(default)s; 0: all)",
-    )
-    parser.add_argument(
-        "--size", metavar="N", type=int, default=8, help="correspondences in a sample (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--out",
-        metavar="RUN",
-        help="folder to keep the predictions in, with everything that learnnorm report shows; the default methods are"
-        f" then also {', '.join(KEPT_METHODS)}",
-    )
+    add = parser.add_argument
+    add("stores", metavar="STORE", nargs="+", help="stores of correspondences (.h5); FILE.h5@3:10 for some pairs")
+    text = "normalisers or weights, with +LM or +optimal or without; module:Name for your own (default: none, Hartley,"
+    text += f" whitening, reweighted, {', '.join(SHIPPED)}, searched)"
+    add("--methods", metavar="NAME", nargs="+", help=text)
+    text = "further weights; the methods or their default stay"
+    add("--weights", metavar="NAME_OR_PATH", nargs="+", help=text)
+    add("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
+    text = "leave out samples whose mean symmetric epipolar distance under the un-normalised eight-point algorithm is"
+    text += " this or larger (default: %(default)g; inf: none)"
+    add("--max-residual", type=float, metavar="PX", default=SampleOptions.max_residual, help=text)
+    text = "at most so many samples of each store and protocol, at random (default: %(default)s; 0: all)"
+    add("--max-samples", metavar="N", type=int, default=SampleOptions.max_samples, help=text)
+    text = "correspondences in a sample (default: %(default)s)"
+    add("--size", metavar="N", type=int, default=8, help=text)
+    text = "folder to keep the predictions in, with everything that learnnorm report shows; the default methods are"
+    add("--out", metavar="RUN", help=f"{text} then also {', '.join(KEPT_METHODS)}")
     add_json_argument(parser)
 
 
@@ -83,14 +59,7 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
 def json_tables(args: argparse.Namespace, inputs: Sequence[str] = ()) -> Iterator[list[Table]]:
     """Give a list for the tables of a command, which are written when the block succeeds, if ``--json`` is given.
 
-    Args:
-        args: arguments with ``json`` and ``command_line``.
-        inputs: files that must not be overwritten; FILE.h5@3:10 for some pairs of a store.
-
-    Raises:
-        ValueError: if the file cannot be written.
-        OSError: if its folder does not exist or is not writable.
-
+    The arguments have ``json`` and ``command_line``. Inputs, also as FILE.h5@3:10, are not overwritten.
     """
     tables: list[Table] = []
     with ExitStack() as stack:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from kornia_learnnorm.export import export_layer, export_networks, load_layer
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
 
@@ -38,22 +38,18 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "onnx":
         if args.inputs or args.points is not None:
             raise ValueError("--inputs and --points belong to --format pt2: the networks are written by themselves")
-        return _write_networks(args.weights, args.out)
+        programs = export_networks(load_layer(args.weights))
+        for name, program in programs.items():
+            file = args.out if len(programs) == 1 else args.out.with_stem(f"{args.out.stem}-{name}")
+            with atomic_write(file) as temporary:
+                temporary.write_bytes(program.model_proto.SerializeToString())
+            _report(file)
+        return 0
     with atomic_write(args.out) as temporary:  # a path that cannot be written is refused before the work
         buffer = BytesIO()  # a file would give its temporary name to the archive
         torch.export.save(export_layer(load_layer(args.weights), args.inputs, args.points), buffer)
         temporary.write_bytes(buffer.getvalue())
     _report(args.out)
-    return 0
-
-
-def _write_networks(weights: str, path: Path) -> int:
-    programs = export_networks(load_layer(weights))
-    for name, program in programs.items():
-        file = path if len(programs) == 1 else path.with_stem(f"{path.stem}-{name}")
-        with atomic_write(file) as temporary:
-            temporary.write_bytes(program.model_proto.SerializeToString())
-        _report(file)
     return 0
 
 

@@ -86,7 +86,6 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(args: Sequence[str] | None) -> int:
-    """Run a command and return its exit code."""
     words = list(sys.argv[1:] if args is None else args)
     try:
         if not words or words[0] not in TRAINING:
@@ -100,7 +99,7 @@ def _run(args: Sequence[str] | None) -> int:
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ImportError) as error:
-        print(f"learnnorm {words[0]}: error: {_one_line(error)}", file=sys.stderr)
+        print(f"learnnorm {words[0]}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
 
 
@@ -133,20 +132,14 @@ def make_parser(names: Collection[str] = (*TRAINING, *TOOLS)) -> argparse.Argume
 
 
 def _examples(lines: str) -> str:
-    """Return examples as the end of a page of help."""
     return "examples:\n" + textwrap.indent(lines, "  ")
 
 
 def _add_training_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     """Add the options of a training command that are needed most to a parser."""
     parser.add_argument("--help-all", action="store_true", help="list all options: the entries of a configuration")
-    parser.add_argument(
-        "--config",
-        metavar="NAME_OR_FILE",
-        action="append",
-        required=True,
-        help="configuration: a name that learnnorm config lists, or a file; can be repeated, later entries win",
-    )
+    text = "configuration: a name that learnnorm config lists, or a file; can be repeated, later entries win"
+    parser.add_argument("--config", metavar="NAME_OR_FILE", action="append", required=True, help=text)
     text = "checkpoint of the run to go on with" if name == "fit" else "checkpoint of the run"
     parser.add_argument("--ckpt_path", metavar="FILE", required=name != "fit", help=text)
     parser.add_argument("--trainer.default_root_dir", metavar="FOLDER", help="folder to write to")
@@ -234,11 +227,6 @@ def _run_training(words: list[str]) -> int:
         rows = [[name, "" if math.isnan(value) else Number(value, "")] for name, value in metrics.items()]
         tables.append(Table(words[0], f"metrics on {MEASURED[words[0]]}", ["metric", "value"], rows))
     return 0
-
-
-def _one_line(error: Exception) -> str:
-    """Return the message of an error on one line."""
-    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

@@ -19,19 +19,13 @@ learnnorm robust store.h5 --out run --estimators RANSAC poselib"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm robust`` to a parser."""
-    parser.add_argument(
-        "stores", metavar="STORE", nargs="+", help="stores of correspondences (.h5); FILE.h5@3:10 for some pairs"
-    )
+    text = "stores of correspondences (.h5); FILE.h5@3:10 for some pairs"
+    parser.add_argument("stores", metavar="STORE", nargs="+", help=text)
     parser.add_argument("--out", metavar="RUN", type=Path, required=True, help="folder to write to")
-    parser.add_argument(
-        "--estimators",
-        metavar="NAME",
-        nargs="+",
-        default=list(DEFAULT_ESTIMATORS),
-        help="robust estimators; learned:WEIGHTS, guided:WEIGHTS and RANSAC:METHOD for your own; RANSAC-calibrated,"
-        " poselib-calibrated and opencv-usac-magsac-calibrated use the cameras of the store"
-        f" (default: {' '.join(DEFAULT_ESTIMATORS)})",
-    )
+    text = "robust estimators; learned:WEIGHTS, guided:WEIGHTS and RANSAC:METHOD for your own; RANSAC-calibrated,"
+    text += " poselib-calibrated and opencv-usac-magsac-calibrated use the cameras of the store"
+    text += f" (default: {' '.join(DEFAULT_ESTIMATORS)})"
+    parser.add_argument("--estimators", metavar="NAME", nargs="+", default=[*DEFAULT_ESTIMATORS], help=text)
     counts = {
         "pairs": "of each store, evenly spaced; 0: all",
         "seeds": "runs on each pair",

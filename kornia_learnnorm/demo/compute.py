@@ -77,22 +77,7 @@ class MethodResult:
 
 
 def read_file(name: str, content: bytes) -> ImageFile:
-    """Return an image file that a user chose, decoded and reduced.
-
-    Args:
-        name: name of the file, for messages only.
-        content: the bytes of the file.
-
-    Raises:
-        ValueError: if the file is too large or not an intact image.
-
-    Example:
-        >>> read_file("notes.txt", b"no pixels")
-        Traceback (most recent call last):
-        ValueError: notes.txt cannot be decoded: 9 bytes, not an image of a kind that Pillow reads, or one with a
-        truncated or corrupt header
-
-    """
+    """Return an image file that a user chose, decoded and reduced; the name is for messages only."""
     if len(content) > MAX_BYTES:
         raise ValueError(f"{name} has {len(content) / 1e6:.0f} MB, at most {MAX_BYTES / 1e6:.0f} MB are taken")
     with TemporaryDirectory() as folder:
@@ -116,9 +101,7 @@ def render_example() -> Example:
 def compare(image1: ImageFile, image2: ImageFile) -> dict[str, MethodResult]:
     """Return what every method, a key of ``METHODS``, makes of the matches of two images.
 
-    Raises:
-        NoReliableMatrixError: if neither RANSAC nor the learned layer finds a matrix.
-
+    Raises NoReliableMatrixError if neither RANSAC nor the learned layer finds a matrix.
     """
     with TemporaryDirectory() as folder:
         paths = Path(folder) / "1", Path(folder) / "2"
@@ -177,18 +160,9 @@ def _time_methods(estimate: PairEstimate) -> dict[str, float]:
 
 
 def epipolar_segment(F_mat: Tensor, point: tuple[float, float], size: Size) -> NDArray[np.float64] | None:
-    r"""Return the ends (2, 2) of the part of the epipolar line :math:`F x` that lies in an image; None where none does.
+    """Return the ends (2, 2) of the part of the epipolar line F x in an image of a size; None where it misses it.
 
-    Args:
-        F_mat: fundamental matrix :math:`(3, 3)` to the image of the line; transposed, from image 2 to image 1.
-        point: pixel :math:`x` in the other image.
-        size: width and height of the image of the line.
-
-    Example:
-        >>> sideways = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
-        >>> epipolar_segment(sideways, (3.0, 7.0), (20, 10)).tolist()
-        [[-0.5, 7.0], [19.5, 7.0]]
-
+    F_mat (3, 3) maps to the image of the line: transposed, from image 2 to image 1. The point x is of the other image.
     """
     line = F_mat.double().numpy() @ [*point, 1.0]
     low, high = np.array([-0.5, -0.5]), np.array(size) - 0.5

@@ -7,7 +7,7 @@ import json
 import logging
 import math
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -15,6 +15,7 @@ from bokeh.document import Document
 from bokeh.layouts import column, row
 from bokeh.models import Column
 from bokeh.models.widgets import CheckboxGroup, Div, FileInput, RadioButtonGroup
+from bokeh.server.server import Server
 from jinja2 import Template
 from tornado.ioloop import IOLoop
 
@@ -31,8 +32,10 @@ from kornia_learnnorm.demo.compute import (
 from kornia_learnnorm.demo.view import ImageView
 from kornia_learnnorm.two_view.result import PairEstimate
 
-__all__ = ["Page"]
+__all__ = ["make_server"]
 
+ADDRESS = "127.0.0.1"  # the page is served to this computer alone
+MAX_MESSAGE = 4 * MAX_BYTES  # of a browser's message in base64, which ends the connection; smaller ones are told
 IMAGES = ("Image 1", "Image 2")
 PAIR = "pair"  # what is computed of both images
 POINTING = "Point at a spot in one image: its epipolar lines by the three methods appear in the other."
@@ -52,13 +55,26 @@ WRAP: Any = {"flex-wrap": "wrap"}
 log = logging.getLogger(__name__)
 
 
-class Page:
-    """The widgets of one browser tab and what they show.
+def make_server(port: int) -> Server:
+    """Return a server of the page, which listens on 127.0.0.1 but does not answer yet; OSError for a taken port."""
+    executor = ThreadPoolExecutor(max_workers=1)  # browser tabs wait for each other
 
-    Args:
-        document: the page of a new browser tab.
-        executor: runs what takes long.
-    """
+    def open_page(document: Document) -> None:
+        page = Page(document, executor)
+        document.on_session_destroyed(lambda _context: page.close())
+
+    origins = [f"{host}:{port}" for host in (ADDRESS, "localhost")]
+    return Server(
+        {"/": open_page},
+        address=ADDRESS,
+        port=port,
+        allow_websocket_origin=origins,  # no page of another site may connect
+        websocket_max_message_size=MAX_MESSAGE,
+    )
+
+
+class Page:
+    """The widgets of one browser tab and what they show; the executor runs what takes long."""
 
     def __init__(self, document: Document, executor: Executor) -> None:
         self._document, self._executor = document, executor
@@ -92,13 +108,8 @@ class Page:
         self._closed = True
 
     def _layout(self) -> Column:
-        choices = row(
-            Div(text="Show the inliers of"),
-            self._method,
-            self._outliers,
-            self._download,
-            styles={**WRAP, "align-items": "center"},
-        )
+        choices = row(Div(text="Show the inliers of"), self._method, self._outliers, self._download)
+        choices.styles = {**WRAP, "align-items": "center"}
         return column(
             Div(text="<h1>Fundamental matrix of two images</h1>", sizing_mode="stretch_width"),
             row(*self._inputs, styles=WRAP, sizing_mode="stretch_width"),
@@ -128,14 +139,13 @@ class Page:
         self._example = None
         self._show_images([None if i == index else other for i, other in enumerate(others)])
         self._runs[PAIR] += 1
-        work = partial(_decode, name, encoded)
-        self._submit(IMAGES[index], f"Reading {name} ...", work, partial(self._show_upload, index))
 
-    def _show_upload(self, index: int, image: ImageFile) -> None:
-        self._match([image if i == index else other for i, other in enumerate(self._images)])
+        def show(image: ImageFile) -> None:
+            self._match([image if i == index else other for i, other in enumerate(self._images)])
+
+        self._submit(IMAGES[index], f"Reading {name} ...", lambda: read_file(name, base64.b64decode(encoded)), show)
 
     def _match(self, images: list[ImageFile | None]) -> None:
-        """Show two images and match them; ask for the other one where there is one alone."""
         self._show_images(images)
         first, second = images
         if first is None or second is None:
@@ -168,7 +178,6 @@ class Page:
             show(result)
 
     def _show_images(self, images: list[ImageFile | None]) -> None:
-        """Show two images, or one, without any result."""
         self._images, self._results = images, {}
         self._table.text = self._download.text = ""
         self._warn("")
@@ -184,7 +193,6 @@ class Page:
         self._show_matches()
 
     def _show_matches(self) -> None:
-        """Show the matches, warnings and download of the chosen method."""
         if not self._results:
             return
         method = METHODS[self._method.active or 0]
@@ -207,15 +215,10 @@ class Page:
         self._warnings.text, self._warnings.visible = text, bool(text)
 
     def _point(self, index: int, x: float, y: float) -> None:
-        """Draw the epipolar lines of a pixel of one image in the other."""
         matrices = {name: found.estimate.F_mat for name, found in self._results.items() if found.estimate is not None}
         if matrices:
             self._views[index].mark((x, y))
             self._views[1 - index].draw_lines({n: F.mT if index else F for n, F in matrices.items()}, (x, y))
-
-
-def _decode(name: str, encoded: str) -> ImageFile:
-    return read_file(name, base64.b64decode(encoded))
 
 
 def _table(results: dict[str, MethodResult], example: Example | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from bokeh.events import Event, MouseMove, PointEvent, Tap
@@ -46,16 +47,9 @@ class ImageView:
         self.layout = column(self._caption, grid, sizing_mode="stretch_width", styles=styles)
 
     def _make_figure(self) -> figure:
-        plot = figure(
-            name=self._title,
-            tools="pan,wheel_zoom,box_zoom,reset",
-            sizing_mode="scale_width",
-            x_range=Range1d(),
-            y_range=Range1d(),
-            background_fill_color="#11161d",
-            outline_line_color=None,
-            min_border=0,
-        )
+        style: dict[str, Any] = {"sizing_mode": "scale_width", "background_fill_color": "#11161d", "min_border": 0}
+        style |= {"tools": "pan,wheel_zoom,box_zoom,reset", "outline_line_color": None}
+        plot = figure(name=self._title, x_range=Range1d(), y_range=Range1d(), **style)
         plot.axis.visible = plot.grid.visible = False
         plot.image_rgba("image", x=-0.5, y=-0.5, dw="width", dh="height", source=self._image)
         plot.scatter("x", "y", source=self._outliers, marker="x", size=7, color=OUTLIER, line_width=1.2)

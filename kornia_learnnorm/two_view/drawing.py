@@ -112,8 +112,8 @@ def _panels(
         height, grid = sum(heights), {"nrows": 2, "height_ratios": heights}
     else:
         height, grid = WIDTH / sum(aspects), {"ncols": 2, "width_ratios": aspects}
-    size = (WIDTH, height + margin)
-    figure = import_matplotlib().figure.Figure(figsize=size, dpi=DPI, facecolor=BACKGROUND, layout="constrained")
+    style: dict[str, Any] = {"dpi": DPI, "facecolor": BACKGROUND, "layout": "constrained"}
+    figure = import_matplotlib().figure.Figure(figsize=(WIDTH, height + margin), **style)
     panels = figure.subplots(**grid)
     for image, (width, height), axes in zip(images, sizes, panels, strict=True):
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
@@ -124,7 +124,6 @@ def _panels(
 
 
 def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -> None:
-    """Draw the epipolar lines of some inliers, each with its point."""
     rows = torch.nonzero(estimate.inliers).flatten().numpy()
     chosen = np.random.default_rng(seed).permutation(rows)[:num_lines]
     points1, points2 = estimate.points1[chosen].numpy(), estimate.points2[chosen].numpy()

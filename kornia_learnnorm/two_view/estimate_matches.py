@@ -16,8 +16,7 @@ from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
-from kornia_learnnorm.two_view.parallax import find_homography
-from kornia_learnnorm.two_view.plane_distances import distances_from_plane
+from kornia_learnnorm.two_view.parallax import distances_from_plane, find_homography
 from kornia_learnnorm.two_view.predicted_error import nominal_camera, predict_error
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, TwoViewSolver
@@ -118,9 +117,7 @@ def _usable_matches(
     return points1[kept], points2[kept], scores[kept]
 
 
-class _Pose(NamedTuple):
-    """What cameras add to an estimate; all None without cameras, and R, t and front where two poses tie."""
-
+class _Pose(NamedTuple):  # all None without cameras, and R, t and front where two poses tie
     E_mat: Tensor | None = None
     R: Tensor | None = None
     t: Tensor | None = None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -122,10 +121,10 @@ class MatchedPair:
         S1, S2 = scaling(self.full_size1, self.size1), scaling(self.full_size2, self.size2)
         cameras = read_cameras(K1, K2)
         K1, K2 = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
-        options: dict[str, Any] = {"layer": layer, "threshold": threshold, "seed": seed, "K1": K1, "K2": K2}
 
         def solve(points1: Tensor, points2: Tensor, scores: Tensor) -> PairEstimate:
-            return estimate_matches(points1, points2, scores, self.size1, self.size2, **options)
+            sizes = self.size1, self.size2
+            return estimate_matches(points1, points2, scores, *sizes, layer, threshold, seed, K1, K2)
 
         try:
             first = solve(self.points1[self.mutual], self.points2[self.mutual], 1 - self.ratios[self.mutual])
@@ -133,12 +132,9 @@ class MatchedPair:
             raise _named(error, (self.path1, self.path2)) from error
         found = first
         if mutual_share(self.points1, self.points2, self.mutual, first.F_mat, threshold) < MIN_MUTUAL_SHARE:
-            found = resolve_ambiguity(
-                first,
-                self.points1[~self.mutual],
-                self.points2[~self.mutual],
-                lambda kept: solve(first.points1[kept], first.points2[kept], first.scores[kept]),
-            )
+            false = self.points1[~self.mutual], self.points2[~self.mutual]
+            matches = first.points1, first.points2, first.scores
+            found = resolve_ambiguity(first, *false, lambda kept: solve(*(value[kept] for value in matches)))
         scale = float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
         return replace(
             found,
@@ -176,10 +172,10 @@ def match_two_images(
             raise _named(NoReliableMatrixError("blank", text), (path1, path2))
     if matcher == "nearest":
         matches, back = match_both_ways(features1, features2)
-        larger = torch.maximum(matches.ratio, back)
     else:
         matches = MATCHERS[matcher](features1, features2)
-        larger = matches.ratio
+        back = matches.ratio
+    larger = torch.maximum(matches.ratio, back)
     kept = matches.ratio.double() < ratio
     points1, points2, ratios = (value[kept].double() for value in (matches.points1, matches.points2, larger))
     sizes = features1.size, features2.size, full_size1, full_size2

@@ -14,26 +14,15 @@ from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.checks import check_cameras
 
-__all__ = [
-    "Cameras",
-    "Points",
-    "check_number",
-    "check_settings",
-    "check_whole",
-    "read_cameras",
-    "read_matches",
-    "read_size",
-]
+__all__ = ["Cameras", "Points", "check_number", "check_settings", "check_whole"]
+__all__ += ["read_cameras", "read_matches", "read_size"]
 
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]
 
 
 def read_matches(points1: Points, points2: Points, scores: Points | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Return matches (N, 2), (N, 2) and scores (N,) in float64; scores of one where there are none.
-
-    TypeError for other than numbers, ValueError for shapes that do not pair up and scores of points beyond [0, 1].
-    """
+    """Return matches (N, 2), (N, 2) and scores (N,) in float64; scores of one where there are none."""
     x1, x2 = _as_float64("points1", points1), _as_float64("points2", points2)
     score = torch.ones(len(x1), dtype=torch.float64) if scores is None else _as_float64("scores", scores)
     if x1.shape != x2.shape or x1.shape[1:] != (2,) or score.shape != x1.shape[:1]:
@@ -58,11 +47,9 @@ def read_size(name: str, size: Size | None, points: Tensor) -> Size:
     if size is None:
         width, height = (points.amax(0).clamp(min=1.0).ceil() + 1).tolist()
         return int(width), int(height)
-    if len(size) != 2:
-        raise ValueError(f"{name} must be a width and a height, got {size}")
     for value in size:
         check_whole(f"width and height of {name}", value)
-    if min(size) < 1:
+    if len(size) != 2 or min(size) < 1:
         raise ValueError(f"{name} must be a positive width and height, got {tuple(size)}")
     return int(size[0]), int(size[1])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -67,11 +68,6 @@ def read_pair_list(path: str | Path) -> list[FilePair]:
     """Return the image files of a list, two names a line, relative to the folder of the list.
 
     Names with spaces stand in quotation marks; a # begins a comment.
-
-    Raises:
-        FileNotFoundError: if there is no such list.
-        ValueError: if a line does not have two names, or there is none.
-
     """
     path = Path(path)
     if not path.is_file():
@@ -100,22 +96,10 @@ def estimate_pairs(
     """Estimate the pairs that are not done yet and append one JSON line each to ``pairs.jsonl``.
 
     A line has what :meth:`~kornia_learnnorm.two_view.result.PairEstimate.as_dict` returns, or
-    :func:`describe_failure` where there is no matrix or an image cannot be read.
-
-    Args:
-        pairs: image files.
-        folder: created where it does not exist; keeps the options, and a later run must have the same.
-        options: of all pairs.
-        jobs: processes on this machine; -1 for as many as it has cores.
-        dask: address of a Dask scheduler whose workers estimate instead.
-
-    Returns:
-        the JSON objects of the pairs, in their order; ``F`` is None where there is no matrix.
-
-    Raises:
-        ValueError: if the folder holds results with other options.
-        OSError: if a file cannot be written, or another process writes the folder.
-
+    :func:`describe_failure` where there is no matrix or an image cannot be read. The folder, created where it does not
+    exist, keeps the options, and a later run must have the same; another process may not write it meanwhile. ``jobs``
+    is a number of processes, -1 for as many as there are cores; the workers of the Dask scheduler at the address
+    ``dask`` estimate instead. Returns the JSON objects of all pairs, in their order.
     """
     folder = Path(folder)
     cameras = [text if text == "exif" else read_camera(text).tolist() for text in options.K]
@@ -123,7 +107,11 @@ def estimate_pairs(
     given = json.loads(json.dumps({**asdict(options), "K": cameras}))
     folder.mkdir(parents=True, exist_ok=True)
     with exclusive(folder):
-        _check_same_options(folder / OPTIONS, given)
+        had = folder / OPTIONS
+        if not had.exists():
+            write_text(had, json.dumps(given, indent=2) + "\n")
+        elif (before := json.loads(had.read_text(encoding="utf-8"))) != given:
+            raise ValueError(f"{folder} holds results with other options: {before}, got {given}")
         done = _read_done(folder / RESULTS)
         todo = [pair for pair in pairs if pair not in done]
         tqdm = import_extra("tqdm", "images", "estimating many pairs").tqdm
@@ -141,32 +129,30 @@ def estimate_pairs(
     return [done[pair] for pair in pairs]
 
 
-def _check_same_options(path: Path, given: Line) -> None:
-    """Write the options of a run; raise ValueError where its folder has others."""
-    if not path.exists():
-        write_text(path, json.dumps(given, indent=2) + "\n")
-    elif (had := json.loads(path.read_text(encoding="utf-8"))) != given:
-        raise ValueError(f"{path.parent} holds results with other options: {had}, got {given}")
-
-
 def _read_done(path: Path) -> dict[FilePair, Line]:
     """Return the results of a file of JSON lines; drop a last line that was not written whole, and unreadable pairs."""
     if not path.exists():
         return {}
     texts = [text for text in path.read_text(encoding="utf-8").splitlines(keepends=True) if text.endswith("\n")]
-    lines = [
-        line for line in map(json.loads, texts) if UNREADABLE not in [warning["code"] for warning in line["warnings"]]
-    ]
+    lines = [line for line in map(json.loads, texts) if UNREADABLE not in [why["code"] for why in line["warnings"]]]
     write_text(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
     return {(Path(line["image1"]["file"]), Path(line["image2"]["file"])): line for line in lines}
 
 
 def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> Line:
     """Return the JSON object of a pair without a matrix: ``F`` is null, and the warning has a code and a text."""
+
+    def describe(path: Path) -> Line:  # sizes are null where the file cannot be read
+        width = height = 0
+        with suppress(OSError):
+            width, height = image_size(path)
+        return {"file": str(path), "width": width or None, "height": height or None}
+
     return {
         **dict.fromkeys(("F", "E", "R", "t", "predicted_error_px")),
         "warnings": [{"code": code, "text": text}],
-        **{name: _describe_image(path) for name, path in (("image1", image1), ("image2", image2))},
+        "image1": describe(image1),
+        "image2": describe(image2),
         "estimator": (RANSAC if options.weights is None else LearnedEightPoint).__name__,
         "seed": options.seed,
         "ratio": options.ratio,
@@ -175,17 +161,7 @@ def describe_failure(code: str, text: str, image1: Path, image2: Path, options: 
     }
 
 
-def _describe_image(path: Path) -> Line:
-    """Return the file and its width and height, null where it cannot be read."""
-    try:
-        width, height = image_size(path)
-    except OSError:
-        width = height = 0
-    return {"file": str(path), "width": width or None, "height": height or None}
-
-
 def _estimate(image1: Path, image2: Path, options: PairOptions) -> Line:
-    """Return the JSON object of a pair."""
     import_cv2().setNumThreads(1)
     try:
         return estimate_pair(image1, image2, **options.arguments(image1, image2)).as_dict()

@@ -1,14 +1,15 @@
 r"""The homography of a scene that is mostly a plane, the parallax of the rest, and the matrix of both.
 
 With the homography :math:`H` of the plane, two matches off the plane determine the epipole :math:`e_2`, since the line
-through :math:`H x_1` and :math:`x_2` passes through it, and :math:`F = [e_2]_\times H`.
-
-Points are pixels (N, 2) in float64, matrices (3, 3), and thresholds pixels.
+through :math:`H x_1` and :math:`x_2` passes through it, and :math:`F = [e_2]_\times H`. What one radial
+distortion of both images explains is no parallax. Points are pixels (N, 2) in float64, matrices (3, 3), and thresholds
+pixels.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,19 +17,25 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import cross_product_matrix
 from torch import Tensor
 
-from kornia_learnnorm.data.images import import_cv2
+from kornia_learnnorm.data.images import Size, import_cv2
+from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.models.contract import Residuals
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 
-__all__ = ["find_homography", "fit_plane_and_parallax", "parallax", "parallax_evidence"]
+__all__ = ["distances_from_plane", "find_homography", "fit_plane_and_parallax", "parallax", "parallax_evidence"]
 
 OFF_PLANE = 2.0  # thresholds; a match that the homography misses by more lies off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
 MIN_PARALLAX_INLIERS = 3  # matches off the plane that a matrix must have to be more than a choice of two
+MAX_DISTORTION = 0.2  # of the radius at the corners of an image
+MAX_LM_STEPS = 10
+TOLERANCE = 1e-6  # cosine of offsets and derivatives at which Levenberg-Marquardt has converged
+AT_INFINITY = 1e6  # halves of the diagonal; offset of a point that the homography moves to infinity
 
 
 def find_homography(points1: Tensor, points2: Tensor, threshold: float) -> Tensor | None:
@@ -53,19 +60,9 @@ def parallax_evidence(distance: Tensor, inliers: Tensor, threshold: float) -> fl
 
     The epipolar line of a match off the plane runs through :math:`H x_1` and the epipole. A random match at the
     distance :math:`r` from :math:`H x_1` lies within :math:`\tau` of this line with probability
-    :math:`\frac{2}{\pi} \arcsin(\tau / r)`. Two matches determine an epipole; the others are evidence for it.
-
-    Small is strong evidence; where fewer than three matches off the plane are inliers, there is none: it is infinite.
-
-    Args:
-        distance: of the matches from where the homography moves them, see :func:`parallax`, (N,).
-        inliers: mask of the inliers of the matrix, (N,).
-        threshold: largest distance :math:`\tau` of an inlier from its epipolar line.
-
-    Reference:
-        L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches between two images and estimate
-        the fundamental matrix, IJCV 2004.
-
+    :math:`\frac{2}{\pi} \arcsin(\tau / r)`. Two matches determine an epipole; the others are evidence for it (as in
+    L. Moisan, B. Stival, IJCV 2004). Small is strong evidence; infinite is none, as where fewer than three matches off
+    the plane are inliers. ``distance`` (N,) is that of :func:`parallax`, ``threshold`` is :math:`\tau`.
     """
     off = distance > OFF_PLANE * threshold
     number, agree = int(off.sum()), int((off & inliers).sum())
@@ -82,12 +79,9 @@ def parallax_evidence(distance: Tensor, inliers: Tensor, threshold: float) -> fl
 def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshold: float, seed: int) -> Tensor | None:
     """Return the fundamental matrix of a homography and an epipole that most matches agree with, refined on all.
 
-    It has rank 2 and unit Frobenius norm; None where fewer than three matches are off the plane. The threshold is the
-    largest Sampson distance of an inlier; the seed draws the pairs of matches off the plane.
-
-    Reference:
-        O. Chum, T. Werner, J. Matas, Two-view geometry estimation unaffected by a dominant plane, CVPR 2005.
-
+    None where fewer than three matches are off the plane. The threshold is the largest Sampson distance of an inlier;
+    the seed draws the pairs of matches off the plane (O. Chum, T. Werner, J. Matas, Two-view geometry estimation
+    unaffected by a dominant plane, CVPR 2005).
     """
     off = (parallax(points1, points2, H) > OFF_PLANE * threshold).nonzero()[:, 0]
     if len(off) < MIN_PARALLAX_INLIERS:
@@ -105,3 +99,72 @@ def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshol
         return None
     loss = GemanMcClure(FINAL_LOSS_SCALE * threshold)
     return refine_fundamental(points1[None], points2[None], scorer.to_pixels(found), loss=loss).F_mat[0]
+
+
+def distances_from_plane(
+    points1: Tensor, points2: Tensor, H: Tensor, size1: Size, size2: Size, threshold: float
+) -> Tensor:
+    r"""Return the distances (N,) of points2 from where the plane and a radial distortion move points1, pixels.
+
+    A point at the radius :math:`r` from the centre of its image, in halves of the diagonal, is that of a pinhole camera
+    at the radius :math:`r (1 + k r^2)`, with one :math:`|k| \le 0.2` for both images. It and the homography (3, 3)
+    minimise Geman and McClure's loss at the scale of the threshold, from the given ones on. Points that are moved to
+    infinity are infinitely far.
+    """
+    T1, T2 = _from_pixels(size1), _from_pixels(size2)
+    ones = torch.ones_like(points1.mT[:1])
+    x1, x2 = (T @ torch.cat([points.mT, ones]) for T, points in ((T1, points1), (T2, points2)))
+    H = T2 @ H @ torch.linalg.inv(T1)
+    start = _Parameters(torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])[None])
+    cost = RobustCost(_BentPlane(), x1[None], x2[None], ones, GemanMcClure(threshold * float(T2[0, 0])))
+    _, optimum = minimize(cost, start, MAX_LM_STEPS, TOLERANCE)
+    distance = cost.squares(optimum.state.matrix())[0].sqrt()
+    return torch.where(distance < AT_INFINITY, distance / T2[0, 0], math.inf)
+
+
+class _Parameters(NamedTuple):
+    """Nine entries of a homography, and a distortion as a share of its bound, through artanh, (1, 10)."""
+
+    values: Tensor
+
+    def matrix(self) -> Tensor:
+        return self.values
+
+    def retract(self, step: Tensor) -> _Parameters:
+        return _Parameters(self.values + step)
+
+    def tangents(self) -> Tensor:
+        return torch.eye(10).to(self.values)[None]
+
+
+class _BentPlane(Residuals):
+    components = 2
+
+    def linearise(self, M: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the offsets (1, 2 N) of x2 from where x1 is moved, and their derivatives (1, 10, 2 N)."""
+        H, bend = M[0, :9].view(3, 3), torch.tanh(M[0, 9])
+        k, slope = MAX_DISTORTION * bend, MAX_DISTORTION * (1 - bend.square())
+        u1, u2 = x1[0, :2], x2[0, :2]
+        square1, square2 = u1.square().sum(0), u2.square().sum(0)
+        ideal1 = torch.cat([u1 * (1 + k * square1), x1[0, 2:]])
+        moved = H @ ideal1
+        v, by_point = moved[:2] / moved[2], ideal1 / moved[2]
+        # Over the local scale: a distortion that shrinks an image must not shrink its errors.
+        stretch = 1 + 2 * k * square2
+        offsets = (v - u2 * (1 + k * square2)) / stretch
+        zero = torch.zeros_like(by_point)
+        rows = [torch.cat([by_point, zero, -v[0] * by_point]), torch.cat([zero, by_point, -v[1] * by_point])]
+        by_k = (H[:2, :2] @ (u1 * square1) - v * (H[2, :2] @ (u1 * square1))) / moved[2]
+        by_k = (by_k - u2 * square2 - 2 * square2 * offsets) / stretch
+        J = torch.cat([torch.stack(rows, 1) / stretch, slope * by_k[None]])
+        # A point that is moved to infinity has no derivatives, so that it does not count.
+        finite = (J.isfinite().all(0) & offsets.isfinite()).all(0)
+        offsets, J = torch.where(finite, offsets, AT_INFINITY), torch.where(finite, J, 0.0)
+        return offsets.flatten()[None], J.flatten(1)[None]
+
+
+def _from_pixels(size: Size) -> Tensor:
+    """Return the transform (3, 3) from pixels to halves of the diagonal, from the centre."""
+    radius = math.hypot(*size) / 2
+    x, y = (side / 2 / radius for side in size)
+    return torch.tensor([[1 / radius, 0, -x], [0, 1 / radius, -y], [0, 0, 1]], dtype=torch.float64)

@@ -25,15 +25,10 @@ COMMON_ERRORS = 400  # matches beyond which more do not help: the errors of neig
 
 
 class PredictedError(NamedTuple):
-    """Standard errors of a fundamental matrix.
+    """Standard errors of a fundamental matrix."""
 
-    Attributes:
-        distance: median symmetric epipolar distance, pixels.
-        angle: larger angle of the rotations and of the directions of translation, degrees.
-    """
-
-    distance: float
-    angle: float
+    distance: float  # median symmetric epipolar distance, pixels
+    angle: float  # larger angle of the rotations and of the directions of translation, degrees
 
 
 def random_parts(number: int, inliers: int, seed: int) -> Tensor:
@@ -45,15 +40,10 @@ def random_parts(number: int, inliers: int, seed: int) -> Tensor:
 
 
 def drop_failed_parts(F_parts: Tensor, support: Tensor, inliers: int) -> Tensor:
-    """Return the matrices of parts that most inliers agree with; all of them where these are few.
+    """Return the matrices of parts (P, 3, 3) that most inliers agree with; all of them where these are few.
 
-    Among many outliers the search in a part can fail. Its matrix has little support among all matches then, and says
-    nothing about how well the inliers determine theirs, unlike another matrix with as much support.
-
-    Args:
-        F_parts: matrices of the parts, (P, 3, 3).
-        support: number of all matches that agree with each, (P,).
-        inliers: number that agree with the matrix of all.
+    Among many outliers the search in a part can fail. Its matrix has little support (P,) among all matches then, and
+    says nothing about how well the inliers determine theirs.
     """
     solved = support >= MIN_SUPPORT * inliers
     return F_parts[solved] if int(solved.sum()) >= MIN_SOLVED_PARTS else F_parts
@@ -68,15 +58,8 @@ def predict_error(
     the latter (delete-d jackknife: J. Shao, C. Wu, A general theory for jackknife variance estimation, Annals of
     Statistics 1989). Errors of neighbouring matches are alike, so no more than 400 of them count.
 
-    Args:
-        F_parts: matrices of the parts of :func:`random_parts`, (P, 3, 3); zeros where there is none.
-        size: matches in a part.
-        points1: pixels of all matches in image 1, (N, 2), float64.
-        points2: pixels of all matches in image 2, (N, 2).
-        F_mat: matrix of all matches, (3, 3).
-        inliers: mask of its inliers, (N,).
-        K1: camera of image 1, (3, 3), or a guess.
-        K2: camera of image 2, (3, 3), or a guess.
+    ``F_parts`` (P, 3, 3) are zeros where there is no matrix; a part has ``size`` of the matches (N, 2), of which
+    ``inliers`` (N,) are those of ``F_mat`` (3, 3). The cameras (3, 3) may be guesses.
     """
     number = len(points1)
     unit = math.sqrt(1 / min(number, COMMON_ERRORS) / (1 / size - 1 / number))
@@ -95,8 +78,7 @@ def _onto_lines(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
     """Return points2 (N, 2) moved onto their epipolar lines."""
     line = convert_points_to_homogeneous(points1) @ F_mat.mT
     normal = line[:, :2]
-    distance = ((normal * points2).sum(-1) + line[:, 2]) / normal.square().sum(-1)
-    return points2 - distance[:, None] * normal
+    return points2 - (((normal * points2).sum(-1) + line[:, 2]) / normal.square().sum(-1))[:, None] * normal
 
 
 def nominal_camera(size: Size) -> Tensor:

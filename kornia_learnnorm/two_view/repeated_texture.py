@@ -2,9 +2,8 @@ r"""False matches of repeated texture, which agree with each other: how they sho
 
 Equal windows of a wall match each other along its rows, so that the false matches agree on an epipole where these rows
 meet, and on a matrix that more matches fit than the true one. Which matches fit cannot tell these matrices apart; that
-the false matches jump away from their neighbours, and are nearest neighbours in one direction only, does.
-
-Points are pixels (N, 2) in float64, matrices (3, 3), and thresholds pixels.
+the false matches jump away from their neighbours, and are nearest neighbours in one direction only, does. Points are
+pixels (N, 2) in float64, matrices (3, 3), and thresholds pixels.
 """
 
 from __future__ import annotations
@@ -55,27 +54,22 @@ def resolve_ambiguity(
 ) -> PairEstimate:
     """Return the estimate of the coherent matches where false ones decided the first, with a warning where in doubt.
 
-    It replaces the first one if fewer false matches fit its matrix for each coherent one that does. On rendered walls
-    of repeated windows the predicted error of the answers without a warning is too small: 0.2 to 0.7 times the true one
-    (10 % and 90 % quantiles).
-
-    Args:
-        first: estimate of all matches.
-        false1: points in image 1 of matches that are not nearest neighbours in both directions.
-        false2: their points in image 2.
-        again: returns the estimate of some matches of the first one, from a mask of them, or raises
-            NoReliableMatrixError.
+    It replaces the first one if fewer false matches, which are not nearest neighbours in both directions, fit its
+    matrix for each coherent one that does. On rendered walls of repeated windows the predicted error of the answers
+    without a warning is too small: 0.2 to 0.7 times the true one (10 % and 90 % quantiles).
+    ``again`` maps a mask of the first one's matches to their estimate, or raises NoReliableMatrixError.
     """
-    coherent = _coherent_rows(first)
+    inlying = first.points1[first.inliers], first.points2[first.inliers]
+    H, coherent = find_homography(*inlying, first.threshold), torch.zeros_like(first.inliers)
+    if H is not None:
+        coherent = coherent_matches(first.points1, first.points2, H, first.threshold)
     matches = first.points1[coherent], first.points2[coherent]
     plane = find_homography(*matches, first.threshold)
     if plane is None:
         return _with_doubt(first, "few matches move like their neighbours")
 
-    def fitting(F_mat: Tensor) -> tuple[float, float]:
-        """Return which shares of the false and of the coherent matches off the plane fit a matrix."""
-        false, true = (fitting_share(*x, plane, F_mat, first.threshold) for x in ((false1, false2), matches))
-        return false, true
+    def fitting(F_mat: Tensor) -> list[float]:  # shares of the false and of the coherent matches off the plane
+        return [fitting_share(*x, plane, F_mat, first.threshold) for x in ((false1, false2), matches)]
 
     best, (false, true) = first, fitting(first.F_mat)
     if false > MIN_FALSE_SHARE or true < MIN_COHERENT_SHARE:
@@ -84,20 +78,12 @@ def resolve_ambiguity(
             left, gained = fitting(second.F_mat)
             if left * true < MAX_SHARE_LEFT * false * gained:
                 best, false, true = second, left, gained
+    off = "of the matches off the main plane that"
     if false > MAX_FALSE_SHARE:
-        doubt = f"{false:.0%} of the matches off the main plane that are nearest in one direction only fit"
-        return _with_doubt(best, doubt)
+        return _with_doubt(best, f"{false:.0%} {off} are nearest in one direction only fit")
     if true < MIN_COHERENT_SHARE:
-        doubt = f"only {true:.0%} of the matches off the main plane that move like their neighbours fit"
-        return _with_doubt(best, doubt)
+        return _with_doubt(best, f"only {true:.0%} {off} move like their neighbours fit")
     return best
-
-
-def _coherent_rows(estimate: PairEstimate) -> Tensor:
-    """Return which matches of an estimate are coherent, (N,) bool; none where no homography explains its inliers."""
-    points1, points2, inliers = estimate.points1, estimate.points2, estimate.inliers
-    H = find_homography(points1[inliers], points2[inliers], estimate.threshold)
-    return torch.zeros_like(inliers) if H is None else coherent_matches(points1, points2, H, estimate.threshold)
 
 
 def _with_doubt(estimate: PairEstimate, reason: str) -> PairEstimate:
@@ -110,12 +96,9 @@ def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: flo
 
     A false match of repeated texture jumps to a copy, away from its neighbours in one image or in both. Where most
     matches around a true one are false, these count little: in a second round the neighbours of a match are weighted by
-    the share of their own neighbours that agree with them. Parallax is measured from where H moves points1.
-
-    References:
-        J. Bian et al., GMS: grid-based motion statistics for fast, ultra-robust feature correspondence, CVPR 2017;
-        J. Ma et al., Locality preserving matching, IJCV 2019.
-
+    the share of their own neighbours that agree with them. Parallax is measured from where H moves points1 (J. Bian et
+    al., GMS: grid-based motion statistics for fast, ultra-robust feature correspondence, CVPR 2017; J. Ma et al.,
+    Locality preserving matching, IJCV 2019).
     """
     vectors = points2 - transform_points(H[None], points1[None])[0]
     views = [_neighbours(points, vectors, PARALLAX * threshold) for points in (points1, points2)]

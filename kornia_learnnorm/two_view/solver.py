@@ -73,15 +73,7 @@ class TwoViewSolver:
         return RANSAC.__name__ if self.layer is None else type(self.layer).__name__
 
     def search(self, size2: Size) -> Solution:
-        """Return the best matrix of all matches and of random parts of them.
-
-        Args:
-            size2: width and height of image 2, pixels.
-
-        Raises:
-            NoReliableMatrixError: if fewer than nine matches agree with it.
-
-        """
+        """Return the best matrix of all matches and of random parts; raise NoReliableMatrixError for few inliers."""
         F_mat, weights = self.solve()
         parts = random_parts(len(weights), int(self.inliers(F_mat).sum()), self.seed)
         F_parts = self._solve_parts(F_mat, parts, size2)
@@ -196,7 +188,10 @@ class TwoViewSolver:
         return refine_fundamental(self.points1[None], self.points2[None], F_mat[None], loss=loss).F_mat[0]
 
     def _try_plane_and_parallax(self, F_mat: Tensor) -> Tensor:
-        """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher."""
+        """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher.
+
+        It is refined at the scale of the noise where no parallax exceeds the threshold.
+        """
         inliers = self.inliers(F_mat)
         if int(inliers.sum()) < 8:
             return F_mat
@@ -209,19 +204,13 @@ class TwoViewSolver:
         other = fit_plane_and_parallax(self.points1, self.points2, H, self.threshold, self.seed)
         if other is not None and self._score(other) > MIN_SCORE_GAIN * self._score(F_mat):
             F_mat = other
-        return self._refine_finely(off_plane, F_mat)
-
-    def _refine_finely(self, off_plane: Tensor, F_mat: Tensor) -> Tensor:
-        """Return the matrix, refined at the scale of the noise where no parallax (N,) exceeds the threshold.
-
-        Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would the
-        inliers of largest error, if the scale of the loss were not the median distance of the inliers.
-        """
         distance = self.distance(F_mat)
         inliers = distance < self.threshold
         evidence = parallax_evidence(off_plane, inliers, self.threshold)
         if evidence <= MAX_LOG_CHANCE_PARALLAX or not bool(inliers.any()):
             return F_mat
+        # Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would
+        # the inliers of largest error, if the scale of the loss were not the median distance of the inliers.
         noise = float(distance[inliers].median())
         scale = min(max(noise, MIN_LOSS_SCALE * self.threshold), FINAL_LOSS_SCALE * self.threshold)
         return self._refine_at(scale, F_mat)

@@ -34,16 +34,10 @@ MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that 
 
 
 class PairWarning(NamedTuple):
-    """A reason to doubt a fundamental matrix.
+    """A reason to doubt a fundamental matrix."""
 
-    Attributes:
-        code: one word for programs: ``few_inliers``, ``chance``, ``clustered``, ``planar``, ``unstable``,
-            ``ambiguous`` or ``no_pose``.
-        text: one sentence for people.
-    """
-
-    code: str
-    text: str
+    code: str  # few_inliers, chance, clustered, planar, unstable, ambiguous or no_pose
+    text: str  # one sentence for people
 
 
 def find_warnings(
@@ -55,16 +49,10 @@ def find_warnings(
     size2: Size,
     angle: float,
 ) -> tuple[PairWarning, ...]:
-    """Return the reasons to doubt the matrix of a pair; none when all is well.
+    """Return the reasons to doubt the matrix of matches (N, 2); none when all is well.
 
-    Args:
-        points1: pixels of all matches in image 1, (N, 2), float64.
-        points2: pixels of all matches in image 2, (N, 2).
-        distance: symmetric epipolar distances of the matches to the matrix, (N,), pixels.
-        off_plane: distances of the matches from the plane that explains most inliers, pixels, (N,), or None.
-        threshold: largest distance of an inlier, pixels.
-        size2: width and height of image 2.
-        angle: standard error of the pose, see :class:`~kornia_learnnorm.two_view.predicted_error.PredictedError`.
+    The matches are ``distance`` (N,) from the matrix and ``off_plane`` (N,), if given, from the plane that explains
+    most inliers, pixels. ``angle`` is that of the :class:`~kornia_learnnorm.two_view.predicted_error.PredictedError`.
     """
     inliers = distance < threshold
     found, total, matches = {}, int(inliers.sum()), len(inliers)
@@ -77,23 +65,15 @@ def find_warnings(
         text = f"the inliers lie close to one line or one point: {spread:.1%} of the image diagonal apart"
         found["clustered"] = text
     if off_plane is not None:
-        found |= _find_plane(off_plane, distance, threshold)
+        near, wide = (float((off_plane[inliers] < k * threshold).double().mean()) for k in (1, 3))
+        evidence = min(parallax_evidence(off_plane, distance < k * threshold, k * threshold) for k in PARALLAX_SCALES)
+        if wide > MIN_PLANAR_SHARE and evidence > MAX_LOG_CHANCE_PARALLAX:
+            text = f"one homography explains {near:.0%} of the inliers within {threshold:g} px and {wide:.0%} within "
+            text += f"{3 * threshold:g} px (a plane, or a camera that only rotates), and the rest do not determine the "
+            found["planar"] = text + "epipole"
     if angle > MAX_ANGLE:
         found["unstable"] = f"the pose changes by {angle:.0f} degrees when the matches are drawn anew"
     return tuple(PairWarning(*item) for item in found.items())
-
-
-def _find_plane(off_plane: Tensor, distance: Tensor, threshold: float) -> dict[str, str]:
-    """Return a warning where most inliers lie on a plane and the parallax of the others is no more than chance."""
-    near, wide = (float((off_plane[distance < threshold] < k * threshold).double().mean()) for k in (1, 3))
-    evidence = min(parallax_evidence(off_plane, distance < k * threshold, k * threshold) for k in PARALLAX_SCALES)
-    if wide <= MIN_PLANAR_SHARE or evidence <= MAX_LOG_CHANCE_PARALLAX:
-        return {}
-    text = (
-        f"one homography explains {near:.0%} of the inliers within {threshold:g} px and {wide:.0%} within "
-        f"{3 * threshold:g} px (a plane, or a camera that only rotates), and the rest do not determine the epipole"
-    )
-    return {"planar": text}
 
 
 def _spread(points: Tensor) -> float:
@@ -102,17 +82,11 @@ def _spread(points: Tensor) -> float:
 
 
 def log_false_alarms(matches: int, inliers: int, threshold: float, size: Size) -> float:
-    """Return log10 of the expected number of matrices with as many inliers among random matches.
+    """Return log10 of the expected number of matrices with as many inliers among as many random matches.
 
-    L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches between two images and estimate the
-    fundamental matrix, IJCV 2004: models from seven matches, and the probability that a random point lies within the
-    threshold of a line.
-
-    Args:
-        matches: number of matches.
-        inliers: number of inliers.
-        threshold: largest distance of an inlier, pixels.
-        size: width and height of image 2, pixels.
+    Models from seven matches, and the probability that a random point of image 2 lies within the threshold, pixels, of
+    a line (L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches between two images and
+    estimate the fundamental matrix, IJCV 2004).
     """
     tests = max(1, matches - 7) * math.comb(matches, inliers) * math.comb(inliers, 7)
     return math.log10(max(1, tests)) + (inliers - 7) * _log_strip(threshold, size)
@@ -122,8 +96,7 @@ def log_false_samples(matches: int, inliers: int, threshold: float, size: Size) 
     """Return log10 of the expected number of a search's samples with as many inliers among random matches.
 
     A search tries 50,000 samples of eight, far fewer than all that :func:`log_false_alarms` counts. A true matrix with
-    too few inliers to be told from all those can have more than a search among random matches finds. Arguments are
-    those of :func:`log_false_alarms`.
+    too few inliers to be told from all those can have more than a search among random matches finds.
     """
     others = max(0, inliers - SAMPLE_SIZE)
     samples = SEARCH_SAMPLES * math.comb(max(0, matches - SAMPLE_SIZE), others)

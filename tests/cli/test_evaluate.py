@@ -199,7 +199,6 @@ def test_without_ground_truth_there_are_no_columns_of_it(folder, capsys):
     ("stores", "weights", "message"),
     [
         (["known.h5"], ["tilted", "other/tilted"], "two methods have the same name, tilted: "),
-        (["known.h5"], ["tilted", "tilted"], "two methods have the same name, tilted: "),
         (["known.h5"], ["Hartley.safetensors"], "two methods have the same name, Hartley: "),
         (["known.h5", "other/known.h5"], ["tilted"], "two files have the same name, known: "),
         (["known.h5", "none.h5"], ["tilted"], "no store at"),

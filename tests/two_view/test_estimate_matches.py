@@ -49,10 +49,8 @@ class TestEstimateMatches:
         assert error < 0.3
         assert 0.2 < result.predicted_error / error < 5
         assert result.warnings == ()
-        json.dumps(result.as_dict(), allow_nan=False)
-
-    def test_no_ratio_test_is_reported_where_none_was_made(self, result):
-        assert (result.ratio, result.as_dict()["ratio"]) == (None, None)
+        content = json.loads(json.dumps(result.as_dict(), allow_nan=False))
+        assert (result.ratio, content["ratio"]) == (None, None)
         assert "ratio" not in result.summary()
 
     def test_cameras_give_the_pose(self, matches):
@@ -117,7 +115,6 @@ class TestEstimateMatches:
         assert first.predicted_error == second.predicted_error
 
     def test_rows_that_are_not_finite_or_far_away_are_left_out(self, matches, result):
-        """As in RANSAC; their scores do not matter."""
         wrong = torch.tensor([[torch.nan, 5.0], [5.0, torch.inf], [1e12, 5.0]], dtype=torch.float64)
         scores = torch.cat([torch.ones(200), torch.tensor([torch.nan, 0.5, 0.5])])
         found = kln.estimate_matches(*(torch.cat([x, wrong + i]) for i, x in enumerate(matches)), scores)
@@ -135,7 +132,6 @@ class TestEstimateMatches:
         ],
     )
     def test_arrays_of_any_number_type(self, matches, convert, monkeypatch):
-        """Whole numbers, other strides and byte orders are read as float64 of the same values is."""
         points = [x.round().numpy() for x in matches]
         read = module.read_matches(*map(convert, points), None)
         assert all(torch.equal(found, torch.from_numpy(x)) for found, x in zip(read, points, strict=False))
@@ -179,7 +175,7 @@ def test_no_matrix(points1, shift, code):
         ({"layer": "robust"}, TypeError, "layer must be a LearnedEightPoint or None, got <class 'str'>"),
         ({"size1": (0, 0)}, ValueError, r"size1 must be a positive width and height, got \(0, 0\)"),
         ({"size2": (640.5, 480)}, TypeError, "width and height of size2 must be a whole number, got 640.5"),
-        ({"size2": (640,)}, ValueError, r"size2 must be a width and a height, got \(640,\)"),
+        ({"size2": (640,)}, ValueError, r"size2 must be a positive width and height, got \(640,\)"),
         ({"K1": torch.eye(3)}, ValueError, "given together"),
         ({"K1": torch.eye(3), "K2": torch.eye(3)[None]}, ValueError, r"K2 must have .* got \[1, 3, 3\]"),
     ],

@@ -42,13 +42,10 @@ class TestFindWarnings:
     def test_of_numbers(self, points, inliers, options, found):
         assert codes(*points, inliers, **options) == found
 
-    def test_clustered(self, points):
+    def test_clustered_and_planar(self, points):
         line = points[0] * torch.tensor([1.0, 0.01])
         assert codes(line, points[1], ALL) == ["clustered"]
-
-    def test_planar(self, points):
-        H = torch.eye(3, dtype=torch.float64)
-        points1, points2 = points[0], points[0].clone()
+        points1, points2, H = points[0], points[0].clone(), torch.eye(3).double()
         assert codes(points1, points2, ALL, H) == ["planar"]
         points2[:40, 0] += torch.linspace(10, 60, 40)  # forty matches with parallax along one direction
         assert codes(points1, points2, ALL, H) == []

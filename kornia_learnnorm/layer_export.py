@@ -1,8 +1,6 @@
 r"""Export of the layers as programs that run without this package, and of their networks as ONNX.
 
-A layer becomes one graph of PyTorch's operators by ``torch.export``: input checks that read no values, transforms,
-networks, solver and refinement. ONNX has no operators for eigenvectors, singular values and LU factorisations, so only
-the networks can be written in it.
+ONNX has no operators for eigenvectors, singular values and LU factorisations, so only the networks are written in it.
 """
 
 from __future__ import annotations
@@ -11,8 +9,7 @@ import copy
 import inspect
 import logging
 import warnings
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +29,7 @@ __all__ = ["export_layer", "export_networks", "load_layer"]
 
 MIN_DYNAMIC_POINTS = 9  # eight correspondences have a solver of their own
 EXAMPLE_BATCH = 2  # sets of the example that is traced; a dynamic size must not be one there
+DTYPES = {"mask": torch.bool}  # of inputs that are not float32
 
 
 def load_layer(name: str | Path) -> EightPoint | LearnedEightPoint:
@@ -109,12 +107,13 @@ def export_layer(
     shape: dict[int, Any] = {0: Dim("B", min=1)}
     if num_points is None:
         shape[1] = Dim("N", min=MIN_DYNAMIC_POINTS, max=most)
-    first = next(layer.parameters(), torch.empty(0))
-    points1, points2, given = _example(num_points or MIN_DYNAMIC_POINTS + 1, inputs, first.device)
+    size = (EXAMPLE_BATCH, num_points or MIN_DYNAMIC_POINTS + 1)
+    device = next(layer.parameters(), torch.empty(0)).device
+    points = torch.zeros(*size, 2, device=device), torch.zeros(*size, 2, device=device)
+    given = {name: torch.ones(size, device=device, dtype=DTYPES.get(name)) for name in inputs}
     shapes = dict.fromkeys(["points1", "points2", *given], shape)
-    module = _Exported(layer, gradients)
     with torch.set_grad_enabled(gradients):
-        return torch.export.export(module, (points1, points2), given, dynamic_shapes=shapes, strict=False)
+        return torch.export.export(_Exported(layer, gradients), points, given, dynamic_shapes=shapes, strict=False)
 
 
 def export_networks(layer: EightPoint | LearnedEightPoint) -> dict[str, Any]:
@@ -140,11 +139,12 @@ def export_networks(layer: EightPoint | LearnedEightPoint) -> dict[str, Any]:
     import_extra("onnx", "onnx", "ONNX export")
     import_extra("onnxscript", "onnx", "ONNX export")
     if isinstance(layer, LearnedEightPoint):
-        outputs = ["logits", "params"]
-        return {
-            f"stage{stage + 1}": _to_onnx(network, _stage_example(stage), outputs)
-            for stage, network in enumerate(layer.networks)
-        }
+        programs = {}
+        for stage, part in enumerate(layer.networks):
+            features = torch.zeros(EXAMPLE_BATCH, 10, POINT_FEATURES + (RESIDUAL_FEATURES if stage else 0))
+            example = {"features": features, "absent": torch.zeros(EXAMPLE_BATCH, 10, dtype=torch.bool)}
+            programs[f"stage{stage + 1}"] = _to_onnx(part, example, ["logits", "params"])
+        return programs
     network = getattr(layer.normalizer, "network", None)
     if network is None:
         raise ValueError(f"the layer has no network: its normaliser is {type(layer.normalizer).__name__}")
@@ -177,50 +177,25 @@ class _Exported(nn.Module):
         return tuple(outputs) if self.gradients else tuple(value.detach() for value in outputs)
 
 
-def _example(
-    num_points: int, inputs: Collection[str], device: torch.device
-) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Return two views of points and further inputs, of which only shapes and dtypes count."""
-    points = torch.zeros(EXAMPLE_BATCH, num_points, 2, device=device)
-    others = {name: torch.ones(EXAMPLE_BATCH, num_points, device=device) for name in inputs}
-    return points, points.clone(), {name: v.bool() if name == "mask" else v for name, v in others.items()}
-
-
-def _stage_example(stage: int) -> dict[str, Tensor]:
-    """Return an example of the inputs of a stage's network."""
-    features = POINT_FEATURES + (RESIDUAL_FEATURES if stage else 0)
-    return {
-        "features": torch.zeros(EXAMPLE_BATCH, 10, features),
-        "absent": torch.zeros(EXAMPLE_BATCH, 10, dtype=torch.bool),
-    }
-
-
 def _to_onnx(network: nn.Module, example: dict[str, Tensor], outputs: list[str]) -> Any:
     """Return the ONNX program of a network with dynamic batch and number of points."""
     sizes = {0: Dim("B", min=1), 1: Dim("N", min=2)}
     shapes = {name: {0: sizes[0]} if name == "null_matrix" else sizes for name in example}
-    with _quiet_exporter():
-        return torch.onnx.export(
-            copy.deepcopy(network).float().cpu().eval(),
-            (),
-            kwargs=example,
-            dynamo=True,
-            verbose=False,
-            input_names=[*example],
-            output_names=outputs,
-            dynamic_shapes=shapes,
-        )
-
-
-@contextmanager
-def _quiet_exporter() -> Iterator[None]:
-    """Silence the exporter, which reports every package that it would also support and warns of its own calls."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
-    logger.setLevel(logging.ERROR)
+    logger.setLevel(logging.ERROR)  # it reports every package that it would also support, and warns of its own calls
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            return torch.onnx.export(
+                copy.deepcopy(network).float().cpu().eval(),
+                (),
+                kwargs=example,
+                dynamo=True,
+                verbose=False,
+                input_names=[*example],
+                output_names=outputs,
+                dynamic_shapes=shapes,
+            )
     finally:
         logger.setLevel(level)

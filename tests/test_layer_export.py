@@ -10,8 +10,8 @@ import pytest
 import torch
 from scenes import correspondences, shaken, shaken_estimator, signless, small, up_to_sign
 
-from kornia_learnnorm import CrossViewNetwork, EightPoint, LearnedEightPoint, LearnedNormalizer, PaperNetwork, Whitening
-from kornia_learnnorm.export import export_layer, export_networks, load_layer
+from kornia_learnnorm import CrossViewNetwork, EightPoint, LearnedEightPoint, LearnedNormalizer, Whitening
+from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 from kornia_learnnorm.pretrained import shipped_weights
 
 SIZES = [(1, 9), (5, 9), (5, 64), (1, 300)]
@@ -72,17 +72,9 @@ def check_without_the_package(program, cases, folder) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.fixture(scope="module")
-def layer():
-    return shaken_estimator(stages=1, depth=1, refine_steps=1)
-
-
-@pytest.fixture(scope="module")
-def program(layer):
-    return export_layer(layer, ["mask", "scores"])
-
-
-def test_any_batch_and_number_of_points_also_without_the_package(layer, program, tmp_path):
+def test_any_batch_and_number_of_points_also_without_the_package(tmp_path):
+    layer = shaken_estimator(stages=1, depth=1, refine_steps=1)
+    program = export_layer(layer, ["mask", "scores"])
     run, cases = program.module(), []
     for points, given in (masked_sets(*size) for size in SIZES):
         check(run, layer, *points, **given)
@@ -94,18 +86,18 @@ def test_any_batch_and_number_of_points_also_without_the_package(layer, program,
     check_without_the_package(tmp_path / "layer.pt2", cases, tmp_path)
     with pytest.raises(AssertionError, match=r"points1.size\(\)\[1\] >= 9"):
         run(*sets(2, 8), mask=torch.ones(2, 8, dtype=torch.bool), scores=torch.ones(2, 8))
+    (points1, points2), given = masked_sets(2, 20)
+    assert not any(value.requires_grad for value in run(points1.requires_grad_(), points2, **given))
 
 
 def check_gradients_of_program(program, layer, *points, **given) -> None:
     points = [value.clone().requires_grad_() for value in points]
-    calls = (program, lambda *values, **given: layer.estimate(*values, **given))
+    calls = program, layer.estimate
     found = [torch.autograd.grad(signless(call(*points, **given)[0]).sum(), points) for call in calls]
     torch.testing.assert_close(*found, rtol=1e-3, atol=1e-6)
 
 
-def test_gradients_of_sets(program):
-    (points1, points2), given = masked_sets(2, 20)
-    assert not any(value.requires_grad for value in program.module()(points1.requires_grad_(), points2, **given))
+def test_gradients_of_sets():
     layer = EightPoint(Whitening())
     check_gradients_of_program(export_layer(layer, gradients=True).module(), layer, *sets(3, 20))
 
@@ -157,7 +149,6 @@ class TestNetworks:
             pytest.importorskip(name, reason=f"{name} is not installed")
 
     def check(self, program, network, example):
-        """Check that ONNX Runtime answers as the network does."""
         import onnxruntime
 
         run = onnxruntime.InferenceSession(program.model_proto.SerializeToString(), providers=["CPUExecutionProvider"])
@@ -168,6 +159,8 @@ class TestNetworks:
             torch.testing.assert_close(torch.from_numpy(got), value, rtol=1e-4, atol=1e-4)
 
     def test_stages(self):
+        with pytest.raises(ValueError, match="no network: its normaliser is Hartley"):
+            export_networks(EightPoint())
         layer = shaken_estimator(depth=1)
         programs = export_networks(layer)
         assert [*programs] == ["stage1", "stage2"]
@@ -176,23 +169,17 @@ class TestNetworks:
                 example = {"features": torch.randn(*size, features), "absent": torch.rand(size) < 0.2}
                 self.check(program, network, example)
 
-    @pytest.mark.parametrize("name", ["crossview", "paper"])
-    def test_network_of_a_normaliser(self, name):
+    def test_network_of_a_normaliser(self):
         """The layer stays as it is, in training and float64."""
-        network = PaperNetwork(8, 2, num_parameters=5) if name == "paper" else CrossViewNetwork(width=8, depth=1)
+        network = CrossViewNetwork(width=8, depth=1)
         layer = EightPoint(shaken(LearnedNormalizer(network=network))).double().train()
         (program,) = export_networks(layer).values()
         assert layer.training
         assert next(layer.parameters()).dtype == torch.float64
         for batch_size, num_points in [(1, 8), (5, 12)]:
             example = {key: torch.randn(batch_size, num_points, 2) for key in ("points1", "points2")}
-            if name == "crossview":
-                example["null_matrix"] = torch.nn.functional.normalize(torch.randn(batch_size, 3, 3), dim=(1, 2))
+            example["null_matrix"] = torch.nn.functional.normalize(torch.randn(batch_size, 3, 3), dim=(1, 2))
             self.check(program, layer.float().eval().normalizer.network, example)
-
-    def test_a_layer_without_network(self):
-        with pytest.raises(ValueError, match="no network: its normaliser is Hartley"):
-            export_networks(EightPoint())
 
 
 def test_wrong_arguments():
