@@ -32,8 +32,6 @@ CONFIGS = sorted(path for path in FOLDER.glob("*.yaml") if path.stem not in (*OF
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 SMALL += ["--trainer.num_sanity_val_steps=0"]
 NETWORK = "model.estimator.init_args.normalizer.init_args.network.init_args"
-SMALL_PAPER_NETWORK = [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
-
 BASES = ("base", "paper-base", "reduction-log")  # what is no overlay of ablations/base
 
 
@@ -47,12 +45,10 @@ PAPER_BASE = [FOLDER / "paper-short.yaml", FOLDER / "ablations/paper-base.yaml"]
 PAPER = {f"paper-{path.stem}": [*PAPER_BASE, path] for path in (FOLDER / "ablations").glob("loss-[as]*.yaml")}
 PAPER["paper-reduction-log"] = [*PAPER_BASE, FOLDER / "ablations/reduction-log.yaml"]
 ABLATIONS = overlays("ablations", "ablations/base") | PAPER
-LAYER = {
-    f"layer-{name}": files for name, files in overlays("ablations/layer", "robust", "ablations/layer/base").items()
-}
-TABLE1 = overlays("table1", "crossview") | {
-    name: files for name, files in overlays("table1", "paper-short").items() if name.startswith("paper")
-}
+OF_LAYER = overlays("ablations/layer", "robust", "ablations/layer/base")
+LAYER = {f"layer-{name}": files for name, files in OF_LAYER.items()}
+OF_PAPER = overlays("table1", "paper-short").items()
+TABLE1 = overlays("table1", "crossview") | {name: files for name, files in OF_PAPER if name.startswith("paper")}
 RUNS = {path.stem: [path] for path in CONFIGS} | ABLATIONS | TABLE1
 RUNS |= {"base": [FOLDER / "ablations/base.yaml"], "paper-base": PAPER_BASE}
 TRAINED = ("crossview", "paper", "crossview-synthetic", "transform-paper", "paper-loss-algebraic", "crossview-both")
