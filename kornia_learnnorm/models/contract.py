@@ -98,6 +98,10 @@ class TwoViewModel(Residuals):
     # The constraint
 
     @abstractmethod
+    def swap(self, M: Tensor) -> Tensor:
+        """Return the matrices of the swapped views."""
+
+    @abstractmethod
     def constrain(self, M: Tensor) -> Tensor:
         """Return the nearest matrices in Frobenius norm that meet the model's constraint."""
 

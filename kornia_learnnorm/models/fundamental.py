@@ -75,6 +75,10 @@ class Fundamental(TwoViewModel):
         r"""Return :math:`T_2^\top F T_1`."""
         return T2.mT @ M @ T1
 
+    def swap(self, M: Tensor) -> Tensor:
+        r"""Return :math:`F^\top`."""
+        return M.mT
+
     def constrain(self, M: Tensor) -> Tensor:
         """Return the nearest matrices of rank 2."""
         return nearest_rank2(M)

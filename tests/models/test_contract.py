@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from scenes import uniform
+from scenes import correspondences, uniform, up_to_sign
 from torch.autograd import gradcheck
 from torch.nn.functional import normalize, one_hot
 
@@ -14,7 +14,9 @@ from kornia_learnnorm import RANSAC, GemanMcClure, LearnedEightPoint, Whitening
 from kornia_learnnorm.estimators.learned import LearnedLayer
 from kornia_learnnorm.estimators.linear import LinearLayer
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
+from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.fundamental import Fundamental
 
 
 class UnitMatrix(NamedTuple):
@@ -52,6 +54,9 @@ class ToyHomography(TwoViewModel):
 
     def carry(self, M, T1, T2):
         return torch.linalg.solve(T2, M @ T1)
+
+    def swap(self, M):
+        return torch.linalg.inv(M)
 
     def constrain(self, M):
         return M
@@ -100,6 +105,15 @@ def test_linear_layer(number, normalizer):
     line.requires_grad_()
     layer(line, line).sum().backward()
     assert line.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("model", [ToyHomography(), Fundamental()], ids=["toy", "fundamental"])
+def test_swap(model):
+    points = plane(noise=0.2)[:2] if model.name == "toy" else correspondences("handheld", 3, 40)
+    layer = LinearLayer(model)
+    largest = 2e-2 if model.name == "toy" else 1e-9  # the toy measures errors in view 2 alone
+    assert up_to_sign(unit_matrix(model.swap(layer(*points))), layer(*reversed(points))) < largest
+    assert up_to_sign(unit_matrix(model.swap(model.swap(layer(*points)))), layer(*points)) < 1e-9
 
 
 def test_minimizer():
