@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from pairs import Pairs, SetNetwork, load_pairs, parse
+from pair_data import Pairs, SetNetwork, load_pairs, parse
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.metrics.inliers import f1_score

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from kornia.geometry import RANSAC
-from pairs import Pairs, load_pairs
+from pair_data import Pairs, load_pairs
 from torch import Tensor
 
 import kornia_learnnorm as kln

@@ -212,7 +212,7 @@ class TestSignals:
         args = ["match", "folder", images, "--out", out, "--jobs", "2", "--num-features", "200", "--max-matches", "30"]
         stopped = [sys.executable, "-c", STOPPED, *map(str, args)]
         run = subprocess.run(stopped, capture_output=True, text=True, timeout=120, start_new_session=True)
-        assert len(list(parts.glob("0*.h5"))) == 8
+        assert len(list(parts.glob("0*.h5"))) == 8, run.stderr
         assert not out.exists()
         assert run.returncode == 130
         error = re.sub(JOBLIB, "", run.stderr)
