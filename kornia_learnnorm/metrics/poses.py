@@ -21,7 +21,7 @@ __all__ = ["mean_average_accuracy", "pose_auc", "pose_error", "rotation_error", 
 
 
 def rotation_error(R: Tensor, R_true: Tensor) -> Tensor:
-    r"""Return the angle between rotations :math:`(*, 3, 3)`, degrees from 0 to 180, :math:`(*)`; NaN where a rotation is.
+    r"""Return the angle between rotations :math:`(*, 3, 3)`, degrees from 0 to 180; NaN where a rotation is.
 
     :math:`\operatorname{atan2}(\|\Delta - \Delta^\top\|_F / \sqrt 2, \operatorname{tr} \Delta - 1)` of
     :math:`\Delta = R R_{true}^\top`; an arc cosine of the trace would lose half of the digits near 0 and 180.
