@@ -95,11 +95,11 @@ class TwoViewModel(Residuals):
     def carry(self, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
         """Return the matrices of points from matrices of points after the transforms T1 and T2."""
 
-    # The constraint
-
     @abstractmethod
     def swap(self, M: Tensor) -> Tensor:
         """Return the matrices of the swapped views."""
+
+    # The constraint
 
     @abstractmethod
     def constrain(self, M: Tensor) -> Tensor:
