@@ -30,7 +30,6 @@ CORE = set().union(*FLOORS[:6])
 CORE_NEEDS = {"filelock", "kornia", "kornia_learnnorm", "numpy", "safetensors", "torch", *sys.stdlib_module_names}
 # cli/main.py names Lightning only to say which extra brings it.
 PLACES = {"argparse": {"cli"}, "pytorch_lightning": {"lightning_modules", "cli"}}
-EXTRA = {"kornia_learnnorm.metrics.modules": {"torchmetrics"}}
 HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "tabulate"]
 HEAVY += ["bokeh", "huggingface_hub"]
 
@@ -88,7 +87,7 @@ def test_imports_point_one_way():
 def test_libraries_have_their_place():
     needs = [(importer, name.partition(".")[0]) for importer, name in all_imports()]
     core = [(importer, library) for importer, library in needs if room_of(importer) in CORE]
-    assert [pair for pair in core if pair[1] not in CORE_NEEDS | EXTRA.get(pair[0], set())] == []
+    assert [pair for pair in core if pair[1] not in CORE_NEEDS] == []
     assert [pair for pair in needs if pair[1] in PLACES and room_of(pair[0]) not in PLACES[pair[1]]] == []
 
 

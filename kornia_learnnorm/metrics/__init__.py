@@ -1,1 +1,1 @@
-"""Metrics of estimates: better rate, pairs, poses, and their torchmetrics modules."""
+"""Metrics of estimates: better rate, pairs and poses."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-__all__ = ["BetterRate", "better_rate", "comparable", "count_better"]
+__all__ = ["BetterRate", "better_rate", "comparable"]
 
 
 class BetterRate(NamedTuple):
@@ -37,18 +37,14 @@ def better_rate(residual: Tensor, baseline: Tensor) -> BetterRate:
         BetterRate(rate=0.333..., ties=1, degenerate=0, compared=3)
 
     """
-    better, ties, compared = (int(count) for count in count_better(residual, baseline))
-    if compared == 0:
-        raise ValueError(f"none of {len(residual)} samples can be compared")
-    return BetterRate(better / compared, ties, len(residual) - compared, compared)
-
-
-def count_better(residual: Tensor, baseline: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return how many residuals (S,) are below the baseline's, how many equal them and how many can be compared."""
     if residual.shape != baseline.shape or residual.ndim != 1:
         raise ValueError(f"residuals must be two (S,) tensors, got {[*residual.shape]} and {[*baseline.shape]}")
     valid = comparable(residual, baseline)
-    return (residual < baseline)[valid].sum(), (residual == baseline)[valid].sum(), valid.sum()
+    compared = int(valid.sum())
+    if compared == 0:
+        raise ValueError(f"none of {len(residual)} samples can be compared")
+    better, ties = (int(kind[valid].sum()) for kind in (residual < baseline, residual == baseline))
+    return BetterRate(better / compared, ties, len(residual) - compared, compared)
 
 
 def comparable(residual: Tensor, baseline: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["PairedDifference", "bootstrap_interval", "bootstrap_means", "paired_bootstrap", "percentile_interval"]
+__all__ = ["PairedDifference", "bootstrap_interval", "paired_bootstrap"]
 
 
 def bootstrap_interval(
@@ -39,17 +39,17 @@ def bootstrap_interval(
         (0.0, 1.0)
 
     """
-    return percentile_interval(bootstrap_means(values, groups, draws, seed), level)
+    return _middle(_means(values, groups, draws, seed), level)
 
 
-def percentile_interval(means: Tensor, level: float = 0.95) -> tuple[float, float]:
+def _middle(means: Tensor, level: float) -> tuple[float, float]:
     """Return the lower and upper end of the middle share ``level`` of a bootstrap's draws."""
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1, got {level}")
     return means.quantile((1 - level) / 2).item(), means.quantile((1 + level) / 2).item()
 
 
-def bootstrap_means(values: Tensor, groups: Tensor, draws: int = 2000, seed: int = 0) -> Tensor:
+def _means(values: Tensor, groups: Tensor, draws: int, seed: int) -> Tensor:
     """Return the mean over the samples (S,) of each draw of whole groups with replacement, (draws,) float64."""
     if values.shape != groups.shape or values.ndim != 1:
         raise ValueError(f"values and groups must be two (S,) tensors, got {[*values.shape]} and {[*groups.shape]}")
@@ -91,7 +91,7 @@ def paired_bootstrap(
     bad = int((~difference.isfinite()).sum())
     if bad:
         raise ValueError(f"differences must be finite, got {bad} NaN or infinite ones of {len(difference)}")
-    means = bootstrap_means(difference, groups, draws, seed)
-    low, high = percentile_interval(means, level)
+    means = _means(difference, groups, draws, seed)
+    low, high = _middle(means, level)
     fewest = min(int((means <= 0).sum()), int((means >= 0).sum()))
     return PairedDifference(difference.mean().item(), low, high, min(1.0, 2 * (1 + fewest) / (1 + draws)))

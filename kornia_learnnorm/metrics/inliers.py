@@ -19,15 +19,12 @@ from math import inf
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_mask
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["epipolar_error", "f1_from_masks", "f1_score", "finite_distance", "inlier_share"]
 
 
-def inlier_share(
-    points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, mask: Tensor | None = None
-) -> Tensor:
+def inlier_share(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float) -> Tensor:
     r"""Return the share of correspondences that agree with an estimate, "% inliers" over 100.
 
     :math:`|\{i : d_i(F) < \tau\}| / N`, strict, with :math:`d` of Fan et al., Eq. 7.
@@ -37,15 +34,14 @@ def inlier_share(
         points2: pixels in the second images with shape :math:`(*, N, 2)`.
         F_mat: estimated fundamental matrices with shape :math:`(*, 3, 3)`, any scale.
         threshold: symmetric epipolar distance :math:`\tau` that an inlier stays below, pixels.
-        mask: true for the correspondences of a padded batch that count, boolean with shape :math:`(*, N)`.
 
     Returns:
         shares with shape :math:`(*)`; zero for a failed estimate, NaN for a pair without correspondences.
 
     Raises:
-        TypeError: if a tensor is not floating-point, dtypes differ, or the mask is not boolean.
+        TypeError: if a tensor is not floating-point or dtypes differ.
         ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up, the mask does not fit them, or the threshold is not positive.
+        ValueError: if the points do not pair up or the threshold is not positive.
 
     Example:
         >>> F_mat = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # lines are rows
@@ -54,14 +50,10 @@ def inlier_share(
         tensor(0.5000)
 
     """
-    inliers = _inliers(points1, points2, F_mat, threshold, mask)
-    total = torch.ones_like(inliers) if mask is None else mask
-    return inliers.sum(-1).to(points1.dtype) / total.sum(-1)
+    return _inliers(points1, points2, F_mat, threshold).to(points1.dtype).mean(-1)
 
 
-def f1_score(
-    points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tensor, threshold: float, mask: Tensor | None = None
-) -> Tensor:
+def f1_score(points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tensor, threshold: float) -> Tensor:
     r"""Return the harmonic mean of precision and recall between the inliers of an estimate and of the ground truth.
 
     :math:`2 |A \cap B| / (|A| + |B|)` with :math:`A = \{i : d_i(F) < \tau\}` and the same :math:`B` of the true matrix.
@@ -71,7 +63,7 @@ def f1_score(
     Returns:
         scores with shape :math:`(*)`; zero where the sets do not meet, NaN where the ground truth has no inliers.
     """
-    masks = (_inliers(points1, points2, matrix, threshold, mask) for matrix in (F_mat, F_true))
+    masks = (_inliers(points1, points2, matrix, threshold) for matrix in (F_mat, F_true))
     return f1_from_masks(*masks).to(points1.dtype)
 
 
@@ -81,16 +73,14 @@ def f1_from_masks(inliers: Tensor, true: Tensor) -> Tensor:
     return torch.where(true.any(-1), 2 * both / either, torch.nan)
 
 
-def epipolar_error(
-    points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tensor, threshold: float = 1.0, mask: Tensor | None = None
-) -> Tensor:
+def epipolar_error(points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tensor, threshold: float = 1.0) -> Tensor:
     r"""Return the mean symmetric epipolar distance of the ground truth's inliers under an estimate, in pixels.
 
     :math:`\frac{1}{|B|} \sum_{i \in B} d_i(F)` with :math:`B = \{i : d_i(F_{true}) < \tau\}`, whatever threshold the
     other metrics are taken at. The arguments and errors are those of :func:`f1_score`. The errors, :math:`(*)`, are
     infinite for a failed estimate and NaN where the ground truth has no inliers.
     """
-    true = _inliers(points1, points2, F_true, threshold, mask)
+    true = _inliers(points1, points2, F_true, threshold)
     distance = finite_distance(points1, points2, F_mat)
     return torch.where(true, distance, 0.0).sum(-1) / true.sum(-1)
 
@@ -100,11 +90,7 @@ def finite_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
     return symmetric_epipolar_distance(points1, points2, F_mat).nan_to_num(nan=inf, posinf=inf)
 
 
-def _inliers(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, mask: Tensor | None) -> Tensor:
+def _inliers(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float) -> Tensor:
     if not threshold > 0:
         raise ValueError(f"threshold must be positive, got {threshold}")
-    inliers = finite_distance(points1, points2, F_mat) < threshold
-    if mask is None:
-        return inliers
-    check_mask(mask, points1, points2)
-    return inliers & mask
+    return finite_distance(points1, points2, F_mat) < threshold

@@ -14,21 +14,11 @@ NUMBERS = st.sampled_from([0.0, 0.5, 1.0, 2.0, INF, NAN])
 
 
 class TestBetterRate:
-    @pytest.mark.parametrize(
-        ("residual", "baseline", "expected"),
-        [
-            ([1.0, 2.0, 3.0, 4.0], [2.0, 1.0, 4.0, 5.0], (0.75, 0, 0, 4)),
-            ([1.0, 2.0], [1.0, 2.0], (0.0, 2, 0, 2)),  # ties are not better
-            ([0.0, 0.0, 1.0], [0.0, 1.0, 0.0], (1 / 3, 1, 0, 3)),
-            ([1.0, NAN, 1.0, NAN], [2.0, 1.0, NAN, NAN], (1.0, 0, 3, 1)),
-            ([INF, 1.0, INF], [1.0, INF, INF], (0.5, 0, 1, 2)),  # one infinite residual is worse than any other
-            ([-INF, NAN, 1.0], [1.0, INF, 2.0], (1.0, 0, 1, 2)),
-        ],
-    )
-    def test_by_hand(self, residual, baseline, expected, dtype, device):
-        tensors = (torch.tensor(values, dtype=dtype, device=device) for values in (residual, baseline))
-        found = better_rate(*tensors)
-        assert found == BetterRate(*expected)
+    def test_by_hand(self, dtype, device):
+        """Ties are not better, one infinite residual is worse than any other, two and NaN are left out."""
+        values = [[1.0, 2.0, 2.0, INF, 1.0, NAN, INF, 1.0], [2.0, 1.0, 2.0, 1.0, INF, 1.0, INF, NAN]]
+        found = better_rate(*torch.tensor(values, dtype=dtype, device=device))
+        assert found == BetterRate(2 / 5, 1, 3, 5)
         assert [type(value) for value in found] == [float, int, int, int]
 
     @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=30))

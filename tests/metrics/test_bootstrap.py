@@ -1,8 +1,6 @@
-"""The bootstrap against another one and against the normal law, alone and of paired differences."""
+"""The bootstrap against another one, alone and of paired differences."""
 
 from __future__ import annotations
-
-from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -46,26 +44,11 @@ class TestBootstrapInterval:
         found = interval(values, groups, level=level, draws=4000)
         np.testing.assert_allclose(found, expected, atol=0.2 * np.std(means))
 
-    @pytest.mark.parametrize("level", [0.5, 0.9, 0.99])
-    def test_independent_samples_follow_the_normal_law(self, level):
-        values = np.random.default_rng(2).normal(3, 2, 200)
-        error = values.std() / np.sqrt(200)
-        end = NormalDist().inv_cdf((1 + level) / 2) * error
-        found = interval(values, np.arange(200), level=level, draws=4000)
-        np.testing.assert_allclose(found, values.mean() + np.array([-end, end]), atol=0.2 * error)
-
     def test_all_draws_of_two_groups(self):
         """Twice the first, one of each in either order, twice the second: a quarter, a half, a quarter."""
         values, groups = [1.0, 1.0, 1.0, 0.0], [5, 5, 5, 2]
         for level, expected in [(0.4, (0.75, 0.75)), (0.6, (0.0, 1.0))]:
             assert bootstrap_interval(torch.tensor(values), torch.tensor(groups), level) == expected
-
-    def test_agreement_within_pairs_widens_it(self):
-        """Eight equal samples are worth one: the interval is wider by the root of eight."""
-        values, groups = np.repeat(np.random.default_rng(3).normal(size=100), 8), np.repeat(np.arange(100), 8)
-        mixed = np.random.default_rng(4).permutation(values)
-        widths = [np.ptp(interval(v, groups, draws=4000)) for v in (values, mixed)]
-        assert widths[0] / widths[1] == pytest.approx(np.sqrt(8), rel=0.2)
 
     def test_seed_decides(self):
         values, groups = uneven_groups()
@@ -81,13 +64,6 @@ class TestBootstrapInterval:
         found = interval(values[order], groups[order], draws=200)
         np.testing.assert_allclose(found, interval(values, groups, draws=200), rtol=1e-12)
 
-    def test_labels_of_the_groups_do_not_matter(self):
-        """In the same order they give the same draws, in another order other draws of the same law."""
-        values, groups = uneven_groups()
-        expected = interval(values, groups, draws=4000)
-        assert (interval(values, 7 * groups - 100, draws=4000) == expected).all()
-        np.testing.assert_allclose(interval(values, 39 - groups, draws=4000), expected, atol=0.05 * np.ptp(expected))
-
     @given(st.lists(st.tuples(st.floats(-1e3, 1e3), st.integers(0, 4)), min_size=2, max_size=20), st.floats(0.01, 0.99))
     def test_lies_among_the_values(self, pairs, level):
         values, groups = torch.tensor([a for a, _ in pairs], dtype=torch.float64), torch.tensor([b for _, b in pairs])
@@ -95,13 +71,6 @@ class TestBootstrapInterval:
             groups[0] += 1
         low, high = bootstrap_interval(values, groups, level, draws=50)
         assert values.min() - 1e-9 <= low <= high <= values.max() + 1e-9
-
-    @pytest.mark.parametrize("kind", [torch.bool, torch.int64, torch.float32])
-    def test_kinds_of_numbers(self, kind):
-        values, groups = torch.tensor([1, 0, 0, 1, 1, 0]), torch.tensor([0, 0, 1, 1, 2, 3])
-        found = bootstrap_interval(values.to(kind), groups)
-        assert found == bootstrap_interval(values.double(), groups)
-        assert [type(end) for end in found] == [float, float]
 
     @pytest.mark.parametrize(
         ("values", "groups", "level", "message"),
@@ -135,11 +104,6 @@ class TestPairedBootstrap:
         assert found.mean == pytest.approx((values - baseline).mean())
         assert found.p_value == pytest.approx(2 * min((means <= 0).mean(), (means >= 0).mean()), abs=0.03)
 
-    def test_interval_is_that_of_the_differences(self):
-        values, baseline, groups = map(torch.tensor, uneven(0.2))
-        found = paired_bootstrap(values, baseline, groups, level=0.9, draws=500, seed=3)
-        assert found[1:3] == bootstrap_interval(values - baseline, groups, 0.9, 500, 3)
-
     @given(st.floats(-1.5, 1.5), st.integers(0, 99))
     def test_small_exactly_where_the_interval_leaves_zero_out(self, effect, seed):
         values, baseline, groups = map(torch.tensor, uneven(effect, seed=seed))
@@ -167,7 +131,6 @@ class TestPairedBootstrap:
     @pytest.mark.parametrize(
         ("values", "baseline", "groups", "message"),
         [
-            (torch.rand(3), torch.rand(4), torch.arange(3), r"two \(S,\) tensors, got \[3\] and \[4\]"),
             (torch.rand(3, 1), torch.rand(3, 1), torch.arange(3), r"two \(S,\) tensors, got \[3, 1\]"),
             (torch.rand(3), torch.rand(3), torch.arange(4), r"got \[3\] and \[4\]"),
             (torch.rand(3), torch.rand(3), torch.zeros(3).long(), "at least two groups are needed, got 1"),

@@ -15,7 +15,7 @@ from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_sh
 INF, NAN = float("inf"), float("nan")
 ROWS = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]], dtype=torch.float64)  # y1 - y2
 METRICS = {
-    "share": lambda points1, points2, F, true, threshold, mask=None: inlier_share(points1, points2, F, threshold, mask),
+    "share": lambda points1, points2, F, true, threshold: inlier_share(points1, points2, F, threshold),
     "f1": f1_score,
     "error": epipolar_error,
 }
@@ -63,15 +63,6 @@ class TestAll:
         np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9)
         assert len(set(expected)) > 1
 
-    def test_mask_leaves_out(self, name):
-        points1, points2, F, true = pairs()
-        mask = torch.rand(points1.shape[:2], generator=torch.Generator().manual_seed(0)) < 0.7
-        points1[~mask] = NAN  # what pads a batch does not matter
-        found = METRICS[name](points1, points2, F, true, 1.0, mask=mask)
-        for k, keep in enumerate(mask):
-            alone = METRICS[name](points1[k, keep], points2[k, keep], F[k], true[k], 1.0)
-            np.testing.assert_allclose(found[k].numpy(), alone.numpy(), rtol=1e-12)
-
     @given(seed=st.integers(0, 2**31), scale=st.floats(0.01, 100), factor=st.sampled_from([-1.0, 1e-9, -3.0, 1e9]))
     def test_what_does_not_matter(self, name, seed, scale, factor):
         """The order, which view is first, the unit of the pixels, scale and sign of the matrices."""
@@ -98,8 +89,6 @@ class TestAll:
     def test_no_correspondences(self, name):
         points1, points2, F, true = pairs()
         assert METRICS[name](points1[:, :0], points2[:, :0], F, true, 1.0).isnan().all()
-        nothing = torch.zeros(points1.shape[:2], dtype=torch.bool)
-        assert METRICS[name](points1, points2, F, true, 1.0, mask=nothing).isnan().all()
 
     @pytest.mark.parametrize(
         ("change", "error", "message"),
@@ -110,9 +99,6 @@ class TestAll:
             (lambda a, b, F, true: (a[..., :1], b, F, true), ShapeError, "."),
             (lambda a, b, F, true: (a, b, F[:, :2], true[:, :2]), ShapeError, "."),
             *((lambda *p, t=t: (*p, t), ValueError, f"must be positive, got {t}") for t in (0.0, -1.0, NAN)),
-            (lambda *p: (*p, 1.0, torch.ones(6, 40)), TypeError, "mask must be a boolean tensor, got torch.float32"),
-            (lambda *p: (*p, 1.0, [True]), TypeError, "mask must be a boolean tensor, got <class 'list'>"),
-            (lambda *p: (*p, 1.0, torch.ones(6, 39).bool()), ValueError, r"\[6, 40\] as points1, got \[6, 39\]"),
         ],
     )
     def test_exceptions(self, name, change, error, message):
@@ -144,14 +130,3 @@ class TestByRows:
         points = self.points(0.0, 0.5, 0.75, 1.0, 40.0)
         assert epipolar_error(*points, ROWS, ROWS).item() == pytest.approx(1.25 / 3)
         assert epipolar_error(*points, ROWS, ROWS, threshold=1.5).item() == pytest.approx(2.25 / 4)
-
-    @pytest.mark.parametrize("true", [ROWS, torch.full_like(ROWS, NAN)], ids=["no inliers", "unknown"])
-    def test_pairs_to_drop(self, true):
-        points = self.points(3.0, 4.0)
-        assert f1_score(*points, ROWS, true, 1.0).isnan().all()
-        assert epipolar_error(*points, ROWS, true).isnan().all()
-        assert inlier_share(*points, ROWS, 1.0).item() == 0.0
-
-    def test_a_point_on_an_epipole_is_no_inlier(self):
-        F = torch.tensor([[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
-        assert inlier_share(torch.zeros(1, 1, 2), torch.ones(1, 1, 2), F, 1e9).item() == 0.0
