@@ -2,8 +2,6 @@ r"""The per-sample optimum of the normalisation: how far any normaliser could go
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
@@ -18,13 +16,16 @@ from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = ["SearchedNormalizer"]
 
+NUM_PARAMETERS = 5  # of each view, as spd_transform takes them
 MAX_PARAMETER = 3.0  # beyond it rounding errors of F would pass for gains
+LEARNING_RATE = 0.1  # length of the first step; it falls to zero as half a cosine
 
 
 class SearchedNormalizer(ProblemNormalizer):
     r"""Search each sample's transforms by gradient descent on its own symmetric epipolar distance.
 
-    :math:`T_i = B(p_i)\, T_i^{base}` with parameters :math:`p_i` for every sample, which start at zero. Adam lowers the
+    :math:`T_i = B(p_i)\, T_i^{base}` with five parameters :math:`p_i` of
+    :func:`~kornia_learnnorm.geometry.transforms.spd_transform` for every sample, which start at zero. Adam lowers the
     logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters of all steps are kept, so that no sample
     ends above its base. They stay within plus and minus 3: beyond, rounding errors of :math:`F` would pass for gains.
 
@@ -33,30 +34,17 @@ class SearchedNormalizer(ProblemNormalizer):
 
     Args:
         base: normaliser to start from; :class:`~kornia_learnnorm.ReweightedWhitening` when not given.
-        transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
-        num_parameters: parameters per view :math:`P`, as the builder wants them.
         steps: steps of the search.
-        learning_rate: first step length; it falls to zero as half a cosine.
     """
 
     min_points = 8
 
-    def __init__(
-        self,
-        base: nn.Module | None = None,
-        transform: Callable[[Tensor], Tensor] = spd_transform,
-        num_parameters: int = 5,
-        steps: int = 100,
-        learning_rate: float = 0.1,
-    ) -> None:
+    def __init__(self, base: nn.Module | None = None, steps: int = 100) -> None:
         super().__init__()
-        if steps < 1 or learning_rate <= 0:
-            raise ValueError(f"steps and learning_rate must be positive, got {steps} and {learning_rate}")
+        if steps < 1:
+            raise ValueError(f"steps must be positive, got {steps}")
         self.base: Normalizer = ReweightedWhitening() if base is None else base
-        self.transform = transform
-        self.num_parameters = num_parameters
         self.steps = steps
-        self.learning_rate = learning_rate
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views, without gradient."""
@@ -68,22 +56,22 @@ class SearchedNormalizer(ProblemNormalizer):
                 T1, T2 = (T.to(problem.x1) for T in transforms_of(self.base, problem))
             with torch.enable_grad():
                 params1, params2 = self._search(problem, T1, T2)
-        return self.transform(params1) @ T1, self.transform(params2) @ T2
+        return spd_transform(params1) @ T1, spd_transform(params2) @ T2
 
     def extra_repr(self) -> str:
         """Return the parameters."""
-        return f"num_parameters={self.num_parameters}, steps={self.steps}, learning_rate={self.learning_rate:g}"
+        return f"steps={self.steps}"
 
     def _search(self, problem: LinearProblem, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best parameters met, ``(B, P)`` of each view."""
         x1, x2, w = problem.points1, problem.points2, problem.weights
-        free = x1.new_zeros(2, len(x1), self.num_parameters, requires_grad=True)
+        free = x1.new_zeros(2, len(x1), NUM_PARAMETERS, requires_grad=True)
         best, least = torch.zeros_like(free), x1.new_full((len(x1),), torch.inf)
-        optimizer = torch.optim.Adam([free], lr=self.learning_rate)
+        optimizer = torch.optim.Adam([free], lr=LEARNING_RATE)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
         for _ in range(self.steps):
             params = MAX_PARAMETER * torch.tanh(free / MAX_PARAMETER)
-            F_mat = solve_in_coordinates(problem, self.transform(params[0]) @ T1, self.transform(params[1]) @ T2)
+            F_mat = solve_in_coordinates(problem, spd_transform(params[0]) @ T1, spd_transform(params[1]) @ T2)
             distance = weighted_mean(symmetric_epipolar_distance(x1, x2, F_mat)[..., None], w)[:, 0]
             better = distance.detach() < least
             least = torch.where(better, distance.detach(), least)

@@ -10,6 +10,8 @@ import pytest
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.evaluation.robust import robust_estimators
+from kornia_learnnorm.evaluation.robust.robust_run import shuffled_pair
 from kornia_learnnorm.evaluation.runs import example
 
 METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
@@ -67,7 +69,9 @@ def robust_command(robust_store):
 def robust_run(robust_command, tmp_path_factory):
     """A run of robust estimators, not to be changed."""
     folder = tmp_path_factory.mktemp("runs") / "run"
-    assert main([*robust_command, str(folder)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robust_estimators, "MAX_SAMPLES", 200)
+        assert main([*robust_command, str(folder)]) == 0
     return folder
 
 
@@ -84,3 +88,14 @@ def robust_again(robust_copied, robust_command):
 @pytest.fixture
 def few_trials(monkeypatch):
     monkeypatch.setattr(example, "TRIALS", 20)
+
+
+@pytest.fixture
+def matches():
+    """Return a function that draws the correspondences of a synthetic image pair."""
+
+    def draw(noise=0.2, outliers=0.2, points=300):
+        store = synthetic_store(1, points, seed=3, noise=noise, outliers=outliers, scenes=["hand-held"])
+        return shuffled_pair(store, 0, "unfiltered", 0)
+
+    return draw

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from pairwise import pairwise
-from scenes import SCENES, correspondences, epipolar_distances, homogeneous, shaken, uniform
+from scenes import SCENES, correspondences, epipolar_distances, homogeneous, uniform
 from torch.autograd import gradcheck
 
 from kornia_learnnorm import Hartley, Identity, ReweightedWhitening, Whitening
@@ -36,13 +36,6 @@ def numpy_diagnose(points1, points2, T1, T2) -> np.ndarray:
         distances = [np.hypot(*x[:, :2].T).mean() for x in (x1, x2)]
         rows.append([np.sqrt(d[0] / d[7]), s[1] / s[2], *distances, 1 - before / after])
     return np.array(rows)
-
-
-@pytest.mark.parametrize("shape", [(), (0,), (2, 3)])
-def test_shapes(shape):
-    assert condition_number(uniform(*shape, 10, 9)).shape == shape
-    assert singularity_ratio(uniform(*shape, 3, 3)).shape == shape
-    assert normalized_distance(uniform(*shape, 8, 2), uniform(*shape, 3, 3)).shape == shape
 
 
 @pytest.mark.parametrize(
@@ -90,16 +83,6 @@ def test_of_a_diagonal(function, matrix, expected):
 
 
 class TestConditionNumber:
-    def test_the_null_vector_does_not_count(self):
-        """A ninth singular value does not change it, be it zero or nearly the eighth."""
-        Q = torch.linalg.qr(uniform(9, 9, low=-1))[0]
-        for last in (0.0, 0.5, 0.999):
-            s = torch.tensor([4.0, 3, 3, 3, 2, 2, 2, 1, last], dtype=torch.float64)
-            assert condition_number(Q * s @ Q.mT).item() == pytest.approx(4, abs=1e-12)
-
-    def test_lower_rank_is_infinite(self):
-        assert condition_number(torch.zeros(8, 9).index_fill(1, torch.tensor([2]), 1.0)).item() > 1e15
-
     @given(st.integers(0, 2**31), st.sampled_from([1e-6, -3.0, 1e6]))
     def test_scale_and_rotations_do_not_matter(self, seed, factor):
         A, Q = uniform(10, 9, low=-1, seed=seed), torch.linalg.qr(uniform(9, 9, low=-1, seed=seed + 1))[0]
@@ -113,15 +96,6 @@ class TestNormalizedDistance:
         # The first lands on (6, 8), the second on (0, 16), the third on the origin.
         assert normalized_distance(points, T).tolist() == pytest.approx([26 / 3])
         assert normalized_distance(points[0], T[0]).item() == pytest.approx(26 / 3)
-
-    @pytest.mark.parametrize("name", SCENES)
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_of_hartley_and_whitening(self, name, num_points):
-        """The mean square of whitening is two, so the mean is less than its root, Hartley's."""
-        points = correspondences(name, 20, num_points)
-        for p, T, W in zip(points, Hartley()(*points), Whitening()(*points), strict=True):
-            np.testing.assert_allclose(normalized_distance(p, T).numpy(), math.sqrt(2), rtol=1e-12)
-            assert (normalized_distance(p, W) < math.sqrt(2)).all()
 
 
 class TestDiagnose:
@@ -151,43 +125,6 @@ class TestDiagnose:
         points = correspondences("handheld", 50, noise=1.0)
         np.testing.assert_allclose(diagnose(*points, normalizer).rank2_share.numpy(), 1, atol=1e-6)
 
-    def test_more_points_leave_less_to_the_projection(self):
-        scenes = (correspondences("handheld", 200, n, noise=1.0) for n in (9, 20, 100))
-        means = [diagnose(*points, Hartley()).rank2_share.mean().item() for points in scenes]
-        assert 0.9 > means[0] > means[1] > means[2]
-
-    def test_any_normalizer_of_the_contract(self):
-        points, seen = correspondences("driving", 5), []
-
-        def doubled(points1, points2, weights):
-            seen.append((points1, points2, weights))
-            T = torch.diag(torch.tensor([2.0, 2.0, 1.0])).expand(5, 3, 3)  # float32
-            return T, T
-
-        found = diagnose(*points, doubled)
-        assert all(torch.equal(s, p) for s, p in zip(seen[0][:2], points, strict=True))
-        assert seen[0][2] is None
-        np.testing.assert_allclose(found.distance1.numpy(), 2 * points[0].norm(dim=-1).mean(1).numpy(), rtol=1e-12)
-
-    def test_float32_points(self):
-        points = [p.float() for p in correspondences("handheld", 5)]
-        single, double = (diagnose(*found, Hartley()) for found in (points, [p.double() for p in points]))
-        assert torch.equal(torch.stack(single), torch.stack(double))
-
-    @torch.no_grad()
-    def test_learned(self):
-        points, normalizer = correspondences("driving", 5, 20), shaken()
-        found = torch.stack(diagnose(*points, normalizer), 1).numpy()
-        np.testing.assert_allclose(found, numpy_diagnose(*points, *normalizer(*points)), rtol=1e-5)
-
-    @pytest.mark.parametrize("num_points", [8, 12])
-    def test_gradients_reach_the_points(self, num_points):
-        points = [p.requires_grad_() for p in correspondences("handheld", 3, num_points, noise=1.0)]
-        for values in diagnose(*points, Hartley())[:2]:
-            for gradient in torch.autograd.grad(values.log().sum(), points, retain_graph=True):
-                assert torch.isfinite(gradient).all()
-                assert gradient.count_nonzero() > 0
-
     @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.floats(-2, 2), st.randoms())
     def test_order_scale_and_shift_do_not_matter_to_hartley(self, seed, num_points, log_scale, random):
         """One scale for both views, which the sum of their distances asks for; the share has no unit."""
@@ -198,14 +135,6 @@ class TestDiagnose:
         torch.testing.assert_close(shuffled, expected, rtol=1e-6, atol=1e-6)
         moved = [10**log_scale * (p + o) for p, o in zip(points, shifts, strict=True)]
         torch.testing.assert_close(torch.stack(diagnose(*moved, Hartley())), expected, rtol=1e-5, atol=1e-5)
-
-    @given(st.integers(0, 2**31), st.sampled_from([8, 20]))
-    def test_swapped_views_swap_the_distances(self, seed, num_points):
-        points1, points2 = correspondences("handheld", 3, num_points, seed, noise=1.0)
-        found, swapped = (diagnose(*p, Whitening()) for p in ((points1, points2), (points2, points1)))
-        swapped = swapped._replace(distance1=swapped.distance2, distance2=swapped.distance1)
-        torch.testing.assert_close(torch.stack(swapped), torch.stack(found), rtol=1e-6, atol=1e-6)
-        assert not torch.allclose(found.distance1, found.distance2, rtol=1e-6)
 
     @pytest.mark.parametrize(
         ("points1", "normalizer", "message"),

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from pairwise import pairwise
 from scenes import SCENES, correspondences, eight_point, epipolar_distances, numpy_hartley, shaken, uniform
 
-from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening, find_fundamental
+from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
-from kornia_learnnorm.geometry.transforms import paper_transform, spd_transform
 
 BASES = {"hartley": Hartley(), "whitening": Whitening(), "reweighted": ReweightedWhitening(), "learned": shaken()}
 
@@ -45,10 +44,10 @@ def numpy_spd(params) -> np.ndarray:
     return T
 
 
-@pytest.mark.parametrize(("steps", "learning_rate"), [(0, 0.1), (-1, 0.1), (10, 0.0), (10, -1.0)])
-def test_exceptions(steps, learning_rate):
-    with pytest.raises(ValueError, match=f"must be positive, got {steps} and {learning_rate}"):
-        SearchedNormalizer(steps=steps, learning_rate=learning_rate)
+@pytest.mark.parametrize("steps", [0, -1])
+def test_exceptions(steps):
+    with pytest.raises(ValueError, match=f"steps must be positive, got {steps}"):
+        SearchedNormalizer(steps=steps)
 
 
 def test_one_step_is_exactly_the_base(dtype):
@@ -82,48 +81,6 @@ class TestSearch:
             T1, T2 = (numpy_spd(spread * random.normal(size=(1500, 5))) @ numpy_hartley(p[None])[0] for p in (p1, p2))
             p1, p2 = (p.expand(1500, 8, 2) for p in (p1, p2))
             assert least < epipolar_distances(p1, p2, eight_point(p1, p2, T1, T2)).mean(1).min()
-
-    def test_steps_that_are_too_long_do_no_harm(self):
-        points = correspondences("handheld", 12)
-        found = mean_distances(*points, SearchedNormalizer(ReweightedWhitening(), steps=4, learning_rate=0.5))
-        assert (found <= mean_distances(*points, ReweightedWhitening()) * (1 + 1e-6)).all()
-
-    def test_steps_fall_to_zero_as_half_a_cosine(self):
-        """Adam's first step has the learning rate's length in every number, and none is much longer."""
-        seen = []
-
-        def spy(params):
-            seen.append(params.detach().clone())
-            return spd_transform(params)
-
-        SearchedNormalizer(Hartley(), spy, steps=40, learning_rate=0.05)(*correspondences("handheld", 3))
-        path = torch.stack(seen[:-2:2])  # view 1, without the transforms returned
-        lengths = path.diff(dim=0).abs().amax((1, 2))
-        assert path[0].count_nonzero() == 0
-        np.testing.assert_allclose((path[1] - path[0]).abs(), 3 * np.tanh(0.05 / 3), rtol=1e-5)  # bounded by 3
-        cosine = 0.05 * (1 + np.cos(np.pi * np.arange(39) / 40)) / 2
-        assert (lengths.numpy() < 3 * cosine).all()
-
-    @pytest.mark.parametrize(("transform", "num_parameters"), [(paper_transform, 3), (spd_transform, 3)])
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_with_other_builders(self, transform, num_parameters, num_points):
-        points = correspondences("handheld", 10, num_points)
-        normalizer = SearchedNormalizer(Hartley(), transform, num_parameters, steps=30)
-        found, hartley = mean_distances(*points, normalizer), mean_distances(*points, Hartley())
-        assert (found <= hartley * (1 + 1e-6)).all()
-        assert np.log(found / hartley).mean() < (-0.1 if num_points == 8 else -0.03)
-        for T, H in zip(normalizer(*points), Hartley()(*points), strict=True):
-            B = T.numpy() @ np.linalg.inv(H.numpy())
-            np.testing.assert_allclose(B[:, :2, 2], 0, atol=1e-9)  # three parameters keep the centroid
-            gram = B[:, :2, :2] @ B[:, :2, :2].swapaxes(1, 2) if transform is paper_transform else B[:, :2, :2]
-            np.testing.assert_allclose(gram[:, 0, 1], 0 if transform is paper_transform else gram[:, 1, 0], atol=1e-9)
-
-    def test_the_result_is_built_from_parameters_and_base(self):
-        points, transforms, *_ = searched("hartley", "handheld", 8)
-        for T, H in zip(transforms, Hartley()(*points), strict=True):
-            linear = (T.numpy() @ np.linalg.inv(H.numpy()))[:, :2, :2]
-            np.testing.assert_allclose(linear, linear.swapaxes(1, 2), atol=1e-9)
-            assert (np.linalg.eigvalsh(linear) > 0).all()
 
 
 class TestInvariances:
@@ -169,14 +126,6 @@ class TestInvariances:
         self.same(normalizer(*extended), normalizer(*points, weights), 1e-4)
         self.same(normalizer(*points, torch.full_like(weights, 0.25)), normalizer(*points), 1e-4)  # equal weights
 
-    def test_weights_are_those_of_the_mean_and_of_the_solution(self):
-        points, weights = correspondences("handheld", 20, 12), uniform(20, 12)
-        normalizer = SearchedNormalizer(Hartley(), steps=30)
-        found, hartley = (mean_distances(*points, n, weights) for n in (normalizer, Hartley()))
-        unweighted = mean_distances(*points, lambda *_: normalizer(*points), weights)
-        assert (found <= hartley * (1 + 1e-6)).all()
-        assert np.log(found).mean() < np.log(unweighted).mean()
-
 
 class TestGradients:
     @pytest.mark.parametrize("learned", [False, True])
@@ -200,25 +149,11 @@ class TestGradients:
             assert torch.equal(T, want)
             assert not torch.allclose(T, H)
 
-    def test_the_matrix_still_depends_on_the_points(self):
-        points = [p.requires_grad_() for p in correspondences("handheld", 3)]
-        find_fundamental(*points, normalizer=SearchedNormalizer(steps=2)).sum().backward()
-        assert all(p.grad.isfinite().all() and p.grad.count_nonzero() > 0 for p in points)
 
-
-LINE = uniform(4, 20, 1, high=600) * torch.tensor([1.0, 0.5])
-DEGENERATE = {
-    "all equal": (torch.full((4, 20, 2), 7.0).double(), torch.full((4, 20, 2), -3.0).double()),
-    "all zero": (torch.zeros(4, 20, 2).double(), torch.zeros(4, 20, 2).double()),
-    "collinear": (LINE, LINE + 7),
-    "one view collinear": (LINE, uniform(4, 20, 2, high=600, seed=1)),
-    "identical views": (uniform(4, 20, 2, high=600), uniform(4, 20, 2, high=600)),
-    "four places": tuple(uniform(4, 20, 2, high=600, seed=k)[:, torch.arange(20) % 4] for k in (0, 1)),
-}
-
-
-@pairwise(num_points=[8, 20], sample=DEGENERATE, dtype=[torch.float32, torch.float64])
-def test_finite_on_degenerate_samples(sample, num_points, dtype):
-    points = [p[:, :num_points].to(dtype) for p in DEGENERATE[sample]]
+@pairwise(num_points=[8, 20], kind=["all equal", "collinear", "four places"], dtype=[torch.float32, torch.float64])
+def test_finite_on_degenerate_samples(kind, num_points, dtype):
+    t, places = uniform(4, num_points, 1, high=600), uniform(4, 4, 2, high=600)[:, torch.arange(num_points) % 4]
+    kinds = {"all equal": 7 + 0 * places, "collinear": t * torch.tensor([1.0, 0.5]), "four places": places}
+    points = kinds[kind].to(dtype)
     for weights in (None, torch.zeros(4, num_points)):
-        assert torch.stack(SearchedNormalizer(steps=5)(*points, weights)).isfinite().all()
+        assert torch.stack(SearchedNormalizer(steps=5)(points, points + 7, weights)).isfinite().all()

@@ -12,13 +12,11 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.evaluation.report.figures import draw_example, report_figures
 from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
-from kornia_learnnorm.evaluation.report.style import line_style
 from kornia_learnnorm.evaluation.robust.robust_run import read_robust
 from kornia_learnnorm.evaluation.runs import example
 from kornia_learnnorm.evaluation.runs.prediction_run import read_run
@@ -75,15 +73,6 @@ def test_pictures_show_what_the_run_has(run, written):
     assert "figure-12" in pictures
     assert "figure-13" not in pictures  # its points are means of 100 samples
     assert not [picture.name for picture in pictures.values() if "Dashed" in picture.text]
-
-
-@pytest.mark.parametrize(
-    ("name", "style"),
-    [("crossview", "--"), ("own", "--"), ("own+LM", "--"), ("Hartley+optimal", "-")],
-)
-def test_lines_of_learned_methods_are_dashed(name, style):
-    assert line_style(name) == style
-    assert line_style("module:Name") == "-"
 
 
 def test_the_answer_comes_first_then_contents_date_and_command(written):
@@ -170,11 +159,3 @@ def test_only_tables_that_fit_are_printed(monkeypatch, capsys, columns, header):
     assert f" {header} │" in text
     assert "…" not in text
     assert text.endswith(f"wider than the {columns} columns of this terminal, see report.html:\n  Wide\n")
-
-
-def test_without_a_sample_of_the_pair_there_is_no_picture_of_it(run):
-    found = read_run(run)
-    (picture,) = draw_example(found, dict.fromkeys(found.about["methods"], "red"))
-    assert picture.name == "figure-10"
-    found.example["pair"] = np.array(99)
-    assert draw_example(found, {}) == []

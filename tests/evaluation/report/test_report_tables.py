@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 
@@ -14,7 +13,6 @@ from kornia_learnnorm.evaluation.report.accuracy import by_motion, report_tables
 from kornia_learnnorm.evaluation.report.numbers import mean_share, median_number, number, paired_change
 from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
 from kornia_learnnorm.evaluation.report.robust_tables import PRINTED, robust_tables
-from kornia_learnnorm.evaluation.report.style import method_colors
 from kornia_learnnorm.evaluation.robust.robust_run import read_robust
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell, read_run
 from kornia_learnnorm.evaluation.tables import Number, Table, tables_as_json
@@ -44,14 +42,12 @@ def test_numbers():
     assert paired_change(values, values * torch.nan) == ""
     values = torch.arange(8) + 1.5
     assert str(paired_change(values, values - 0.5)) == "+0.500 [+0.500, +0.500], < 0.001"
-    assert str(paired_change(values[1:], values[1:] - 0.5)) == "+0.500"
     halved = paired_change(values, values + np.log(2), logarithms=True)
     assert str(halved) == "-50.0 [-50.0, -50.0], < 0.001"
     pair = torch.arange(8).repeat_interleave(2)
     assert str(mean_share(torch.zeros(16), pair)) == "0.0 [0.0, 0.0]"
     assert str(mean_share(torch.zeros(16).masked_fill(pair == 3, torch.nan), pair)) == "0.0"  # seven pairs
     assert mean_share(torch.full((16,), torch.nan), pair) == ""
-    assert method_colors(["none", "Hartley"]) == {"none": "#8b8b8b", "Hartley": "#e69f00"}
 
 
 def without_truth(run, robust):
@@ -66,37 +62,12 @@ def without_truth(run, robust):
     return run, robust
 
 
-def of_one_pair(run, robust):
-    cells = []
-    for cell in run.cells:
-        kept = cell.pair == cell.pair[0]
-        predictions = {name: {key: v[kept] for key, v in p.items()} for name, p in cell.predictions.items()}
-        cells.append(dataclasses.replace(cell, pair=cell.pair[kept], predictions=predictions))
-    for cell in robust.cells:
-        for results in (r for e in cell.estimates.values() for r in e.values()):
-            results.update({key: values[:1] for key, values in results.items()})
-    return dataclasses.replace(run, cells=cells), robust
-
-
-@pytest.mark.parametrize("change", [without_truth, of_one_pair])
-def test_unknown_numbers_are_empty_cells(run, robust_run, change):
-    found, robust = change(read_run(run), read_robust(robust_run))
-    tables = [*report_tables(found), *robust_tables(robust)]
-    cells = [cell for table in tables for row in as_text(table.rows) for cell in row]
-    assert len(tables) >= 12
-    assert "" in cells
-    assert not [cell for cell in cells if re.search("nan|inf", cell)]
-
-
 @pytest.mark.parametrize(
     ("description", "name"),
     [
-        ("KITTI odometry 06", "KITTI"),
         ("KITTI odometry 06, 10", "KITTI"),
         ("KITTI odometry 00, 06", ""),
-        ("KITTI odometry 06, 00", ""),
         ("TUM RGB-D freiburg3_long_office_household, frames about 1 s apart, resized to 1226x370", "TUM"),
-        ("TUM RGB-D rgbd_dataset_freiburg3_long_office_household, resized to 1226x370", "TUM"),
         ("TUM RGB-D freiburg3_long_office_household, frames about 1 s apart", ""),
         ("TUM RGB-D freiburg1_desk, resized to 1226x370", ""),
         ("images of kitti_06", ""),
@@ -107,10 +78,15 @@ def test_the_papers_data(description, name):
 
 
 def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_run):
-    found = read_run(run)
+    found, robust = read_run(run), read_robust(robust_run)
     shares = found.cells[0].predictions["whitening"]["inliers"].clone()
     heldout = {name: p["heldout"].clone() for name, p in found.cells[0].predictions.items()}
-    found, _ = without_truth(found, read_robust(robust_run))
+    found, robust = without_truth(found, robust)
+    cells = [
+        cell for table in (*report_tables(found), *robust_tables(robust)) for row in as_text(table.rows) for cell in row
+    ]
+    assert "" in cells
+    assert not [cell for cell in cells if re.search("nan|inf", cell)]
     for name, values in heldout.items():
         found.cells[0].predictions[name]["heldout"][:] = values
     tables = {t.title: t for table in report_tables(found) if (t := table.known_parts())}
@@ -122,6 +98,12 @@ def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_r
     header = tables["Fit and accuracy: scenes, filtered"].header[:4]
     assert header == ["method", "fit px", "held out px", "condition number"]
     assert not any("By motion" in title or "Worst" in title for title in tables)
+    robust.about["stores"]["kitti_06"] = "images of a folder, 3 pairs, 990 matches"
+    table, time, tests = (table.known_parts() for table in robust_tables(robust)[:3])
+    assert table.header == ["estimator", "inliers % @0.1 px", "inliers % @1 px"]
+    assert time.header == ["estimator", "ms @0.1 px", "samples @0.1 px", "ms @1 px", "samples @1 px"]
+    assert tests.header[2:] == ["inliers @0.1 px: change, p", "inliers @1 px: change, p"]
+    assert "ground-truth" not in [row[0] for row in (*table.rows, *time.rows)]
 
 
 def motion_cell(forward, truth):
@@ -206,23 +188,6 @@ def test_numbers_of_robust_estimators(robust_run):
     assert changes[3] == f"{100 * (mine - other).mean().item():+.3f}"  # too few pairs for an interval
 
 
-def test_robust_estimators_without_ground_truth(robust_run):
-    found = read_robust(robust_run)
-    for by_threshold in found.cells[0].estimates.values():
-        for figures in by_threshold.values():
-            for key in ("f1", "error", "rotation_error", "translation_error"):
-                figures[key][:] = torch.nan
-    found.about["stores"]["kitti_06"] = "images of a folder, 3 pairs, 990 matches"
-    table, time, tests = (table.known_parts() for table in robust_tables(found)[:3])
-    assert table.header == ["estimator", "inliers % @0.1 px", "inliers % @1 px"]
-    assert time.header == ["estimator", "ms @0.1 px", "samples @0.1 px", "ms @1 px", "samples @1 px"]
-    assert tests.header[2:] == ["inliers @0.1 px: change, p", "inliers @1 px: change, p"]
-    assert time.title == "Time: kitti_06, filtered"
-    assert "ground-truth" not in [row[0] for row in (*table.rows, *time.rows)]
-    shares = found.cells[0].estimates["opencv-usac"][1.0]["inliers"]
-    assert str(table.rows[0][2]).startswith(f"{100 * shares.mean():.2f} ±")
-
-
 def test_parts_of_a_table():
     rows = [["a", "-", Number(1.5, ".1f"), ""], ["b", "-", "", ""], ["c", "-", "-", "-"]]
     known = Table("", "", ["method", "own", "truth", "angle"], rows).known_parts()
@@ -231,16 +196,13 @@ def test_parts_of_a_table():
 
 
 def test_cells_as_json():
-    numbers = [Number(1.499, "+.2f"), Number(2.5e6, ".3g"), Number(1.52, ".1f", (1.24, 2.0))]
-    numbers += [Number(-3, ".1f", (-4, -2), 0.0004), Number(-3, ".1f", (-4, -2), 0.0312), Number(7, ".2f", std=0.1)]
-    numbers += [Number(99.9, ".1f", trained_on=True), Number(99.9, ".1f", (99.0, 100.0), trained_on=True)]
+    numbers = [Number(1.499, "+.2f"), Number(2.5e6, ".3g"), Number(-3, ".1f", (-4, -2), 0.0004)]
+    numbers += [Number(7, ".2f", std=0.1), Number(99.9, ".1f", (99.0, 100.0), trained_on=True)]
     cells = ["12", "", "-", 12, *numbers, "kitti_00, kitti_01", Number(np.inf)]
     header = ["name", *map(str, range(len(cells) - 1))]
     (row,) = json.loads(tables_as_json("", [Table("", "", header, [cells])]))["tables"][0]["rows"]
-    interval = {"value": -3.0, "low": -4.0, "high": -2.0}
-    expected = [None, None, 12, 1.5, 2.5e6, {"value": 1.5, "low": 1.2, "high": 2.0}, interval | {"p": 0.001}]
-    expected += [interval | {"p": 0.031}, {"value": 7.0, "std": 0.1}, {"value": 99.9, "trained_on": True}]
-    expected += [{"value": 99.9, "low": 99.0, "high": 100.0, "trained_on": True}, "kitti_00, kitti_01", "inf"]
-    assert [*row.values()] == ["12", *expected]
-    assert [*map(str, numbers[:4])] == ["+1.50", "2.5e+06", "1.5 [1.2, 2.0]", "-3.0 [-4.0, -2.0], < 0.001"]
-    assert [*map(str, numbers[5:])] == ["7.00 ± 0.10", "99.9 *", "99.9 [99.0, 100.0] *"]
+    expected = [None, None, 12, 1.5, 2.5e6, {"value": -3.0, "low": -4.0, "high": -2.0, "p": 0.001}]
+    expected += [{"value": 7.0, "std": 0.1}, {"value": 99.9, "low": 99.0, "high": 100.0, "trained_on": True}]
+    assert [*row.values()] == ["12", *expected, "kitti_00, kitti_01", "inf"]
+    shown = ["+1.50", "2.5e+06", "-3.0 [-4.0, -2.0], < 0.001", "7.00 ± 0.10", "99.9 [99.0, 100.0] *"]
+    assert [*map(str, numbers)] == shown

@@ -59,11 +59,6 @@ def test_weights_of_ones_own_are_named_where_another_method_wins():
     assert text.endswith("`own` has 5.200 px.")
 
 
-def test_where_hartley_wins_a_method_without_an_error_is_not_next():
-    text = summary_of({"Hartley": errors(1.0), "broken": errors(math.nan)})
-    assert "`Hartley` has the smallest error on the ground-truth inliers, median 6.500 px. Not tested" in text
-
-
 def test_the_quoted_median_decides_and_a_smaller_geometric_mean_is_named():
     """Two fifths of a method's samples are nearly exact: its geometric mean is smaller, its median larger."""
     few = torch.where(torch.arange(SAMPLES) % 5 < 2, 1e-4, 3.0)

@@ -80,30 +80,11 @@ def test_estimators_and_stores_join(robust_copied, tmp_path):
     assert [*found.cells[3].estimates] == ["opencv-usac", "opencv-lmeds"]
 
 
-def test_runs_with_hypotheses_of_older_versions_are_joined(robust_copied, robust_again):
-    about = json.loads((robust_copied / "run.json").read_text())
-    about["robust"] |= {"solvers": {"Hartley": "Hartley"}, "hypotheses": 12}
-    (robust_copied / "run.json").write_text(json.dumps(about))
-    assert main(robust_again) == 0
-
-
 def test_a_package_that_is_not_installed(robust_copied, robust_store, monkeypatch):
     monkeypatch.setitem(peers.PEERS, "poselib", peers.PeerPackage(pytest.fail, "no_such_module", "poselib"))
     options = ["--pairs", "2", "--seeds", "2", "--estimators", "poselib", "--out", str(robust_copied)]
     assert main(["robust", str(robust_store), *options]) == 0
     assert read_robust(robust_copied).about["estimators"]["poselib"] is None
-
-
-def test_damaged(robust_copied, robust_again, refused):
-    path = robust_copied / "robust/kitti_06/filtered/1px/RANSAC.npz"
-    whole = path.read_bytes()
-    for content in (b"", b"bad", whole[:100]):
-        path.write_bytes(content)
-        for again in (["report", robust_copied], robust_again):
-            refused(again, f"{path} is damaged, remove it")
-    (robust_copied / "run.json").write_text('{"format": 4, "robust": {"stores": {}}}')
-    for again in (["report", robust_copied], robust_again):
-        refused(again, "run.json is damaged: estimators, versions, pairs")
 
 
 def test_what_fails_is_left_out_and_others_go_on(robust_store, tmp_path, monkeypatch, capsys):
