@@ -20,7 +20,6 @@ __all__ = [
     "design_matrix",
     "nearest_null_vector",
     "null_vector",
-    "smallest_right_singular_vector",
     "solve_rows",
 ]
 
@@ -145,18 +144,6 @@ def nearest_null_vector(A: Tensor, preferred: Tensor) -> Tensor:
     return normalize(Vh.mT @ (zero * (Vh @ preferred))[..., None], dim=-2).squeeze(-1)
 
 
-def smallest_right_singular_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return the unit vectors :math:`v` that minimise :math:`\sum_i w_i (A_i v)^2`, twice differentiable.
-
-    The eigenvectors of the Gram matrix :math:`A^\top W A` are a start, and where it has lost the digits of small
-    singular values, those of the singular value decomposition of :math:`\sqrt w A`. A Newton step with the residuals
-    :math:`A v` brings the digits back, and two more give the derivatives. Other singular values
-    may coincide, the weights may be zero, and a last singular value that is not simple sends a zero gradient instead of
-    an infinite one.
-    """
-    return _smallest(A, weights, _gram_product(A, weights))[0]
-
-
 def _gram_product(A: Tensor, weights: Tensor | None) -> Callable[[Tensor], Tensor]:
     """Return the product of vectors with ``A^T W A``."""
 
@@ -168,9 +155,12 @@ def _gram_product(A: Tensor, weights: Tensor | None) -> Callable[[Tensor], Tenso
 
 
 def _smallest(A: Tensor, weights: Tensor | None, product: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Return the vector of :func:`smallest_right_singular_vector` and all singular values of ``sqrt(weights) A``.
+    """Return the last right singular vectors of ``sqrt(weights) A``, twice differentiable, and all singular values.
 
-    ``product`` multiplies vectors by the Gram matrix and has the derivatives.
+    The eigenvectors of the Gram matrix are a start, and where it has lost the digits of small singular values, those of
+    the singular value decomposition. A Newton step with ``product``, which multiplies vectors by the Gram matrix and
+    has the derivatives, brings the digits back, and two more give the derivatives. A last singular value that is not
+    simple sends a zero gradient instead of an infinite one.
     """
     with torch.no_grad():
         values, vectors = torch.linalg.eigh(A.mT @ (A if weights is None else A * weights[..., None]))

@@ -9,12 +9,7 @@ from kornia.core.exceptions import ShapeError
 from scenes import SCENES, correspondences, homogeneous, numpy_hartley, signless, uniform
 from torch.autograd import gradcheck, gradgradcheck
 
-from kornia_learnnorm.geometry.dlt import (
-    design_matrix,
-    nearest_null_vector,
-    null_vector,
-    smallest_right_singular_vector,
-)
+from kornia_learnnorm.geometry.dlt import design_matrix, nearest_null_vector, null_vector
 
 
 class TestDesignMatrix:
@@ -33,10 +28,12 @@ class TestDesignMatrix:
 class TestNullVector:
     @pytest.mark.parametrize("num_points", [8, 9, 40])
     def test_is_the_last_right_singular_vector(self, num_points):
-        A = uniform(10, num_points, 9, low=-1)
-        expected = np.linalg.svd(A.numpy(), full_matrices=True)[2][:, -1]
-        sign = np.sign((expected * null_vector(A).numpy()).sum(-1, keepdims=True))
-        np.testing.assert_allclose(null_vector(A).numpy(), sign * expected, atol=1e-12)
+        A, weights = uniform(10, num_points, 9, low=-1), uniform(10, num_points, low=0.1, seed=1)
+        for w in (None, weights):  # which have no effect on eight
+            h = null_vector(A, w).numpy()
+            rooted = A.numpy() if w is None else A.numpy() * np.sqrt(w.numpy())[..., None]
+            expected = np.linalg.svd(rooted, full_matrices=True)[2][:, -1]
+            np.testing.assert_allclose(h, np.sign((expected * h).sum(-1, keepdims=True)) * expected, atol=1e-11)
 
     @pytest.mark.parametrize("name", SCENES)
     @pytest.mark.parametrize("noise", [True, False])
@@ -57,16 +54,28 @@ class TestNullVector:
         h, expected = null_vector(scaled), null_vector(A)
         assert torch.minimum((h - expected).norm(dim=-1), (h + expected).norm(dim=-1)).max() < 1e-8
 
-    def test_weights_of_eight_rows_do_not_matter(self):
-        A, weights = uniform(10, 8, 9, low=-1), uniform(10, 8, low=0.01)
-        assert torch.equal(null_vector(A, weights), null_vector(A))
-
     @pytest.mark.parametrize("num_points", [8, 12])
     def test_gradients(self, num_points):
         A = uniform(2, num_points, 9, low=-1).requires_grad_()
         outer = lambda A: signless(null_vector(A).unflatten(-1, (3, 3)))  # noqa: E731
         assert gradcheck(outer, [A])
-        assert gradgradcheck(outer, [A[:1].detach().requires_grad_()])
+        assert gradgradcheck(outer, [A[:1].detach().requires_grad_()], fast_mode=True)
+
+    def test_small_values_keep_their_digits(self):
+        """Singular values 1 to 1e-9: the square of the condition number would leave nothing of the last ones."""
+        rng = np.random.default_rng(0)
+        U, V = (np.linalg.qr(rng.normal(size=(5, n, 9)))[0] for n in (12, 9))
+        A = torch.from_numpy(U @ np.diag([*[1.0] * 6, 1e-3, 1e-6, 1e-9]) @ V.swapaxes(1, 2))
+        h = null_vector(A).numpy()
+        np.testing.assert_allclose(h, np.sign((V[..., -1] * h).sum(-1, keepdims=True)) * V[..., -1], atol=1e-8)
+
+    @pytest.mark.parametrize("last", [[1.0, 1.0], [0.0, 0.0]])
+    def test_no_gradient_where_the_last_value_is_not_simple(self, last):
+        A = torch.eye(12, 9, dtype=torch.float64) * torch.tensor([*[1.0] * 7, *last])
+        h = null_vector(A.requires_grad_())
+        (gradient,) = torch.autograd.grad(h @ uniform(9), [A])
+        assert h.norm().item() == pytest.approx(1)
+        assert gradient.isfinite().all()
 
     def test_any_batch_shape(self):
         assert null_vector(uniform(8, 9)).shape == (9,)
@@ -88,51 +97,3 @@ class TestNearestNullVector:
     def test_is_the_one_null_vector_of_independent_rows(self):
         A = uniform(6, 8, 9, low=-1)
         assert ((nearest_null_vector(A, uniform(9)) * null_vector(A)).sum(-1).abs() - 1).abs().max() < 1e-12
-
-
-class TestSmallestRightSingularVector:
-    def test_weighted_minimum(self):
-        A, weights = uniform(20, 7, 4, low=-1), uniform(20, 7, low=0.1)
-        v = smallest_right_singular_vector(A, weights).numpy()
-        values, vectors = np.linalg.eigh(np.einsum("bmi,bm,bmj->bij", A, weights, A))
-        assert np.abs((vectors[..., 0] * v).sum(-1)) == pytest.approx(1, abs=1e-12)
-        np.testing.assert_allclose(np.einsum("bm,bm->b", weights, np.einsum("bmi,bi->bm", A, v) ** 2), values[:, 0])
-
-    def test_small_values_keep_their_digits(self):
-        """Singular values 1 to 1e-9: the square of the condition number would leave nothing of the last ones."""
-        rng = np.random.default_rng(0)
-        U, V = (np.linalg.qr(rng.normal(size=(5, 4, 4)))[0] for _ in range(2))
-        A = torch.from_numpy(U @ np.diag([1, 1e-3, 1e-6, 1e-9]) @ V.swapaxes(1, 2))
-        v = smallest_right_singular_vector(A).numpy()
-        sign = np.sign((V[..., -1] * v).sum(-1, keepdims=True))
-        np.testing.assert_allclose(v, sign * V[..., -1], atol=1e-8)
-
-    def test_gradients_where_other_values_coincide(self):
-        A = torch.diag(torch.tensor([2.0, 2.0, 0.5], dtype=torch.float64)).requires_grad_()
-        direction = uniform(3, 2, low=-1)
-        square = lambda A: (smallest_right_singular_vector(A) @ direction).square()  # noqa: E731
-        assert gradcheck(square, [A])
-        assert gradgradcheck(square, [A])
-
-    @pytest.mark.parametrize("values", [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    def test_no_gradient_where_the_last_is_not_simple(self, values):
-        A = torch.diag(torch.tensor(values, dtype=torch.float64)).requires_grad_()
-        v = smallest_right_singular_vector(A)
-        (gradient,) = torch.autograd.grad(v @ uniform(3), [A])
-        assert v.norm().item() == pytest.approx(1)
-        assert torch.isfinite(gradient).all()
-        if values[0] == values[1]:
-            assert gradient.abs().max() < 1e-12
-
-    def test_gradient_at_zero_weight(self):
-        A, weights = uniform(2, 7, 4, low=-1), uniform(2, 7, low=0.1, seed=1)
-        weights[:, 0] = 0
-        values = [A.requires_grad_(), weights.requires_grad_()]
-        square = lambda A, w: (smallest_right_singular_vector(A, w) @ uniform(4, 2, low=-1, seed=2)).square()  # noqa: E731
-        gradient = torch.autograd.grad(square(*values).sum(), values)[1]
-        # From one side only: a weight cannot be negative.
-        step = torch.zeros(2, 7, dtype=torch.float64)
-        step[:, 0] = 1e-6
-        with torch.no_grad():
-            slope = (square(A, weights + step) - square(A, weights)).sum(-1) / 1e-6
-        assert gradient[:, 0].numpy() == pytest.approx(slope.numpy(), rel=1e-3)
