@@ -65,13 +65,11 @@ def whitening_from_moments(mean: Tensor, covariance: Tensor, floor: float = 1e-6
     return affine_transform(inverse_sqrt(covariance, floor), mean)
 
 
-def paper_transform(params: Tensor, origin: Tensor | None = None) -> Tensor:
-    r"""Build the paper's transform :math:`T_L = \mathrm{diag}(\alpha_1, \alpha_2, 1)\, R(\theta)\, C(o)`.
+def paper_transform(params: Tensor) -> Tensor:
+    r"""Build the paper's transform, of centred points: :math:`\mathrm{diag}(\alpha_1, \alpha_2, 1)\, R(\theta)`.
 
     Args:
-        params: :math:`(\log\alpha_1, \log\alpha_2, \theta)` with shape :math:`(*, 3)`; zero gives :math:`C(o)`.
-        origin: the points :math:`o` moved to zero, with shape :math:`(*, 2)`; zero when not given, for points that are
-            centred already.
+        params: :math:`(\log\alpha_1, \log\alpha_2, \theta)` with shape :math:`(*, 3)`; zero gives the identity.
 
     Returns:
         transforms with shape :math:`(*, 3, 3)`.
@@ -89,8 +87,7 @@ def paper_transform(params: Tensor, origin: Tensor | None = None) -> Tensor:
     KORNIA_CHECK_SHAPE(params, ["*", "3"])
     alpha, (c, s) = params[..., :2].exp(), (params[..., 2].cos(), params[..., 2].sin())
     rotation = torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
-    origin = torch.zeros_like(params[..., :2]) if origin is None else origin
-    return affine_transform(alpha[..., None] * rotation, origin)
+    return affine_transform(alpha[..., None] * rotation, torch.zeros_like(params[..., :2]))
 
 
 def spd_transform(params: Tensor) -> Tensor:

@@ -13,24 +13,40 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_correspondence
 K = torch.tensor([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
 
 
+def focal_length(camera):
+    check_cameras(camera, camera)
+    return camera[0, 0]
+
+
 class TestCameras:
     @pytest.mark.parametrize("scale", [1.0, -2.0, 1e-3])
     def test_any_scale(self, scale):
         check_cameras(scale * K, K.expand(4, 3, 3), 4)
 
-    def test_transposed(self):
-        """The error names the camera and its last row, also of a single one in a batch."""
-        with pytest.raises(ValueError, match=r"^K1 .*320 240 1.*transposed"):
-            check_cameras(K.T, K)
-        with pytest.raises(ValueError, match=r"^K2 .*320 240 1.*transposed"):
-            check_cameras(K, torch.stack([K, K.T]).requires_grad_(), 2)
+    @pytest.mark.parametrize(
+        ("K1", "K2", "error", "message"),
+        [
+            (K, None, ValueError, "got only K1"),
+            (None, K, ValueError, "got only K2"),
+            (K, torch.zeros(3, 3), ValueError, "K2 must be finite and invertible"),
+            (torch.full((3, 3), torch.nan), K, ValueError, "K1 must be finite and invertible"),
+            (torch.rand(3, 4), K, ValueError, r"K1 .* \[3, 3\] or \[2, 3, 3\], got \[3, 4\]"),
+            (K, K.expand(4, 3, 3), ValueError, r"K2 .* got \[4, 3, 3\]"),
+            (K.long(), K, TypeError, r"K1 must be a floating-point tensor, got torch\.int64"),
+            (K.numpy(), K, TypeError, "K1 must be a floating-point tensor"),
+            (K.T, K, ValueError, r"^K1 .*320 240 1.*transposed"),
+            (K, torch.stack([K, K.T]).requires_grad_(), ValueError, r"^K2 .*320 240 1.*transposed"),
+        ],
+    )
+    def test_exceptions(self, K1, K2, error, message):
+        with pytest.raises(error, match=message):
+            check_cameras(K1, K2, 2)
 
-    def test_values_are_not_read_in_transforms(self):
-        def focal_length(camera):
-            check_cameras(camera, camera)
-            return camera[0, 0]
-
+    def test_values_are_not_read_in_vmap(self):
         assert torch.func.vmap(focal_length)(torch.stack([K, K.T])).tolist() == [700.0, 700.0]
+
+    @pytest.mark.long
+    def test_values_are_not_read_when_compiled(self):
         assert torch.compile(focal_length, backend="eager", fullgraph=True)(K.T) == 700.0
 
 
@@ -39,13 +55,12 @@ class TestCorrespondences:
         values, weights = uniform(3, 6, 2), uniform(3, 6, seed=1)
         expected = [np.average(v, axis=0, weights=w) for v, w in zip(values, weights, strict=True)]
         np.testing.assert_allclose(weighted_mean(values, weights).numpy(), expected)
-        np.testing.assert_allclose(weighted_mean(values, None).numpy(), values.numpy().mean(1))
-        np.testing.assert_allclose(weighted_mean(values, 0 * weights).numpy(), values.numpy().mean(1))
+        for equal in (None, 0 * weights):
+            np.testing.assert_allclose(weighted_mean(values, equal).numpy(), values.numpy().mean(1))
 
     def test_solve_dtype(self):
-        assert solve_dtype(torch.device("cpu")) == torch.float64
-        assert solve_dtype(torch.device("cuda:0")) == torch.float64
-        assert solve_dtype(torch.device("mps")) == torch.float32
+        found = [solve_dtype(torch.device(name)) for name in ("cpu", "cuda:0", "mps")]
+        assert found == [torch.float64, torch.float64, torch.float32]
 
     def test_errors_name_the_argument(self):
         """What else is refused is tested with the estimators and normalisers."""

@@ -34,27 +34,13 @@ class TestMask:
         weights = (uniform(number, seed=seed + 1) * 4).floor() if weighted else None
         assert distinct_points(points1, points2, weights).tolist() == reference(points1, points2, weights)
 
-    @pytest.mark.parametrize(
-        ("points1", "points2", "kept"),
-        [
-            ([[0, 0], [0, 0], [1, 0]], [[5, 5], [6, 5], [6, 5]], [True, False, True]),  # of a chain every second
-            ([[0, 1], [-0.0, 1]], [[2, 3], [4, 5]], [True, False]),  # zeros of both signs are equal
-            ([[0, 1], [1, 0], [0, 0], [1, 1]], [[1, 1], [0, 0], [1, 0], [0, 1]], [True] * 4),  # equal coordinates
-        ],
-    )
-    def test_by_hand(self, points1, points2, kept):
-        assert distinct_points(torch.tensor(points1).double(), torch.tensor(points2).double()).tolist() == kept
+    def test_by_hand(self):
+        """Zeros of both signs are equal; equal coordinates in another order are not."""
+        points1, points2 = torch.tensor([[[0.0, 1], [-0.0, 1], [1, 0]], [[2, 3], [4, 5], [5, 4]]])
+        assert distinct_points(points1, points2).tolist() == [True, False, True]
 
 
 class TestRansac:
-    def test_many_matches_on_one_point_count_once(self):
-        """All of 165 agree with every epipolar line through the point; the other hundred are random."""
-        points1, points2 = uniform(265, 2, high=600), uniform(265, 2, high=600, seed=1)
-        points2[:165] = points2[0]
-        _, inliers = RANSAC(seed=0, max_samples=2000)(points1, points2)
-        assert inliers[:165].sum() <= 1
-        assert inliers.sum() < 30
-
     @pytest.mark.parametrize("cameras", [False, True])
     def test_copies_are_absent(self, cameras):
         scene = scenes("handheld", 1, 200, noise=0.3, outliers=0.3)

@@ -62,15 +62,9 @@ class TestSmallestSingularVectors:
         assert gradcheck(outer, [A])
         assert gradgradcheck(outer, [A])
 
-    def test_values_do_not_depend_on_whether_gradients_are_wanted(self):
-        A = uniform(100, 3, 3, low=-1)
-        plain = smallest_right_singular_vector_3x3(A)
-        assert torch.equal(smallest_right_singular_vector_3x3(A.clone().requires_grad_()).detach(), plain)
-
     def test_any_batch_shape_and_zero(self):
-        assert smallest_right_singular_vector_3x3(uniform(3, 3)).shape == (3,)
-        assert smallest_right_singular_vector_3x3(uniform(2, 4, 3, 3)).shape == (2, 4, 3)
-        assert smallest_right_singular_vector_3x3(uniform(0, 3, 3)).shape == (0, 3)
+        for shape in ((), (2, 4), (0,)):
+            assert smallest_right_singular_vector_3x3(uniform(*shape, 3, 3)).shape == (*shape, 3)
         assert smallest_right_singular_vector_3x3(torch.zeros(2, 3, 3).double()).norm(dim=-1).tolist() == [1, 1]
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import SCENES, correspondences, epipolar_distances, scenes, uniform, up_to_sign
+from scenes import SCENES, correspondences, epipolar_distances, up_to_sign
 
 from kornia_learnnorm import find_fundamental
 from kornia_learnnorm.geometry.dlt import design_matrix
@@ -57,7 +57,9 @@ class TestSolve:
     @pytest.mark.parametrize("name", SCENES)
     def test_against_a_loop_in_numpy(self, name):
         x1, x2 = coordinates(*correspondences(name, 30))
-        for found, expected in zip(solve_samples(x1, x2, 0.01), reference(x1, x2), strict=True):
+        F = solve_samples(x1, x2, 0.01)
+        assert torch.allclose(torch.linalg.matrix_norm(F), torch.ones(len(F), dtype=F.dtype))
+        for found, expected in zip(F, reference(x1, x2), strict=True):
             assert up_to_sign(found[None], expected[None]) < 1e-5
 
     @pytest.mark.parametrize("name", NOISY)
@@ -69,20 +71,6 @@ class TestSolve:
         distances = [np.median(epipolar_distances(*points, F).mean(1)) for F in (found, expected)]
         assert distances[0] == pytest.approx(distances[1], rel=0.1)
 
-    @pytest.mark.parametrize("name", NOISY)
-    def test_exact_points(self, name):
-        scene = scenes(name, 50, noise=0.0)
-        x1, x2 = scene.points1, scene.points2
-        kept = are_determined(*coordinates(x1, x2), 0.01)
-        for found, expected in zip(solve(x1, x2), scene.F_mat[kept], strict=True):
-            assert up_to_sign(found[None], expected[None] / expected.norm()) < 1e-6
-
-    def test_singular_and_of_unit_norm(self):
-        F = solve_samples(*coordinates(*correspondences("handheld", 100)), 0.01)
-        values = torch.linalg.svdvals(F)
-        assert torch.allclose(values.norm(dim=-1), torch.ones(len(F), dtype=F.dtype))
-        assert (values[:, 2] / values[:, 1]).median() < 1e-6
-
     def test_leaves_undetermined_samples_out(self):
         points1, points2 = correspondences("handheld", 6)
         for points in (points1, points2):
@@ -90,17 +78,14 @@ class TestSolve:
         x1, x2 = coordinates(points1, points2)
         others = torch.tensor([0, 1, 3, 4, 5])
         assert torch.allclose(solve_samples(x1, x2, 0.01), solve_samples(x1[others], x2[others], 0.01))
-        assert solve_samples(x1[2:3], x2[2:3], 0.01).shape == (0, 3, 3)
-
-    def test_no_samples(self):
-        none = uniform(0, 8, 3)
-        assert solve_samples(none, none, 0.01).shape == (0, 3, 3)
-        assert are_determined(none, none, 0.01).shape == (0,)
+        for few in (slice(2, 3), slice(0)):
+            assert solve_samples(x1[few], x2[few], 0.01).shape == (0, 3, 3)
 
     @given(order=st.permutations(range(8)))
-    def test_the_order_of_the_points_does_not_count(self, order):
+    def test_neither_the_order_of_the_points_nor_of_the_views_counts(self, order):
         points1, points2 = correspondences("orbit", 5)
         assert up_to_sign(solve(points1, points2), solve(points1[:, order], points2[:, order])) < 1e-6
+        assert up_to_sign(solve(points1, points2), solve(points2, points1).mT) < 1e-6
 
     @given(scale=st.floats(0.1, 10), x=st.floats(-1e4, 1e4), y=st.floats(-1e4, 1e4))
     def test_similarities_of_the_pixels(self, scale, x, y):
@@ -109,16 +94,8 @@ class TestSolve:
         distances = epipolar_distances(*points, solve(*points)).mean(1)
         np.testing.assert_allclose(epipolar_distances(*moved, solve(*moved)).mean(1), scale * distances, rtol=1e-4)
 
-    def test_swapping_the_views_transposes(self):
-        points1, points2 = correspondences("driving", 5)
-        assert up_to_sign(solve(points2, points1), solve(points1, points2).mT) < 1e-6
-
 
 class TestDetermined:
-    def test_samples_in_space(self):
-        points1, points2 = correspondences("random", 200)
-        assert are_determined(*coordinates(points1, points2), 0.01).float().mean() > 0.98
-
     @pytest.mark.parametrize("kind", ["coincident", "on a line", "on a plane", "seven on a plane"])
     def test_degenerate_samples(self, kind):
         points1, points2 = correspondences("handheld", 50)
