@@ -97,15 +97,6 @@ def test_rank_and_norm(name, scene, num_points, dtype):
         assert (values[:, 2] < 1e-12).all()
 
 
-@pytest.mark.parametrize("num_points", [8, 20])
-@pytest.mark.parametrize("name", [*LINEAR, "refined"])
-def test_float32_is_float64_rounded(name, num_points):
-    points = [p.float() for p in correspondences("orbit", 50, num_points)]
-    single = ALL[name](*points)
-    assert single.dtype == torch.float32
-    assert up_to_sign(single, ALL[name](*(p.double() for p in points))) < 1e-6
-
-
 @pytest.mark.parametrize(
     ("name", "scene", "bound"),
     [
@@ -119,7 +110,9 @@ def test_swapped_views_give_the_transpose(name, scene, bound):
     assert hartley_difference(mirrored.mT, F_mat, *points) < bound
 
 
-@pytest.mark.parametrize(("name", "bound"), [("projection", 1e-12), ("optimal", 1e-10), ("corrected", 1e-10)])
+@pytest.mark.parametrize(
+    ("name", "bound"), [("projection", 1e-12), ("optimal", 1e-10), ("corrected", 1e-10), ("refined", 1e-7)]
+)
 def test_batch_is_many_single_calls(name, bound):
     points = correspondences("random", 6, 12)
     alone = [ALL[name](*(p[k : k + 1] for p in points)) for k in range(6)]

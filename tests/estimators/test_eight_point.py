@@ -22,8 +22,7 @@ from scenes import (
     unit,
     up_to_sign,
 )
-from torch.func import grad, jacrev, vmap
-from torch.utils.checkpoint import checkpoint
+from torch.func import grad, vmap
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import EightPoint, Hartley, ReweightedWhitening, Whitening, find_fundamental
@@ -58,15 +57,8 @@ class TestEightPoint:
         assert not torch.equal(projection, optimal)
         assert torch.equal(EightPoint()(*points), find_fundamental(*points))
 
-    def test_owns_its_normalizer(self):
-        normalizer = shaken()
-        layer = EightPoint(normalizer)
-        assert [id(p) for p in layer.parameters()] == [id(p) for p in normalizer.parameters()]
-        assert all(key.startswith("normalizer.") for key in layer.state_dict())
-        assert not layer.train(False).normalizer.training
-        assert not list(EightPoint(halves).parameters())
-
     def test_round_trips(self):
+        assert all(key.startswith("normalizer.") for key in EightPoint(shaken()).state_dict())
         layer, points = EightPoint(shaken()), correspondences()
         other = EightPoint(shaken(seed=1))
         assert not torch.equal(other(*points), layer(*points))
@@ -109,13 +101,6 @@ class TestMask:
             assert gradient.isfinite().all()
             assert not gradient[:, 12:].any()
 
-    def test_gradients_are_those_without_the_rows(self):
-        points, mask = [p.requires_grad_() for p in correspondences("handheld", 3, 12)], torch.arange(16) < 12
-        padded = [torch.cat([p, torch.full((3, 4, 2), torch.nan)], 1) for p in points]
-        F_mats = EightPoint()(*padded, None, mask.expand(3, 16)), EightPoint()(*points)
-        masked, plain = (torch.autograd.grad(signless(F_mat).sum(), points) for F_mat in F_mats)
-        torch.testing.assert_close(masked, plain, rtol=1e-8, atol=1e-12)
-
     def test_wrong_masks(self):
         for mask, error, message in [
             (torch.ones(3, 8), TypeError, r"mask must be a boolean tensor, got torch\.float32"),
@@ -127,18 +112,6 @@ class TestMask:
 
 
 class TestWeights:
-    def test_zero_counts_as_absent(self, layer):
-        points1, points2 = correspondences("handheld", 3, 15)
-        weights = uniform(3, 15, low=0.1)
-        weights[:, 10:] = 0
-        points = [points1.clone().requires_grad_(), points2.clone().requires_grad_()]
-        F_mat = layer(*points, weights)
-        expected = layer(points1[:, :10], points2[:, :10], weights[:, :10])
-        assert up_to_sign(F_mat.detach(), expected.detach()) < 1e-6
-        for gradient in torch.autograd.grad(signless(F_mat).sum(), points):
-            assert not gradient[:, 10:].any()
-            assert gradient[:, :10].any()
-
     @pytest.mark.parametrize("size", [1e-40, 1e-29, 1e-20, 1e20, 1e38])
     def test_only_ratios_count(self, layer, size):
         points = [p.float() for p in correspondences("handheld", 3, 12)]
@@ -155,16 +128,10 @@ class TestWeights:
 class TestDetermined:
     @pytest.mark.parametrize("num_points", [8, 12])
     def test_degenerate(self, layer, num_points):
-        along = uniform(3, num_points, 1, high=500)
-        line = along * torch.tensor([1.0, 0.5], dtype=torch.float64)
+        line = uniform(3, num_points, 1, high=500) * torch.tensor([1.0, 0.5])
         plane = uniform(3, num_points, 2, high=500)
-        kinds = {
-            "coincident": coincident(num_points),
-            "collinear": (line, 3 * line + 7),
-            "plane": (plane, plane @ torch.tensor([[1.1, 0.1], [-0.2, 0.9]], dtype=torch.float64) + 5),
-            "identical": (plane, plane),
-        }
-        for points1, points2 in kinds.values():
+        moved = plane @ torch.tensor([[1.1, 0.1], [-0.2, 0.9]], dtype=torch.float64) + 5
+        for points1, points2 in (coincident(num_points), (line, 3 * line + 7), (plane, moved), (plane, plane)):
             estimate = layer.estimate(points1, points2)
             assert not estimate.determined.any()
             assert estimate.F_mat.isfinite().all()
@@ -221,26 +188,9 @@ class TestCameras:
         assert up_to_sign(estimate.E_mat, true_essential(scene)) < 1e-6
         assert torch.allclose(torch.linalg.matrix_norm(estimate.E_mat), torch.ones(5).double())
 
-    def test_calibrated_points(self):
-        scene = scenes("handheld", 5, 20)
-        rays = [
-            ((torch.cat([x, torch.ones_like(x[..., :1])], -1) @ torch.linalg.inv(K).mT)[..., :2])
-            for x, K in ((scene.points1, scene.K1), (scene.points2, scene.K2))
-        ]
-        pixels = EightPoint().estimate(scene.points1, scene.points2, K1=scene.K1, K2=scene.K2)
-        assert up_to_sign(EightPoint()(*rays), pixels.E_mat) < 1e-6  # square pixels, or the projection would differ
-
     def test_wrong_cameras(self):
-        for K, error, message in [
-            (torch.rand(3, 4), ValueError, r"K1 .* \[3, 3\] or \[20, 3, 3\], got \[3, 4\]"),
-            (torch.eye(3).expand(4, 3, 3), ValueError, r"got \[4, 3, 3\]"),
-            (torch.zeros(3, 3), ValueError, "K1 must be finite and invertible"),
-            (torch.eye(3).long(), TypeError, r"K1 .* got torch\.int64"),
-        ]:
-            with pytest.raises(error, match=message):
-                EightPoint().estimate(*correspondences(), K1=K, K2=torch.eye(3))
-            with pytest.raises(ValueError, match="got only K1"):
-                EightPoint().estimate(*correspondences(), K1=torch.eye(3))
+        with pytest.raises(ValueError, match="got only K1"):
+            EightPoint().estimate(*correspondences(), K1=torch.eye(3))
 
 
 class TestMatches:
@@ -347,28 +297,15 @@ class TestBackEnds:
         compiled = torch.compile(layer, fullgraph=True)
         assert up_to_sign(compiled(*points).detach(), layer(*points).detach()) < 1e-6
 
-    def test_vmap(self, layer):
-        layer, points = layer.double(), correspondences("handheld", 5, 20)  # batches of one round differently
-        mapped = vmap(lambda x1, x2: layer(x1[None], x2[None])[0])(*points)
-        assert up_to_sign(mapped.detach(), layer(*points).detach()) < 1e-9
-
     def test_functional_gradients(self, layer):
-        points1, points2 = correspondences("handheld", 3)
+        layer, points = layer.double(), [p.requires_grad_() for p in correspondences("handheld", 3, 12)]
 
         def loss(x1, x2):
-            return layer(x1[None], x2[None]).square()[..., 0, :].sum()
+            return layer(x1, x2).square()[..., 0, :].sum()
 
-        layer = layer.double()
-        each = vmap(grad(loss))(points1, points2)
-        assert torch.allclose(each[0], jacrev(loss)(points1[0], points2[0]), rtol=1e-6, atol=1e-9)
-
-    def test_checkpoint(self, layer):
-        points1, points2 = correspondences("handheld", 3)
-        gradients = []
-        for call in (layer, lambda *x: checkpoint(layer, *x, use_reentrant=False)):
-            x1 = points1.clone().requires_grad_()
-            gradients.append(torch.autograd.grad(signless(call(x1, points2)).sum(), x1)[0])
-        assert torch.equal(*gradients)
+        each = vmap(grad(lambda *x: loss(*(p[None] for p in x)), (0, 1)))(*points)
+        plain = torch.autograd.grad(loss(*points), points)
+        torch.testing.assert_close(each, plain, rtol=1e-5, atol=1e-9)
 
     def test_deterministic_algorithms(self, layer):
         points1, points2 = correspondences("handheld", 3)

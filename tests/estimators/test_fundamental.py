@@ -7,7 +7,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
 from scenes import (
     SCENES,
@@ -18,14 +17,13 @@ from scenes import (
     hartley_difference,
     numpy_hartley,
     numpy_whitening,
-    scenes,
     signless,
     uniform,
     up_to_sign,
 )
-from torch.autograd import gradcheck, gradgradcheck
+from torch.autograd import gradcheck
 
-from kornia_learnnorm import Hartley, Identity, PerView, ReweightedWhitening, Whitening, find_fundamental
+from kornia_learnnorm import Hartley, Identity, ReweightedWhitening, Whitening, find_fundamental
 
 # Each normaliser with its independent computation.
 REFERENCES = {
@@ -41,27 +39,18 @@ def unit_square(batch_size: int, num_points: int) -> tuple[torch.Tensor, torch.T
 
 
 class TestFindFundamental:
-    @pairwise(name=SCENES, num_points=[8, 9, 50], reference=REFERENCES)
-    def test_agrees_with_numpy(self, name, num_points, reference, device):
+    @pairwise(name=SCENES, num_points=[8, 9, 50], reference=REFERENCES, weighted=[False, True])
+    def test_agrees_with_numpy(self, name, num_points, reference, weighted, device):
         points1, points2 = correspondences(name, 20, num_points)
+        weights = uniform(20, num_points, low=0.01, seed=5) if weighted else None
         normalizer, transform = REFERENCES[reference]
-        F_mat = find_fundamental(points1.to(device), points2.to(device), normalizer=normalizer).cpu()
-        expected = eight_point(points1, points2, transform(points1), transform(points2))
+        on_device = [None if v is None else v.to(device) for v in (points1, points2, weights)]
+        F_mat = find_fundamental(*on_device, normalizer).cpu()
+        expected = eight_point(points1, points2, transform(points1, weights), transform(points2, weights), weights)
         # In pixels the design matrix has a condition number of 1e10, and either computation loses as many digits.
-        pixels, hartley = (1e-8, 1e-7) if reference == "identity" else (1e-9, 1e-9)
+        pixels, hartley = (1e-7, 1e-7) if reference == "identity" else (1e-9, 1e-9)
         assert up_to_sign(F_mat, expected) < pixels
         assert hartley_difference(F_mat, expected, points1, points2) < hartley
-
-    @pytest.mark.parametrize("name", ["driving", "handheld", "random"])
-    @pytest.mark.parametrize("reference", REFERENCES)
-    def test_agrees_with_numpy_when_weighted(self, name, reference):
-        points1, points2 = correspondences(name, 20, 30)
-        weights = uniform(20, 30, low=0.01, seed=5)
-        normalizer, transform = REFERENCES[reference]
-        F_mat = find_fundamental(points1, points2, weights, normalizer)
-        expected = eight_point(points1, points2, transform(points1, weights), transform(points2, weights), weights)
-        assert up_to_sign(F_mat, expected) < 1e-9
-        assert hartley_difference(F_mat, expected, points1, points2) < 1e-9
 
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
     @pytest.mark.parametrize("num_points", [8, 50])
@@ -73,51 +62,22 @@ class TestFindFundamental:
         F_mat = find_fundamental(points1, points2)
         assert hartley_difference(F_mat, expected, points1, points2) < 2e-4  # eigenvectors of A^T A: half of the digits
 
-    def test_takes_any_normalizer_of_the_contract(self):
-        points1, points2 = correspondences()
-        expected = find_fundamental(points1, points2)
-        assert up_to_sign(find_fundamental(points1, points2, normalizer=PerView(normalize_points)), expected) < 1e-9
-        assert up_to_sign(find_fundamental(points1, points2, None, lambda *args: Hartley()(*args)), expected) < 1e-12
-        single = find_fundamental(points1, points2, normalizer=lambda *args: [T.float() for T in Identity()(*args)])
-        assert single.dtype == torch.float64
-
-    @given(
-        st.integers(0, 2**31),
-        st.sampled_from([8, 15]),
-        st.floats(-2, 2),
-        st.floats(-3.14, 3.14),
-        st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)),
-    )
-    def test_hartley_moves_with_similarities(self, seed, num_points, log_scale, angle, shift):
-        points1, points2 = correspondences("handheld", 4, num_points, seed)
-        c, s = 10**log_scale * np.cos(angle), 10**log_scale * np.sin(angle)
-        S = torch.tensor([[c, -s, shift[0]], [s, c, shift[1]], [0, 0, 1]], dtype=torch.float64)
-        moved = points1 @ S[:2, :2].mT + S[:2, 2]
-        F_mat, pulled_back = find_fundamental(points1, points2), find_fundamental(moved, points2) @ S
-        assert hartley_difference(F_mat, pulled_back, points1, points2) < 1e-6
-
+    @pytest.mark.parametrize("normalizer", [Hartley(), Whitening()])
     @given(st.integers(0, 2**31), st.sampled_from([8, 15]), st.lists(st.floats(-1, 1), min_size=6, max_size=6))
-    def test_whitening_moves_with_affinities(self, seed, num_points, entries):
+    def test_moves_with_similarities_or_affinities(self, normalizer, seed, num_points, entries):
         points1, points2 = correspondences("handheld", 4, num_points, seed)
+        a, b, c, d, x, y = entries
+        linear = [[a, -b], [b, a]] if isinstance(normalizer, Hartley) else [[a, b], [c, d]]
         S = torch.eye(3, dtype=torch.float64)
-        S[:2] += 0.45 * torch.tensor(entries, dtype=torch.float64).view(2, 3) * torch.tensor([1, 1, 500.0])
+        S[:2, :2] += 0.45 * torch.tensor(linear, dtype=torch.float64)
+        S[:2, 2] = 500 * torch.tensor([x, y], dtype=torch.float64)
         moved = points2 @ S[:2, :2].mT + S[:2, 2]
-        F_mat = find_fundamental(points1, points2, normalizer=Whitening())
-        pulled_back = S.mT @ find_fundamental(points1, moved, normalizer=Whitening())
+        F_mat = find_fundamental(points1, points2, normalizer=normalizer)
+        pulled_back = S.mT @ find_fundamental(points1, moved, normalizer=normalizer)
         assert hartley_difference(F_mat, pulled_back, points1, points2) < 1e-6
 
 
 class TestWeights:
-    @pytest.mark.parametrize("num_points", [8, 9, 30])
-    def test_common_factor_changes_nothing(self, num_points):
-        points = correspondences("handheld", 10, num_points)
-        weights = uniform(10, num_points, low=0.1)
-        F_mat = find_fundamental(*points, weights, Whitening())
-        for factor in (1e-6, 7.0, 1e6):
-            assert hartley_difference(find_fundamental(*points, factor * weights, Whitening()), F_mat, *points) < 1e-10
-        ones = find_fundamental(*points, torch.ones(10, num_points))
-        assert up_to_sign(ones, find_fundamental(*points)) < 1e-12
-
     @pytest.mark.parametrize("normalizer", [Identity(), Hartley(), Whitening(), ReweightedWhitening()])
     @pytest.mark.parametrize("num_points", [8, 9, 20])
     def test_zero_means_absent_in_value_and_in_gradient(self, normalizer, num_points):
@@ -139,13 +99,6 @@ class TestWeights:
         for got, want in zip(found[:2], wanted[:2], strict=True):
             assert got[:, num_points:].abs().max() < 1e-12 * want.abs().max()
         assert torch.isfinite(found[2]).all()
-
-    def test_outliers_with_small_weights_hardly_count(self):
-        scene = scenes("orbit", 20, 40, noise=0.0, outliers=0.25)
-        weights = torch.where(scene.inliers, 1.0, 1e-14).double()
-        F_mat = find_fundamental(scene.points1, scene.points2, weights)
-        assert up_to_sign(F_mat, scene.F_mat) < 1e-6
-        assert up_to_sign(find_fundamental(scene.points1, scene.points2), scene.F_mat) > 1e-3
 
 
 @pytest.mark.parametrize("rank2", [None, True])
@@ -169,10 +122,6 @@ class TestGradients:
         """Of eight without weights see test_eight_point.py."""
         values = [*unit_square(1, 9), uniform(1, 9, low=0.2, seed=3)]
         check_gradients(derivative(lambda *v: signless(find_fundamental(*v, normalizer))), *values)
-
-    def test_second_of_eight_by_pytorch(self):
-        values = [v.requires_grad_() for v in unit_square(1, 8)]
-        assert gradgradcheck(lambda p, q: signless(find_fundamental(p, q)), values)
 
     @pytest.mark.parametrize("num_points", [8, 20])
     def test_with_respect_to_transforms(self, num_points):

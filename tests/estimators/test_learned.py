@@ -12,7 +12,6 @@ from scenes import (
     check_gradients,
     correspondences,
     rewrite_weights,
-    scenes,
     seeded,
     shaken_estimator,
     signless,
@@ -21,40 +20,32 @@ from scenes import (
 )
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators.match_features import CommonFrame, masked_median
+from kornia_learnnorm.estimators.match_features import masked_median
 
 
 def shaken_double(**options) -> kln.LearnedEightPoint:
     return shaken_estimator(**options).double()
 
 
-class TestInvariances:
-    @settings(max_examples=8)
-    @given(num_points=st.sampled_from([8, 9, 40]), seed=st.integers(0, 2**20))
-    @torch.no_grad()
-    def test_order_of_the_correspondences(self, num_points, seed):
-        layer, points = shaken_double(), correspondences("handheld", 4, num_points)
-        order = torch.randperm(num_points, generator=torch.Generator().manual_seed(seed))
-        estimate = layer.estimate(*points)
-        shuffled = layer.estimate(*(p[:, order] for p in points))
-        assert up_to_sign(shuffled.F_mat, estimate.F_mat) < 1e-6
-        assert torch.allclose(shuffled.weights, estimate.weights[:, order], atol=1e-8)
-
-    @settings(max_examples=8)
-    @given(num_points=st.sampled_from([8, 9, 40]), seed=st.integers(0, 2**20))
-    @torch.no_grad()
-    def test_swap_of_the_views(self, num_points, seed):
-        layer, (points1, points2) = shaken_double(), correspondences("handheld", 4, num_points, seed=seed)
-        assert up_to_sign(layer(points2, points1), layer(points1, points2).mT) < 1e-6
-
-    @settings(max_examples=8)
-    @given(num_points=st.sampled_from([9, 40]), factor=st.floats(1e-3, 1e3), shift=st.floats(-1e3, 1e3))
-    @torch.no_grad()
-    def test_one_scale_and_translation_of_both_images(self, num_points, factor, shift):
-        layer, points = shaken_double(), correspondences("handheld", 4, num_points)
-        moved = layer(*(factor * (p + shift) for p in points))
-        T = torch.tensor([[factor, 0, factor * shift], [0, factor, factor * shift], [0, 0, 1]], dtype=torch.float64)
-        assert up_to_sign(T.mT @ moved @ T, layer(*points)) < 1e-5
+@settings(max_examples=8)
+@given(
+    num_points=st.sampled_from([8, 9, 40]),
+    seed=st.integers(0, 2**20),
+    factor=st.floats(1e-3, 1e3),
+    shift=st.floats(-1e3, 1e3),
+)
+@torch.no_grad()
+def test_invariances(num_points, seed, factor, shift):
+    """To the order of the correspondences, a swap of the views, and one scale and translation of both images."""
+    layer, points = shaken_double(), correspondences("handheld", 4, num_points, seed=seed)
+    order = torch.randperm(num_points, generator=seeded(seed))
+    estimate, shuffled = layer.estimate(*points), layer.estimate(*(p[:, order] for p in points))
+    assert up_to_sign(shuffled.F_mat, estimate.F_mat) < 1e-6
+    assert torch.allclose(shuffled.weights, estimate.weights[:, order], atol=1e-8)
+    assert up_to_sign(layer(*points[::-1]).mT, estimate.F_mat) < 1e-6
+    moved = layer(*(factor * (p + shift) for p in points))
+    T = torch.tensor([[factor, 0, factor * shift], [0, factor, factor * shift], [0, 0, 1]], dtype=torch.float64)
+    assert up_to_sign(T.mT @ moved @ T, estimate.F_mat) < 1e-5
 
 
 class TestSmallSets:
@@ -109,12 +100,6 @@ class TestEstimate:
         assert torch.allclose(estimate.weights, estimate.stages[-1].logits.sigmoid())
         assert estimate.E_mat is None
         assert estimate.determined.all()
-
-    @torch.no_grad()
-    def test_cameras(self):
-        scene = scenes("handheld", 5, 20)
-        estimate = shaken_double().estimate(scene.points1, scene.points2, K1=scene.K1, K2=scene.K2)
-        assert up_to_sign(estimate.E_mat, scene.K2.mT @ estimate.F_mat @ scene.K1) < 1e-12
 
     @pytest.mark.parametrize("number", [0, 5, 8])
     def test_scores_of_few_matches_get_zero(self, number):
@@ -209,8 +194,3 @@ class TestFeatures:
             assert torch.equal(found[k, 0], held[(len(held) - 1) // 2])
         assert torch.equal(masked_median(values, torch.ones(6, 11)), masked_median(values, None))
         assert not masked_median(values, torch.zeros(6, 11)).any()
-
-    def test_the_view_of_smaller_spread_comes_first(self):
-        points = uniform(3, 20, 2, high=100)
-        assert CommonFrame.from_points(points, 2 * points, None).swapped.tolist() == [False] * 3
-        assert CommonFrame.from_points(2 * points, points, None).swapped.tolist() == [True] * 3
