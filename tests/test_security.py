@@ -168,7 +168,7 @@ class TestImages:
     def test_declared_pixels(self, tmp_path, size):
         path = tmp_path / "large.png"
         path.write_bytes(png(*size, bytes(1000)))
-        with pytest.raises(ValueError, match=r"large\.png declares more than 178956970 pixels, the limit, 2 \* PIL"):
+        with pytest.raises(ValueError, match=r"large\.png .* exceeds limit of 178956970 pixels"):
             read_image(path)
         assert image_size(path) == (0, 0)
 

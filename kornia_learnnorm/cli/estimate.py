@@ -9,8 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from kornia_learnnorm.data.images import image_size, read_colour
-from kornia_learnnorm.data.masks import read_mask
+from kornia_learnnorm.data.images import image_size, read_colour, read_mask
 from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs

@@ -1,4 +1,4 @@
-"""Reading image files as grey values or colours of eight bits, reduced to a size.
+"""Reading image files as grey values or colours of eight bits, reduced to a size, and masks of the pixels that count.
 
 Pillow, of the extra ``images``, is imported on use. The centre of the top left pixel is (0, 0), as in OpenCV.
 """
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["Size", "image_size", "import_cv2", "open_image", "read_colour", "read_image", "resize_image", "scaling"]
-__all__ += ["check_grey", "focal_length_35mm", "reduced_size", "scale_points"]
+__all__ = ["Size", "check_grey", "content_mask", "focal_length_35mm", "image_size", "import_cv2", "read_colour"]
+__all__ += ["read_image", "read_mask", "reduced_size", "resize_image", "scale_points", "scaling"]
 
 Size = tuple[int, int]  # width and height, pixels
 
@@ -32,6 +32,9 @@ ORIENTATION, EXIF_IFD, FOCAL_LENGTH_35MM = 0x0112, 0x8769, 0xA405  # tags
 QUARTER_TURNS = (5, 6, 7, 8)  # orientations that swap width and height
 # Names in PIL.Image.Transpose of the turns that undo the orientations from 2 on.
 TURNS = ("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90")
+MAX_BLACK = 2  # largest grey value of a black frame
+MAX_UNEVEN = 0.05  # share of a frame's row or column that may differ from its median; more is noise of a dark image
+MIN_USED = 128  # smallest grey value of a mask's pixel that counts
 
 
 def import_cv2() -> Any:
@@ -56,7 +59,7 @@ def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint
     """Return the grey values :math:`(H, W)`, uint8, of an image file, turned as its EXIF orientation says.
 
     They are those of OpenCV's ``IMREAD_GRAYSCALE``, which in other formats than PNG and JPEG can be a level higher (two
-    for CMYK). Of 16 bits the upper eight are kept, of an animation the first image; transparency is over black.
+    for CMYK). Of an animation the first image is read; transparency is over black.
 
     Args:
         path: a file in any format that Pillow decodes.
@@ -64,8 +67,7 @@ def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint
             and a JPEG decoded at a fraction of its size. None keeps the size of the file, as :func:`image_size` has it.
 
     FileNotFoundError if there is no such file; ValueError if it is no image, is truncated, corrupt, larger than twice
-    ``PIL.Image.MAX_IMAGE_PIXELS`` or of another kind of pixels, as floating-point numbers, or if ``max_size`` is below
-    1.
+    ``PIL.Image.MAX_IMAGE_PIXELS``, has more than eight bits of grey, or if ``max_size`` is below 1.
     """
     return _read(Path(path), "L", max_size)
 
@@ -80,29 +82,20 @@ def _read(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
     if not path.exists():
         raise FileNotFoundError(f"image {path} does not exist")
     reduced_size((1, 1), max_size)  # checks the limit before a file is read
-    size = path.stat().st_size
-    if path.is_dir() or size == 0:
-        got = "a folder" if path.is_dir() else "empty (0 bytes)"
-        raise ValueError(f"image {path} is {got}, expected an image file")
     Image = import_pillow()
     try:
         return _decode(path, mode, max_size)
-    except Image.DecompressionBombError as error:
-        limit = f"{2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels, the limit, 2 * PIL.Image.MAX_IMAGE_PIXELS"
-        raise ValueError(f"image {path} declares more than {limit}") from error
     except Exception as error:  # a broken file can end in nearly any error of Pillow's decoders
-        reason = "truncated or corrupt"
-        if isinstance(error, Image.UnidentifiedImageError):
-            reason = "not an image of a kind that Pillow reads, or one with a truncated or corrupt header"
-        elif isinstance(error, TypeError | MemoryError):
+        reason = "not an image, truncated or corrupt"
+        if isinstance(error, TypeError | MemoryError | Image.DecompressionBombError):
             reason = str(error) or "too large for the memory"
         elif isinstance(error, OSError) and error.strerror:  # of the system; Pillow's own have no number
             reason = error.strerror
-        raise ValueError(f"image {path} cannot be decoded: {size} bytes, {reason}") from error
+        raise ValueError(f"image {path} cannot be decoded: {path.stat().st_size} bytes, {reason}") from error
 
 
 def _decode(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
-    """Return the pixels in a mode, L or RGB; TypeError for pixels that are not converted to eight bits."""
+    """Return the pixels in a mode, L or RGB; TypeError for pixels of more than eight bits."""
     with open_image(path) as image:
         image.verify()  # the checksums of a PNG, which decoding skips
     with open_image(path) as image:
@@ -114,11 +107,14 @@ def _decode(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
         if drafted is None:
             size = reduced_size(image.size, max_size)  # again, since loading turns a TIFF
         box = drafted[1] if drafted else (0, 0, *image.size)  # a JPEG at an eighth has a part of a last pixel
-        image = _eight_bits(image)
+        if image.mode[0] in "IF" or image.mode == "LAB":
+            raise TypeError(f"pixels of the kind {image.mode} are not read, expected eight bits of grey or colours")
+        clear = "transparency" in image.info or image.mode[-1] in "Aa"
+        image = image.convert("RGBA" if clear else "L" if image.mode in ("1", "L") else "RGB")
     image = image if size == image.size else _reduce(image, size, box)
     if 2 <= turn <= 8:
         image = image.transpose(import_pillow().Transpose[TURNS[turn - 2]])
-    if image.mode == "RGBA":  # over black
+    if clear:  # over black
         image = import_pillow().fromarray(np.asarray(image.convert("RGBa"))[..., :3])
     if (image.mode, mode) == ("RGB", "L"):
         image = image.convert("L", LUMA)
@@ -136,17 +132,6 @@ def focal_length_35mm(path: Path) -> float:
     """Return a photograph's equivalent focal length on film of 36 x 24 mm, millimetres, by EXIF; 0 for unknown."""
     with open_image(path) as image:
         return float(image.getexif().get_ifd(EXIF_IFD).get(FOCAL_LENGTH_35MM, 0))
-
-
-def _eight_bits(image: Any) -> Any:
-    """Return a loaded image in one of the modes L, RGB and RGBA."""
-    if image.mode.startswith("I") and 0 <= image.getextrema()[0] <= image.getextrema()[1] < 1 << 16:
-        return import_pillow().fromarray((np.asarray(image) >> 8).astype(np.uint8))
-    if image.mode[0] in "IF" or image.mode == "LAB":
-        raise TypeError(f"pixels of the kind {image.mode} are not read, expected grey, RGB, CMYK or a palette")
-    if "transparency" in image.info or image.mode[-1] in "Aa":
-        return image.convert("RGBA")
-    return image.convert("L" if image.mode in ("1", "L") else "RGB")
 
 
 def _reduce(image: Any, size: Size, box: tuple[float, float, float, float] | None = None) -> Any:
@@ -214,3 +199,44 @@ def scale_points(points: NDArray[Any], size_from: Size, size_to: Size) -> NDArra
     """Return pixels :math:`(*, 2)` of an image of one (width, height) in it at another, by :func:`scaling`."""
     factors = scaling(size_from, size_to).diagonal()[:2].numpy()
     return np.asarray((np.asarray(points, np.float64) + 0.5) * factors - 0.5)
+
+
+def read_mask(path: str | Path, size: Size, max_size: int | None = None) -> NDArray[np.bool_]:
+    """Return which pixels of an image count by a mask file, (H, W) bool: those above 127.
+
+    :func:`read_image` reads the file, so transparent pixels do not count; ``max_size`` is the limit that the image was
+    read with. A mask without a pixel that counts is a ValueError, and one that does not
+    have the (width, height) of the image file, turned by EXIF.
+    """
+    mask = read_image(path, max_size) >= MIN_USED
+    got = image_size(path)
+    if got != size:
+        raise ValueError(f"mask {path} has {got[0]} x {got[1]} pixels, its image {size[0]} x {size[1]}")
+    if not mask.any():
+        raise ValueError(f"mask {path} has no pixel above {MIN_USED - 1}")
+    return mask
+
+
+def content_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+    """Return which pixels are inside of a black frame, (H, W) bool; None if there is no frame.
+
+    The frame is made of the outermost rows and columns with grey values of at most 2, of which 95 % or more are equal.
+    The rows and columns of a dark photograph have noise and are kept. An image that is black all over has no frame.
+    Other arrays than grey values in uint8 are a TypeError or a ValueError.
+    """
+    check_grey(image)
+    inside = [np.flatnonzero(~_black_rows(lines)) for lines in (image, image.T)]
+    if any(len(kept) == 0 for kept in inside):
+        return None
+    (top, bottom), (left, right) = ((kept[0], kept[-1] + 1) for kept in inside)
+    mask = np.zeros(image.shape, bool)
+    mask[top:bottom, left:right] = True
+    return None if mask.all() else mask
+
+
+def _black_rows(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which rows are black and constant."""
+    black = np.asarray(image.max(1) <= MAX_BLACK)
+    rows = image[black]
+    black[black] = (rows != np.median(rows, 1, keepdims=True)).mean(1) <= MAX_UNEVEN if len(rows) else False
+    return black

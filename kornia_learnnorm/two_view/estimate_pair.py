@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.images import Size, image_size, import_cv2, read_image, resize_image, scaling
-from kornia_learnnorm.data.masks import content_mask
+from kornia_learnnorm.data.images import Size, content_mask, image_size, import_cv2, read_image, resize_image, scaling
 from kornia_learnnorm.data.matching.features import DETECTORS, Features, keep_features
 from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
 from kornia_learnnorm.estimators.learned import LearnedEightPoint

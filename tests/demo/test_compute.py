@@ -49,11 +49,11 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("content", "message"),
         [
-            (b"", "empty"),
+            (b"", "0 bytes"),
             (b"no pixels at all", "not an image"),
             (png(200, 100)[:60], "truncated or corrupt"),
             (png(200, 100) + bytes(3000), "at most 0 MB"),
-            (png(400, 300), "declares more than 100000 pixels"),
+            (png(400, 300), "exceeds limit of 100000 pixels"),
         ],
     )
     def test_bad_files_are_named_without_their_folder(self, monkeypatch, content, message):
