@@ -19,9 +19,9 @@ from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import TOOLS, TRAINING, main, make_parser
+from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
-from lightning_modules.callbacks import _duration
 from lightning_modules.config_files import find_config
 
 pytestmark = pytest.mark.usefixtures("program")
@@ -51,7 +51,7 @@ OF_PAPER = overlays("table1", "paper-short").items()
 TABLE1 = overlays("table1", "crossview") | {name: files for name, files in OF_PAPER if name.startswith("paper")}
 RUNS = {path.stem: [path] for path in CONFIGS} | ABLATIONS | TABLE1
 RUNS |= {"base": [FOLDER / "ablations/base.yaml"], "paper-base": PAPER_BASE}
-TRAINED = ("crossview", "paper", "crossview-synthetic", "transform-paper", "paper-loss-algebraic", "crossview-both")
+TRAINED = ("crossview", "paper", "transform-paper")
 STORES = ("kitti_00", "kitti_01", "kitti_03", "kitti_06", "tum_fr3_office")
 
 
@@ -84,12 +84,10 @@ def together(configs):
 
 @pytest.mark.parametrize("name", RUNS)
 def test_every_config_runs(name, data, tmp_path, monkeypatch, capsys, refused):
-    """One of each kind trains; of the others, task, data and trainer are made."""
+    """One of each transform trains; of the others, task, data and trainer are made."""
     monkeypatch.setenv("LEARNNORM_DATA", str(data))
     options = [*together(RUNS[name]), *SMALL, f"--trainer.default_root_dir={tmp_path}"]
     options += ["--data.val.init_args.number=50"]
-    if name.endswith("synthetic"):
-        options += ["--data.train.init_args.number=200"]
     if RUNS[name][0].stem.startswith("paper"):
         options += [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
     if name not in TRAINED:
@@ -97,25 +95,27 @@ def test_every_config_runs(name, data, tmp_path, monkeypatch, capsys, refused):
         return
     assert main(["fit", *options]) == 0
     assert_trained(tmp_path / "weights.safetensors")
-    if name in ("crossview", "paper"):
+    if name == "crossview":
         options += [f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"]
-        assert [main([command, *options]) for command in ("validate", "test", "predict")] == [0, 0, 0]
+        assert [main([command, *options]) for command in ("test", "predict")] == [0, 0]
         assert "better_than_hartley" in capsys.readouterr().out
         assert set(load_file(tmp_path / "predictions.safetensors")) == {"F_mat", "T1", "T2", "pair", "residual"}
 
 
 @pytest.mark.parametrize("name", OF_SETS)
 def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch, capsys, refused):
-    if name != "robust-synthetic":  # they name pairs of the real stores
-        monkeypatch.setenv("LEARNNORM_DATA", str(request.getfixturevalue("real_data")))
+    """Those of real stores are only made."""
     config = ["--config", str(FOLDER / f"{name}.yaml")]
+    config += ["--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={tmp_path}"]
+    if name != "robust-synthetic":
+        monkeypatch.setenv("LEARNNORM_DATA", str(request.getfixturevalue("real_data")))
+        refused(["fit", *config, "--trainer.max_steps=0"], "trainer.max_steps is 0")
+        return
     for stage in ("train", "val"):
         config += [f"--data.{stage}.init_args.correspondences=128", f"--data.{stage}.init_args.batches=2"]
-    config += ["--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={tmp_path}"]
     assert main(["fit", *config, "--trainer.max_steps=2"]) == 0
-    kind = kln.LearnedNormalizer if name == "crossview-sets" else kln.LearnedEightPoint
-    layer = kind.from_pretrained(tmp_path / "weights.safetensors")
-    assert "synthetic scenes" in layer.trained_on
+    layer = kln.LearnedEightPoint.from_pretrained(tmp_path / "weights.safetensors")
+    assert layer.trained_on == ("synthetic scenes",)
     assert all(bool(value.any()) for key, value in layer.state_dict().items() if "logit.weight" in key)
     checkpoint = f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"
     assert main(["validate", *config, checkpoint]) == 0
@@ -152,9 +152,9 @@ def test_other_training_data_leave_normalizer_and_loss_alone(name):
 @pytest.mark.parametrize(
     ("commands", "options", "message"),
     [
-        ("validate test predict", [], "give the checkpoint by --ckpt_path"),
-        ("fit test", ["--ckpt_path=weights.safetensors"], "weights.safetensors is not a checkpoint of a training run"),
-        ("fit test", ["--ckpt_path=none.ckpt"], "no checkpoint at none.ckpt"),
+        ("validate predict", [], "give the checkpoint by --ckpt_path"),
+        ("fit", ["--ckpt_path=weights.safetensors"], "weights.safetensors is not a checkpoint of a training run"),
+        ("test", ["--ckpt_path=none.ckpt"], "no checkpoint at none.ckpt"),
         ("test", ["--ckpt_path=checkpoints/last.ckpt", f"--{NETWORK}.width=32"], "holds another network than the one"),
     ],
 )
@@ -173,13 +173,13 @@ def test_interrupted(monkeypatch, capsys):
     assert capsys.readouterr().err == "interrupted\n"
 
 
-# The console script in a process where importing one module is interrupted.
+# The console script in a process where importing torch is interrupted.
 INTERRUPTED_IMPORT = """
 import sys
 
 class Interrupting:
     def find_spec(self, name, path=None, target=None):
-        if name == sys.argv[1]:
+        if name == "torch":
             raise KeyboardInterrupt
 
 sys.meta_path.insert(0, Interrupting())
@@ -188,10 +188,9 @@ sys.exit(kornia_learnnorm_command.main())
 """
 
 
-@pytest.mark.parametrize("module", ["torch", "kornia_learnnorm.cli.main"])
-def test_interrupted_while_importing(module, tmp_path):
-    command = [sys.executable, "-c", INTERRUPTED_IMPORT, module]
+def test_interrupted_while_importing(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(FOLDER.parent)}
+    command = [sys.executable, "-c", INTERRUPTED_IMPORT]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
@@ -218,16 +217,11 @@ def test_output_whose_reader_has_ended_is_no_error(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_synthesize_evaluate_estimate(tmp_path, capsys, refused):
+def test_synthesize(tmp_path, refused):
     assert main(["synthesize", str(tmp_path), "--pairs", "2", "--points", "80"]) == 0
-    assert main(["evaluate", str(tmp_path / "synthetic.h5"), "--weights", "crossview"]) == 0
-    out = capsys.readouterr().out
-    assert [out.count(f"| {row} ") for row in ("none", "Hartley", "whitening", "reweighted", "searched")] == [2] * 5
-    pair = [str(tmp_path / "image1.png"), str(tmp_path / "image2.png")]
-    assert main(["estimate", *pair, "--out", str(tmp_path / "pair.png"), "--json", str(tmp_path / "F.json")]) == 0
-    assert (tmp_path / "pair.png").stat().st_size > 10_000
-    assert "inliers" in capsys.readouterr().out
-    refused(["synthesize", tmp_path / "F.json"], "F.json is a file: expected a folder")
+    assert len(read_store(tmp_path / "synthetic.h5")) == 6
+    assert {path.name for path in tmp_path.glob("[gi]*")} == {"ground_truth.json", "image1.png", "image2.png"}
+    refused(["synthesize", tmp_path / "image1.png"], "image1.png is a file: expected a folder")
 
 
 FIT = ["fit", "--config", "crossview-synthetic"]
@@ -240,7 +234,6 @@ DATA = "data: {{{}: {{class_path: kornia_learnnorm.data.sources.StoreSamples, in
     [
         (["fit", "--config", "crossview", *SMALL], "", "the environment variable LEARNNORM_DATA, named in "),
         (["estimate", "none1.png", "none2.png"], "", "none1.png"),
-        (["synthesize", "folder", "--pairs", "0"], "", "0"),
         (["synthesize", "folder", "--scenes", "moon"], "", "moon"),
         (["fit"], "", "give one by --config, a file or one of crossview, "),
         (["validate"], "", "for example learnnorm validate --config crossview-synthetic --ckpt_path "),
@@ -248,16 +241,13 @@ DATA = "data: {{{}: {{class_path: kornia_learnnorm.data.sources.StoreSamples, in
         (["fit", "--config", "bad.yaml"], "trainer: {max_steps: 9}", "fit.model.estimator"),
         ([*FIT, "--nonsense"], "", "--nonsense; learnnorm fit --help-all lists the options"),
         ([*FIT, f"--{NETWORK}.widht=3"], "", "Option 'widht' is not accepted"),
-        ([*FIT, "--trainer.precision", "12"], "", "trainer.precision"),
         ([*FIT, "--trainer.default_root_dir", "bad.yaml"], "", "bad.yaml is a file: expected a folder for the run"),
         ([*FIT, "--config", "unknown"], "", "no configuration unknown: expected a file, or one of crossview, "),
         ([*FIT, "--json", "a.json"], "", "--json a.json"),
         (WITH_BAD, "model: {nomalizer: 3}", "model.nomalizer"),
-        (WITH_BAD, "model: 3", "fit.model"),
         *((WITH_BAD, bad, "") for bad in ("", "- 1", "a: [1", "\xff\xfe")),
         (WITH_BAD, DATA.format("train", "{paths: [none.h5]}"), "no store at none.h5\n"),
         (WITH_BAD, DATA.format("val", "{paths: [none.h5], max_ratios: 7}"), "max_ratios"),
-        (WITH_BAD, DATA.format("val", "{paths: [none.h5], size: 3}"), "at least 8 correspondences"),
     ],
 )
 def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, monkeypatch, refused):
@@ -279,28 +269,25 @@ def test_a_missing_package_is_one_line(blocked, extra, tmp_path, monkeypatch, re
         refused(command, f"needs {blocked}: run pip install '.[{extra}]'")
 
 
-@pytest.mark.parametrize(("command", "stage"), [("validate", "val"), ("test", "test")])
-def test_json_of_a_checkpoint_has_its_metrics(command, stage, trained, tmp_path, capsys, refused):
+def test_json_of_a_checkpoint_has_its_metrics(trained, tmp_path, capsys, refused):
     folder, options = trained
     last, path = folder / "checkpoints/last.ckpt", tmp_path / "metrics.json"
-    words = [command, *options, "--ckpt_path", str(last)]
+    words = ["validate", *options, "--ckpt_path", str(last)]
     assert main([*words, "--json", str(path)]) == 0
-    out = capsys.readouterr().out
-    assert main([*words, "--json=-"]) == 0
-    found, again = json.loads(path.read_text()), json.loads(capsys.readouterr().out)
+    out, found = capsys.readouterr().out, json.loads(path.read_text())
     assert found["command"] == shlex.join(["learnnorm", *words, "--json", str(path)])
-    assert found["tables"] == again["tables"]
     (table,) = found["tables"]
-    names = {f"{stage}/{name}" for name in ("log_sed", "better_than_hartley", "better_than_whitening", "left_out")}
+    names = {f"val/{name}" for name in ("log_sed", "better_than_hartley", "better_than_whitening", "left_out")}
     assert {row["metric"] for row in table["rows"]} == names
     assert all(row["metric"] in out and str(row["value"]) in out for row in table["rows"])
+    assert main([*words, "--json=-"]) == 0
+    assert json.loads(capsys.readouterr().out)["tables"] == found["tables"]
     refused([*words, "--json", last], f"--json {last}: expected a new file or -")
-    refused([*words, "--json", tmp_path / "none/a.json"], "none does not exist")
 
 
 @pytest.mark.parametrize(
     "option",
-    ["max_steps=0", "max_epochs=0", "limit_train_batches=0", "limit_train_batches=0.0", "max_time=00:00:00:00"],
+    ["max_epochs=0", "limit_train_batches=0", "limit_train_batches=0.0", "max_time=00:00:00:00"],
 )
 def test_a_training_without_steps_is_refused(option, tmp_path, refused):
     folder = tmp_path / "run"
@@ -320,10 +307,6 @@ def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog, capsys):
     assert [text for text in caplog.messages if re.fullmatch(r"about \d+ s for the remaining 2 steps, .*", text)]
     assert [text for text in caplog.messages if re.fullmatch(r"13 steps in \d+ s", text)]
     assert [text for text in caplog.messages if re.search("available|Tip|Seed", text)] == []  # Lightning's own
-
-
-def test_durations():
-    assert [*map(_duration, (0.1, 89, 120, 5399, 9000))] == ["1 s", "89 s", "2 min", "90 min", "2.5 h"]
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -372,11 +355,11 @@ def test_configurations_are_found_by_name_from_any_folder(tmp_path, monkeypatch,
     assert find_config("crossview") == Path("crossview")
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.yaml")), ids=lambda path: path.stem)
-def test_configurations_take_the_accelerator_that_is_there(path):
-    trainer = yaml.safe_load(path.read_text()).get("trainer", {})
-    assert trainer.get("accelerator", "auto") == "auto"
-    assert "accelerator" in trainer or path.parent != FOLDER
+def test_configurations_take_the_accelerator_that_is_there():
+    for path in FOLDER.rglob("*.yaml"):
+        trainer = yaml.safe_load(path.read_text()).get("trainer", {})
+        assert trainer.get("accelerator", "auto") == "auto", path
+        assert "accelerator" in trainer or path.parent != FOLDER, path
 
 
 def help_of(*words):
@@ -422,10 +405,7 @@ def test_the_options_of_the_help_are_among_all(command):
     ("arguments", "message"),
     [
         ([], "usage: learnnorm "),
-        (["unknown"], "usage: learnnorm "),
-        (["evaluate"], "usage: learnnorm evaluate "),
         (["config", "crossview", "--unheard", "of"], "learnnorm config: error: unrecognized arguments: --unheard of"),
-        (["estimate", "a.png", "b.png", "--unheard"], "usage: learnnorm estimate "),
     ],
 )
 def test_bad_usage_exits_with_2(arguments, message, capsys):
