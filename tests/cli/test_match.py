@@ -79,7 +79,7 @@ def test_skipped_pairs_are_listed_up_to_a_number(written, tmp_path, capsys, monk
     (root / "sequences/06/image_0/000001.png").write_bytes(b"")
     assert run("kitti", root, tmp_path / "s.h5", "--sequences", "06") == 0
     captured = capsys.readouterr()
-    assert captured.err.count("000001.png is empty (0 bytes)") == 1
+    assert captured.err.count("000001.png cannot be decoded: 0 bytes") == 1
     assert "skipped 2 pairs in all; the store lists them" in captured.err
     assert len(read_store(tmp_path / "s.h5").provenance["skipped"]) == 2
 
