@@ -162,6 +162,29 @@ def epipolar_distances(points1, points2, F) -> np.ndarray:
     return residual / np.hypot(*lines2[..., :2].T).T + residual / np.hypot(*lines1[..., :2].T).T
 
 
+def numpy_sampson(points1, points2, F) -> np.ndarray:
+    """Sampson distances in pixels, with signs, (*, N)."""
+    x1, x2, F = homogeneous(np.asarray(points1)), homogeneous(np.asarray(points2)), np.asarray(F)
+    lines2, lines1 = x1 @ F.swapaxes(-1, -2), x2 @ F
+    return (x2 * lines2).sum(-1) / np.sqrt((lines1[..., :2] ** 2).sum(-1) + (lines2[..., :2] ** 2).sum(-1))
+
+
+def least_squares(distances, q, step: float = 1e-6, iterations: int = 300) -> float:
+    """Least sum of squares found from q by damped Gauss-Newton steps on central differences."""
+    damping, cost = 1e-3, (distances(q) ** 2).sum()
+    for _ in range(iterations):
+        J = np.stack([(distances(q + s) - distances(q - s)) / (2 * step) for s in step * np.eye(len(q))], -1)
+        H = J.T @ J
+        damped = H + damping * np.diag(H.diagonal()) + 1e-12 * np.eye(len(q))
+        new = q - np.linalg.solve(damped, J.T @ distances(q))
+        new_cost = (distances(new) ** 2).sum()
+        if abs(new_cost - cost) < 1e-13 * cost:
+            break
+        q, cost, damping = (new, new_cost, damping / 5) if new_cost < cost else (q, cost, damping * 5)
+        damping = min(max(damping, 1e-12), 1e12)
+    return cost
+
+
 def up_to_sign(F, G) -> float:
     """Largest difference of two batches of matrices, each scaled to unit norm, whatever their signs."""
     F, G = unit(np.asarray(F, dtype=np.float64)), unit(np.asarray(G, dtype=np.float64))

@@ -5,14 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from kornia.core.exceptions import ShapeError
-from scenes import cross, homogeneous, scenes, true_essential, uniform, up_to_sign
+from scenes import cross, homogeneous, least_squares, numpy_sampson, scenes, true_essential, uniform, up_to_sign
 
 from kornia_learnnorm.estimators.refinement import refine_essential
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, squared_loss
 from kornia_learnnorm.geometry.minimal import solve_calibrated_samples
-
-NAN = float("nan")
 
 
 def disturbed(E, size: float = 0.02) -> torch.Tensor:
@@ -25,15 +22,8 @@ def problem(name: str = "handheld", batch_size: int = 3, num_points: int = 40, n
     return (scene.points1, scene.points2), true_essential(scene), (scene.K1, scene.K2)
 
 
-def numpy_distances(F, points1, points2) -> np.ndarray:
-    """Sampson distances in pixels, with signs, (N,)."""
-    x1, x2 = homogeneous(points1), homogeneous(points2)
-    line1, line2 = x2 @ F, x1 @ F.T
-    return (x2 * line2).sum(-1) / np.sqrt((line1[:, :2] ** 2).sum(1) + (line2[:, :2] ** 2).sum(1))
-
-
-def gauss_newton(R, t, points1, points2, K1, K2, iterations: int = 100) -> float:
-    """Least cost found from a pose: damped steps of a rotation vector and of two angles of t, central differences."""
+def gauss_newton(R, t, points1, points2, K1, K2) -> float:
+    """Least cost found from a pose, by a rotation vector and two angles of t."""
     t = t / np.linalg.norm(t)
     side = np.linalg.svd(t[None])[2][1:]
 
@@ -41,21 +31,11 @@ def gauss_newton(R, t, points1, points2, K1, K2, iterations: int = 100) -> float
         angle = np.linalg.norm(q[:3]) + 1e-300
         k = cross(q[:3] / angle)
         turned = (np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k) @ R
-        E = cross(t + q[3:] @ side) @ turned
-        return numpy_distances(np.linalg.inv(K2).T @ E @ np.linalg.inv(K1), points1, points2)
+        return numpy_sampson(
+            points1, points2, np.linalg.inv(K2).T @ cross(t + q[3:] @ side) @ turned @ np.linalg.inv(K1)
+        )
 
-    q, damping = np.zeros(5), 1e-3
-    cost = (distances(q) ** 2).sum()
-    for _ in range(iterations):
-        d = distances(q)
-        J = np.stack([(distances(q + s) - distances(q - s)) / 2e-7 for s in 1e-7 * np.eye(5)], -1)
-        H = J.T @ J
-        new = q - np.linalg.solve(H + damping * np.diag(H.diagonal()), J.T @ d)
-        new_cost = (distances(new) ** 2).sum()
-        if abs(new_cost - cost) < 1e-13 * cost:
-            break
-        q, cost, damping = (new, new_cost, damping / 5) if new_cost < cost else (q, cost, damping * 5)
-    return cost
+    return least_squares(distances, np.zeros(5), 1e-7)
 
 
 class TestRefineEssential:
@@ -85,9 +65,8 @@ class TestRefineEssential:
         found = refine_essential(*points, E, *K, weights, loss)
         F0 = torch.linalg.inv(K[1]).mT @ E @ torch.linalg.inv(K[0])
         for F, cost in ((F0, found.cost_before), (found.F_mat, found.cost)):
-            for k in range(3):
-                squares = torch.from_numpy(numpy_distances(*(v[k].numpy() for v in (F, *points))) ** 2)
-                assert cost[k].item() == pytest.approx((weights[k] * loss(squares)[0]).sum().item(), rel=1e-7)
+            squares = torch.from_numpy(numpy_sampson(*points, F) ** 2)
+            np.testing.assert_allclose(cost, (weights * loss(squares)[0]).sum(-1), rtol=1e-7)
         assert (found.cost <= found.cost_before).all()
 
     def test_what_the_matrices_are(self):
@@ -113,18 +92,13 @@ class TestRefineEssential:
 
 
 class TestInvariances:
-    def test_permutation(self):
+    def test_neither_the_order_of_the_points_nor_of_the_views_counts(self):
         points, E, K = problem()
         order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
         found, again = (refine_essential(*p, disturbed(E), *K).E_mat for p in (points, [p[:, order] for p in points]))
         assert up_to_sign(found, again) < 1e-7
-
-    def test_swapping_the_views_transposes(self):
-        points, E, K = problem()
-        found = refine_essential(*points, disturbed(E), *K)
-        swapped = refine_essential(*points[::-1], disturbed(E).mT, *K[::-1])
-        assert up_to_sign(found.E_mat, swapped.E_mat.mT) < 1e-7
-        np.testing.assert_allclose(found.cost, swapped.cost)
+        swapped = refine_essential(*points[::-1], disturbed(E).mT, *K[::-1]).E_mat
+        assert up_to_sign(found, swapped.mT) < 1e-7
 
     @pytest.mark.parametrize("scale", [1e-3, 7.0, 1e3])
     def test_scale_of_the_pixels(self, scale):
@@ -154,16 +128,10 @@ POINTS, EYE = uniform(2, 10, 2), torch.eye(3, dtype=torch.float64)
     [
         ({"points1": POINTS[:, :4], "points2": POINTS[:, :4]}, ValueError, "at least 5 correspondences .* got 4"),
         ({"points2": POINTS[:1]}, ValueError, "must pair up"),
-        ({"E_mat": EYE}, ShapeError, r"\[3, 3\]"),
         ({"E_mat": EYE[None]}, ValueError, "one matrix per set of points is needed, got 1 matrices and 2 sets"),
-        ({"E_mat": 0 * EYE.repeat(2, 1, 1)}, ValueError, "E_mat must not be zero, got 2 zero matrices"),
-        ({"E_mat": NAN * EYE.repeat(2, 1, 1)}, ValueError, "E_mat must be finite, got 18"),
         ({"E_mat": None}, TypeError, "E_mat must be a floating-point tensor"),
         ({"K1": None}, ValueError, "K1 and K2 must be given together, got only K2"),
-        ({"K2": 0 * EYE}, ValueError, "K2 must be finite and invertible"),
-        ({"K1": NAN * EYE}, ValueError, "K1 must be finite and invertible"),
         ({"K1": EYE.repeat(3, 1, 1)}, ValueError, r"K1 must have shape \[3, 3\] or \[2, 3, 3\], got \[3, 3, 3\]"),
-        ({"K1": EYE.long()}, TypeError, "K1 must be a floating-point tensor, got torch.int64"),
         ({"loss": "huber"}, TypeError, "loss must be a function"),
         ({"distance": "foo"}, ValueError, "distance must be"),
         ({"max_iterations": -1}, ValueError, "must be >= 0"),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -27,7 +25,7 @@ def shaken_double(**options) -> kln.LearnedEightPoint:
     return shaken_estimator(**options).double()
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(
     num_points=st.sampled_from([8, 9, 40]),
     seed=st.integers(0, 2**20),
@@ -170,14 +168,6 @@ class TestFiles:
     def test_garbled_architecture(self, file, architecture):
         rewrite_weights(file, lambda _, metadata: metadata.update(architecture=architecture))
         with pytest.raises(ValueError, match=r"weights\.safetensors describes no estimator of this version"):
-            kln.LearnedEightPoint.from_pretrained(file)
-
-    def test_architecture_of_another_size(self, file):
-        def deepen(_, metadata):
-            metadata["architecture"] = json.dumps(json.loads(metadata["architecture"]) | {"depth": 5})
-
-        rewrite_weights(file, deepen)
-        with pytest.raises(ValueError, match="do not fit the architecture"):
             kln.LearnedEightPoint.from_pretrained(file)
 
     def test_weights_of_a_normaliser(self):

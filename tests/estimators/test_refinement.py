@@ -13,9 +13,10 @@ from scenes import (
     correspondences,
     epipolar_distances,
     hartley_difference,
-    homogeneous,
     in_hartley,
+    least_squares,
     numpy_hartley,
+    numpy_sampson,
     scenes,
     signless,
     uniform,
@@ -39,39 +40,22 @@ LOSSES = [squared_loss, Huber(0.5), Cauchy(0.5), GemanMcClure(2.0), Truncated(3.
 
 
 def numpy_distances(F, points1, points2, kind: str) -> np.ndarray:
-    """Distances in pixels, without sign, (N,)."""
-    x1, x2 = homogeneous(points1), homogeneous(points2)
-    line1, line2 = x2 @ F, x1 @ F.T
-    norm1, norm2 = np.hypot(*line1[:, :2].T), np.hypot(*line2[:, :2].T)
-    algebraic = (x2 * line2).sum(-1)
-    return algebraic / np.hypot(norm1, norm2) if kind == "sampson" else algebraic * (1 / norm1 + 1 / norm2)
+    """Distances in pixels, (N,), of which those of Sampson have signs."""
+    return numpy_sampson(points1, points2, F) if kind == "sampson" else epipolar_distances(points1, points2, F)
 
 
-def gauss_newton(F, points1, points2, kind: str = "sampson", iterations: int = 300) -> float:
-    """Least cost found from F: damped steps of F = [a b a*s + b*t] (epipole by two ratios) by central differences."""
+def gauss_newton(F, points1, points2, kind: str) -> float:
+    """Least cost found from F, as F = [a b a*s + b*t] (epipole by two ratios)."""
     T1, T2 = (numpy_hartley(p[None])[0] for p in (points1, points2))
     F = unit(np.linalg.inv(T2).T @ F @ np.linalg.inv(T1))
     # Turn the epipole of view 1 to the third axis, where the last column of F vanishes and the chart is centred.
     V = np.linalg.svd(F)[2].T
-    G = F @ V
 
     def distances(q):
         columns = np.column_stack([q[:6].reshape(3, 2), q[:6].reshape(3, 2) @ q[6:]])
         return numpy_distances(T2.T @ columns @ V.T @ T1, points1, points2, kind)
 
-    q = np.concatenate([G[:, :2].reshape(6), np.zeros(2)])
-    damping, cost = 1e-3, (distances(q) ** 2).sum()
-    for _ in range(iterations):
-        d, steps = distances(q), 1e-6 * np.eye(8)
-        J = np.stack([(distances(q + s) - distances(q - s)) / 2e-6 for s in steps], -1)
-        H = J.T @ J
-        new = q - np.linalg.solve(H + damping * np.diag(H.diagonal()) + 1e-12 * np.eye(8), J.T @ d)
-        new_cost = (distances(new) ** 2).sum()
-        if abs(new_cost - cost) < 1e-13 * cost:
-            break
-        q, cost, damping = (new, new_cost, damping / 5) if new_cost < cost else (q, cost, damping * 5)
-        damping = min(max(damping, 1e-12), 1e12)
-    return cost
+    return least_squares(distances, np.concatenate([(F @ V)[:, :2].reshape(6), np.zeros(2)]))
 
 
 class TestRefineFundamental:
@@ -110,7 +94,7 @@ class TestRefineFundamental:
         assert found.converged.all()
         T1, T2 = (torch.from_numpy(numpy_hartley(points)) for points in (points1, points2))
         F_hat = torch.from_numpy(in_hartley(found.F_mat, points1, points2))
-        for seed in range(20):
+        for seed in range(5):
             near = T2.mT @ (F_hat + 1e-3 * uniform(10, 3, 3, low=-1, seed=seed)) @ T1
             cost = refine_fundamental(points1, points2, near, None, kind, loss, 0).cost
             assert (cost > found.cost * (1 - 1e-9)).all()
@@ -196,7 +180,7 @@ class TestRefineFundamental:
         for one, many in zip(*gradients, strict=True):
             torch.testing.assert_close(one, many, rtol=1e-4, atol=1e-8)
 
-    @pytest.mark.parametrize("loss", LOSSES)
+    @pytest.mark.parametrize("loss", [squared_loss, Cauchy(0.5)])
     def test_tolerance_trades_steps_for_cost(self, loss):
         points1, points2 = correspondences("driving", 20, 100, noise=0.5)
         F0 = find_fundamental(points1, points2)

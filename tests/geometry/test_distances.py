@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from scenes import SCENES, correspondences, epipolar_distances, homogeneous, scenes, uniform
+from scenes import SCENES, correspondences, epipolar_distances, homogeneous, numpy_sampson, scenes, uniform
 from torch.autograd import gradcheck
 
 from kornia_learnnorm import algebraic_distance, find_fundamental, sampson_distance, symmetric_epipolar_distance
@@ -19,13 +19,6 @@ ORIGIN = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])  #
 POINTS, MATRICES = uniform(2, 8, 2), uniform(2, 3, 3)
 
 
-def numpy_sampson(points1, points2, F):
-    x1, x2 = homogeneous(points1.numpy()), homogeneous(points2.numpy())
-    lines2, lines1 = x1 @ F.numpy().swapaxes(-1, -2), x2 @ F.numpy()
-    squared = (lines1[..., :2] ** 2).sum(-1) + (lines2[..., :2] ** 2).sum(-1)
-    return np.abs((x2 * lines2).sum(-1)) / np.sqrt(squared)
-
-
 def numpy_algebraic(points1, points2, F):
     x1, x2, F = homogeneous(points1.numpy()), homogeneous(points2.numpy()), F.numpy()
     return np.abs(np.einsum("bni,bij,bnj->bn", x2, F / np.linalg.norm(F, axis=(1, 2), keepdims=True), x1))
@@ -33,7 +26,7 @@ def numpy_algebraic(points1, points2, F):
 
 REFERENCES = {
     symmetric_epipolar_distance: epipolar_distances,
-    sampson_distance: numpy_sampson,
+    sampson_distance: lambda *values: np.abs(numpy_sampson(*values)),
     algebraic_distance: numpy_algebraic,
 }
 
