@@ -67,18 +67,15 @@ class TestEightPoint:
             assert torch.equal(again(*points), layer(*points))
 
 
-NOT_FINITE = "not finite and invertible"
-
-
 def test_a_normaliser_that_breaks_the_contract():
     for normalizer, error, message in [
         (Hartley, TypeError, "normalizer must be .* got <class"),
         ("hartley", TypeError, "normalizer must be .* got 'hartley'"),
         (lambda *_: (torch.eye(3), torch.eye(3)), ValueError, r"shape \(2, 3, 3\), got \[\(3, 3\)"),
         (lambda *_: torch.zeros(2, 3, 3), ValueError, r"shape \(2, 3, 3\), got .*Tensor"),
-        (lambda *_: (torch.full((2, 3, 3), torch.nan),) * 2, ValueError, NOT_FINITE),
-        (lambda *_: (torch.zeros(2, 3, 3),) * 2, ValueError, NOT_FINITE),
-        (lambda *_: ((1 / torch.eye(3)).expand(2, 3, 3),) * 2, ValueError, NOT_FINITE),
+        (lambda *_: (torch.full((2, 3, 3), torch.nan),) * 2, ValueError, "not finite and invertible"),
+        (lambda *_: (torch.zeros(2, 3, 3),) * 2, ValueError, "not finite and invertible"),
+        (lambda *_: ((1 / torch.eye(3)).expand(2, 3, 3),) * 2, ValueError, "not finite and invertible"),
     ]:
         with pytest.raises(error, match=message):
             EightPoint(normalizer)(torch.rand(2, 8, 2), torch.rand(2, 8, 2))
@@ -206,13 +203,6 @@ class TestMatches:
         assert up_to_sign(estimate.F_mat.detach(), expected.detach()) < 1e-9
         signless(estimate.F_mat).sum().backward()
         assert all(score.grad.any() and score.grad.isfinite().all() for score in scores)
-
-    def test_a_pair_without_matches(self):
-        points1, points2 = correspondences("handheld", 2, 30)
-        matches = [torch.arange(10)[:, None].expand(10, 2), torch.zeros(0, 2, dtype=torch.int64)]
-        estimate = EightPoint(shaken()).from_matches(points1, points2, matches, [torch.rand(10), torch.rand(0)])
-        assert estimate.determined.tolist() == [True, False]
-        assert estimate.F_mat.isfinite().all()
 
 
 @pytest.mark.long

