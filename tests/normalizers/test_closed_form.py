@@ -75,19 +75,3 @@ class TestWhitening:
         root = inverse_sqrt(covariance)
         np.testing.assert_allclose((root @ covariance @ root).numpy(), np.tile(np.eye(2), (50, 1, 1)), atol=1e-8)
         assert torch.equal(inverse_sqrt(torch.zeros(2, 2)), torch.eye(2))
-
-
-class TestPerView:
-    def test_passes_weights_only_where_there_are_any(self):
-        calls = []
-
-        def normalize(points, **kwargs):
-            calls.append((points, kwargs))
-            return None, torch.eye(3).expand(len(points), 3, 3)
-
-        points1, points2, weights = torch.rand(2, 8, 2), torch.rand(2, 8, 2), torch.rand(2, 8)
-        PerView(normalize)(points1, points2)
-        PerView(normalize)(points1, points2, weights)
-        assert [points for points, _ in calls] == [points1, points2, points1, points2]
-        assert [list(kwargs) for _, kwargs in calls] == [[], [], ["weights"], ["weights"]]
-        assert calls[2][1]["weights"] is weights

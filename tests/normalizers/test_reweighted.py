@@ -5,18 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pairwise import pairwise
 from scenes import (
     SCENES,
     correspondences,
     epipolar_distances,
-    hartley_difference,
     homogeneous,
     numpy_hartley,
     numpy_whitening,
-    scenes,
     uniform,
 )
 
@@ -76,7 +72,7 @@ class TestReweightedWhitening:
             np.testing.assert_allclose(T.cpu().numpy(), expected, rtol=rtol, atol=atol)
 
     def test_more_iterations_lower_the_distance(self):
-        points1, points2 = correspondences("random", 1000)
+        points1, points2 = correspondences("random", 300)
         means = [mean_distances(points1, points2, ReweightedWhitening(k)).mean() for k in (0, 1, 2, 5, 10)]
         assert mean_distances(points1, points2, Hartley()).mean() > mean_distances(points1, points2, Whitening()).mean()
         assert mean_distances(points1, points2, Whitening()).mean() > means[0]
@@ -84,29 +80,11 @@ class TestReweightedWhitening:
 
     @pytest.mark.parametrize(("name", "better", "ratio"), [("driving", 0.98, 0.6), ("handheld", 0.98, 0.8)])
     def test_beats_hartley(self, name, better, ratio):
-        points1, points2 = correspondences(name, 2000, noise=0.5)
+        points1, points2 = correspondences(name, 500, noise=0.5)
         found, hartley = (mean_distances(points1, points2, n) for n in (ReweightedWhitening(), Hartley()))
         assert (found < hartley).mean() > better
         assert found.mean() < ratio * hartley.mean()
         assert np.median(found) < np.median(hartley)
-
-    @settings(max_examples=10)
-    @given(
-        st.integers(0, 2**31),
-        st.sampled_from([8, 9, 50]),
-        st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
-        st.tuples(*[st.floats(-2e3, 2e3)] * 4),
-    )
-    def test_moves_with_scale_and_shift(self, seed, num_points, log_scales, shifts):
-        points1, points2 = correspondences("driving", 4, num_points, seed)
-        scales, shifts = 10 ** torch.tensor(log_scales).double(), torch.tensor(shifts).double().view(2, 2)
-        moved = [s * (p + o) for p, s, o in zip((points1, points2), scales, shifts, strict=True)]
-        transforms = zip(*(ReweightedWhitening(2)(*points) for points in ((points1, points2), moved)), strict=True)
-        for (T, found), s, o in zip(transforms, scales, shifts, strict=True):
-            S = torch.eye(3, dtype=torch.float64)
-            S[:2] = torch.stack([s, 0 * s, s * o[0], 0 * s, s, s * o[1]]).view(2, 3)
-            difference = (found @ S - T).norm(dim=(-2, -1)) / T.norm(dim=(-2, -1))
-            assert difference.max() < 1e-4
 
     @pytest.mark.parametrize("num_points", [8, 30])
     def test_weights_are_repetitions(self, num_points):
@@ -137,24 +115,3 @@ class TestReweightedWhitening:
     def test_exceptions(self, iterations, damping):
         with pytest.raises(ValueError, match=rf"iterations .* damping > 0, got {iterations} and {damping}"):
             ReweightedWhitening(iterations, damping)
-
-
-class TestTheory:
-    def test_the_correction_leaves_a_product_of_two_lines(self):
-        """Eight points: the residual after projection is a product of distances to one line in each view."""
-        scene = scenes("driving", 50, 8)
-        T1, T2 = Whitening()(scene.points1, scene.points2)
-        F_mat = find_fundamental(scene.points1, scene.points2, normalizer=Whitening()).numpy()
-        x1, x2 = homogeneous(scene.points1.numpy()), homogeneous(scene.points2.numpy())
-        residual = np.einsum("bni,bij,bnj->bn", x2, F_mat, x1)
-        A = np.einsum("bni,bnj->bnij", x2 @ T2.numpy().swapaxes(1, 2), x1 @ T1.numpy().swapaxes(1, 2)).reshape(50, 8, 9)
-        U, s, Vh = np.linalg.svd(np.linalg.svd(A, full_matrices=True)[2][:, -1].reshape(50, 3, 3))
-        a = (x2 @ T2.numpy().swapaxes(1, 2) @ U[:, :, 2:]).squeeze(-1)
-        b = (x1 @ T1.numpy().swapaxes(1, 2) @ Vh[:, 2, :, None]).squeeze(-1)
-        for r, expected in zip(residual, s[:, 2:] * a * b, strict=True):
-            assert abs(np.corrcoef(r, expected)[0, 1]) == pytest.approx(1, abs=1e-6)
-
-    def test_any_transforms_give_the_same_rank_two_matrix_when_there_is_nothing_to_correct(self):
-        scene = scenes("orbit", 20, 8, noise=0.0)
-        F_mats = [find_fundamental(*scene[:2], normalizer=n) for n in (Hartley(), ReweightedWhitening())]
-        assert hartley_difference(*F_mats, *scene[:2]) < 1e-8

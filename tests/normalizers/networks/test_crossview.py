@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from pairwise import pairwise
-from scenes import DTYPES, numpy_whitening, prepared, rewrite_weights, shaken, uniform
+from scenes import numpy_whitening, prepared, rewrite_weights, shaken, uniform
 from torch.autograd import gradcheck
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer
 from kornia_learnnorm.estimators.set_network import AttentiveContextBlock
-from kornia_learnnorm.normalizers.networks import crossview as networks
 from kornia_learnnorm.normalizers.networks.crossview import ContextLayer, SetNetwork
 
 FEATURES = ["epipolar", "both", "own"]
@@ -34,14 +31,6 @@ def set_network(outputs: int = 3) -> SetNetwork:
 
 
 class TestSetNetwork:
-    @pairwise(batch_size=[0, 1, 3], num_points=[1, 8, 30], dtype=DTYPES)
-    def test_smoke(self, batch_size, num_points, device, dtype):
-        net = SetNetwork(4, 6, width=16, depth=3, outputs=5).to(device, dtype)
-        points, whole = uniform(batch_size, num_points, 4), uniform(batch_size, 6)
-        found = net(points.to(device, dtype), whole.to(device, dtype))
-        assert (found.shape, found.dtype) == ((batch_size, 5), dtype)
-        assert found.count_nonzero() == 0  # the last layer starts at zero
-
     def test_weights_that_are_all_zero_are_finite(self):
         net, points = set_network(), uniform(3, 10, 4).requires_grad_()
         weights = torch.zeros(3, 10).double().requires_grad_()
@@ -64,13 +53,6 @@ class TestSetNetwork:
         with torch.autocast("cpu", torch.bfloat16):
             assert block(uniform(2, 8, 16).float(), None).dtype == torch.float32
 
-    def test_sees_points_set_and_their_number(self):
-        net, points, whole = set_network(), uniform(1, 10, 4), uniform(1, 6, seed=1)
-        expected = net(points, whole)
-        assert not torch.allclose(net(points * 1.1, whole), expected)
-        assert not torch.allclose(net(points, whole * 1.1), expected)
-        assert not torch.allclose(net(points[:, :5], whole), expected)
-
     def test_gradcheck(self):
         net = set_network()
         values = [uniform(2, 5, 4), uniform(2, 6, seed=1), uniform(2, 5, low=0.1, seed=2)]
@@ -88,23 +70,10 @@ class TestCrossViewNetwork:
             for params in net(points1, points2):
                 np.testing.assert_allclose(params.detach().numpy(), bound * np.tanh(bias / bound), rtol=1e-12)
 
-    def test_size(self):
-        net = CrossViewNetwork(width=24, depth=3, num_parameters=4)
-        assert len(net.set_network.layers) == 3
-        assert net.set_network.point_stem.weight.shape == (24, 13)
-        assert net.set_network.head[-1].weight.shape == (4, 24)
-
     @pytest.mark.parametrize(("features", "num_points"), [("epipolar", 8), ("epipolar", 11), ("both", 11), ("own", 8)])
     def test_gradcheck(self, num_points, features):
         net, points = network(features=features), [p.requires_grad_() for p in whitened("orbit", 1, num_points)]
-        assert gradcheck(net, points, eps=1e-7, atol=1e-4, rtol=1e-3)
-
-    @pytest.mark.parametrize("features", FEATURES)
-    def test_every_parameter_learns(self, features):
-        net, (points1, points2) = network(features=features), whitened()
-        torch.cat(net(points1, points2)).square().sum().backward()
-        for name, parameter in net.named_parameters():
-            assert parameter.grad.count_nonzero() > 0, name
+        assert gradcheck(net, points, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
 class TestFeatures:
@@ -127,18 +96,6 @@ class TestFeatures:
         net, (points1, points2) = network(features=features), whitened()
         for found, expected in zip(net(points1, points2.roll(1, 1)), net(points1, points2), strict=True):
             assert torch.allclose(found, expected, rtol=1e-10) is not sees
-
-    @pytest.mark.parametrize(("features", "solves"), [("own", False), ("both", False), ("epipolar", True)])
-    def test_only_epipolar_features_need_the_null_vector(self, features, solves, monkeypatch):
-        net, points = network(features=features), whitened()
-        monkeypatch.setattr(networks, "null_vector", None)
-        with pytest.raises(TypeError, match="not callable") if solves else nullcontext():
-            net(*points)
-
-    @pytest.mark.parametrize(("features", "numbers"), [("own", (2, 1)), ("both", (4, 1)), ("epipolar", (13, 10))])
-    def test_numbers_that_enter(self, features, numbers):
-        net = CrossViewNetwork(width=8, depth=1, features=features)
-        assert (net.set_network.point_stem.in_features, net.set_network.set_stem.in_features) == numbers
 
     @pytest.mark.parametrize("name", ["Own", None])
     def test_unknown(self, name):
