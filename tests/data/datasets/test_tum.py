@@ -62,7 +62,7 @@ def test_association(tum, stamps, expected):
     assert np.isnan(x) if expected is None else x == expected
 
 
-@pytest.mark.parametrize("norm", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize("norm", [0.01, 1.0])
 def test_quaternion_of_any_norm(tum, norm):
     rng = np.random.default_rng(0)
     q, t, points = rng.normal(size=4), rng.normal(size=3), rng.normal(size=(5, 3))
@@ -72,17 +72,3 @@ def test_quaternion_of_any_norm(tum, norm):
     pose = read_tum(tum, [FR1])[0].pose
     assert np.allclose(points @ pose[:3, :3].T + pose[:3, 3], rotated(q, points) + t)
     assert np.array_equal(pose[3], [0, 0, 0, 1])
-
-
-def test_images_are_in_order_of_time(tum):
-    path = tum / FR1 / "rgb.txt"
-    path.write_text("\n".join(reversed(path.read_text().splitlines())))
-    frames = read_tum(tum, [FR1])
-    assert [frame.name for frame in frames] == sorted(frame.name for frame in frames)
-
-
-def test_no_ground_truth(tum):
-    (tum / FR1 / "groundtruth.txt").unlink()
-    frames = read_tum(tum)
-    assert np.isnan([frame.pose for frame in frames[:FRAMES]]).all()
-    assert np.isfinite([frame.pose for frame in frames[FRAMES:]]).all()

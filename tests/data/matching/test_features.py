@@ -53,27 +53,16 @@ def test_disk_of_random_weights(monkeypatch):
     monkeypatch.setattr("kornia.feature.disk.disk.load_state_dict_from_url", lambda *_, **__: weights)
     found = detect_disk(texture(width=200), 50)  # 180 and 200 are no multiples of 16
     assert 0 < len(found.points) <= 50
+    assert (found.points.max(0) < (200, 180)).all()
     assert found.descriptors.shape == (len(found.points), 128)
     assert (found.points.dtype, found.descriptors.dtype, found.size) == (np.float32, np.float32, (200, 180))
     assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-4)
-
-
-def test_disk_names_pixels_x_first(monkeypatch):
-    class Bright(torch.nn.Module):  # scores a pixel by how bright it is
-        def forward(self, images):
-            return torch.cat([torch.ones(1, 128, *images.shape[2:]), images[:, :1]], 1)
-
-    monkeypatch.setattr(DISK, "from_pretrained", lambda: DISK(unet=Bright()).eval())
-    image = np.zeros((90, 100), np.uint8)
-    image[40, 70], image[20, 30] = 255, 200
-    assert sorted(detect_disk(image, 10).points.tolist()) == [[30, 20], [70, 40]]
 
 
 def test_keynet_leaves_out_what_fills_up(monkeypatch):
     """Kornia fills up with frames of zeros where it finds fewer features than it was asked for."""
     frames = torch.zeros(1, 5, 2, 3)
     frames[0, :2, :, 2] = torch.tensor([[30.0, 20.0], [70.0, 40.0]])
-    frames[0, :2, 0, 0] = frames[0, :2, 1, 1] = 11.0
     output = frames, torch.zeros(1, 5), torch.rand(1, 5, 128)
     monkeypatch.setattr(module, "pretrained", lambda *_: lambda image: output)
     found = detect_keynet(texture(), 5)
@@ -102,19 +91,22 @@ def test_keynet_of_random_weights(monkeypatch):
 
 
 def test_lightglue_of_random_weights(monkeypatch):
-    glue = LightGlue(None, input_dim=128).eval()
-    monkeypatch.setattr(matching, "_lightglue", lambda: glue)
+    monkeypatch.setattr(matching, "_lightglue", LightGlue(None, input_dim=128).eval().__call__)
+    monkeypatch.setattr(matching, "pretrained", lambda name, network: network)
     rng = np.random.default_rng(0)
-    rows = rng.normal(size=(2, 30, 128)).astype(np.float32)
-    sides = [Features(rng.uniform(0, 90, (30, 2)).astype(np.float32), row, (100, 90)) for row in rows]
+    points, rows = rng.uniform(0, 90, (2, 30, 2)), rng.normal(size=(2, 30, 128))
+    sides = [Features(*map(np.float32, side), (100, 90)) for side in zip(points, rows, strict=True)]
     matches = matching.match_lightglue(*sides)
     assert matches.points1.shape == matches.points2.shape == (len(matches.ratio), 2)
     assert all(part.dtype == torch.float32 for part in matches)
     assert ((matches.ratio >= 0) & (matches.ratio <= 1)).all()
+    with pytest.raises(ValueError, match=r"the descriptors of DISK, .* got float32 with 64 columns"):
+        matching.match_lightglue(*(side._replace(descriptors=side.descriptors[:, :64]) for side in sides))
 
 
-@pytest.mark.parametrize("detect", [detect_disk, detect_keynet])
-@pytest.mark.parametrize("error", [urllib.error.URLError("no network"), EOFError("Ran out of input")])
+@pytest.mark.parametrize(
+    ("detect", "error"), [(detect_disk, urllib.error.URLError("no network")), (detect_keynet, EOFError("Ran out"))]
+)
 def test_weights_that_cannot_be_loaded(monkeypatch, detect, error):
     for place in ("disk.disk", "keynet", "affine_shape", "orientation", "hardnet"):
         monkeypatch.setattr(f"kornia.feature.{place}.load_state_dict_from_url", Mock(side_effect=error))

@@ -3,7 +3,7 @@ import pytest
 import torch
 from scenes import homogeneous, seeded
 
-from kornia_learnnorm.data.synthetic import draws, forward_driving, handheld, orbit, random_scenes, scenes
+from kornia_learnnorm.data.synthetic import draws, forward_driving, handheld, orbit, random_scenes
 
 NAMED = [forward_driving, handheld, orbit]
 ALL = [random_scenes, *NAMED]
@@ -28,7 +28,7 @@ def triangulated_depths(scene):
 
 
 @pytest.mark.parametrize("make", ALL)
-@pytest.mark.parametrize(("batch_size", "num_points"), [(1, 1), (3, 8), (2, 50)])
+@pytest.mark.parametrize(("batch_size", "num_points"), [(1, 1), (2, 50)])
 def test_shapes_and_dtypes(make, batch_size, num_points):
     scene = make(batch_size, num_points, seeded())
     points, matrix = (num_points, 2), (3, 3)
@@ -83,16 +83,11 @@ def test_inliers_lie_before_both_cameras_and_in_both_images(make, monkeypatch):
 @pytest.mark.parametrize("make", ALL)
 def test_the_generator_determines_everything(make):
     torch.manual_seed(0)
+    before = torch.get_rng_state()
     first, again, other = (make(3, 12, seeded(seed)) for seed in (5, 5, 6))
-    torch.manual_seed(1)
-    untouched = torch.rand(1)
+    assert torch.equal(torch.get_rng_state(), before)
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not torch.equal(first.points1, other.points1)
-    source = seeded()
-    assert not torch.equal(make(3, 12, source).points1, make(3, 12, source).points1)
-    torch.manual_seed(1)
-    make(3, 12, seeded())
-    assert torch.equal(torch.rand(1), untouched)
 
 
 @pytest.mark.parametrize("make", NAMED)
@@ -150,57 +145,6 @@ def test_random_scenes_have_the_breadth_promised():
     assert all(torch.isfinite(value).all() for value in scene)
     outside = (scene.points2 < 0) | (scene.points2 > scene.image_size[:, None] - 1)
     assert not outside.any(-1)[~scene.inliers].any()
-
-
-def test_half_of_the_random_scenes_are_clustered():
-    size = torch.tensor([[1000.0, 500.0]]).double().expand(2000, 2)
-    spread = [draws.spread_points(size, 30, seeded(8), clustered=share).std(1).prod(-1) for share in (0.0, 0.5, 1.0)]
-    below = [(values < 20_000).double().mean().item() for values in spread]  # uniform: 289 x 144 = 41,600
-    assert below[0] < 0.01
-    assert below[2] > 0.3
-    assert below[1] == pytest.approx(below[2] / 2, abs=0.05)
-
-
-def test_ground_plane():
-    size, K = draws.random_cameras(2000, seeded(9))
-    points = draws.spread_points(size, 20, seeded(10))
-    height = torch.full((2000, 1), 2.0).double()
-    depths = draws.draw_depths(points, K, 3.0, 75.0, height, seeded(11))
-    assert depths.min() >= 3
-    assert depths.max() <= 75
-    level = (points[..., 1] - K[:, 1, 2, None]) / K[:, 1, 1, None] * depths  # how far below the camera
-    assert ((level - 2).abs() < 1e-9).double().mean() == pytest.approx(0.4, abs=0.05)
-
-
-def flat(batch_size, num_points):
-    """Points at a depth of five, with their camera: points, depths, K, image size."""
-    size, K = draws.fixed_camera(batch_size, (640.0, 480.0), 500.0, (319.5, 239.5), seeded())
-    points = draws.spread_points(size, num_points, seeded())
-    return points, torch.full((batch_size, num_points), 5.0).double(), K, size
-
-
-BACK = torch.diag(torch.tensor([-1.0, 1.0, -1.0])).double()  # a camera that looks back
-
-
-def test_points_that_no_motion_shows_become_outliers():
-    points, depths, K, size = flat(2, 32)
-    R = BACK.expand(2, 1, 3, 3)
-    scene = scenes.two_views(points, depths, K, R, torch.ones(2, 1, 3).double(), size, 8)
-    assert not scene.inliers.any()
-    zero = torch.zeros(2, 8, 2).double()
-    scene = scenes._corrupt(scene, zero, zero, torch.zeros(2, 1).double(), seeded())
-    assert not scene.inliers.any()
-    assert (scene.points2 >= 0).all()
-    assert (scene.points2 <= size[:, None] - 1).all()
-
-
-def test_the_first_motion_that_shows_enough_is_chosen():
-    points, depths, K, size = flat(1, 64)
-    R = torch.stack([BACK, torch.eye(3).double(), torch.eye(3).double()])[None]
-    t = torch.tensor([[[0.0, 0, 0], [0.125, 0, 0], [0.01, 0, 0]]]).double()
-    scene = scenes.two_views(points, depths, K, R, t, size, 24)
-    assert scene.inliers.all()
-    assert scene.t.tolist() == [[0.125, 0.0, 0.0]]
 
 
 def test_motions_of_the_named_scenes():
