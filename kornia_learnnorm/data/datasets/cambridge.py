@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.datasets.textfiles import TextLine, camera_matrix, text_lines
+from kornia_learnnorm.data.datasets.textfiles import TextLine, camera_matrix, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 
 __all__ = ["read_cambridge"]
@@ -44,7 +44,7 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
             K = np.full((3, 3), np.nan)
             if focal > 0:
                 K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
-            pose = line.pose(row[3:] * [1, -1, -1, -1], row[:3])  # the inverse rotation
+            pose = rigid_motion(line.quaternion(row[3:]) * [1, -1, -1, -1], row[:3])  # the inverse rotation
             frames[name] = Frame(root / name, name, name.rpartition("/")[0], size, K, pose)
         if len(frames) == before:
             raise ValueError(f"{path} lists no images after the three lines of its header")

@@ -43,12 +43,12 @@ class TextLine(NamedTuple):
             raise FileNotFoundError(f"{self.path}, line {self.number}: no image at {self.path.parent / name}")
         return name
 
-    def pose(self, wxyz: Array, centre: Array) -> Array:
-        """Return the matrix (4, 4) of a quaternion (w, x, y, z) of any norm but zero and a translation."""
+    def quaternion(self, wxyz: Array) -> Array:
+        """Return a quaternion (w, x, y, z) of any norm but zero with unit norm."""
         norm = np.linalg.norm(wxyz)
         if norm == 0:
             raise self.error("a quaternion other than zero")
-        return rigid_motion(np.asarray(quaternion_to_rotation_matrix(torch.from_numpy(wxyz / norm))), centre)
+        return np.asarray(wxyz / norm)
 
 
 def text_lines(path: Path, what: str) -> Iterator[TextLine]:
@@ -64,8 +64,9 @@ def text_lines(path: Path, what: str) -> Iterator[TextLine]:
             raise ValueError(f"{path} is not a text file in UTF-8: {error}") from error
 
 
-def rigid_motion(R: Array, t: Array) -> Array:
-    """Return the matrix (4, 4) of a rotation and a translation."""
+def rigid_motion(rotation: Array, t: Array) -> Array:
+    """Return the matrix (4, 4) of a rotation, (3, 3) or a unit quaternion (w, x, y, z), and a translation."""
+    R = rotation if rotation.ndim == 2 else quaternion_to_rotation_matrix(torch.from_numpy(rotation)).numpy()
     return np.block([[R, t[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 

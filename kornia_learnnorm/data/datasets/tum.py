@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.splits import choose_sequences
-from kornia_learnnorm.data.datasets.textfiles import camera_matrix, text_lines
+from kornia_learnnorm.data.datasets.textfiles import camera_matrix, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 
 __all__ = ["read_tum"]
@@ -31,16 +31,12 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
     """Return the frames of the TUM RGB-D benchmark (J. Sturm et al., IROS 2012), by sequence and time.
 
     ``root`` is a sequence's folder, with ``rgb.txt`` and ``groundtruth.txt``, metres, or a folder of sequences, of
-    which
-    ``sequences`` are names in the order to read, None for all. A frame gets the nearest pose, the earlier one of a tie,
-    or
-    NaN if there is none within ``max_difference`` seconds. Cameras are NaN unless the folder's name has ``freiburg1``
-    to
-    ``freiburg3`` or ``fr1`` to ``fr3`` in it.
+    which ``sequences`` are names in the order to read, None for all. A frame gets the nearest pose, the earlier one of
+    a tie, or NaN if there is none within ``max_difference`` seconds. Cameras are NaN unless the folder's name has
+    ``freiburg1`` to ``freiburg3`` or ``fr1`` to ``fr3`` in it.
 
     FileNotFoundError if there is no sequence, or an image that ``rgb.txt`` lists is missing; ValueError if a sequence
-    is
-    unknown, a line malformed, a file is empty or ``max_difference`` is negative.
+    is unknown, a line malformed, a file is empty or ``max_difference`` is negative.
     """
     root = Path(root)
     if not max_difference >= 0:
@@ -50,12 +46,14 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
         kinect = re.search(r"(?<![a-z])fr(?:eiburg)?([1-3])(?!\d)", name)
         focal, distortion = KINECTS[kinect[1]] if kinect else (None, ())
         K = camera_matrix(*focal) if focal else np.full((3, 3), np.nan)
-        times, poses = _trajectory(folder / "groundtruth.txt")
+        trajectory = _trajectory(folder / "groundtruth.txt")
         for time, listed in _images(folder):
             # Stamps have microseconds; at 1e9 s float64 resolves a quarter of one, which must not decide on ties.
-            differences = np.abs(times - time).round(6)
-            known = len(times) > 0 and differences.min() <= max_difference
-            pose = poses[int(differences.argmin())] if known else np.full((4, 4), np.nan)
+            differences = np.abs(trajectory[:, 0] - time).round(6)
+            pose = np.full((4, 4), np.nan)
+            if len(differences) and differences.min() <= max_difference:
+                row = trajectory[differences.argmin()]
+                pose = rigid_motion(row[4:], row[1:4])
             image, short = folder / listed, str(PurePosixPath(folder.relative_to(root), listed))
             frames.append(Frame(image, short, name, image_size(image), K, pose, distortion))
     return frames
@@ -72,15 +70,12 @@ def _images(folder: Path) -> list[tuple[float, str]]:
     return sorted(images)
 
 
-def _trajectory(path: Path) -> tuple[Array, Array]:
-    """Return the times (N,) and the poses (N, 4, 4) by time; N = 0 without a file."""
-    if not path.exists():
-        return np.empty(0), np.empty((0, 4, 4))
+def _trajectory(path: Path) -> Array:
+    """Return times, translations and unit quaternions (w, x, y, z) by time, (N, 8); N = 0 without a file."""
     rows = []
-    for line in text_lines(path, "poses"):
+    for line in text_lines(path, "poses") if path.exists() else ():
         row = line.numbers(line.text.split(), 8, "timestamp tx ty tz qx qy qz qw")
-        rows.append((row[0], line.pose(row[[7, 4, 5, 6]], row[1:4])))
-    if not rows:
+        rows.append([*row[:4], *line.quaternion(row[[7, 4, 5, 6]])])
+    if not rows and path.exists():
         raise ValueError(f"{path} has no poses")
-    rows.sort(key=lambda row: row[0])
-    return np.array([time for time, _ in rows]), np.array([pose for _, pose in rows])
+    return np.array(sorted(rows, key=lambda row: row[0])).reshape(-1, 8)
