@@ -219,7 +219,7 @@ class TestGoingOn:
         ("place", "error"),
         [
             ("kornia_learnnorm.data.matching.match_store.StoreWriter.add", OSError(28, "No space left on device")),
-            ("kornia_learnnorm.data.matching.feature_cache.np.savez", OSError("1024 written of 000.png")),
+            ("kornia_learnnorm.data.matching.match_store.np.savez", OSError("1024 written of 000.png")),
             ("kornia_learnnorm.data.matching.match_store.read_frame", KeyboardInterrupt()),
         ],
     )
