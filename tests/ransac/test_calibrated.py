@@ -5,42 +5,40 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from scenes import homogeneous, scenes, uniform, unit, up_to_sign
+from scenes import cross, homogeneous, scenes, true_essential, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
 from kornia_learnnorm.geometry.pose import in_front
 from kornia_learnnorm.metrics.poses import pose_error
-from kornia_learnnorm.ransac.samplers import ProsacSampler, UniformSampler, WeightedSampler
+from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 
 
 def pair(name: str = "handheld", num_points: int = 200, noise: float = 0.3, outliers: float = 0.4, seed: int = 0):
     """Correspondences (N, 2) of one pair, both cameras, its essential matrix, and which are no outliers."""
     scene = scenes(name, 1, num_points, seed, noise=noise, outliers=outliers)
-    K1, K2, R, t = scene.K1[0], scene.K2[0], scene.R[0].numpy(), scene.t[0].numpy()
-    return (scene.points1[0], scene.points2[0]), (K1, K2), essential(R, t), scene.inliers[0]
+    return (scene.points1[0], scene.points2[0]), (scene.K1[0], scene.K2[0]), true_essential(scene)[0], scene.inliers[0]
 
 
 def plane(num_points: int = 60, off_plane: int = 0, seed: int = 0):
-    """Noise-free correspondences of a plane, and some points behind it; both cameras, R and t."""
+    """Noise-free correspondences of a plane, and some points behind it; both cameras, their E, R and t."""
     scene = scenes("handheld", 1, num_points, seed, noise=0.0, outliers=0.0)
     K1, K2, R, t = scene.K1[0].numpy(), scene.K2[0].numpy(), scene.R[0].numpy(), scene.t[0].numpy()
     rays = homogeneous(scene.points1[0].numpy()) @ np.linalg.inv(K1).T
     depth = 4 / (rays @ np.array([0.2, -0.1, 1.0]))
     depth[:off_plane] *= np.linspace(1.2, 3, off_plane)
     x2 = (depth[:, None] * rays @ R.T + 0.5 * t / np.linalg.norm(t)) @ K2.T
-    return (scene.points1[0], torch.from_numpy(x2[:, :2] / x2[:, 2:])), (scene.K1[0], scene.K2[0]), R, t
-
-
-def essential(R, t) -> np.ndarray:
-    """[t]_x R of unit norm."""
-    return unit(np.cross(np.eye(3), t).T @ R)
+    return (
+        (scene.points1[0], torch.from_numpy(x2[:, :2] / x2[:, 2:])),
+        (scene.K1[0], scene.K2[0]),
+        true_essential(scene),
+        R,
+        t,
+    )
 
 
 def of_pixels(E_mat, K1, K2) -> torch.Tensor:
-    return (torch.linalg.inv(K2).mT @ torch.as_tensor(E_mat).to(K1) @ torch.linalg.inv(K1))[None]
+    return (torch.linalg.inv(K2).mT @ E_mat.to(K1) @ torch.linalg.inv(K1))[None]
 
 
 def estimate(points, cameras, weights=None, **options):
@@ -77,22 +75,11 @@ class TestSmoke:
         assert up_to_sign(found.E_mat[None], E[None]) < 0.02
 
 
-CAMERA = torch.tensor([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
-
-
 class TestExceptions:
     def test_cameras(self):
-        for K1, K2, error, message in [
-            (torch.eye(3), None, ValueError, "got only K1"),
-            (None, torch.eye(3), ValueError, "got only K2"),
-            (torch.eye(3), torch.zeros(3, 3), ValueError, "K2 must be finite"),
-            (torch.full((3, 3), torch.nan), torch.eye(3), ValueError, "K1 must be finite"),
-            (torch.eye(3)[None], torch.eye(3), ValueError, r"K1 .* got \[1, 3, 3\]"),
-            (torch.eye(3), CAMERA.T, ValueError, "K2 .* got 320 240 1"),
-            (np.eye(3), torch.eye(3), TypeError, "K1 must be a floating-point tensor"),
-        ]:
-            with pytest.raises(error, match=message):
-                RANSAC().estimate(uniform(20, 2), uniform(20, 2, seed=1), None, K1, K2)
+        """What else is refused is tested with check_cameras."""
+        with pytest.raises(ValueError, match=r"K1 .* got \[1, 3, 3\]"):
+            RANSAC().estimate(uniform(20, 2), uniform(20, 2, seed=1), None, torch.eye(3)[None], torch.eye(3))
 
     def test_fewer_than_five(self):
         with pytest.raises(ValueError, match="at least 5 correspondences are needed, got 4"):
@@ -116,32 +103,23 @@ class TestAccuracy:
 
     def test_mostly_a_plane(self):
         """Samples of eight are degenerate or need points off the plane; samples of five do not."""
-        points, cameras, R, t = plane(off_plane=6)
+        points, cameras, E, _, _ = plane(off_plane=6)
         found = estimate(points, cameras)
-        assert up_to_sign(found.E_mat[None], essential(R, t)[None]) < 1e-6
+        assert up_to_sign(found.E_mat[None], E) < 1e-6
         assert found.inliers.all()
 
     @pytest.mark.parametrize("seed", range(3))
     def test_plane(self, seed):
         """The poses that fit a plane are those of its homography, by OpenCV: two, each with two signs."""
         cv2 = pytest.importorskip("cv2")
-        points, cameras, R, t = plane(seed=seed)
+        points, cameras, _, R, t = plane(seed=seed)
         found = estimate(points, cameras)
         assert found.inliers.all()
         assert kln.sampson_distance(*points, found.F_mat).max() < 1e-6
         H = R + 0.5 * np.outer(t / np.linalg.norm(t), np.array([0.2, -0.1, 1.0]) / 4)
         _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
-        solutions = [essential(R, t[:, 0]) for R, t in zip(rotations, translations, strict=True)]
+        solutions = [cross(t[:, 0]) @ R for R, t in zip(rotations, translations, strict=True)]
         assert min(up_to_sign(found.E_mat[None], E[None]) for E in solutions) < 1e-5
-
-    def test_is_closer_to_the_truth_than_without_cameras(self):
-        errors = []
-        for seed in range(10):
-            points, (K1, K2), E, _ = pair(num_points=60, noise=0.5, seed=seed)
-            F_mats = [estimate(points, cameras).F_mat for cameras in ((K1, K2), ())]
-            errors.append([up_to_sign((K2.mT @ F @ K1)[None], E[None]) for F in F_mats])
-        known, unknown = np.median(errors, 0)
-        assert known < unknown
 
     @pytest.mark.long
     def test_many_matches_and_few_inliers(self):
@@ -157,15 +135,15 @@ class TestAccuracy:
         assert optimum.cost_before <= 1.001 * optimum.cost
 
 
-def distorted(seed: int, scale: float = 1.0):
+def distorted(seed: int):
     """Correspondences of a lens that moves the corners inwards by 3 %, and the cameras, E, R and t of a pinhole."""
     scene = scenes("handheld", 1, 300, seed, noise=0.3, outliers=0.3)
-    T, points = torch.diag(torch.tensor([scale, scale, 1.0])).double(), []
+    points = []
     for pixels, K in ((scene.points1[0], scene.K1[0]), (scene.points2[0], scene.K2[0])):
         offset = pixels - K[:2, 2]
         square = offset.square().sum(-1, keepdim=True)
-        points.append(scale * (K[:2, 2] + offset * (1 - 0.03 * square / square.max())))
-    return points, (T @ scene.K1[0], T @ scene.K2[0]), scene.R, scene.t
+        points.append(K[:2, 2] + offset * (1 - 0.03 * square / square.max()))
+    return points, (scene.K1[0], scene.K2[0]), scene.R, scene.t
 
 
 def error_of_pose(F_mat, points, cameras, R, t):
@@ -179,7 +157,7 @@ class TestInexactCameras:
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
     def test_exact_cameras_are_kept(self, name):
         """Rounding does not speak against cameras either: the last pair has no noise."""
-        pairs = [pair(name, noise=0.5, seed=seed) for seed in range(5)] + [pair(noise=0.0, outliers=0.3)]
+        pairs = [pair(name, noise=0.5, seed=seed) for seed in range(2)] + [pair(noise=0.0, outliers=0.3)]
         for points, cameras, _, _ in pairs:
             found = estimate(points, cameras)
             assert up_to_sign(found.F_mat[None], of_pixels(found.E_mat, *cameras)) < 1e-9
@@ -187,7 +165,7 @@ class TestInexactCameras:
     def test_distortion(self):
         """The pose is better than that of the best essential matrix, and the essential matrix is the nearest one."""
         free, known = [], []
-        for seed in range(10):
+        for seed in range(5):
             points, cameras, R, t = distorted(seed)
             found = estimate(points, cameras)
             one = [v[None] for v in (*points, found.E_mat, *cameras)]
@@ -197,12 +175,6 @@ class TestInexactCameras:
             U, _, Vh = torch.linalg.svd(cameras[1].mT @ found.F_mat @ cameras[0])
             assert up_to_sign(found.E_mat[None], (U[:, :2] @ Vh[:2] * 0.5**0.5)[None]) < 1e-9
         assert np.mean(free) < 0.8 * np.mean(known)
-
-    @pytest.mark.parametrize("scale", [0.1, 30.0])
-    def test_scale_of_the_pixels(self, scale):
-        found, (scaled_points, scaled_cameras, _, _) = estimate(*distorted(0)[:2]), distorted(0, scale)
-        scaled = estimate(scaled_points, scaled_cameras, inl_th=scale)
-        assert up_to_sign(found.E_mat[None], scaled.E_mat[None]) < 1e-2
 
 
 class TestInFront:
@@ -229,19 +201,15 @@ class TestInFront:
 
 
 class TestInvariances:
-    @given(seed=st.integers(0, 5))
-    def test_swapping_the_views_transposes(self, seed):
+    @pytest.mark.parametrize("seed", range(2))
+    def test_neither_the_order_of_the_points_nor_of_the_views_counts(self, seed):
         points, cameras, _, _ = pair("driving", 100, seed=seed)
+        order = torch.randperm(100, generator=torch.Generator().manual_seed(1))
         found, swapped = estimate(points, cameras), estimate(points[::-1], cameras[::-1])
-        assert (found.inliers == swapped.inliers).float().mean() > 0.97
-        assert up_to_sign(found.E_mat[None], swapped.E_mat.mT[None]) < 0.02
-
-    def test_permutation(self):
-        points, cameras, _, _ = pair(outliers=0.2)
-        order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
-        found, again = estimate(points, cameras), estimate([p[order] for p in points], cameras)
-        assert (found.inliers[order] == again.inliers).float().mean() > 0.97
-        assert up_to_sign(found.E_mat[None], again.E_mat[None]) < 0.02
+        again = estimate([p[order] for p in points], cameras)
+        for inliers, E_mat in ((swapped.inliers, swapped.E_mat.mT), (again.inliers[order.argsort()], again.E_mat)):
+            assert (found.inliers == inliers).float().mean() > 0.97
+            assert up_to_sign(found.E_mat[None], E_mat[None]) < 0.02
 
     @pytest.mark.parametrize("scale", [0.1, 30.0])
     def test_scale_of_the_pixels(self, scale):
@@ -251,16 +219,3 @@ class TestInvariances:
         found = estimate(points, cameras)
         assert up_to_sign(found.E_mat[None], scaled.E_mat[None]) < 1e-2
         assert (found.inliers == scaled.inliers).float().mean() > 0.97
-
-
-def test_samplers_of_five(generator):
-    scores = uniform(20)
-    scores[10:] = 0
-    uniformly, weighted = UniformSampler(20, torch.device("cpu"), 5), WeightedSampler(scores, size=5)
-    for sampler, total in ((uniformly, 20), (weighted, 10), (ProsacSampler(scores, size=5), 10)):
-        drawn = sampler.draw(100, generator)
-        assert drawn.shape == (100, 5)
-        assert (drawn.sort(-1).values.diff(dim=-1) > 0).all()
-        assert drawn.max() < total
-    for sampler, share in ((uniformly, 0.25), (weighted, float(scores[:5].sum() / scores.sum()))):
-        assert sampler.hit_rate(torch.arange(20) < 5, slice(None)) == pytest.approx(share**5, rel=1e-5)

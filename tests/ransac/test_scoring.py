@@ -44,18 +44,6 @@ class TestBest:
         counts = scorer.inliers(best.F_mat).sum(-1).numpy()
         assert np.abs(counts - (own <= 1.5).sum(-1)).max() <= 1  # a distance next to the threshold
 
-    def test_rows_that_count(self, pair, matrices, factor):
-        rows = torch.arange(0, 500, 3)
-        some, few = (
-            PairScorer(*pair, 1.5, Fundamental(distance=factor), rows),
-            PairScorer(pair[0][rows], pair[1][rows], 1.5, Fundamental(distance=factor)),
-        )
-        best = few.to_pixels(few.best(few.from_pixels(matrices), 5).F_mat)
-        assert torch.allclose(
-            some.best(some.from_pixels(matrices), 5).score, few.best(few.from_pixels(best), 5).score, rtol=1e-3
-        )
-        assert some.x1.shape == (3, 500)
-
     def test_fewer_than_asked_for(self, pair, matrices, factor):
         scorer = PairScorer(*pair, 1.5, Fundamental(distance=factor))
         matrices = scorer.from_pixels(matrices)
@@ -78,19 +66,6 @@ class TestBest:
         expected = few.best(few.from_pixels(scorer.to_pixels(matrices)), 64)
         assert torch.allclose(few.best(few.from_pixels(scorer.to_pixels(kept)), 64).score, expected.score, rtol=1e-3)
         assert torch.equal(scorer.best(kept, 8).F_mat, scorer.best(matrices, 8).F_mat)
-
-    def test_no_shortlist_of_few(self, pair, matrices, factor):
-        many = [points.repeat(3, 1) for points in pair]
-        assert len(PairScorer(*many, 1.5, Fundamental(distance=factor)).shortlist(matrices)) == 64
-        assert len(PairScorer(*many, 1.5, Fundamental(distance=factor)).shortlist(matrices[:50])) == 50
-        assert len(PairScorer(*pair, 1.5, Fundamental(distance=factor)).shortlist(matrices)) == 200
-
-    @given(scale=st.sampled_from([-1e6, -1.0, 1e-6, 3.0]))
-    def test_scale_and_sign_do_not_count(self, factor, scale):
-        points = correspondences("driving", 1, 60)
-        scorer = PairScorer(points[0][0], points[1][0], 1.0, Fundamental(distance=factor))
-        F = scorer.from_pixels(find_fundamental(points[0][:, :20], points[1][:, :20]))
-        assert torch.allclose(scorer.best(F, 1).score, scorer.best(scale * F, 1).score, rtol=1e-3)
 
     def test_nothing_speaks_for_zero_or_nan(self, pair, factor):
         F = torch.tensor([0.0, torch.nan, torch.inf]).double()[:, None, None].expand(3, 3, 3)

@@ -19,16 +19,9 @@ def three_threads():
     torch.set_num_threads(before)
 
 
-def test_one_inside_and_all_after():
-    with one_thread():
+def test_one_inside_and_all_after_an_error_too():
+    with pytest.raises(ValueError, match="inside"), one_thread(), one_thread():
         assert torch.get_num_threads() == 1
-        with one_thread():
-            assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == 3
-
-
-def test_after_an_error():
-    with pytest.raises(ValueError, match="inside"), one_thread():
         raise ValueError("inside")
     assert torch.get_num_threads() == 3
 
