@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from itertools import count
 
@@ -43,20 +42,13 @@ class TestResult:
         assert F_mat.norm().item() == pytest.approx(1)
         assert torch.linalg.svdvals(F_mat.double())[2] < 1e-7
 
-    @pytest.mark.parametrize("normalizer", [None, kln.Whitening(), kln.ReweightedWhitening()])
+    @pytest.mark.parametrize("normalizer", [None, kln.Whitening(), shaken()])
     @pytest.mark.parametrize("rank2", [None, "projection", "optimal"])
     def test_any_normalizer(self, normalizer, rank2):
-        points1, points2, F_true, _ = pair()
+        points1, points2, F_true, _ = pair(num_points=200)
         F_mat, _ = RANSAC(normalizer, rank2=rank2, seed=0)(points1, points2)
         inlying = epipolar_distances(points1, points2, F_true.numpy()) < 1
         assert np.median(epipolar_distances(points1, points2, F_mat.numpy())[inlying]) < 1
-
-    def test_learned_normalizer_in_a_module(self):
-        points1, points2, _, true = pair(num_points=100)
-        ransac = RANSAC(shaken(), max_samples=200, seed=0)
-        assert ransac(points1, points2)[1][true].float().mean() > 0.7
-        assert set(ransac.state_dict()) == {f"normalizer.{name}" for name in ransac.normalizer.state_dict()}
-        assert isinstance(copy.deepcopy(ransac).eval(), RANSAC)
 
     def test_estimate(self):
         points1, points2 = pair()[:2]
@@ -105,7 +97,7 @@ class TestExceptions:
             *(({"seed": seed}, TypeError, f"seed must be .* got {seed!r}") for seed in ("a", True)),
             ({"sampler": "prosac"}, TypeError, "sampler must be .* got 'prosac'"),
             ({"normalizer": "hartley"}, TypeError, "normalizer must be .* got 'hartley'"),
-            *(({k: "1"}, TypeError, f"{k} must be a number, got '1'") for k in ("inl_th", "confidence", "max_seconds")),
+            ({"inl_th": "1"}, TypeError, "inl_th must be a number, got '1'"),
         ]:
             with pytest.raises(error, match=message):
                 RANSAC(**wrong)
@@ -113,17 +105,13 @@ class TestExceptions:
     def test_correspondences(self):
         for points1, points2, weights, error, message in [
             (POINTS.long(), POINTS, None, TypeError, "points1 must be .* got torch.int64"),
-            (POINTS.numpy(), POINTS, None, TypeError, r"numpy.ndarray.*torch.from_numpy\(points1\)"),
-            (POINTS, POINTS.float(), None, TypeError, "one dtype"),
             (POINTS[None], POINTS[None], None, ShapeError, r"\[1, 20, 2\]"),
             (POINTS, POINTS[1:], None, ValueError, r"\[20, 2\] and \[19, 2\]"),
-            *((POINTS[:n], POINTS[:n], None, ValueError, f"at least 8 .* got {n}") for n in (0, 1, 7)),
+            (POINTS[:7], POINTS[:7], None, ValueError, "at least 8 .* got 7"),
             (POINTS, POINTS, torch.ones(20).bool(), TypeError, "got torch.bool"),
             (POINTS, POINTS, torch.ones(19), ValueError, r"weights .* \[20\], got \[19\]"),
-            *(
-                (POINTS, POINTS, torch.full((20,), bad), ValueError, "finite and not negative")
-                for bad in (-1.0, NAN, float("inf"))
-            ),
+            (POINTS, POINTS, -torch.ones(20), ValueError, "finite and not negative"),
+            (POINTS, POINTS, torch.full((20,), NAN), ValueError, "finite and not negative"),
         ]:
             with pytest.raises(error, match=message):
                 RANSAC()(points1, points2, weights)
@@ -143,12 +131,6 @@ class TestAccuracy:
         F_mat, inliers = RANSAC(seed=0)(points1, points2)
         assert up_to_sign(F_mat[None], F_true[None]) < 1e-8
         assert inliers.all()
-
-    def test_refining_helps(self):
-        points1, points2, _, true = pair(noise=1.0)
-        refined, plain = (RANSAC(seed=0, inl_th=3.0, refine=refine)(points1, points2)[0] for refine in (True, False))
-        errors = [epipolar_distances(points1[true], points2[true], F_mat).mean() for F_mat in (refined, plain)]
-        assert errors[0] < errors[1]
 
     @pytest.mark.long
     @pytest.mark.parametrize("name", ["kitti_06", "tum_fr3_office"])
@@ -171,14 +153,13 @@ class TestSeeds:
         assert torch.equal(state, torch.get_rng_state())
 
     def test_seeds_of_numpy_and_other_default_dtypes(self):
-        points1, points2, _, _ = pair(num_points=50)
-        first = RANSAC(seed=3)(points1.float(), points2.float())
+        points = [p.float() for p in pair(num_points=50)[:2]]
+        first = RANSAC(seed=3)(*points)[0]
         torch.set_default_dtype(torch.float64)
         try:
-            second = RANSAC(seed=np.int64(3))(points1.float(), points2.float())
+            assert torch.equal(RANSAC(seed=np.int64(3))(*points)[0], first)
         finally:
             torch.set_default_dtype(torch.float32)
-        assert torch.equal(first[0], second[0])
 
 
 class TestContexts:
@@ -247,20 +228,15 @@ class TestHardInput:
         assert inliers[true].float().mean() > 0.9
         assert np.median(epipolar_distances(points1[true], points2[true], F_mat.double())) < 0.6
 
-    def test_all_outliers(self):
-        F_mat, inliers = RANSAC(seed=0, max_samples=2000)(uniform(300, 2, high=500), uniform(300, 2, high=500, seed=1))
+    @pytest.mark.parametrize("value", [None, 0.0, 5.0, 1e6])
+    def test_all_outliers_or_all_identical(self, value):
+        points = [uniform(50, 2, high=500, seed=k) if value is None else torch.full((50, 2), value) for k in (0, 1)]
+        F_mat, inliers = RANSAC(seed=0, max_samples=2000)(*points)
         assert F_mat.isfinite().all()
-        assert inliers.float().mean() < 0.3
+        assert failed((F_mat, inliers)) or (inliers.all() if value is not None else inliers.float().mean() < 0.5)
 
-    @pytest.mark.parametrize("value", [0.0, 5.0, 1e6])
-    def test_all_identical(self, value):
-        points = torch.full((50, 2), value)
-        F_mat, inliers = RANSAC(seed=0, max_samples=2000)(points, points)
-        assert F_mat.isfinite().all()
-        assert inliers.all() or failed((F_mat, inliers))
-
-    @pytest.mark.parametrize("normalizer", [None, kln.Hartley(), kln.ReweightedWhitening()])
-    @pytest.mark.parametrize("value", [1e10, 1e30, -1e150, 1e300])
+    @pytest.mark.parametrize("normalizer", [None, kln.ReweightedWhitening()])
+    @pytest.mark.parametrize("value", [1e10, -1e150, 1e300])
     def test_points_that_are_far_away(self, normalizer, value):
         points1, points2, _, true = pair(num_points=200)
         points1[:3], points2[2:4] = value, -value
@@ -285,14 +261,11 @@ class TestHardInput:
         assert RANSAC(seed=0)(points1[order], points2[order])[1][true[order]].float().mean() > 0.95
 
     @pytest.mark.long
-    @pytest.mark.parametrize(("size", "dtype"), [((256, 256), torch.float32), ((320, 240), torch.float64)])
-    def test_dense_matches_in_the_order_of_the_rows(self, size, dtype):
-        rows, columns = torch.meshgrid(*map(torch.arange, size), indexing="ij")
-        points1 = torch.stack([columns, rows], -1).flatten(0, 1).double() + 1e-6 * uniform(size[0] * size[1], 2)
-        depth = uniform(len(points1), 1, low=4, high=8)
-        points2 = points1 + 150 / depth + 0.1 * uniform(len(points1), 2, low=-1, seed=1)
-        _, inliers = RANSAC(seed=0)(points1.to(dtype), points2.to(dtype))
-        assert inliers.float().mean() > 0.99
+    def test_dense_matches_in_the_order_of_the_rows(self):
+        rows, columns = torch.meshgrid(torch.arange(256), torch.arange(256), indexing="ij")
+        points1 = torch.stack([columns, rows], -1).flatten(0, 1) + 1e-6 * uniform(2**16, 2)
+        points2 = points1 + 150 / uniform(2**16, 1, low=4, high=8) + 0.1 * uniform(2**16, 2, low=-1, seed=1)
+        assert RANSAC(seed=0)(points1.float(), points2.float())[1].float().mean() > 0.99
 
     @pytest.mark.parametrize("distance", ["sampson", "symmetric"])
     @pytest.mark.parametrize("number", [100, 1000])

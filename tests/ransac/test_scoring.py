@@ -53,18 +53,15 @@ class TestBest:
         assert torch.equal(best.F_mat, joined.F_mat)
         assert torch.allclose(best.score, joined.score)  # products of other shapes round differently
 
-    def test_shortlist(self, factor):
-        scene = scenes("handheld", 1, 1200, noise=0.5, outliers=0.3)
-        points = scene.points1[0], scene.points2[0]
-        samples = torch.rand(300, 1200, generator=torch.Generator().manual_seed(1)).topk(8).indices
-        matrices = find_fundamental(*(p[samples] for p in points))
-        rows = torch.randperm(1200, generator=torch.Generator().manual_seed(2))
+    def test_shortlist(self, pair, matrices, factor):
+        points, rows = [p.repeat(3, 1) for p in pair], torch.randperm(1500, generator=torch.Generator().manual_seed(2))
         scorer = PairScorer(*points, 1.5, Fundamental(distance=factor), rows)
+        few = PairScorer(*(p[rows[:512]] for p in points), 1.5, Fundamental(distance=factor))
         matrices = scorer.from_pixels(matrices)
         kept = scorer.shortlist(matrices)
-        few = PairScorer(*(p[rows[:512]] for p in points), 1.5, Fundamental(distance=factor))
-        expected = few.best(few.from_pixels(scorer.to_pixels(matrices)), 64)
-        assert torch.allclose(few.best(few.from_pixels(scorer.to_pixels(kept)), 64).score, expected.score, rtol=1e-3)
+        assert [len(kept), len(scorer.shortlist(matrices[:50])), len(few.shortlist(matrices))] == [64, 50, 200]
+        expected = few.best(few.from_pixels(scorer.to_pixels(matrices)), 64).score
+        assert torch.allclose(few.best(few.from_pixels(scorer.to_pixels(kept)), 64).score, expected, rtol=1e-3)
         assert torch.equal(scorer.best(kept, 8).F_mat, scorer.best(matrices, 8).F_mat)
 
     def test_nothing_speaks_for_zero_or_nan(self, pair, factor):

@@ -20,8 +20,10 @@ def three_threads():
 
 
 def test_one_inside_and_all_after_an_error_too():
-    with pytest.raises(ValueError, match="inside"), one_thread(), one_thread():
+    with one_thread(), one_thread():
         assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 3
+    with pytest.raises(ValueError, match="inside"), one_thread():
         raise ValueError("inside")
     assert torch.get_num_threads() == 3
 
