@@ -89,14 +89,7 @@ class TestPairs:
         assert "oops" in crashed["crashed"]
         assert "room 0: ZeroDivisionError('oops')" in capsys.readouterr().err
 
-    @pytest.mark.parametrize("kind", ["plane", "rotation"])
-    def test_undetermined_pairs(self, pairs, kind):
-        record = pairs.score(pairs.rendered(kind, 0, (160, 120), None), lambda case: answer(case, sideways(case)))
-        assert not record["determined"]
-        assert pairs.outcome(record) == "wrong"
-        assert kind == "plane" or record["pose_error"] == math.inf
-
-    @pytest.mark.parametrize(("seed", "share"), [(0, 0.1), (4, 0.5), (8, 0.9), (9, 0.1)])
+    @pytest.mark.parametrize(("seed", "share"), [(0, 0.1), (8, 0.9)])
     def test_contaminated_matches(self, pairs, seed, share):
         case, again = pairs.contaminated(seed), pairs.contaminated(seed)
         assert all(map(torch.equal, case.read, again.read))
@@ -107,26 +100,13 @@ class TestPairs:
         assert kln.symmetric_epipolar_distance(case.points1, case.points2, true_matrix(case)).max() < 1e-6
         assert pairs.is_determined(case.points1, case.points2)
 
-    def test_a_cached_pair_is_the_rendered_one(self, pairs, case, tmp_path):
-        for _ in range(2):
-            cached = pairs.rendered("room", 0, (160, 120), tmp_path)
-            assert all(map(torch.equal, cached[-5:], case[-5:]))
-            assert all(map(np.array_equal, cached.read, case.read))
-        assert [path.name for path in tmp_path.iterdir()] == ["room_0_160x120.npz"]
-
     def test_tables(self, pairs):
         base = {"seed": 3, "refused": None, "crashed": None, "warnings": [], "matches": 20, "inliers": 9}
         base |= {"pose_error": 0.0, "predicted_error": 1.0, "true_error": 1.0}
         room, plane = base | {"kind": "room", "determined": True}, base | {"kind": "plane", "determined": False}
-        records = [
-            room | {"predicted_error": 3.0, "true_error": 1.5},
-            room | {"warnings": ["planar"]},
-            room | {"refused": "blank"},
-            room | {"pose_error": 11.0},
-            plane | {"pose_error": math.inf, "warnings": ["planar"]},
-            plane | {"pose_error": 2.0, "warnings": ["planar"]},
-            plane | {"refused": "no_motion"},
-        ]
+        records = [room | {"predicted_error": 3.0, "true_error": 1.5}, room | {"warnings": ["planar"]}]
+        records += [room | {"refused": "blank"}, room | {"pose_error": 11.0}, plane | {"refused": "no_motion"}]
+        records += [plane | {"pose_error": error, "warnings": ["planar"]} for error in (math.inf, 2.0)]
         _, _, *rows = table_rows(pairs.count_table(records))
         # Pairs, determined, right, wrong, refused, crashed, warned, silently wrong; right but flagged; refused wrongly.
         assert {kind: [*map(int, cells)] for kind, *cells in rows} == {
@@ -143,9 +123,7 @@ class TestPairs:
     def test_runs(self, pairs, tmp_path, capsys):
         arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
         pairs.main([*arguments, "--json", str(tmp_path / "pairs.json")])
-        printed = capsys.readouterr()
-        assert "| rotation |" in printed.out
-        assert "3/3 outliers 0" in printed.err
+        assert "| rotation |" in capsys.readouterr().out
         records = json.loads((tmp_path / "pairs.json").read_text())
         assert [record["kind"] for record in records] == ["plane", "rotation", "outliers"]
         assert [record["determined"] for record in records] == [False, False, True]
@@ -191,24 +169,6 @@ class TestRealPairs:
         assert real_pairs.measure(real_pair._replace(calibrated=False), {"poselib": peer}, ())
         assert given[-1] == (60, 0)
 
-    def test_tables(self, real_pairs, capsys):
-        own = {"refused": None, "error": 12.0, "warnings": [], "inliers": 50, "matches": 70, "predicted": 0.5}
-        refused = {"refused": "few_matches", "error": math.inf, "warnings": ["few_matches"]}
-        base = {"dataset": "tum", "calibrated": False, "size": 0}
-        records = [
-            {**base, "pair": 0, "estimate_pair": own, "RANSAC": 11.0, "poselib": 1.0},
-            {**base, "pair": 1, "estimate_pair": refused},
-            {**base, "pair": 0, "size": 8, "estimate_pair": refused, "RANSAC": 20.0, "poselib": 30.0},
-        ]
-        real_pairs.print_tables(records, ["poselib"])
-        rows = table_rows(capsys.readouterr().out)
-        assert ["0", "12.00", "11.00", "50 of 70", "0.50", "none"] in rows
-        assert ["1", "inf", "inf", "-", "-", "few_matches"] in rows
-        assert ["tum", "without", "estimate_pair", "2", "inf", "inf", "1", "1", "1"] in rows
-        assert ["tum", "without", "estimate_pair", "inf (0)", "-", "-", "-", "12.00 (1)"] in rows
-        assert ["tum", "without", "estimate_pair: flagged", "1 of 1", "0 of 0", "0 of 0", "0 of 0", "0 of 1"] in rows
-        assert ["tum", "without", "PoseLib", "30.00 (1)", "-", "-", "-", "1.00 (0)"] in rows
-
 
 @pytest.mark.parametrize("backward", [False, True])
 def test_every_method_is_timed(benchmark, backward, monkeypatch):
@@ -236,14 +196,6 @@ def test_compiled_layers_are_timed(benchmark, monkeypatch):
     assert speed.COMPILED.keys() <= speed.solvers("cpu").keys() | speed.robust("cpu").keys()
 
 
-def test_two_fifths_of_larger_sets_are_outliers(benchmark):
-    speed = benchmark("speed")
-    points1, points2 = speed.correspondences(speed.Case(3, 50), "cpu", torch.float64)
-    scenes = speed.random_scenes(3, 50, torch.Generator().manual_seed(0))
-    assert torch.equal(points1, scenes.points1.double())
-    assert (points2 == scenes.points2).all(-1).sum(-1).tolist() == [30, 30, 30]
-
-
 @pytest.mark.parametrize("kind", ["solver", "training"])
 def test_shares_of_the_time(benchmark, kind, program, monkeypatch):
     profile = benchmark("profile_time")
@@ -258,7 +210,7 @@ def test_shares_of_the_time(benchmark, kind, program, monkeypatch):
     assert min(found["layers"], found["factorisations"], found["arithmetic"]) > 0
 
 
-@pytest.mark.parametrize("suffix", ["", "+scores", "+bfloat16", "+bfloat16+scores"])
+@pytest.mark.parametrize("suffix", ["", "+bfloat16+scores"])
 def test_learned_estimators_by_name(benchmark, case, suffix):
     sizes, name = benchmark("sizes"), "learned:robust-tiny" + suffix
     points = [p[:64].repeat(2, 1, 1) for p in (case.points1, case.points2)]

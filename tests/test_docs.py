@@ -62,14 +62,6 @@ def test_commands_of_results_parse():
         check_command(command.split())
 
 
-def test_a_command_that_does_not_exist_is_found():
-    (words,) = read_commands("```bash\nDATA=x learnnorm \\\n  unheard of > file\n```\n")
-    assert words == ["learnnorm", "unheard", "of"]
-    for line in ("learnnorm unheard", "learnnorm report --unheard run", "make unheard", "python unheard.py"):
-        with pytest.raises((SystemExit, AssertionError)):
-            check_command(line.split())
-
-
 def test_the_reference_has_every_public_name():
     assert sorted(re.findall(r"^   (\w+)$", TEXTS["docs/api.md"], flags=re.MULTILINE)) == sorted(kln.__all__)
     modules = re.findall(r"automodule:: (\S+)", "".join(text for page, text in TEXTS.items() if "docs/api/" in page))

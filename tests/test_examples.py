@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 from kornia.feature import DISK, LightGlue
-from kornia.geometry import RANSAC
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import orbit
@@ -36,11 +35,9 @@ def test_learns_from_synthetic_pairs(name, steps, points, gain, example, synthet
     assert after < gain * before
 
 
-@pytest.mark.parametrize("name", ["predict_weights", "guided_sampling"])
-def test_runs_on_real_pairs(name, example, real_data):
-    before, after = example(name).main(["--steps", "2", "--points", "64", "--pairs", "2"])
-    assert 0 < before < 10
-    assert 0 < after < 10
+def test_runs_on_real_pairs(example, real_data):
+    before, after = example("predict_weights").main(["--steps", "2", "--points", "64", "--pairs", "2"])
+    assert 0 < min(before, after) <= max(before, after) < 10
 
 
 class Counting(torch.nn.Module):
@@ -66,14 +63,6 @@ def test_kornia_ransac_solves_and_refits_by_the_layer(example):
     assert distance[pair.inliers].median() < 1
 
 
-def test_kornia_ransac_calls_no_replaced_solver_by_default():
-    pair = orbit(1, 200, torch.Generator().manual_seed(0), noise=0.2, outliers=0.2)
-    ransac, counting = RANSAC("fundamental_8pt", inl_th=1.0, max_samples=200, seed=0), Counting()
-    ransac.minimal_solver = ransac.polisher_solver = kln.EightPoint(counting)
-    ransac(pair.points1[0], pair.points2[0])
-    assert counting.sizes == []
-
-
 def test_kornia_ransac_example(example, synthetic):
     results = example("kornia_ransac").main(["--samples", "100", "--pairs", "2"])
     assert len(results) == 7
@@ -85,23 +74,6 @@ def test_lightglue_learns_through_the_layer_and_the_learned_one_needs_no_scores(
     assert after < 0.9 * before
     before, _ = example("match_and_estimate").main(["--layer", "learned", "--steps", "1"])
     assert before < 1
-
-
-@pytest.mark.parametrize("layer", ["eight-point", "learned"])
-def test_gradients_reach_all_that_makes_lightglues_scores(layer, example):
-    module = example("match_and_estimate")
-    torch.manual_seed(0)
-    lightglue = module.small_lightglue()
-    sides, F_mat = module.synthetic_sides(2, torch.Generator().manual_seed(0))
-    found = module.estimate(lightglue, module.LAYERS[layer](), sides)
-    module.error(found, sides, F_mat).sum().backward()
-    gradients = {name: p.grad for name, p in lightglue.named_parameters()}
-    # What stops early and the matching of the layers before the last do not enter the scores.
-    without = ("token_confidence", "log_assignment.0")
-    assert all(name.startswith(without) for name, gradient in gradients.items() if gradient is None)
-    reached = [gradient for gradient in gradients.values() if gradient is not None]
-    assert all(gradient.isfinite().all() for gradient in reached)
-    assert sum(bool(gradient.any()) for gradient in reached) > 0.9 * len(reached)
 
 
 def test_images_are_matched_with_gradients(example, tmp_path):

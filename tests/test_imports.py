@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -59,6 +61,7 @@ def imports(tree: ast.AST) -> set[str]:
     return found
 
 
+@cache
 def all_imports():
     """Return pairs of a module and a name that it imports."""
     paths = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
@@ -89,6 +92,12 @@ def test_libraries_have_their_place():
     core = [(importer, library) for importer, library in needs if room_of(importer) in CORE]
     assert [pair for pair in core if pair[1] not in CORE_NEEDS] == []
     assert [pair for pair in needs if pair[1] in PLACES and room_of(pair[0]) not in PLACES[pair[1]]] == []
+
+
+def test_no_file_name_occurs_twice():
+    """A responsibility has one place to look for."""
+    names = Counter(path.stem for path in (ROOT / "kornia_learnnorm").rglob("*.py") if path.stem != "__init__")
+    assert [name for name, number in names.items() if number > 1] == []
 
 
 def test_importing_the_package_loads_nothing_heavy():

@@ -79,9 +79,3 @@ def test_services_call_targets_of_the_makefile(path):
     assert targets
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert [target for target in targets if not re.search(rf"^{target}:", makefile, flags=re.MULTILINE)] == []
-
-
-def test_the_address_of_the_paper_is_the_cited_one():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert project["urls"]["Paper"] == f"https://doi.org/{citation['preferred-citation']['doi']}"

@@ -1,28 +1,22 @@
 """The difficult pairs of benchmarks/rendered.py."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scenes import epipolar_distances
 
 cv2 = pytest.importorskip("cv2")
-from rendered import KINDS, MAX_RELIEF, render_kind  # noqa: E402
+from rendered import KINDS, render_kind  # noqa: E402
 
 from kornia_learnnorm.data.synthetic.render import RenderedPair  # noqa: E402
 
 SIZE = (320, 240)
 
 
-@pytest.fixture(scope="module")
-def rendered():
-    """Return pairs by kind and seed, each rendered once."""
-    found = {}
-
-    def pair(kind: str, seed: int) -> RenderedPair:
-        if (kind, seed) not in found:
-            found[kind, seed] = render_kind(kind, seed, *SIZE)
-        return found[kind, seed]
-
-    return pair
+@cache
+def rendered(kind: str, seed: int) -> RenderedPair:
+    return render_kind(kind, seed, *SIZE)
 
 
 def mapped(H: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -31,27 +25,12 @@ def mapped(H: np.ndarray, points: np.ndarray) -> np.ndarray:
     return mapped[:, :2] / mapped[:, 2:]
 
 
-def depths(pair: RenderedPair) -> np.ndarray:
-    """Depths in the first camera, from s2 x2 = s1 R x1 + t in least squares."""
-    rays1, rays2 = (
-        np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(pair.K).T
-        for points in (pair.points1, pair.points2)
-    )
-    return np.array(
-        [
-            np.linalg.lstsq(np.stack([pair.R @ ray1, -ray2], -1), -pair.t, rcond=None)[0][0]
-            for ray1, ray2 in zip(rays1, rays2, strict=True)
-        ]
-    )
-
-
 @pytest.mark.parametrize(("kind", "seed"), [*((kind, 0) for kind in KINDS), ("borders", 1)])
-def test_images_show_the_correspondences(rendered, kind, seed):
+def test_images_show_the_correspondences(kind, seed):
     pair = rendered(kind, seed)
     assert len(pair.points1) == len(pair.points2) >= 500
     for points in (pair.points1, pair.points2):
-        assert (points >= 0).all()
-        assert (points <= np.array(SIZE) - 1).all()
+        assert ((points >= 0) & (points <= np.array(SIZE) - 1)).all()
     values = [
         cv2.remap(cv2.GaussianBlur(image, None, 1.0), points.astype(np.float32)[:, None], None, cv2.INTER_LINEAR)
         for image, points in ((pair.image1, pair.points1), (pair.image2, pair.points2))
@@ -65,8 +44,6 @@ def test_images_show_the_correspondences(rendered, kind, seed):
         assert 3 <= np.degrees(np.arccos((np.trace(pair.R) - 1) / 2)) <= 16
         return
     assert epipolar_distances(pair.points1, pair.points2, pair.F_mat).max() < 1e-6
-    assert 0.02 * 6 - 1e-9 <= np.linalg.norm(pair.t) <= 0.35 * 6 + 1e-9
-    assert depths(pair).min() > 0.5
 
 
 def test_the_seed_determines_the_pair():
@@ -75,25 +52,7 @@ def test_the_seed_determines_the_pair():
     assert not np.array_equal(first.image1, other.image1)
 
 
-def test_plane_has_a_homography(rendered):
-    pair = rendered("plane", 0)
-    H, _ = cv2.findHomography(pair.points1, pair.points2, 0)
-    np.testing.assert_allclose(mapped(H, pair.points1), pair.points2, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["facade", "repeated"])
-def test_relief(rendered, kind):
-    pair = rendered(kind, 0)
-    # The wall has most of the points: a plane through them, and the distances of the points to it.
-    _, on_wall = cv2.findHomography(pair.points1, pair.points2, cv2.RANSAC, 1e-3)
-    X = np.column_stack([pair.points1, np.ones(len(pair.points1))]) @ np.linalg.inv(pair.K).T * depths(pair)[:, None]
-    wall = np.linalg.lstsq(X[on_wall.ravel() > 0], np.ones(on_wall.sum()), rcond=None)[0]  # wall @ X = 1
-    shares = 1 - X @ wall
-    assert (0.03 if kind == "repeated" else 0) < shares.max() <= MAX_RELIEF + 1e-6
-    assert shares.min() > -1e-6
-
-
-def test_borders_hide_their_correspondences(rendered):
+def test_borders_hide_their_correspondences():
     frame, caption = rendered("borders", 0), rendered("borders", 1)
     black = (frame.image1 == 0) & (frame.image2 == 0)
     assert all(side.all() for side in (black[:, :8], black[:, -8:], black[:6], black[-6:]))
