@@ -46,10 +46,10 @@ def blobs(centres: np.ndarray, width: int = 240, height: int = 180, width_of_blo
 def centroids(image: np.ndarray, near: np.ndarray, reach: int = 14, floor: int = 0) -> np.ndarray:
     """Centre of mass of the grey values above a floor about each of some pixels."""
     found = []
-    for cx, cy in np.round(near).astype(int):
-        y, x = np.mgrid[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1]
-        mass = image[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1].astype(float).clip(floor) - floor
-        found.append([(mass * x).sum() / mass.sum(), (mass * y).sum() / mass.sum()])
+    for centre in np.round(near).astype(int):
+        (left, top), (right, bottom) = centre - reach, centre + reach + 1
+        mass = image[top:bottom, left:right].astype(float).clip(floor) - floor
+        found.append([(mass.sum(0) @ np.arange(left, right)), (mass.sum(1) @ np.arange(top, bottom))] / mass.sum())
     return np.array(found)
 
 
@@ -142,13 +142,8 @@ def write_colmap(root: Path, camera: str = f"PINHOLE {SIZE[0]} {SIZE[1]} {FOCAL}
     write_lines(root / "pairs.txt", *(f"{a} {b}" for a, b in pairwise(names)))
 
 
-LAYOUTS = {
-    "kitti": write_kitti,
-    "tum": write_tum,
-    "cambridge": write_cambridge,
-    "folder": write_folder,
-    "colmap": write_colmap,
-}
+LAYOUTS = {"kitti": write_kitti, "tum": write_tum, "cambridge": write_cambridge}
+LAYOUTS |= {"folder": write_folder, "colmap": write_colmap}
 
 
 def edit(path: Path, line: int, text: str | None) -> None:
@@ -170,13 +165,6 @@ def moved(pixels: float, focal: float = FOCAL) -> np.ndarray:
 
 
 def rotated(wxyz: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Rotate vectors (N, 3) by a unit quaternion: q v q*, with Hamilton's product."""
-
-    def product(p, q):
-        w = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdims=True)
-        return np.concatenate(
-            [w, p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])], -1
-        )
-
-    pure = np.column_stack([np.zeros(len(vectors)), vectors])
-    return product(product(np.broadcast_to(wxyz, pure.shape), pure), (wxyz * [1, -1, -1, -1])[None])[:, 1:]
+    """Rotate vectors (N, 3) by a unit quaternion."""
+    w, u = wxyz[0], wxyz[1:]
+    return vectors + 2 * (w * np.cross(u, vectors) + np.cross(u, np.cross(u, vectors)))

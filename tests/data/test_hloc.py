@@ -45,11 +45,6 @@ def test_reference(paths, tmp_path):
     assert all(np.isnan(getattr(got, name)).all() for name in "FKRt")
 
 
-def test_no_matches(paths):
-    change(paths[1], f"{PAIR}/matches0", np.int16([-1, -1, -1]))
-    assert read_hloc(*paths).offsets.tolist() == [0, 0]
-
-
 @pytest.mark.parametrize(
     ("which", "name", "value", "message"),
     [

@@ -1,7 +1,5 @@
 """Stores: what is written comes back, some pairs of it, and what a broken file says."""
 
-from pathlib import Path
-
 import h5py
 import numpy as np
 import pytest
@@ -47,10 +45,9 @@ def test_file_follows_the_format(path):
     assert shapes["names"][0] == (6, 2)
 
 
-@pytest.mark.parametrize("pairs", ["", "@0:2"])
-def test_missing_file(tmp_path, pairs):
+def test_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no store at .*none\.h5"):
-        read_store(f"{tmp_path / 'none.h5'}{pairs}")
+        read_store(f"{tmp_path / 'none.h5'}@0:2")
 
 
 @pytest.mark.parametrize("change", [lambda data: b"not a store", lambda data: data[:3000]])
@@ -127,16 +124,16 @@ def test_a_failed_write_leaves_the_old_file(uneven, path):
     assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
 
 
-@pytest.mark.parametrize(("first", "stop"), [(0, 1), (1, 2), (2, 5), (0, 6)])
-def test_select(uneven, first, stop):
+@pytest.mark.parametrize(("first", "stop"), [(0, 1), (2, 5), (0, 6)])
+def test_some_pairs(uneven, path, first, stop):
     part = uneven.select(first, stop)
     assert part.names == uneven.names[first:stop]
-    assert (part.dataset, part.pairs, part.detector) == (uneven.dataset, uneven.pairs, uneven.detector)
     for new, old in enumerate(range(first, stop)):
         np.testing.assert_equal(part.matches(new), uneven.matches(old))
         for name in ("image_size", "F", "K", "R", "t"):
             np.testing.assert_array_equal(getattr(part, name)[new], getattr(uneven, name)[old])
     assert len(part.points1) == len(part.points2) == len(part.ratio) == part.offsets[-1]
+    same(read_store(f"{path}@{first}:0{stop}"), part)
 
 
 def test_matches_of_a_pair(uneven):
@@ -149,16 +146,7 @@ def test_matches_of_a_pair(uneven):
     assert [len(part) for part in uneven.matches(1)] == [0, 0, 0]
 
 
-@pytest.mark.parametrize(("text", "pairs"), [("2:5", (2, 5)), ("0:6", (0, 6)), ("03:04", (3, 4))])
-def test_read_some_pairs(uneven, path, text, pairs):
-    part = read_store(Path(f"{path}@{text}"))
-    same(part, uneven.select(*pairs))
-    same(read_store(f"{path}@{text}"), part)
-    write_store(path.with_name("part.h5"), part)
-    same(read_store(path.with_name("part.h5")), part)
-
-
-@pytest.mark.parametrize(("first", "stop"), [(0, 0), (6, 6), (4, 2), (0, 7), (6, 9), (-1, 2), (-2, -1)])
+@pytest.mark.parametrize(("first", "stop"), [(0, 0), (4, 2), (0, 7), (-1, 2)])
 def test_pairs_that_are_not_there(uneven, path, first, stop):
     message = f"pairs {first}:{stop} were asked for, the store has 0:6"
     with pytest.raises(ValueError, match=message):

@@ -38,7 +38,6 @@ class TestMatchImages:
         [
             ({"image1": np.full((180, 240), 7, np.uint8)}, ValueError, r"image 1 is blank .* 0 features"),
             ({"image2": np.full((180, 240), 7, np.uint8)}, ValueError, r"image 2 is blank .* 0 features"),
-            ({"image1": texture() / 255.0}, TypeError, "an image must be an array of uint8, got float64"),
             ({"image2": np.zeros((180, 240, 3), np.uint8)}, ValueError, r"must be grey .* got \(180, 240, 3\)"),
             ({"num_features": 0}, ValueError, "num_features must be at least 2, got 0"),
         ],
@@ -68,15 +67,6 @@ def greedy(rows: list[tuple]) -> list[tuple]:
 
 
 class TestOneToOne:
-    def test_by_hand(self):
-        points1 = torch.tensor([[float(10 * i), 5.0] for i in range(6)])
-        points2 = points1 + 1
-        ratio = torch.tensor([0.5, 0.1, 0.3, 0.2, 0.6, 0.4])
-        points2[4] = points2[1]  # 4 loses to 1
-        points1[2] = points1[3]  # 2 loses to 3
-        points1[5] = torch.nextafter(points1[0], points1[0] + 1)  # nearly equal is not equal
-        assert one_to_one(points1, points2, ratio).tolist() == [1, 3, 5, 0]
-
     @given(matches=shared_matches(), seed=st.integers(0, 99))
     def test_against_a_loop(self, matches, seed):
         kept = one_to_one(*matches)
