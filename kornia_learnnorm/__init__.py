@@ -12,11 +12,12 @@ Example:
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.linear import EightPoint, find_fundamental
 from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
+from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
 from kornia_learnnorm.geometry.distances import algebraic_distance, sampson_distance, symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.rank2 import optimal_rank2
-from kornia_learnnorm.losses import BoundedEpipolarLoss, EpipolarLoss, InlierLoss, LogEpipolarLoss
+from kornia_learnnorm.losses import BoundedEpipolarLoss, EpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.identity import Identity
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
@@ -46,7 +47,9 @@ __all__ = [
     "InlierLoss",
     "LearnedEightPoint",
     "LearnedNormalizer",
+    "LearnedRelativePose",
     "LogEpipolarLoss",
+    "LogEssentialLoss",
     "NoReliableMatrixError",
     "PaperNetwork",
     "PerView",

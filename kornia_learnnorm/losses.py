@@ -15,7 +15,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
-__all__ = ["BoundedEpipolarLoss", "EpipolarLoss", "InlierLoss", "LogEpipolarLoss"]
+__all__ = ["BoundedEpipolarLoss", "EpipolarLoss", "InlierLoss", "LogEpipolarLoss", "LogEssentialLoss"]
 
 MAX_DISTANCE = 1e4  # pixels; larger distances count as this and send no gradient
 
@@ -172,6 +172,41 @@ class LogEpipolarLoss(nn.Module):
         """Return the loss of each set, (B,), of correspondences (B, M, 2) x 2 under matrices (B, 3, 3)."""
         distance = symmetric_epipolar_distance(points1, points2, F_mat).clamp(max=MAX_DISTANCE)
         return (distance + self.floor).log().mean(-1)
+
+
+class LogEssentialLoss(nn.Module):
+    r"""Logarithm of the chordal distance :math:`d` of essential matrices of unit norm, :math:`\log \sqrt{d^2 + f^2}`.
+
+    The sign of a matrix has no meaning: the nearer of both counts.
+
+    The distance is about the angle between two poses, in radians: of the translations times the root of one half, and
+    of the rotations.
+
+    Args:
+        floor: distance :math:`f`, far below which nothing is gained.
+
+    Raises:
+        ValueError: if ``floor`` is not positive.
+
+    Example:
+        >>> E_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
+        >>> LogEssentialLoss(1.0)(E_mat, -2 * E_mat)
+        tensor([0.])
+
+    """
+
+    def __init__(self, floor: float = 0.003) -> None:
+        super().__init__()
+        if not floor > 0:
+            raise ValueError(f"floor must be positive, got {floor}")
+        self.floor = floor
+
+    def forward(self, E_mat: Tensor, true: Tensor) -> Tensor:
+        """Return the loss of each set, (B,), of essential matrices and the true ones, (B, 3, 3), of any scale."""
+        E_mat, true = (M / torch.linalg.matrix_norm(M, keepdim=True) for M in (E_mat, true.to(E_mat)))
+        # In place of the root of a sum of squares, which has no derivative at zero.
+        squares = torch.stack([E_mat - true, E_mat + true]).square().sum((-1, -2)).amin(0)
+        return ((squares + self.floor**2).sqrt()).log()
 
 
 class InlierLoss(nn.Module):

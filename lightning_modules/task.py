@@ -15,11 +15,12 @@ from torch.optim.lr_scheduler import LRScheduler
 from torchmetrics import CatMetric, MeanMetric, Metric, SumMetric
 
 from kornia_learnnorm.data.sets import MatchSets
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned import LearnedLayer
 from kornia_learnnorm.estimators.linear import EightPoint
+from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss
+from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
 from kornia_learnnorm.metrics.better_rate import comparable
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
@@ -46,6 +47,9 @@ class SetLoss(nn.Module):
         labelled: loss of the true inliers of the sets with ground truth.
         inlier_weight: weight of the cross-entropy of the logits, which is added to ``labelled``.
         label_free_weight: weight of the label-free loss.
+        pose: loss of essential matrices and the true ones.
+        pose_weight: share of ``pose``, from 0 to 1, in the loss of labelled sets with cameras; the rest is
+            ``labelled``'s.
     """
 
     def __init__(
@@ -54,12 +58,17 @@ class SetLoss(nn.Module):
         labelled: LogEpipolarLoss | None = None,
         inlier_weight: float = 0.3,
         label_free_weight: float = 4.0,
+        pose: LogEssentialLoss | None = None,
+        pose_weight: float = 0.0,
     ) -> None:
         super().__init__()
+        if not 0 <= pose_weight <= 1:
+            raise ValueError(f"pose_weight must be in [0, 1], got {pose_weight}")
         self.label_free = label_free or BoundedEpipolarLoss()
         self.labelled = labelled or LogEpipolarLoss()
         self.inlier = InlierLoss()
-        self.inlier_weight, self.label_free_weight = inlier_weight, label_free_weight
+        self.pose = pose or LogEssentialLoss()
+        self.inlier_weight, self.label_free_weight, self.pose_weight = inlier_weight, label_free_weight, pose_weight
 
     def forward(self, sets: MatchSets, F_mat: Tensor, logits: Tensor | None) -> Tensor:
         """Return the loss of each set, (B,), of its matrix (B, 3, 3) and the logits of its matches (B, N), if any."""
@@ -68,6 +77,14 @@ class SetLoss(nn.Module):
         if sets.labelled is None:
             return unknown
         known = self.labelled(heldout1, heldout2, F_mat)
+        if self.pose_weight and sets.K1 is not None and sets.K2 is not None and sets.E_mat is not None:
+            calibrated = sets.E_mat.isfinite().flatten(1).all(1)
+            eye = torch.eye(3).to(F_mat)  # where unknown: NaN has no derivative that can be dropped
+            K1, K2, true = (
+                torch.where(calibrated[:, None, None], value.to(F_mat), eye) for value in (sets.K1, sets.K2, sets.E_mat)
+            )
+            share = self.pose_weight * calibrated
+            known = (1 - share) * known + share * self.pose(K2.mT @ F_mat @ K1, true)
         if logits is not None and sets.inliers is not None:
             known = known + self.inlier_weight * self.inlier(logits, sets.inliers)
         return torch.where(sets.labelled, known, unknown)
@@ -82,7 +99,8 @@ class EstimatorTask(pl.LightningModule):
     other set, or with a gradient that is not finite, changes nothing, warns, and is counted: ``train/skipped``.
 
     Args:
-        estimator: the estimator to train: a :class:`~kornia_learnnorm.LearnedEightPoint`, or an
+        estimator: the estimator to train: a :class:`~kornia_learnnorm.LearnedEightPoint`, a
+            :class:`~kornia_learnnorm.LearnedRelativePose`, which needs sets with cameras, or an
             :class:`~kornia_learnnorm.EightPoint` with a :class:`~kornia_learnnorm.LearnedNormalizer`.
         loss: module of ``(points1, points2, F_mat, heldout1, heldout2)`` that returns a scalar or a loss for each set,
             such as :class:`~kornia_learnnorm.EpipolarLoss` or your own; :class:`SetLoss` when not given.
@@ -104,11 +122,11 @@ class EstimatorTask(pl.LightningModule):
         sample_gradient: float | None = 1.0,
     ) -> None:
         super().__init__()
-        if not isinstance(estimator, LearnedEightPoint | EightPoint):
-            raise TypeError(f"expected a LearnedEightPoint or an EightPoint, got {type(estimator).__name__}")
+        if not isinstance(estimator, LearnedLayer | EightPoint):
+            raise TypeError(f"expected a learned layer or an EightPoint, got {type(estimator).__name__}")
         if isinstance(estimator, EightPoint) and not isinstance(estimator.normalizer, LearnedNormalizer):
             raise TypeError(f"expected a LearnedNormalizer in EightPoint, got {type(estimator.normalizer).__name__}")
-        self.estimator: LearnedEightPoint | EightPoint = estimator.train()  # shipped weights come in evaluation mode
+        self.estimator: LearnedLayer | EightPoint = estimator.train()  # shipped weights come in evaluation mode
         self.loss = loss or SetLoss()
         self.optimizer, self.lr_scheduler = optimizer, lr_scheduler
         self.warm_up, self.sample_gradient = warm_up, sample_gradient
@@ -119,9 +137,9 @@ class EstimatorTask(pl.LightningModule):
         self._sets = 0  # of all processes since the last step
 
     @property
-    def trained(self) -> LearnedEightPoint | LearnedNormalizer:
+    def trained(self) -> LearnedLayer | LearnedNormalizer:
         """The module that learns, whose weights ``from_pretrained`` reads."""
-        if isinstance(self.estimator, LearnedEightPoint):
+        if isinstance(self.estimator, LearnedLayer):
             return self.estimator
         return cast(LearnedNormalizer, self.estimator.normalizer)
 
@@ -164,7 +182,7 @@ class EstimatorTask(pl.LightningModule):
         heldout = batch.heldout1.double(), batch.heldout2.double()
         arrived: list[Tensor] = []
         with self._limited_gradients(arrived):
-            stages = self._stages(*points, batch.scores)
+            stages = self._stages(batch)
         total = points[0].new_zeros(())
         of_sets = isinstance(self.loss, SetLoss)
         for number, (F_mat, logits) in enumerate(stages, 1):
@@ -174,16 +192,29 @@ class EstimatorTask(pl.LightningModule):
             total.register_hook(arrived.append)  # type: ignore[no-untyped-call]
         return total
 
-    def _stages(self, points1: Tensor, points2: Tensor, scores: Tensor | None) -> list[tuple[Tensor, Tensor | None]]:
+    def _stages(self, batch: MatchSets) -> list[tuple[Tensor, Tensor | None]]:
         """Return the matrices of each stage, which its own losses train, and the logits where there are some."""
-        layer = self.estimator
-        if not isinstance(layer, LearnedEightPoint):
-            return [(layer(points1, points2), None)]
+        layer, points = self.estimator, (batch.points1.double(), batch.points2.double())
+        if not isinstance(layer, LearnedLayer):
+            return [(layer(*points), None)]
         before, layer.detach_stages = layer.detach_stages, True
         try:
-            return [*layer.estimate(points1, points2, scores=scores).stages]
+            if not isinstance(layer, LearnedRelativePose):
+                return [*layer.estimate(*points, scores=batch.scores).stages]
+            K1, K2 = _cameras(batch)
+            stages = layer.estimate(*points, K1, K2, scores=batch.scores).stages
+            inverse1, inverse2 = (torch.linalg.inv_ex(K)[0] for K in (K1, K2))
+            return [(inverse2.mT @ stage.E_mat @ inverse1, stage.logits) for stage in stages]
         finally:
             layer.detach_stages = before
+
+    def _estimate(self, batch: MatchSets) -> Tensor:
+        """Return the matrices of the estimator, without scores."""
+        points = batch.points1.double(), batch.points2.double()  # in float32, F itself loses digits of the residual
+        if isinstance(self.estimator, LearnedRelativePose):
+            return self.estimator.estimate(*points, *_cameras(batch)).F_mat
+        F_mat: Tensor = self.estimator(*points)
+        return F_mat
 
     @contextmanager
     def _limited_gradients(self, arrived: list[Tensor]) -> Iterator[None]:
@@ -216,7 +247,7 @@ class EstimatorTask(pl.LightningModule):
         """Log the metrics of a batch, in the test too; Lightning gathers them over batches and processes."""
         batch, left_out = _finite(batch)
         points = batch.points1.double(), batch.points2.double()
-        F_mat = self.estimator(*points)
+        F_mat = self._estimate(batch)
         if isinstance(self.loss, SetLoss):
             size = next(name for largest, name in SIZES.items() if batch.points1.shape[1] <= largest)
             error = symmetric_epipolar_distance(batch.heldout1.double(), batch.heldout2.double(), F_mat)
@@ -239,13 +270,18 @@ class EstimatorTask(pl.LightningModule):
 
     def predict_step(self, batch: MatchSets, batch_idx: int) -> dict[str, Tensor]:
         """Return matrices, mean residuals and, of a normaliser, transforms of a batch."""
-        points = batch.points1.double(), batch.points2.double()  # in float32, F itself loses digits of the residual
-        F_mat = self.estimator(*points)
+        points, F_mat = (batch.points1.double(), batch.points2.double()), self._estimate(batch)
         residual = symmetric_epipolar_distance(*points, F_mat).mean(-1)
         found = {"F_mat": F_mat, "residual": residual, "pair": batch.pair}
         if isinstance(self.trained, LearnedNormalizer):
             found["T1"], found["T2"] = self.trained(*points)
         return found
+
+
+def _cameras(batch: MatchSets) -> tuple[Tensor, Tensor]:
+    if batch.K1 is None or batch.K2 is None:
+        raise ValueError("LearnedRelativePose needs sets with cameras, got none")
+    return batch.K1.double(), batch.K2.double()
 
 
 class Median(CatMetric):

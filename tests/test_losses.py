@@ -149,7 +149,17 @@ class TestLossesOfSets:
         assert value.isfinite().all()
         assert not gradient.any()
 
-    @pytest.mark.parametrize("loss", [BoundedEpipolarLoss, LogEpipolarLoss])
+    def test_log_essential(self):
+        E_mat, true = uniform(4, 3, 3, low=-1), uniform(4, 3, 3, low=-1, seed=1)
+        loss = kln.LogEssentialLoss(0.1)
+        E, T = (M.numpy() / np.linalg.norm(M.numpy(), axis=(1, 2))[:, None, None] for M in (E_mat, true))
+        distance = np.minimum(*(np.linalg.norm(E - sign * T, axis=(1, 2)) for sign in (1, -1)))
+        np.testing.assert_allclose(loss(-3 * E_mat, true), np.log(np.hypot(distance, 0.1)))
+        assert gradcheck(lambda E: loss(E, true), E_mat.requires_grad_(), eps=1e-6, atol=1e-4)
+        (gradient,) = torch.autograd.grad(loss(E_mat, -E_mat.detach()).sum(), E_mat)
+        assert gradient.abs().max() < 1e-6
+
+    @pytest.mark.parametrize("loss", [BoundedEpipolarLoss, LogEpipolarLoss, kln.LogEssentialLoss])
     @pytest.mark.parametrize("number", [0.0, -1.0, math.nan])
     def test_exceptions(self, loss, number):
         with pytest.raises(ValueError, match="must be positive, got"):

@@ -20,7 +20,8 @@ def augment(sets: MatchSets, generator: Generator) -> MatchSets:
     Rotations: up to about 15 degrees for each view alone, in half of the sets; a quarter turn or none for both; any
     angle for each view in a tenth. Scales: log-uniform 0.6-1.6 for both, 0.8-1.25 for one, and as much for the aspect
     of both. Half of the sets are mirrored, in half the views are swapped. In half of the sets up to 40 % of the matches
-    get a wrong partner: another match's, or their own shifted by 5-150 px in any direction.
+    get a wrong partner: another match's, or their own shifted by 5-150 px in any direction. Directions in the cameras
+    don't change: their matrices take the maps.
     """
     batch_size, centre = len(sets.points1), sets.points1.mean(1)
     A1, A2 = (A.to(centre) for A in _maps(batch_size, generator))
@@ -34,7 +35,12 @@ def augment(sets: MatchSets, generator: Generator) -> MatchSets:
     points2 = torch.where(replaced[..., None], _wrong_partners(points2, generator), points2)
     inliers = None if sets.inliers is None else torch.where(replaced, 0.0, sets.inliers)
     scores = None if sets.scores is None else torch.where(replaced, 0.2 * sets.scores, sets.scores)
-    return MatchSets(points1, points2, heldout1, heldout2, sets.pair, scores, inliers, sets.labelled)
+    cameras: list[Tensor | None] = [sets.K1, sets.K2, sets.E_mat]
+    if sets.K1 is not None and sets.K2 is not None and sets.E_mat is not None:
+        shift = affine_transform(torch.eye(2).to(centre).expand(batch_size, 2, 2), -centre)
+        K1, K2 = (A.to(K) @ shift.to(K) @ K for A, K in ((A1, sets.K1), (A2, sets.K2)))
+        cameras = [torch.where(swap, a, b) for a, b in ((K2, K1), (K1, K2), (sets.E_mat.mT, sets.E_mat))]
+    return MatchSets(points1, points2, heldout1, heldout2, sets.pair, scores, inliers, sets.labelled, *cameras)
 
 
 def _maps(batch_size: int, generator: Generator) -> tuple[Tensor, Tensor]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import torch
+from kornia.geometry.epipolar import cross_product_matrix
 from torch import Generator, Tensor
 
 from kornia_learnnorm.data.augmentation import augment
@@ -74,6 +76,7 @@ class _Pair(NamedTuple):
     points: Tensor  # (M, 4), pixels in both views
     ratio: Tensor  # (M,), Lowe's ratio
     distance: Tensor  # (M,), pixels from the true epipolar lines, NaN if unknown
+    cameras: tuple[Tensor, Tensor, Tensor]  # K1, K2 and E, each (3, 3), NaN if unknown
 
     def passing(self, max_ratio: float | None) -> Tensor:
         """Return the indices of the matches that pass the ratio test."""
@@ -97,7 +100,8 @@ class _Pair(NamedTuple):
         points, distance = self.points[rows], self.distance[rows]
         inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
         labelled = ~distance.isnan().any()
-        return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], 1 - self.ratio[rows], inliers, labelled
+        scores = 1 - self.ratio[rows]
+        return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], scores, inliers, labelled, *self.cameras
 
 
 def _read_pairs(path: str, labels: bool) -> list[_Pair]:
@@ -111,7 +115,10 @@ def _read_pairs(path: str, labels: bool) -> list[_Pair]:
         F_mat = torch.from_numpy(store.F[i]) if labels else torch.full((3, 3), torch.nan, dtype=torch.float64)
         distance = symmetric_epipolar_distance(points1, points2, F_mat)
         points = torch.cat([points1, points2], -1).float()
-        pair = _Pair(points, torch.from_numpy(store.ratio[rows]), distance.float())
+        K1, K2, R, t = (torch.from_numpy(value) for value in (*store.K[i], store.R[i], store.t[i]))
+        E_mat = cross_product_matrix(t[None])[0] @ R
+        cameras = K1.float(), K2.float(), (E_mat / torch.linalg.matrix_norm(E_mat)).float()
+        pair = _Pair(points, torch.from_numpy(store.ratio[rows]), distance.float(), cameras)
         if len(pair.heldout) >= MIN_HELDOUT:
             pairs.append(pair)
     return pairs
@@ -124,23 +131,27 @@ class SyntheticSets:
         num_heldout: exact correspondences of each scene, or further matches.
         matches: function of the number of scenes, the points per scene, further exact ones and a generator.
         labels: use exact correspondences and the true inliers; without, scenes are supervised by their own matches.
+        coarse: share of scenes whose matches are as those of learned detectors, see
+            :func:`~kornia_learnnorm.data.synthetic.random_matches.random_matches`; zero for another function.
     """
 
     def __init__(
         self,
         num_heldout: int = 48,
-        matches: Callable[[int, int, int, Generator], SyntheticMatches] = random_matches,
+        matches: Callable[..., SyntheticMatches] = random_matches,
         labels: bool = True,
+        coarse: float = 0.0,
     ) -> None:
-        self.num_heldout, self.matches, self.labels = num_heldout, matches, labels
+        self.num_heldout, self.labels, self.coarse = num_heldout, labels, coarse
+        self.matches = partial(matches, coarse=coarse) if coarse else matches
 
     def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
         """Return the matches of new scenes."""
         pair, labelled = torch.arange(num_sets), torch.full((num_sets,), self.labels)
         if self.labels:
             found = self.matches(num_sets, num_points, self.num_heldout, generator)
-            points1, points2, scores, inliers, exact1, exact2 = (value.float() for value in found)
-            return MatchSets(points1, points2, exact1, exact2, pair, scores, inliers, labelled)
+            points1, points2, scores, inliers, exact1, exact2, *cameras = (value.float() for value in found)
+            return MatchSets(points1, points2, exact1, exact2, pair, scores, inliers, labelled, *cameras)
         total = num_points + self.num_heldout
         found = self.matches(num_sets, total, 1, generator)
         order = torch.randperm(total, generator=generator)
@@ -180,8 +191,8 @@ class RandomSets:
         shares = [1.0] * len(sources) if shares is None else list(shares)
         if len(shares) != len(sources) or min(shares) < 0 or not sum(shares) > 0:
             raise ValueError(f"shares must be one non-negative number for each of {len(sources)} sources, got {shares}")
-        if not 8 <= sizes[0] <= sizes[1]:
-            raise ValueError(f"sizes must be a range of at least 8 matches, got {sizes}")
+        if not 5 <= sizes[0] <= sizes[1]:
+            raise ValueError(f"sizes must be a range of at least 5 matches, 8 without cameras, got {sizes}")
         if batches < 1:
             raise ValueError(f"batches must be at least 1, got {batches}")
         self.sources, self.shares = list(sources), shares

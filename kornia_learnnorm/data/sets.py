@@ -25,6 +25,9 @@ class MatchSets(NamedTuple):
     scores: Tensor | None = None  # (B, N), 1 minus Lowe's ratio
     inliers: Tensor | None = None  # (B, N), one for inliers, zero for outliers, NaN where that is not known
     labelled: Tensor | None = None  # (B,) bool, whether the ground truth is known; None where it is known of no set
+    K1: Tensor | None = None  # cameras, (B, 3, 3), NaN where unknown
+    K2: Tensor | None = None
+    E_mat: Tensor | None = None  # true essential matrices of unit Frobenius norm, (B, 3, 3), NaN where unknown
 
     def select(self, rows: Tensor) -> MatchSets:
         """Return the sets of the given rows (indices or mask)."""

@@ -20,7 +20,7 @@ from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
-__all__ = ["LearnedEightPoint", "LearnedEstimate", "LearnedLayer", "StageEstimate"]
+__all__ = ["LearnedEightPoint", "LearnedEstimate", "LearnedLayer", "StageEstimate", "check_scores"]
 
 FORMAT = "kornia_learnnorm.eight_point.v1"
 
@@ -40,6 +40,8 @@ class LearnedLayer(MatchLayer):
 
     scores_are = "scores"
     model_name: str  # of the model whose files this class loads
+    # Numbers that a stage's network reads of a correspondence, reads from the second on, and gives for the whole set.
+    features, residual_features, outputs = POINT_FEATURES, RESIDUAL_FEATURES, 2 * TRANSFORM_PARAMS
     # Arguments that files hold.
     architecture: tuple[str, ...] = ("width", "depth", "stages", "learn_transforms", "refine_steps")
 
@@ -56,9 +58,7 @@ class LearnedLayer(MatchLayer):
         self.model, self.width, self.depth, self.stages = model, width, depth, stages
         self.learn_transforms, self.refine_steps = learn_transforms, refine_steps
         self.networks = nn.ModuleList(
-            SetWeightingNetwork(
-                POINT_FEATURES + (RESIDUAL_FEATURES if stage else 0), width, depth, 2 * TRANSFORM_PARAMS
-            )
+            SetWeightingNetwork(self.features + (self.residual_features if stage else 0), width, depth, self.outputs)
             for stage in range(stages)
         )
         self.detach_stages = False
@@ -119,7 +119,7 @@ class LearnedLayer(MatchLayer):
     ) -> tuple[LinearProblem, tuple[StageEstimate, ...], Tensor]:
         """Return the problem, what each stage gives and the final estimate, and the probabilities of inliers."""
         problem = prepare_problem(self.model, points1, points2, weights, mask)
-        scores = None if scores is None else _check_scores(scores, points1, mask).to(problem.x1)
+        scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
 
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
             given = scores if scores is None or rows is None else scores[rows]
@@ -276,7 +276,7 @@ class LearnedEightPoint(LearnedLayer):
         return LearnedEstimate(F_mat, E_mat, problem.determined, problem.gap, probability, stages[: self.stages])
 
 
-def _check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor:
+def check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor:
     """Return the scores, zero where masked; raise a clear error for scores outside of 0 to 1 or of a wrong shape."""
     check_tensor("scores", scores)
     if scores.shape != points1.shape[:-1]:

@@ -241,7 +241,7 @@ def prepare_problem(
         check_mask(mask, points1, points2, weights)
         points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
         weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
-    check_correspondences(points1, points2, weights, model.min_points)
+    check_correspondences(points1, points2, weights, model.sample_size)
     weights = None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
     return LinearProblem.from_points(points1, points2, weights, model)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_mask, check_tensor, solve_dtype
 
-__all__ = ["in_front", "in_front_of_best_pose", "relative_pose"]
+__all__ = ["choose_pose", "in_front", "in_front_of_best_pose", "relative_pose"]
 
 
 def relative_pose(
@@ -66,6 +66,16 @@ def relative_pose(
     row, best = torch.arange(len(R), device=R.device), votes.argmax(-1)
     R = torch.where(known[:, None, None], R[row, best], torch.nan)
     return R.to(dtype), torch.where(known[:, None], t[row, best], torch.nan).to(dtype)
+
+
+def choose_pose(
+    R: Tensor, t: Tensor, points1: Tensor, points2: Tensor, K1: Tensor, K2: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the poses (B, 3, 3) and (B, 3), of several (B, S, 3, 3) and (B, S, 3), with most weight in front."""
+    with torch.no_grad():
+        votes = (_in_front(R, t, _rays(points1, K1), _rays(points2, K2)) * weights[:, None]).sum(-1)
+        best = votes.argmax(1)[:, None, None]
+    return R.gather(1, best[..., None].expand(-1, 1, 3, 3))[:, 0], t.gather(1, best.expand(-1, 1, 3))[:, 0]
 
 
 def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor) -> Tensor:

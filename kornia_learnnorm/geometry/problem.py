@@ -16,7 +16,7 @@ from kornia_learnnorm.geometry.checks import needs_gradient, read_condition, sol
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP, MIN_GAP, nearest_null_vector
 from kornia_learnnorm.geometry.matrices import inverse
 
-__all__ = ["LinearProblem", "hartley_coordinates", "solve_where_determined"]
+__all__ = ["LinearProblem", "generic_points", "hartley_coordinates", "solve_where_determined"]
 
 
 @dataclass
@@ -162,7 +162,7 @@ def _solve_traced(
     No derivative meets an undetermined set: generic points take its place, and their result is dropped.
     """
     rows, points = problem.determined[:, None], (problem.points1, problem.points2)
-    generic = _generic_points(problem.points1)
+    generic = generic_points(problem.points1)
     points1, points2 = (torch.where(rows[..., None], p, g) for p, g in zip(points, generic, strict=True))
     weights = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
     solutions = solve(LinearProblem.from_points(points1, points2, weights, problem.model), None)
@@ -174,7 +174,7 @@ def _solve_traced(
     )
 
 
-def _generic_points(like: Tensor) -> tuple[Tensor, Tensor]:
+def generic_points(like: Tensor) -> tuple[Tensor, Tensor]:
     """Return correspondences (B, N, 2) that determine a matrix: multiples of irrational numbers, modulo one."""
     index = torch.arange(1, like.shape[1] + 1, dtype=like.dtype, device=like.device)[:, None]
     roots = torch.tensor([2.0, 3.0, 5.0, 7.0], dtype=like.dtype, device=like.device).sqrt()

@@ -95,9 +95,26 @@ class Calibrated(NamedTuple):
         """Return the fundamental matrices, (B, 3, 3)."""
         return self.C2.mT @ self.essential() @ self.C1
 
+    def poses(self) -> tuple[Tensor, Tensor]:
+        """Return the four rotations (B, 4, 3, 3) and unit translations (B, 4, 3) of the essential matrices."""
+        U, V = self.axes.unbind(1)
+        turn = self.A.new_tensor([[0.0, 1.0], [-1.0, 0.0]]) @ self.A * 2**0.5
+        R = []
+        for inner in (turn, -turn):
+            handed = U[..., :2] @ inner @ V[..., :2].mT
+            last = U[..., :, 2:] @ V[..., :, 2:].mT
+            sign = torch.linalg.det(handed + last).sign().detach()
+            R.append(handed + sign[:, None, None] * last)
+        t = U[..., 2]
+        return torch.stack([R[0], R[0], R[1], R[1]], 1), torch.stack([t, -t, t, -t], 1)
+
+    def essential_tangents(self) -> Tensor:
+        """Return the derivatives (B, 9, 5) of the essential matrices' column-major entries by a step."""
+        return Rank2(self.axes, self.A).tangents()[..., :5]
+
     def tangents(self) -> Tensor:
         """Return the derivatives (B, 9, 5) of the fundamental matrices' column-major entries by a step."""
-        D = Rank2(self.axes, self.A).tangents()[..., :5]
+        D = self.essential_tangents()
         columns = self.C2.mT[:, None] @ torch.unflatten(D, 1, (3, 3))  # (B, column of E, row of F, 5)
         return (self.C1.mT @ columns.flatten(2)).view_as(D)
 

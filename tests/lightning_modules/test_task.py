@@ -10,7 +10,7 @@ from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
 from kornia_learnnorm.data.sources import SyntheticSamples, block_generator
 from lightning_modules.callbacks import ExportWeights, WritePredictions
 from lightning_modules.datamodule import EVALUATION_SEED, CorrespondenceDataModule
-from lightning_modules.task import EstimatorTask
+from lightning_modules.task import EstimatorTask, SetLoss
 
 
 def make_data(**arguments):
@@ -21,6 +21,12 @@ def make_data(**arguments):
 def layer_task(**arguments):
     torch.manual_seed(0)
     return EstimatorTask(kln.LearnedEightPoint(width=16, depth=1, stages=2), **arguments)
+
+
+def pose_task():
+    torch.manual_seed(0)
+    layer = kln.LearnedRelativePose(width=16, depth=1, stages=2)
+    return EstimatorTask(layer, SetLoss(pose_weight=0.5), lambda params: torch.optim.AdamW(params, lr=1e-2))
 
 
 def sets_task():
@@ -55,7 +61,12 @@ def test_samples_lower_the_loss(tmp_path, precision):
 
 @pytest.mark.parametrize(
     ("make", "labels", "steps", "least"),
-    [(layer_task, True, 30, 0.05), (layer_task, False, 50, 0.01), (sets_task, True, 60, 0.02)],
+    [
+        (layer_task, True, 30, 0.05),
+        (layer_task, False, 50, 0.01),
+        (sets_task, True, 60, 0.02),
+        (pose_task, True, 20, 0.05),
+    ],
 )
 def test_sets_lower_the_loss(make, labels, steps, least, tmp_path):
     task, data = make(), make_sets(labels)
@@ -67,6 +78,19 @@ def test_sets_lower_the_loss(make, labels, steps, least, tmp_path):
     trainer.fit(task, data)
     assert task.compute_loss(batch).item() < before - least
     assert {"val/median_32", "val/median_256"} <= {*trainer.callback_metrics}
+
+
+def test_pose_loss_counts_sets_with_cameras_alone():
+    sets = SyntheticSets(8).draw(4, 20, block_generator(1))
+    unknown = torch.full_like(sets.E_mat, torch.nan)
+    sets = sets._replace(E_mat=torch.where(torch.arange(4)[:, None, None] < 2, sets.E_mat, unknown))
+    F_mat = torch.rand(4, 3, 3, dtype=torch.float64, requires_grad=True)
+    both, pixels = (SetLoss(pose_weight=weight)(sets, F_mat, None) for weight in (0.5, 0.0))
+    assert torch.equal(both[2:], pixels[2:])
+    assert (both != pixels)[:2].all()
+    assert torch.autograd.grad(both.sum(), F_mat)[0].isfinite().all()
+    with pytest.raises(ValueError, match=r"pose_weight must be in \[0, 1\], got 2"):
+        SetLoss(pose_weight=2)
 
 
 def test_a_loss_leaves_the_estimator_as_it_was():
@@ -171,7 +195,7 @@ def test_a_training_without_an_end_has_no_cycle(tmp_path):
 @pytest.mark.parametrize(
     ("estimator", "message"),
     [
-        (kln.Hartley(), "expected a LearnedEightPoint or an EightPoint, got Hartley"),
+        (kln.Hartley(), "expected a learned layer or an EightPoint, got Hartley"),
         (kln.EightPoint(), "expected a LearnedNormalizer in EightPoint, got Hartley"),
     ],
 )

@@ -36,9 +36,14 @@ class SyntheticMatches(NamedTuple):
     inliers: Tensor  # one for inliers, zero for outliers, (B, N)
     exact1: Tensor  # pixels in the first image of further correspondences, without noise, (B, M, 2)
     exact2: Tensor  # pixels in the second image of the further correspondences, (B, M, 2)
+    K1: Tensor  # cameras, (B, 3, 3)
+    K2: Tensor
+    E_mat: Tensor  # true essential matrices of unit Frobenius norm, (B, 3, 3)
 
 
-def random_matches(batch_size: int, num_points: int, num_exact: int, generator: Generator) -> SyntheticMatches:
+def random_matches(
+    batch_size: int, num_points: int, num_exact: int, generator: Generator, coarse: float = 0.0
+) -> SyntheticMatches:
     """Draw matches of varied scenes.
 
     All scenes of a call are of one kind: random (:func:`~kornia_learnnorm.data.synthetic.scenes.random_scenes`),
@@ -48,6 +53,10 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     the others 20 to 90 %: two fifths anywhere in the other image, the rest at the partner of another point, often of
     one of a few, or shifted by 4-150 px. In a quarter of the scenes, with 10 to 50 % outliers, the shifts are one, as
     of an object that moves. Outliers are neighbours in a third of the scenes.
+
+    A share ``coarse`` of the scenes has matches as learned detectors give them: noise of 0.2-1.5 px, smaller where the
+    score is high; half of these scenes as LightGlue leaves them, with up to 20 % outliers and most scores near one, the
+    others as mutual nearest neighbours with 10 to 70 %.
 
     A scene has ``num_points`` matches and ``num_exact`` further correspondences without noise.
     """
@@ -66,7 +75,13 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
 
     scale = draws.log_uniform((batch_size, 1, 1), 0.05, 1.0, generator)
     heavy = draws.uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
-    uneven = (0.6 * draws.normal((batch_size, num_points, 1), generator)).exp()  # features of different sizes
+    quality = draws.normal((batch_size, num_points, 1), generator)
+    uneven = (0.6 * quality).exp()  # features of different sizes
+    learned = scale.new_zeros(batch_size, 1, dtype=torch.bool)
+    if coarse:
+        learned = draws.uniform((batch_size, 1), 0.0, 1.0, generator) < coarse
+        wide = draws.log_uniform((batch_size, 1, 1), 0.2, 1.5, generator)
+        scale = torch.where(learned[..., None], wide, scale)
     points1, points2 = (
         p
         + scale
@@ -76,13 +91,19 @@ def random_matches(batch_size: int, num_points: int, num_exact: int, generator: 
     )
     clean, common = (draws.uniform((batch_size, 1), 0.0, 1.0, generator) < share for share in (0.5, 0.25))
     share = draws.uniform((batch_size, 1), 0.0, 1.0, generator)
-    share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, 0.2 + 0.7 * share))
+    dirty = torch.where(learned, 0.1 + 0.6 * share, 0.2 + 0.7 * share)
+    share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, dirty))
     outliers = _choose_outliers(points1, share, generator)
     wrong = _wrong_partners(points2, scene.image_size, common, generator)
     points2 = torch.where(outliers[..., None], wrong, points2)
     distance = symmetric_epipolar_distance(points1, points2, scene.F_mat)
     inliers = shown & (distance < 3 * scale[..., 0] + 0.5)
-    return SyntheticMatches(points1, points2, _scores(inliers, clean, generator), inliers, exact1, exact2)
+    scores = _scores(inliers, clean, generator)
+    if coarse:
+        scores = torch.where(learned, _learned_scores(inliers, quality[..., 0], clean, generator), scores)
+    E_mat = scene.K2.mT @ scene.F_mat @ scene.K1
+    E_mat = E_mat / torch.linalg.matrix_norm(E_mat, keepdim=True)
+    return SyntheticMatches(points1, points2, scores, inliers, exact1, exact2, scene.K1, scene.K2, E_mat)
 
 
 def wide_baseline(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
@@ -163,3 +184,14 @@ def _scores(inliers: Tensor, clean: Tensor, generator: Generator) -> Tensor:
     bad = 1 - 0.3 * draws.uniform(shape, 0.0, 1.0, generator) ** 3
     ratio = torch.where(inliers, good, bad)
     return 1 - torch.where(clean, 0.8 * ratio, ratio)
+
+
+def _learned_scores(inliers: Tensor, quality: Tensor, clean: Tensor, generator: Generator) -> Tensor:
+    """Return scores (B, N) as of LightGlue, in sets marked ``clean`` (B, 1), and of ratios of nearest neighbours.
+
+    ``quality`` (B, N) is the logarithm of the noise of each match, with a normal distribution.
+    """
+    chance = draws.normal(tuple(inliers.shape), generator)
+    good = torch.where(clean, 3 - 1.7 * quality + 0.7 * chance, -0.7 - 0.6 * quality + 0.5 * chance)
+    bad = torch.where(clean, 1.5 * chance, chance - 2.2)
+    return torch.where(inliers, good, bad).sigmoid()

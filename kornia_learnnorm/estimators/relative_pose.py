@@ -1,0 +1,264 @@
+r"""The learned relative pose of calibrated cameras: essential matrix, rotation and translation from matches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer, check_scores
+from kornia_learnnorm.estimators.linear import prepare_problem
+from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES
+from kornia_learnnorm.estimators.pose_stages import (
+    POSE_OUTPUTS,
+    POSE_POINT_FEATURES,
+    POSE_RESIDUAL_FEATURES,
+    run_pose_stages,
+)
+from kornia_learnnorm.geometry.checks import check_cameras
+from kornia_learnnorm.geometry.dlt import MIN_GAP
+from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.geometry.pose import choose_pose
+from kornia_learnnorm.geometry.problem import LinearProblem, generic_points
+from kornia_learnnorm.models.essential import Calibrated, Essential
+
+__all__ = ["LearnedRelativePose", "PoseStage", "RelativePoseEstimate"]
+
+
+class PoseStage(NamedTuple):
+    """What one stage gives."""
+
+    E_mat: Tensor  # essential matrices of unit Frobenius norm, (B, 3, 3)
+    logits: Tensor  # of the probabilities that the correspondences are inliers, (B, N)
+
+
+class RelativePoseEstimate(NamedTuple):
+    """Relative poses of a batch of image pairs, and what the layer makes of their correspondences."""
+
+    E_mat: Tensor  # essential matrices of unit Frobenius norm, x2^T K2^-T E K1^-1 x1 = 0, (B, 3, 3)
+    F_mat: Tensor  # K2^-T E K1^-1 with unit Frobenius norm, (B, 3, 3)
+    R: Tensor  # rotations of X2 = R X1 + t, (B, 3, 3)
+    t: Tensor  # translations of unit length, (B, 3)
+    determined: Tensor  # whether the correspondences allow for finitely many matrices, (B,) bool
+    gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
+    # Probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that do not
+    # determine their matrix.
+    weights: Tensor
+    stages: tuple[PoseStage, ...]  # the last one holds the result
+
+
+class LearnedRelativePose(LearnedLayer):
+    r"""Estimate the relative pose of calibrated cameras from matches with outliers in one differentiable pass.
+
+    The essential sibling of :class:`~kornia_learnnorm.LearnedEightPoint`. Its networks also read the directions of both
+    points, the size of the set in pixels and, from the second stage on, the distances in pixels. In each stage the
+    weighted design rows of all matches give a :math:`9 \times 9` matrix of moments. Candidates are the essential
+    matrices in the span of its four smallest eigenvectors
+    (:func:`~kornia_learnnorm.geometry.five_point.essential_in_span`), the nearest one to the smallest eigenvector, that
+    of the stage before and, in the last stage, those of minimal samples drawn by the weights. The one of least robust
+    cost is refined by reweighted least squares of the Sampson distances over the five parameters of a relative pose,
+    which carries the gradients.
+
+    The order of the correspondences has no effect. Swapping the views, with their cameras, gives :math:`E^\top` up to
+    sign. Planes and cameras that move forward are solved as other scenes are; a camera that only turns has no
+    translation, and some direction is returned. Lenses are taken to be free of distortion: undistort the points before.
+
+    Args:
+        width: channels of the networks.
+        depth: blocks of each stage's network.
+        stages: number of stages.
+        refine_steps: reweightings in the last stage, and at most two in the others. Derivatives are those of the steps:
+            more steps bring them closer to those of the optimum.
+        samples: minimal samples in the last stage.
+
+    Attributes:
+        detach_stages: send no gradient from a stage into the one before and draw no minimal samples, as when the layer
+            itself is trained; a loss of every stage takes its place.
+        trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
+
+    Raises:
+        ValueError: if a number is not whole or too small.
+
+    Example:
+        >>> layer = LearnedRelativePose(width=16, depth=2)
+        >>> K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> layer(500 * torch.rand(2, 100, 2), 500 * torch.rand(2, 100, 2), K, K).shape
+        torch.Size([2, 3, 3])
+
+    """
+
+    model_name = Essential.name
+    architecture = ("width", "depth", "stages", "refine_steps", "samples")
+    features, residual_features, outputs = POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES, POSE_OUTPUTS
+
+    def __init__(
+        self, width: int = 48, depth: int = 4, stages: int = 3, refine_steps: int = 5, samples: int = 32
+    ) -> None:
+        eye = torch.eye(3)[None]
+        super().__init__(Essential(eye, eye), width, depth, stages, False, refine_steps)
+        if not isinstance(samples, int) or samples < 0:
+            raise ValueError(f"samples must be a whole number, at least 0, got {samples!r}")
+        self.samples = samples
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path = "robust-pose-synthetic") -> LearnedRelativePose:
+        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
+
+        Args:
+            name: ``"robust-pose-synthetic"``, ``"robust-pose"``, or the path of a ``.safetensors`` file.
+
+        Returns:
+            the estimator, in evaluation mode.
+
+        Raises:
+            FileNotFoundError: if there are no such weights; the message lists those that ship.
+            ValueError: if the file is not an estimator of this package or its tensors do not fit.
+
+        """
+        return super().from_pretrained(name)  # configurations need the name of the class, not Self
+
+    @classmethod
+    def from_eight_point(
+        cls, layer: LearnedEightPoint, refine_steps: int = 5, samples: int = 32
+    ) -> LearnedRelativePose:
+        """Return an untrained estimator whose networks start from those of an estimator of fundamental matrices.
+
+        What only they read, directions and distances in pixels, has no effect yet.
+        """
+        started = cls(layer.width, layer.depth, layer.stages, refine_steps, samples)
+        columns = torch.tensor([*range(POINT_FEATURES), *range(cls.features, cls.features + RESIDUAL_FEATURES)])
+        for own, other in zip(started.networks, layer.networks, strict=True):
+            state = {k: v for k, v in other.state_dict().items() if not k.startswith("head.2.")}
+            new, old = own.state_dict(), state.pop("stem.weight")
+            new["stem.weight"] = torch.zeros_like(new["stem.weight"]).index_copy(1, columns[: old.shape[1]], old)
+            own.load_state_dict(new | state)
+        return started
+
+    def extra_repr(self) -> str:
+        """Return the parameters."""
+        return f"refine_steps={self.refine_steps}, samples={self.samples}, trained_on={self.trained_on}"
+
+    def forward(  # type: ignore[override]
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        K1: Tensor,
+        K2: Tensor,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        scores: Tensor | None = None,
+    ) -> Tensor:
+        """Return the essential matrices; arguments, shapes and errors as for :meth:`estimate`."""
+        *_, states, _ = self._pose_stages(points1, points2, K1, K2, weights, mask, scores)
+        return unit_matrix(states[-1].essential()).to(points1.dtype)
+
+    def estimate(
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        K1: Tensor | None = None,
+        K2: Tensor | None = None,
+        *,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        scores: Tensor | None = None,
+    ) -> RelativePoseEstimate:
+        r"""Return essential matrices, poses, the weights of the correspondences and what each stage gives.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 5`, float32 or float64.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            K1: cameras of the first view with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
+            K2: cameras of the second view.
+            weights: optional non-negative weights with shape :math:`(B, N)`, which multiply the predicted ones.
+            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows
+                may hold any value, NaN too, and get a gradient of zero; without a mask NaN is an error.
+            scores: optional scores of the matches with shape :math:`(B, N)`, from 0 to 1: a matcher's confidence, or 1
+                minus Lowe's ratio, which the networks read.
+
+        Returns:
+            the matrices, poses, weights and stages, in the dtype of the points. Of the four poses of an essential
+            matrix it is the one with most weight of correspondences in front of both cameras. Sets that do not
+            determine a matrix, such as fewer than five different correspondences, get one of a sideways motion,
+            without gradient.
+
+        Raises:
+            TypeError: if the points are not floating-point tensors of one dtype, weights, scores or cameras not
+                floating-point, or the mask not boolean.
+            ShapeError: if a shape is wrong.
+            ValueError: if a camera is missing or not invertible, there are fewer than five rows, shapes do not pair up,
+                an unmasked value is not finite, a weight is negative, or a score is outside of 0 to 1.
+
+        """
+        problem, cameras, determined, gap, states, logits = self._pose_stages(
+            points1, points2, K1, K2, weights, mask, scores
+        )
+        dtype = points1.dtype
+        stages = tuple(
+            PoseStage(unit_matrix(state.essential()).to(dtype), logit.to(dtype))
+            for state, logit in zip(states, logits, strict=True)
+        )
+        probability = logits[-1].sigmoid()
+        if problem.weights is not None:
+            probability = torch.where(problem.weights > 0, probability, 0.0)
+        state, (inverse1, inverse2) = states[-1], (torch.linalg.inv_ex(K)[0] for K in cameras)
+        F_mat = unit_matrix(inverse2.mT @ state.essential() @ inverse1)
+        R, t = choose_pose(*state.poses(), problem.points1, problem.points2, *cameras, probability.detach())
+        probability = probability.to(dtype)
+        return RelativePoseEstimate(
+            stages[-1].E_mat, F_mat.to(dtype), R.to(dtype), t.to(dtype), determined, gap, probability, stages
+        )
+
+    def _pose_stages(
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        K1: Tensor | None,
+        K2: Tensor | None,
+        weights: Tensor | None,
+        mask: Tensor | None,
+        scores: Tensor | None,
+    ) -> tuple[LinearProblem, tuple[Tensor, Tensor], Tensor, Tensor, list[Calibrated], list[Tensor]]:
+        """Return the problem, the cameras, which sets are determined and by how much, and the stages."""
+        if K1 is None or K2 is None:
+            raise ValueError("cameras K1 and K2 are needed; LearnedEightPoint does without")
+        problem = prepare_problem(self.model, points1, points2, weights, mask)
+        check_cameras(K1, K2, points1.shape[0])
+        scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
+        K1, K2 = (K.to(problem.x1).expand(len(points1), 3, 3) for K in (K1, K2))
+        determined, gap = _determined(problem)
+        # No derivative meets an undetermined set: generic points take its place, and their result is dropped.
+        rows = determined[:, None]
+        points = zip((problem.points1, problem.points2), generic_points(problem.points1), strict=True)
+        p1, p2 = (torch.where(rows[..., None], own, other) for own, other in points)
+        given = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
+        solved = LinearProblem.from_points(p1, p2, given, self.model)
+        eye = torch.eye(3).to(K1)
+        C1, C2 = (torch.where(rows[..., None], K, eye) for K in (K1, K2))
+        options = self.refine_steps, self.samples, self.detach_stages
+        states, logits = run_pose_stages(self.networks, solved, C1, C2, scores, *options)
+        sideways = Essential(eye[None], eye[None]).calibrated(
+            p1.new_tensor(self.model.preferred).view(1, 3, 3).expand(len(p1), -1, -1)
+        )
+        states = [
+            state._replace(
+                axes=torch.where(rows[..., None, None], state.axes, sideways.axes),
+                A=torch.where(rows[..., None], state.A, sideways.A),
+            )
+            for state in states
+        ]
+        logits = [torch.where(rows, logit, 0.0) for logit in logits]
+        return problem, (K1, K2), determined, gap, states, logits
+
+
+@torch.no_grad()
+def _determined(problem: LinearProblem) -> tuple[Tensor, Tensor]:
+    """Return which sets have five independent rows in their design matrix, (B,) bool, and the relative gap, (B,)."""
+    A = problem.model.rows(problem.x1, problem.x2)
+    if problem.present is not None:
+        A = A * problem.present[..., None]
+    values = torch.linalg.eigvalsh(A.mT @ A).clamp(min=0)
+    gap = (values[:, 4] / (values[:, 8] + (values[:, 8] == 0))).sqrt()
+    return gap > MIN_GAP, gap

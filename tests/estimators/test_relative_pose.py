@@ -1,0 +1,236 @@
+"""The learned relative pose: truth, invariances, small and degenerate sets, gradients, files, errors."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kornia.geometry.epipolar import essential_from_Rt
+from pairwise import pairwise
+from scenes import (
+    DTYPES,
+    check_gradients,
+    correspondences,
+    scenes,
+    seeded,
+    signless,
+    true_essential,
+    uniform,
+    up_to_sign,
+)
+from torch.nn.functional import normalize
+
+import kornia_learnnorm as kln
+
+pytestmark = pytest.mark.numerical
+
+
+def pose_layer(**options) -> kln.LearnedRelativePose:
+    """A layer whose weights differ from one another, as after training."""
+    torch.manual_seed(0)
+    layer = kln.LearnedRelativePose(**{"width": 16, "depth": 2, "stages": 2, "samples": 8} | options).double().eval()
+    generator = seeded(1)
+    with torch.no_grad():
+        for parameter in layer.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype))
+    return layer
+
+
+def inputs(name="orbit", *args, **options):
+    """Points and cameras of a scene."""
+    scene = scenes(name, *args, **options)
+    return [scene.points1, scene.points2, scene.K1, scene.K2]
+
+
+@pairwise(batch_size=[0, 1, 3], num_points=[5, 6, 8, 60], kind=["plain", "weights", "mask", "scores"], dtype=DTYPES)
+def test_smoke(batch_size, num_points, kind, dtype):
+    values = [value.to(dtype) for value in inputs("orbit", max(batch_size, 1), num_points)]
+    values = [value[:batch_size] for value in values]
+    rows = uniform(batch_size, num_points)
+    given = {"plain": {}, "mask": {"mask": rows > 0.1}}.get(kind, {kind: rows})
+    found = pose_layer().estimate(*values, **given)
+    shapes = {"E_mat": (3, 3), "F_mat": (3, 3), "R": (3, 3), "t": (3,), "weights": (num_points,)}
+    for name, shape in shapes.items():
+        value = getattr(found, name)
+        assert (value.shape, value.dtype) == ((batch_size, *shape), dtype)
+        assert value.isfinite().all()
+    assert len(found.stages) == 2
+    assert torch.equal(pose_layer()(*values, **given), found.E_mat)
+
+
+@pytest.mark.parametrize("num_points", [6, 8, 50, 400])
+@pytest.mark.parametrize("kind", ["orbit", "handheld", "driving"])
+def test_finds_the_truth_without_noise(kind, num_points):
+    scene = scenes(kind, 20, num_points, noise=0.0)
+    with torch.no_grad():
+        found = pose_layer().estimate(scene.points1, scene.points2, scene.K1, scene.K2)
+    assert found.determined.all()
+    gaps = torch.stack([(found.E_mat - s * true_essential(scene)).flatten(1).norm(dim=1) for s in (1, -1)]).amin(0)
+    right = gaps < 1e-7
+    assert right.double().mean() >= (0.8 if num_points == 6 else 1.0)  # six points can have two solutions
+    assert (found.R - scene.R)[right].abs().max() < 1e-6
+    assert (found.t - normalize(scene.t, dim=-1))[right].abs().max() < 1e-6
+    assert up_to_sign(essential_from_Rt(*_origin(found), found.R, found.t[..., None]) / 2**0.5, found.E_mat) < 1e-9
+    x1, x2 = (torch.cat([p, torch.ones_like(p[..., :1])], -1) for p in (scene.points1, scene.points2))
+    assert (x2 * (x1 @ found.F_mat.mT)).sum(-1)[right].abs().max() < 1e-6
+
+
+def _origin(found):
+    eye = torch.eye(3, dtype=torch.float64).expand_as(found.R)
+    return eye, torch.zeros_like(found.t)[..., None]
+
+
+def test_planes_and_outliers():
+    """Points on a plane, of which a fifth has a wrong partner."""
+    generator, K = seeded(3), torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]], dtype=torch.float64)
+    points1 = uniform(10, 100, 2, seed=3) * torch.tensor([640.0, 480.0], dtype=torch.float64)
+    rays = torch.linalg.solve(K, torch.cat([points1, torch.ones_like(points1[..., :1])], -1).mT).mT
+    X = rays * (5 / (1 + 0.3 * rays[..., :1] - 0.2 * rays[..., 1:2]))
+    R = torch.matrix_exp(torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.05], [-0.2, 0.05, 0]], dtype=torch.float64))
+    t = torch.tensor([0.8, 0.1, 0.3], dtype=torch.float64)
+    x2 = (X @ R.mT + t) @ K.mT
+    points2 = x2[..., :2] / x2[..., 2:]
+    points2[:, :20] = 600 * torch.rand(10, 20, 2, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        found = pose_layer(samples=64).estimate(points1, points2, K, K)
+    assert (kln.sampson_distance(points1[:, 20:], points2[:, 20:], found.F_mat).amax(1) < 1e-3).double().mean() >= 0.8
+    assert ((found.R - R).flatten(1).norm(dim=1) < 1e-3).any()  # a plane has two poses
+
+
+@settings(max_examples=8)
+@given(num_points=st.sampled_from([12, 30, 300]), seed=st.integers(0, 2**20), shift=st.floats(-1e3, 1e3))
+@torch.no_grad()
+def test_invariances(num_points, seed, shift):
+    """To the order of the correspondences, a swap of the views, and moved pixels with moved cameras."""
+    layer, (points1, points2, K1, K2) = pose_layer(), inputs("handheld", 4, num_points, seed=seed)
+    found, order = layer.estimate(points1, points2, K1, K2), torch.randperm(num_points, generator=seeded(seed))
+    shuffled = layer.estimate(points1[:, order], points2[:, order], K1, K2)
+    assert up_to_sign(shuffled.E_mat, found.E_mat) < 1e-5
+    assert torch.allclose(shuffled.weights, found.weights[:, order], atol=1e-6)
+    swapped = layer.estimate(points2, points1, K2, K1)
+    assert up_to_sign(swapped.E_mat.mT, found.E_mat) < 1e-5
+    move = torch.eye(3, dtype=torch.float64)
+    move[:2, 2] = shift
+    moved = layer(points1 + shift, points2 + shift, move @ K1, move @ K2)
+    assert up_to_sign(moved, found.E_mat) < 1e-5
+
+
+def test_masked_rows_do_not_count():
+    layer, (points1, points2, K1, K2) = pose_layer(), inputs("orbit", 3, 20)
+    mask = torch.arange(20).expand(3, 20) < 12
+    hidden = [torch.where(mask[..., None], p, torch.nan).requires_grad_() for p in (points1, points2)]
+    found = layer(*hidden, K1, K2, mask=mask)
+    assert up_to_sign(found.detach(), layer(points1[:, :12], points2[:, :12], K1, K2).detach()) < 1e-6
+    signless(found).sum().backward()
+    for points in hidden:
+        assert points.grad[~mask].eq(0).all()
+        assert points.grad.isfinite().all()
+
+
+DEGENERATE = {
+    "coincident": lambda p: (p[:, :1].expand_as(p), p[:, :1].expand_as(p)),
+    "four places": lambda p: (p[:, torch.arange(12) % 4], p[:, torch.arange(12) % 4] + 5),
+    "collinear": lambda p: (p * torch.tensor([1, 0]).to(p), p * torch.tensor([1, 0]).to(p) + 3),
+    "no motion": lambda p: (p, p),
+    "zero": lambda p: (0 * p, 0 * p),
+    "unrelated": lambda p: (p, p.flip(1)),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_finite_on_degenerate_sets(name):
+    _, _, K1, K2 = inputs("orbit", 3, 12)
+    points = [p.clone().requires_grad_() for p in DEGENERATE[name](uniform(3, 12, 2, high=600))]
+    layer = pose_layer()
+    found = layer.estimate(*points, K1, K2)
+    assert found.determined.any() == (name in ("no motion", "unrelated"))
+    loss = signless(found.E_mat).sum() + found.R.sum() + found.weights.sum()
+    gradients = torch.autograd.grad(loss, [*points, *layer.parameters()], allow_unused=True)
+    for value in (found.E_mat, found.R, found.t, *(g for g in gradients if g is not None)):
+        assert value.isfinite().all()
+
+
+def test_gradients():
+    """With many steps derivatives are those of the optimum."""
+    layer = pose_layer(stages=1, refine_steps=60, samples=0)
+    points1, points2, K1, K2 = inputs("orbit", 1, 12, noise=0.3)
+
+    def numbers(points1, points2, scores):
+        return signless(layer(points1, points2, K1[0], K2[0], scores=scores))
+
+    check_gradients(numbers, points1, points2, uniform(1, 12), atol=1e-4, rtol=1e-2)
+
+
+def test_every_parameter_gets_a_gradient():
+    layer = pose_layer()
+    found = layer.estimate(*inputs("orbit", 3, 20))
+    (signless(found.E_mat).sum() + sum(signless(stage.E_mat).sum() for stage in found.stages)).backward()
+    assert all(parameter.grad is not None and parameter.grad.isfinite().all() for parameter in layer.parameters())
+
+
+def test_matches_of_networks():
+    points1, points2, K1, K2 = inputs("orbit", 2, 30)
+    matches = [torch.arange(20)[:, None].expand(20, 2), torch.arange(4)[:, None].expand(4, 2)]
+    scores = [torch.rand(len(pairs), dtype=torch.float64, requires_grad=True) for pairs in matches]
+    found = pose_layer().from_matches(points1, points2, matches, scores, K1, K2)
+    assert found.determined.tolist() == [True, False]
+    first, second = torch.autograd.grad(signless(found.E_mat).sum(), scores)
+    assert first.any()
+    assert not second.any()
+
+
+def test_vmap_and_compile_agree():
+    layer, values = pose_layer(), inputs("orbit", 2, 20)
+    expected = layer(*values).detach()
+    mapped = torch.func.vmap(lambda *rows: layer(*(row[None] for row in rows))[0])(*values)
+    assert up_to_sign(mapped.detach(), expected) < 1e-6
+
+
+def test_files(tmp_path):
+    layer = pose_layer()
+    layer.trained_on = ("one",)
+    layer.save_pretrained(tmp_path / "pose.safetensors")
+    loaded = kln.LearnedRelativePose.from_pretrained(tmp_path / "pose.safetensors")
+    assert (loaded.trained_on, loaded.samples, loaded.training) == (("one",), 8, False)
+    values = inputs("orbit", 2, 20)
+    assert torch.equal(loaded(*values), layer(*values))
+    assert torch.equal(pickle.loads(pickle.dumps(loaded))(*values), layer(*values))
+    with pytest.raises(ValueError, match=r"model 'essential', expected 'fundamental'"):
+        kln.LearnedEightPoint.from_pretrained(tmp_path / "pose.safetensors")
+
+
+def test_starts_from_an_eight_point_estimator():
+    eight = kln.LearnedEightPoint.from_pretrained("robust-tiny")
+    layer = kln.LearnedRelativePose.from_eight_point(eight).eval()
+    points1, points2, K1, K2 = inputs("orbit", 2, 60)
+    scores = uniform(2, 60)
+    first = eight.estimate(points1, points2, scores=scores).stages[0].logits
+    assert torch.allclose(layer.estimate(points1, points2, K1, K2, scores=scores).stages[0].logits, first, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"K1": None}, ValueError, "cameras K1 and K2 are needed"),
+        ({"K1": torch.zeros(3, 3)}, ValueError, "K1"),
+        ({"K2": torch.eye(3).expand(5, 3, 3)}, Exception, "K2"),
+        ({"points1": torch.rand(2, 4, 2), "points2": torch.rand(2, 4, 2)}, ValueError, "at least 5 .*, got 4"),
+        ({"points1": torch.rand(2, 7, 2)}, ValueError, "pair up"),
+        ({"points1": torch.full((2, 8, 2), torch.nan)}, ValueError, "finite"),
+        ({"scores": torch.full((2, 8), 2.0)}, ValueError, "scores .* got 2 to 2"),
+        ({"weights": torch.full((2, 8), -1.0)}, ValueError, "weights"),
+    ],
+)
+def test_wrong_input(change, error, message):
+    given = dict(zip(("points1", "points2"), (p.float() for p in correspondences("orbit", 2, 8)), strict=True))
+    with pytest.raises(error, match=message):
+        pose_layer()(**given | {"K1": torch.eye(3), "K2": torch.eye(3)} | change)
+
+
+def test_wrong_options():
+    for options, message in [({"samples": -1}, "samples must be"), ({"width": 0}, "width must be")]:
+        with pytest.raises(ValueError, match=message):
+            kln.LearnedRelativePose(**options)
