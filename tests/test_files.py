@@ -64,20 +64,22 @@ def test_a_failed_write_keeps_the_old_file(tmp_path):
 def test_commands_refuse_a_folder_that_another_run_writes(tmp_path, refused):
     for module in ("cv2", "h5py", "pytorch_lightning"):
         pytest.importorskip(module)
-    store, out = tmp_path / "store.h5", tmp_path / "run"
+    from make_sequences import write_image
+
+    store, out, matched = tmp_path / "store.h5", tmp_path / "run", tmp_path / "matched.h5"
     write_store(store, synthetic_store(pairs=1, points=40))
-    main(["synthesize", str(tmp_path / "images"), "--pairs", "1", "--points", "40"])
-    (tmp_path / "pairs.txt").write_text("images/image1.png images/image2.png")
+    for number in range(2):
+        write_image(tmp_path / f"images/{number}.png", 6 * number)
+    (tmp_path / "pairs.txt").write_text("images/0.png images/1.png")
     out.mkdir()
-    with exclusive(out):
+    match = ["match", "folder", tmp_path / "images", "--out", matched, "--jobs", "1"]
+    with exclusive(out), exclusive(matched):
         refused(["evaluate", store, "--methods", "Hartley", "--out", out], "run is in use by process ")
         refused(["robust", store, "--estimators", "RANSAC", "--out", out], "run is in use by process ")
         refused(["estimate", "--pairs", tmp_path / "pairs.txt", "--out", out], "run is in use by process ")
         options = ["--trainer.max_steps=1", f"--trainer.default_root_dir={out}"]
         refused(["fit", "--config", "crossview-synthetic", *options], "run is in use by process ")
+        assert main([*map(str, match)]) == 2
         assert [path.name for path in out.iterdir()] == [".lock"]
-    match = ["match", "folder", str(tmp_path / "images"), "--out", str(tmp_path / "matched.h5"), "--jobs", "1"]
-    with exclusive(tmp_path / "matched.h5"):
-        assert main(match) == 2
     assert not (tmp_path / "matched.h5.parts").exists()
-    assert main(match) == 0
+    assert main([*map(str, match)]) == 0

@@ -28,29 +28,25 @@ pytestmark = pytest.mark.usefixtures("program")
 
 FOLDER = Path(__file__).parents[2] / "configs"
 OF_SETS = ("crossview-sets", "robust", "robust-synthetic")
-CONFIGS = sorted(path for path in FOLDER.glob("*.yaml") if path.stem not in (*OF_SETS, "own"))
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 SMALL += ["--trainer.num_sanity_val_steps=0"]
 NETWORK = "model.estimator.init_args.normalizer.init_args.network.init_args"
 BASES = ("base", "paper-base", "reduction-log")  # what is no overlay of ablations/base
 
 
-def overlays(folder, *bases):
+def runs(pattern, *bases, prefix="", but=BASES):
     """Lists of configurations that are given together, by the name of the last; each changes those before it."""
-    paths = [path for path in sorted((FOLDER / folder).glob("*.yaml")) if path.stem not in BASES]
-    return {path.stem: [*(FOLDER / f"{base}.yaml" for base in bases), path] for path in paths}
+    paths = [path for path in sorted(FOLDER.glob(f"{pattern}.yaml")) if path.stem not in but]
+    return {prefix + path.stem: [*(FOLDER / f"{base}.yaml" for base in bases), path] for path in paths}
 
 
-PAPER_BASE = [FOLDER / "paper-short.yaml", FOLDER / "ablations/paper-base.yaml"]
-PAPER = {f"paper-{path.stem}": [*PAPER_BASE, path] for path in (FOLDER / "ablations").glob("loss-[as]*.yaml")}
-PAPER["paper-reduction-log"] = [*PAPER_BASE, FOLDER / "ablations/reduction-log.yaml"]
-ABLATIONS = overlays("ablations", "ablations/base") | PAPER
-OF_LAYER = overlays("ablations/layer", "robust", "ablations/layer/base")
-LAYER = {f"layer-{name}": files for name, files in OF_LAYER.items()}
-OF_PAPER = overlays("table1", "paper-short").items()
-TABLE1 = overlays("table1", "crossview") | {name: files for name, files in OF_PAPER if name.startswith("paper")}
-RUNS = {path.stem: [path] for path in CONFIGS} | ABLATIONS | TABLE1
-RUNS |= {"base": [FOLDER / "ablations/base.yaml"], "paper-base": PAPER_BASE}
+PAPER_BASE = ("paper-short", "ablations/paper-base")
+ABLATIONS = runs("ablations/*", "ablations/base")
+ABLATIONS |= runs("ablations/loss-[as]*", *PAPER_BASE, prefix="paper-")
+ABLATIONS |= runs("ablations/reduction-log", *PAPER_BASE, prefix="paper-", but=())
+LAYER = runs("ablations/layer/*", "robust", "ablations/layer/base", prefix="layer-")
+TABLE1 = runs("table1/*", "crossview") | runs("table1/paper*", "paper-short")
+RUNS = runs("*", but=(*OF_SETS, "own")) | runs("ablations/base", but=()) | ABLATIONS | TABLE1
 TRAINED = ("crossview", "paper", "transform-paper")
 STORES = ("kitti_00", "kitti_01", "kitti_03", "kitti_06", "tum_fr3_office")
 
@@ -77,17 +73,12 @@ def assert_trained(weights):
         assert not torch.isclose(T, base, rtol=1e-6).all()
 
 
-def together(configs):
-    """The options that give several configurations."""
-    return [word for config in configs for word in ("--config", str(config))]
-
-
 @pytest.mark.parametrize("name", RUNS)
 def test_every_config_runs(name, data, tmp_path, monkeypatch, capsys, refused):
     """One of each transform trains; of the others, task, data and trainer are made."""
     monkeypatch.setenv("LEARNNORM_DATA", str(data))
-    options = [*together(RUNS[name]), *SMALL, f"--trainer.default_root_dir={tmp_path}"]
-    options += ["--data.val.init_args.number=50"]
+    options = [word for config in RUNS[name] for word in ("--config", str(config))]
+    options += [*SMALL, f"--trainer.default_root_dir={tmp_path}", "--data.val.init_args.number=50"]
     if RUNS[name][0].stem.startswith("paper"):
         options += [f"--{NETWORK}.width=8", f"--{NETWORK}.depth=2"]
     if name not in TRAINED:
@@ -234,7 +225,6 @@ DATA = "data: {{{}: {{class_path: kornia_learnnorm.data.sources.StoreSamples, in
     [
         (["fit", "--config", "crossview", *SMALL], "", "the environment variable LEARNNORM_DATA, named in "),
         (["estimate", "none1.png", "none2.png"], "", "none1.png"),
-        (["synthesize", "folder", "--scenes", "moon"], "", "moon"),
         (["fit"], "", "give one by --config, a file or one of crossview, "),
         (["validate"], "", "for example learnnorm validate --config crossview-synthetic --ckpt_path "),
         (["fit", "crossview"], "", "'crossview'; a configuration is given by --config crossview"),
@@ -243,7 +233,6 @@ DATA = "data: {{{}: {{class_path: kornia_learnnorm.data.sources.StoreSamples, in
         ([*FIT, f"--{NETWORK}.widht=3"], "", "Option 'widht' is not accepted"),
         ([*FIT, "--trainer.default_root_dir", "bad.yaml"], "", "bad.yaml is a file: expected a folder for the run"),
         ([*FIT, "--config", "unknown"], "", "no configuration unknown: expected a file, or one of crossview, "),
-        ([*FIT, "--json", "a.json"], "", "--json a.json"),
         (WITH_BAD, "model: {nomalizer: 3}", "model.nomalizer"),
         *((WITH_BAD, bad, "") for bad in ("", "- 1", "a: [1", "\xff\xfe")),
         (WITH_BAD, DATA.format("train", "{paths: [none.h5]}"), "no store at none.h5\n"),
@@ -259,14 +248,14 @@ def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, 
 
 
 @pytest.mark.parametrize(
-    ("blocked", "extra"), [("h5py", "images"), ("tqdm", "images"), ("lightning_modules.training", "train")]
+    ("command", "blocked", "extra"),
+    [("evaluate s.h5", "h5py", "images"), ("fit", "lightning_modules.training", "train")],
 )
-def test_a_missing_package_is_one_line(blocked, extra, tmp_path, monkeypatch, refused):
-    write_store(tmp_path / "s.h5", synthetic_store(pairs=1, points=40))
+def test_a_missing_package_is_one_line(command, blocked, extra, tmp_path, monkeypatch, refused):
+    monkeypatch.chdir(tmp_path)
+    write_store("s.h5", synthetic_store(pairs=1, points=40))
     monkeypatch.setitem(sys.modules, blocked, None)
-    store, out = tmp_path / "s.h5", tmp_path / "run"
-    for command in [["fit"]] if extra == "train" else [["evaluate", store], ["robust", store, "--out", out]]:
-        refused(command, f"needs {blocked}: run pip install '.[{extra}]'")
+    refused(command.split(), f"needs {blocked}: run pip install '.[{extra}]'")
 
 
 def test_json_of_a_checkpoint_has_its_metrics(trained, tmp_path, capsys, refused):
@@ -326,10 +315,9 @@ def test_an_interrupted_training_exits_as_interrupted(number, code, tmp_path, mo
     assert not Path("runs/crossview-synthetic/weights.safetensors").exists()
 
 
-@pytest.mark.parametrize("callbacks", ["null", "[{class_path: lightning_modules.callbacks.ExportWeights}]"])
-def test_a_training_writes_its_weights_once_whatever_its_callbacks(callbacks, trained, tmp_path, capsys):
-    options = [*trained[1], f"--trainer.default_root_dir={tmp_path}", f"--trainer.callbacks={callbacks}"]
-    assert main(["fit", *options]) == 0
+def test_a_training_writes_its_weights_once_whatever_its_callbacks(trained, tmp_path, capsys):
+    callbacks = "[{class_path: lightning_modules.callbacks.ExportWeights}]"
+    assert main(["fit", *trained[1], f"--trainer.default_root_dir={tmp_path}", f"--trainer.callbacks={callbacks}"]) == 0
     assert capsys.readouterr().out.count(f"wrote {tmp_path / 'weights.safetensors'}") == 1
     assert (tmp_path / "checkpoints/last.ckpt").is_file()
     assert_trained(tmp_path / "weights.safetensors")
