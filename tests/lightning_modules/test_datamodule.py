@@ -26,23 +26,12 @@ def test_batches_depend_on_seed_and_position_alone(source, size):
     again = BatchLoader(source, size, seed=0, shuffle=True)
     again.load_state_dict({"epoch": 1, "batch": 2})
     assert same(again, second[2:])
-    ordered = BatchLoader(source, size, seed=0, shuffle=False)
-    assert same(ordered, list(ordered))
-
-
-def test_samples_make_batches_of_one_size_and_keep_their_order_without_a_shuffle():
-    source = SyntheticSamples(300, max_residual=None)
-    assert [len(batch.pair) for batch in BatchLoader(source, 64, seed=0, shuffle=True)] == [60] * 5
-    ordered = [batch.pair for batch in BatchLoader(source, 64, seed=0, shuffle=False)]
-    assert torch.equal(torch.cat(ordered), torch.arange(300))
-
-
-def test_batches_of_random_sets_are_the_source_s():
-    source = random_sets()
-    batches = list(BatchLoader(source, None, seed=0, shuffle=True))
-    assert same(batches, [source.draw(0, block) for block in range(20)])
-    assert {batch.points1.shape[1] for batch in batches} != {batches[0].points1.shape[1]}
-    assert {batch.scores is None for batch in batches} == {True, False}
+    ordered = list(BatchLoader(source, size, seed=0, shuffle=False))
+    if size is None:
+        assert same(ordered, [source.draw(0, block) for block in range(20)])
+    else:
+        assert [len(batch.pair) for batch in first] == [60] * 5
+        assert torch.equal(torch.cat([batch.pair for batch in ordered]), torch.arange(300))
 
 
 @pytest.mark.parametrize(
@@ -70,16 +59,15 @@ def test_validation_shares_no_sample_with_training_and_can_be_missing():
         CorrespondenceDataModule().train_dataloader()
 
 
-@pytest.mark.parametrize("batch_pairs", [1, 3, 4, 10])
+@pytest.mark.parametrize("batch_pairs", [3, 10])
 def test_batches_of_whole_pairs(batch_pairs):
     source = Pairs()
     loader = BatchLoader(source, batch_pairs, seed=5, shuffle=True, by_pair=True)
     assert len(loader) == -(-10 // batch_pairs)
     orders = []
-    for epoch in range(3):
-        batches = list(loader)
+    for epoch in range(2):
+        batches, drawn, order = list(loader), source.draw(5 + epoch, 0), []
         assert len(batches) == len(loader)
-        drawn, order = source.draw(5 + epoch, 0), []
         for batch in batches:
             pairs = batch.pair.unique()
             assert 0 <= batch_pairs - len(pairs) <= 1
@@ -89,14 +77,7 @@ def test_batches_of_whole_pairs(batch_pairs):
             order += batch.pair.unique_consecutive().tolist()
         assert sorted(order) == list(range(10))
         orders.append(order)
-    assert orders[0] != orders[1] != orders[2] != orders[0]
-
-
-def test_one_sample_a_pair_is_counting_samples():
-    source = SyntheticSamples(number=100)
-    by_sample, by_pair = (BatchLoader(source, 16, 0, shuffle=True, by_pair=flag) for flag in (False, True))
-    for _ in range(3):  # the filter leaves another number each epoch
-        assert same(list(by_pair), list(by_sample))
+    assert orders[0] != orders[1]
 
 
 def test_batch_pairs_are_for_training_alone():
@@ -111,7 +92,7 @@ def test_batch_pairs_are_for_training_alone():
 
 @pytest.mark.parametrize(
     ("source", "size", "by_pair"),
-    [(SyntheticSamples(number=9000), 512, False), (Pairs(), 4, True), (random_sets(batches=4), None, False)],
+    [(SyntheticSamples(number=5000), 512, False), (Pairs(), 4, True), (random_sets(batches=4), None, False)],
 )
 @pytest.mark.parametrize("world_size", [2, 3])
 def test_processes_share_an_epoch(source, size, by_pair, world_size):
@@ -131,9 +112,7 @@ def test_processes_share_an_epoch(source, size, by_pair, world_size):
         assert held == sum(len(source.draw(epoch, block).pair) for block in range(len(source.blocks(epoch))))
 
 
-@pytest.mark.parametrize(
-    ("source", "size"), [(SyntheticSamples(20_000, max_residual=None), 3000), (random_sets(), None)]
-)
+@pytest.mark.parametrize(("source", "size"), [(SyntheticSamples(9000, max_residual=None), 1500), (random_sets(), None)])
 def test_workers_change_nothing(source, size):
     plain, helped = (BatchLoader(source, size, 0, shuffle=True, workers=workers) for workers in (0, 2))
     assert same(list(helped), list(plain))

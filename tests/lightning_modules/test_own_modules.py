@@ -2,14 +2,13 @@
 
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
-from scenes import correspondences
+from scenes import correspondences, rewrite_weights
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
@@ -73,9 +72,8 @@ def test_weights_come_back_where_the_module_is_trusted(weights):
 
 def test_nothing_is_imported_without_trust(weights, monkeypatch):
     monkeypatch.delitem(sys.modules, "own_modules")
-    with pytest.raises(
-        ValueError, match=r"own_modules\.PointNetwork is not of this package.*own_modules=\['own_modules'"
-    ):
+    message = r"own_modules\.PointNetwork is not of this package.*own_modules=\['own_modules'"
+    with pytest.raises(ValueError, match=message):
         kln.LearnedNormalizer.from_pretrained(weights)
     with pytest.raises(ValueError, match="is not of this package"):
         kln.LearnedNormalizer.from_pretrained(weights, own_modules=["os"])
@@ -91,13 +89,13 @@ def test_nothing_is_imported_without_trust(weights, monkeypatch):
     ],
 )
 def test_a_trusted_module_gives_only_what_it_defines(name, message, weights, tmp_path):
-    with safe_open(weights, "pt") as file:
-        metadata = file.metadata()
-    architecture = json.loads(metadata["architecture"])
-    architecture["network"]["name"] = name
-    save_file(load_file(weights), tmp_path / "a.safetensors", {**metadata, "architecture": json.dumps(architecture)})
+    def rename(_, metadata):
+        architecture = json.loads(metadata["architecture"])
+        metadata["architecture"] = json.dumps(architecture | {"network": architecture["network"] | {"name": name}})
+
+    rewrite_weights(shutil.copy(weights, tmp_path), rename)
     with pytest.raises(ValueError, match=message):
-        kln.LearnedNormalizer.from_pretrained(tmp_path / "a.safetensors", own_modules=["own_modules", "gone_modules"])
+        kln.LearnedNormalizer.from_pretrained(tmp_path / weights.name, own_modules=["own_modules", "gone_modules"])
 
 
 def test_evaluate_shows_them(weights, capsys, refused):
@@ -106,9 +104,7 @@ def test_evaluate_shows_them(weights, capsys, refused):
     assert main(["evaluate", "s.h5", "--methods", "Hartley", "--weights", name, f"{name}+LM"]) == 0
     out = capsys.readouterr().out
     assert out.count("| run ") == out.count("| run+LM ") == 2
-    refused(
-        ["evaluate", "s.h5", "--methods", "Hartley", str(weights)], "own_modules.PointNetwork is not of this package"
-    )
+    refused(["evaluate", "s.h5", "--methods", "Hartley", weights], "own_modules.PointNetwork is not of this package")
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_samples_lower_the_loss(tmp_path, precision):
 @pytest.mark.parametrize(
     ("make", "labels", "steps", "least"),
     [
-        (layer_task, True, 30, 0.05),
+        (layer_task, True, 20, 0.05),
         (layer_task, False, 50, 0.01),
         (sets_task, True, 60, 0.02),
         (pose_task, True, 20, 0.05),
@@ -72,9 +72,8 @@ def test_sets_lower_the_loss(make, labels, steps, least, tmp_path):
     task, data = make(), make_sets(labels)
     batch = SyntheticSets(32, labels=labels).draw(64, 32, block_generator(9))
     before = task.compute_loss(batch).item()
-    trainer = make_trainer(
-        tmp_path, max_steps=steps, enable_checkpointing=False, gradient_clip_val=1.0, limit_val_batches=4
-    )
+    options = {"enable_checkpointing": False, "gradient_clip_val": 1.0, "limit_val_batches": 4}
+    trainer = make_trainer(tmp_path, max_steps=steps, **options)
     trainer.fit(task, data)
     assert task.compute_loss(batch).item() < before - least
     assert {"val/median_32", "val/median_256"} <= {*trainer.callback_metrics}
@@ -102,12 +101,11 @@ def test_a_loss_leaves_the_estimator_as_it_was():
     assert not any(network._forward_hooks for network in task.estimator.networks)
 
 
-@pytest.mark.parametrize("log", [True, False])
-def test_accumulated_batches_make_the_step_of_a_larger_one(tmp_path, log):
+def test_accumulated_batches_make_the_step_of_a_larger_one(tmp_path):
     """Up to rounding, where the batches have the same number of samples; the limit of gradients is at work."""
     source, states = SyntheticSamples(number=256, num_heldout=4, max_residual=None), []
     for size, parts in ((64, 1), (16, 4)):
-        loss = kln.EpipolarLoss(log=log, heldout_weight=0.5)
+        loss = kln.EpipolarLoss(log=True, heldout_weight=0.5)
         task = normaliser_task(double=True, loss=loss, sample_gradient=0.1)
         data = CorrespondenceDataModule(source, source, batch_size=size)
         trainer = make_trainer(tmp_path, max_steps=6, enable_checkpointing=False, accumulate_grad_batches=parts)
@@ -179,7 +177,7 @@ def test_heldout_loss_and_epoch_schedule(tmp_path):
     assert trainer.optimizers[0].param_groups[0]["lr"] == pytest.approx(1e-3 * 0.8**epochs)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3])
+@pytest.mark.parametrize("steps", [1, 2])
 def test_every_number_of_steps_has_a_schedule(tmp_path, steps):
     trainer = make_trainer(tmp_path, max_steps=steps, limit_val_batches=0, enable_checkpointing=False)
     trainer.fit(layer_task(), make_sets(correspondences=32))
@@ -193,14 +191,10 @@ def test_a_training_without_an_end_has_no_cycle(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("estimator", "message"),
-    [
-        (kln.Hartley(), "expected a learned layer or an EightPoint, got Hartley"),
-        (kln.EightPoint(), "expected a LearnedNormalizer in EightPoint, got Hartley"),
-    ],
+    ("estimator", "kind"), [(kln.Hartley(), "learned layer"), (kln.EightPoint(), "LearnedNormalizer")]
 )
-def test_estimators_that_learn_nothing_are_refused(estimator, message):
-    with pytest.raises(TypeError, match=message):
+def test_estimators_that_learn_nothing_are_refused(estimator, kind):
+    with pytest.raises(TypeError, match=f"expected a {kind} .*, got Hartley"):
         EstimatorTask(estimator)
 
 
