@@ -136,14 +136,11 @@ def _duration(seconds: float) -> str:
 
 
 class ExportWeights(Callback):
-    """Write the trained module to a safetensors file in the trainer's default root directory when training ends.
+    """Write the trained module to ``weights.safetensors`` in the trainer's default root directory when training ends.
 
     What cannot be saved and loaded again is refused before the training. The file names the training data: the stores,
     or ``synthetic scenes``; nothing for a source of another class.
     """
-
-    def __init__(self, filename: str = "weights.safetensors") -> None:
-        self.filename = filename
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Save the module to a temporary folder and load it again; a ValueError where it does not come back."""
@@ -166,7 +163,7 @@ class ExportWeights(Callback):
         if trainer.global_step == 0:
             raise ValueError("the training ended before its first step: no weights were written")
         if trainer.is_global_zero and isinstance(pl_module, EstimatorTask):
-            path = Path(trainer.default_root_dir) / self.filename
+            path = Path(trainer.default_root_dir) / "weights.safetensors"
             path.parent.mkdir(parents=True, exist_ok=True)
             source = getattr(getattr(trainer, "datamodule", None), "train", None)
             pl_module.trained.trained_on = tuple(dict.fromkeys(_names_of(source)))
@@ -184,10 +181,9 @@ def _names_of(source: Any) -> list[str]:
 
 
 class WritePredictions(Callback):
-    """Write the tensors that ``predict`` returns to one safetensors file in the trainer's default root directory."""
+    """Write the tensors that ``predict`` returns to ``predictions.safetensors`` in the default root directory."""
 
-    def __init__(self, filename: str = "predictions.safetensors") -> None:
-        self.filename = filename
+    def __init__(self) -> None:
         self._batches: list[dict[str, Tensor]] = []
 
     def on_predict_batch_end(
@@ -202,7 +198,7 @@ class WritePredictions(Callback):
         self._batches = []
         if not trainer.is_global_zero:
             return
-        path = Path(trainer.default_root_dir) / self.filename
+        path = Path(trainer.default_root_dir) / "predictions.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
         fields = {key: torch.cat([batch[key] for batch in batches]) for key in batches[0]}
         with atomic_write(path) as beside:

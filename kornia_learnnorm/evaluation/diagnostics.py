@@ -63,7 +63,7 @@ def diagnose_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> D
     """Return the diagnostics of a problem under known transforms (B, 3, 3); see :func:`diagnose`."""
     points1, points2 = problem.points1, problem.points2
     x1, x2 = convert_points_to_homogeneous(points1) @ T1.mT, convert_points_to_homogeneous(points2) @ T2.mT
-    A, F_hat = design_matrix(x1, x2), problem.null_matrix_in(T1, T2)
+    A, F_hat = design_matrix(x1, x2), problem.solve_in(T1, T2)[0]
     matrices = (transform_fundamental(F_mat, T1, T2) for F_mat in (F_hat, rank2_projection(F_hat)))
     before, after = (symmetric_epipolar_distance(points1, points2, F_mat).mean(-1) for F_mat in matrices)
     return Diagnostics(

@@ -12,7 +12,6 @@ from torch.nn.functional import normalize
 from kornia_learnnorm.geometry.checks import needs_gradient, safe_divisor
 
 __all__ = [
-    "adjugate",
     "cofactors",
     "determinant",
     "inverse",
@@ -26,11 +25,6 @@ RANK1_WEIGHT = 1e-27  # of the complement of the rows, above the square of what 
 EPSILON = 1e-15  # of the mean eigenvalue, which a threefold one leaves of itself
 COLUMN_PREFERENCE = 1.1893  # of the last diagonal entry over the first: equal entries are not tied
 MIN_RELATIVE_GAP = 1e-10  # of the two largest eigenvalues of the cofactors' Gram matrix, for a unique vector
-
-
-def adjugate(A: Tensor) -> Tensor:
-    r"""Return the adjugate of matrices :math:`(*, 3, 3)`: :math:`\mathrm{adj}(A)\, A = \det(A)\, I`."""
-    return cofactors(A).mT
 
 
 def cofactors(A: Tensor) -> Tensor:

@@ -90,12 +90,8 @@ class LinearProblem:
             h = h.index_copy(0, rows, nearest_null_vector(A, A.new_tensor(self.model.preferred)))
         return torch.unflatten(h, -1, (3, 3)), gap, all_determined
 
-    def null_matrix_in(self, T1: Tensor, T2: Tensor) -> Tensor:
-        r"""Return the null matrix in the coordinates :math:`T_i x_i` of pixels :math:`x_i`, unit norm, (B, 3, 3)."""
-        return self.solve_in(T1, T2)[0]
-
     def solve_in(self, T1: Tensor, T2: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Return the null matrix in the coordinates :math:`T_i x_i`, (B, 3, 3), and its relative gap, (B,)."""
+        r"""Return the unit null matrix in the coordinates :math:`T_i x_i`, (B, 3, 3), and its relative gap, (B,)."""
         if T1 is self.T1 and T2 is self.T2:
             return self.solve()
         if self.points1.shape[1] == self.model.min_points:

@@ -6,8 +6,6 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import solve_dtype, weighted_mean
-
 __all__ = [
     "affine_transform",
     "inverse_sqrt",
@@ -16,7 +14,6 @@ __all__ = [
     "transform_fundamental",
     "transform_points",
     "whitening_from_moments",
-    "whitening_transform",
 ]
 
 
@@ -40,24 +37,11 @@ def transform_points(points: Tensor, T: Tensor) -> Tensor:
     return points @ T[..., :2, :2].mT + T[..., None, :2, 2]
 
 
-def whitening_transform(points: Tensor, weights: Tensor | None = None, floor: float = 1e-6) -> Tensor:
-    r"""Return the transforms :math:`(*, 3, 3)` that move centroids to the origin and make covariances the identity.
-
-    :math:`T = [\Sigma^{-1/2}, -\Sigma^{-1/2} o; 0, 1]` with the symmetric root (ZCA), in closed form, of points
-    :math:`(*, N, 2)` with optional weights :math:`(*, N)`. The ratio of the eigenvalues of :math:`\Sigma` is at least
-    ``floor``.
-    """
-    dtype = solve_dtype(points.device)
-    rows, w = points.to(dtype).mT.contiguous(), None if weights is None else weights.to(dtype)
-    origin = weighted_mean(rows.mT, w)
-    x, y = (rows - origin[..., None]).unbind(-2)
-    a, b, c = weighted_mean(torch.stack([x * x, x * y, y * y], -2).mT, w).unbind(-1)
-    covariance = torch.unflatten(torch.stack([a, b, b, c], -1), -1, (2, 2))
-    return whitening_from_moments(origin, covariance, floor).to(points.dtype)
-
-
 def whitening_from_moments(mean: Tensor, covariance: Tensor, floor: float = 1e-6) -> Tensor:
-    r"""Return :func:`whitening_transform` of points with a mean :math:`(*, 2)` and covariance :math:`(*, 2, 2)`."""
+    r"""Return whitening transforms :math:`(*, 3, 3)`, from means :math:`(*, 2)` and covariances :math:`(*, 2, 2)`.
+
+    The ratio of the covariance's eigenvalues is at least ``floor``; coincident points keep their scale.
+    """
     spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     # What rounding leaves of coincident points.
     rounding = 16 * torch.finfo(mean.dtype).eps * torch.linalg.vector_norm(mean.detach(), dim=-1)

@@ -101,7 +101,7 @@ class LearnedNormalizer(ProblemNormalizer):
         T1, T2 = (T.to(problem.x1) for T in transforms_of(self.base, problem))
         x1, x2 = transform_points(problem.points1, T1), transform_points(problem.points2, T2)
         if getattr(self.network, "needs_null_matrix", False):
-            params1, params2 = self.network(x1, x2, problem.weights, null_matrix=problem.null_matrix_in(T1, T2))
+            params1, params2 = self.network(x1, x2, problem.weights, null_matrix=problem.solve_in(T1, T2)[0])
         else:
             params1, params2 = self.network(x1, x2, problem.weights)
         return self.transform(params1) @ T1, self.transform(params2) @ T2

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.matrices import adjugate, smallest_right_singular_vector_3x3
+from kornia_learnnorm.geometry.checks import needs_gradient, safe_divisor
+from kornia_learnnorm.geometry.matrices import cofactors, smallest_right_singular_vector_3x3
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, whitening_from_moments
 from kornia_learnnorm.normalizers.normalizer import ProblemNormalizer
@@ -66,10 +66,7 @@ class ReweightedWhitening(ProblemNormalizer):
         """Return the transforms :math:`(B, 3, 3)` of both views."""
         # Where rounding decides on the null vector, it decides on the weights too, and every iteration multiplies their
         # derivatives by another inverse of a vanishing number.
-        if torch.is_grad_enabled() and (problem.x1.requires_grad or problem.x2.requires_grad):
-            held = problem.detach(~problem.determined)
-        else:
-            held = problem
+        held = problem.detach(~problem.determined) if needs_gradient(problem.x1, problem.x2) else problem
         # Hartley's coordinates keep the shape of the pixels, which the distances to lines need.
         # The batch comes last, (2, N, 2, B) for coordinates and views: every operation runs along contiguous memory.
         points = torch.stack([held.x1, held.x2])[..., :2].permute(3, 2, 0, 1).contiguous()
@@ -94,7 +91,7 @@ class ReweightedWhitening(ProblemNormalizer):
         if self.iterations == 0:
             return w
         # Adjugates stand for inverses: a line has no scale, and they exist where inverses do not.
-        inverse = adjugate(F0)
+        inverse = cofactors(F0).mT
         inverses = torch.stack([inverse, inverse.mT]).permute(2, 3, 0, 1).contiguous()
         determinant = (inverse[..., 0, :] * F0[..., :, 0]).sum(-1)
         products = _products(points)
@@ -133,7 +130,7 @@ def _whitening(points: Tensor, w: Tensor) -> Tensor:
 def _first_line(points: Tensor, F0: Tensor, w: Tensor) -> Tensor:
     """Return view 1's line of the rank-2 correction in the coordinates whitened with ``w``, ``(B, 3)``, unit norm."""
     T = _whitening(points, w)
-    F_hat = transform_fundamental(F0, *adjugate(T))
+    F_hat = transform_fundamental(F0, *cofactors(T).mT)
     return normalize((T[0].mT @ smallest_right_singular_vector_3x3(F_hat)[..., None]).squeeze(-1), dim=-1)
 
 
@@ -157,8 +154,8 @@ def _best_line(products: Tensor, w: Tensor, target: Tensor, minors: Tensor, entr
     """
     moments = (products * w[:, None]).sum(0)
     p, q, r, s = torch.unflatten(moments.index_select(0, minors), 0, (4, 6)).unbind(0)
-    cofactors = torch.addcmul(p * q, r, s, value=-1).index_select(0, entries)
-    line = (torch.unflatten(cofactors, 0, (3, 3)) * target).sum(1)
+    inverse = torch.addcmul(p * q, r, s, value=-1).index_select(0, entries)
+    line = (torch.unflatten(inverse, 0, (3, 3)) * target).sum(1)
     # Not `normalize`, whose floor leaves short lines short: from singular moments, shorter with every iteration.
     return line / safe_divisor(line.square().sum(0)).sqrt()
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.geometry.checks import weighted_mean
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.geometry.transforms import whitening_transform
+from kornia_learnnorm.geometry.transforms import whitening_from_moments
 from kornia_learnnorm.normalizers.normalizer import ProblemNormalizer
 
 __all__ = ["Whitening"]
@@ -40,7 +41,12 @@ class Whitening(ProblemNormalizer):
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views."""
-        T1, T2 = whitening_transform(torch.stack([problem.points1, problem.points2]), problem.weights, self.floor)
+        rows = torch.stack([problem.points1, problem.points2]).mT.contiguous()
+        origin = weighted_mean(rows.mT, problem.weights)
+        x, y = (rows - origin[..., None]).unbind(-2)
+        a, b, c = weighted_mean(torch.stack([x * x, x * y, y * y], -2).mT, problem.weights).unbind(-1)
+        covariance = torch.unflatten(torch.stack([a, b, b, c], -1), -1, (2, 2))
+        T1, T2 = whitening_from_moments(origin, covariance, self.floor)
         return T1, T2
 
     def extra_repr(self) -> str:

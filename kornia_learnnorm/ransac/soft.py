@@ -14,7 +14,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Generator, Tensor
 
 from kornia_learnnorm.estimators.linear import find_fundamental
-from kornia_learnnorm.geometry.checks import check_correspondences
+from kornia_learnnorm.geometry.checks import check_correspondences, check_tensor
 from kornia_learnnorm.geometry.distances import sampson_distance
 from kornia_learnnorm.normalizers.normalizer import Normalizer
 
@@ -52,9 +52,7 @@ def sample_minimal_sets(logits: Tensor, count: int, generator: Generator | None 
         (torch.Size([2, 16, 8]), torch.Size([2, 16]))
 
     """
-    if not isinstance(logits, Tensor) or not logits.is_floating_point():
-        raise TypeError(f"logits must be a floating-point tensor, got {getattr(logits, 'dtype', type(logits))}")
-    KORNIA_CHECK_SHAPE(logits, ["B", "N"])
+    check_tensor("logits", logits, ["B", "N"])
     if logits.shape[1] < 8:
         raise ValueError(f"at least 8 correspondences are needed, got {logits.shape[1]}")
     if bad := int((~torch.isfinite(logits)).sum()):
@@ -154,15 +152,11 @@ def expected_loss(
         raise ValueError(f"the loss must return one value per matrix, {[batch, count]}, got {[*losses.shape]}")
     expected = (scores.softmax(-1) * losses).sum(-1)
     if log_probs is not None:
-        advantage = (expected[:, None] - _without_each(scores, losses)).detach()
+        left_out = torch.eye(count, dtype=torch.bool, device=scores.device)
+        without_each = (scores[:, None].masked_fill(left_out, -torch.inf).softmax(-1) * losses[:, None]).sum(-1)
+        advantage = (expected[:, None] - without_each).detach()
         expected = expected + (advantage * (log_probs - log_probs.detach())).sum(-1)
     return SoftChoice(expected, F, scores.softmax(-1))
-
-
-def _without_each(scores: Tensor, losses: Tensor) -> Tensor:
-    """Return expected losses (B, K) where one sample is left out."""
-    left_out = torch.eye(scores.shape[1], dtype=torch.bool, device=scores.device)
-    return (scores[:, None].masked_fill(left_out, -torch.inf).softmax(-1) * losses[:, None]).sum(-1)
 
 
 def _check(points1: Tensor, samples: Tensor, log_probs: Tensor | None) -> None:

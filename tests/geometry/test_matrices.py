@@ -9,7 +9,7 @@ from scenes import uniform
 from torch.autograd import gradcheck, gradgradcheck
 
 from kornia_learnnorm.geometry.matrices import (
-    adjugate,
+    cofactors,
     determinant,
     smallest_right_singular_vector_3x3,
     smallest_singular_vectors,
@@ -68,12 +68,12 @@ class TestSmallestSingularVectors:
         assert smallest_right_singular_vector_3x3(torch.zeros(2, 3, 3).double()).norm(dim=-1).tolist() == [1, 1]
 
 
-class TestAdjugate:
-    def test_is_determinant_times_inverse(self, dtype):
+class TestCofactors:
+    def test_transposed_are_determinant_times_inverse(self, dtype):
         A = uniform(20, 3, 3, low=-1, dtype=dtype)
         np.testing.assert_allclose(determinant(A).numpy(), np.linalg.det(A.numpy()), atol=1e-6)
         expected = np.linalg.det(A.numpy())[:, None, None] * np.linalg.inv(A.numpy())
-        np.testing.assert_allclose(adjugate(A).numpy(), expected, atol=2e-6 if dtype == torch.float32 else 1e-14)
+        np.testing.assert_allclose(cofactors(A).mT.numpy(), expected, atol=2e-6 if dtype == torch.float32 else 1e-14)
 
     def test_of_singular_matrices(self):
         """Of rank 2, the product of both null vectors; of rank 1, zero."""
@@ -81,8 +81,8 @@ class TestAdjugate:
         U, s, Vh = np.linalg.svd(F_mat.numpy())
         factor = np.linalg.det(U @ Vh) * s[:, 0] * s[:, 1]
         expected = factor[:, None, None] * Vh[:, 2, :, None] * U[:, None, :, 2]
-        np.testing.assert_allclose(adjugate(F_mat).numpy(), expected, atol=1e-14)
-        assert adjugate(uniform(20, 3, 1) @ uniform(20, 1, 3, seed=1)).abs().max() < 1e-15
+        np.testing.assert_allclose(cofactors(F_mat).mT.numpy(), expected, atol=1e-14)
+        assert cofactors(uniform(20, 3, 1) @ uniform(20, 1, 3, seed=1)).abs().max() < 1e-15
 
     def test_gradcheck(self):
-        assert gradcheck(adjugate, [uniform(2, 3, 3, low=-1).requires_grad_()])
+        assert gradcheck(cofactors, [uniform(2, 3, 3, low=-1).requires_grad_()])

@@ -178,7 +178,7 @@ class SetNetwork(nn.Module):
         absent = None if weights is None else (weights <= 0)[..., None]
         for layer in self.layers:
             h = layer(h, absent)
-        outputs: Tensor = self.head(torch.cat([set_maximum(h, absent, 1), _average(h, weights)], -1))
+        outputs: Tensor = self.head(torch.cat([set_maximum(h, absent, 1), weighted_mean(h, weights)], -1))
         return outputs
 
 
@@ -200,11 +200,3 @@ class ContextLayer(nn.Module):
         hidden = self.point(z).add_(self.context(set_maximum(z, absent, 1))[:, None]).relu_()
         update: Tensor = self.out(hidden)
         return h + update
-
-
-def _average(h: Tensor, weights: Tensor | None) -> Tensor:
-    """Return the average over the points, ``(B, C)``."""
-    if weights is None:
-        return h.mean(1)
-    total = weights.sum(1, keepdim=True)
-    return (weights[..., None] * h).sum(1) / torch.where(total > 0, total, 1.0)
