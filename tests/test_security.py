@@ -20,7 +20,6 @@ from safetensors.torch import save_file
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.images import image_size, read_image
-from kornia_learnnorm.data.sources import StoreSamples
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
@@ -174,21 +173,15 @@ class TestImages:
 
 
 class TestArrays:
-    """Arrays that runs and filters leave on disk, and attributes of stores: no pickle in them is read."""
+    """Arrays that runs leave on disk, and attributes of stores: no pickle in them is read."""
 
     def test_npz(self, made, tmp_path):
         np.savez(tmp_path / "forged.npz", plain_residual=np.array([Touches(made)], object))
         with pytest.raises(ValueError, match=r"forged\.npz is damaged"):
             read_arrays(tmp_path / "forged.npz")
 
-    def test_store_and_cache_of_its_filter(self, made, tmp_path):
+    def test_attributes_of_a_store(self, made, tmp_path):
         write_store(tmp_path / "store.h5", synthetic_store(pairs=2, points=30, seed=1))
-        source = StoreSamples([str(tmp_path / "store.h5")], cache=str(tmp_path / "cache"))
-        source.draw(0, 0)
-        (held,) = (tmp_path / "cache").iterdir()
-        np.save(held, np.array([Touches(made)], object))
-        with pytest.raises(ValueError, match="allow_pickle=False"):
-            source.draw(0, 0)
         with h5py.File(tmp_path / "store.h5", "r+") as file:
             file.attrs["dataset"] = np.void(pickle.dumps(Touches(made)))
         read_store(tmp_path / "store.h5")

@@ -7,11 +7,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.data.residual_filter import plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.estimators.linear import find_fundamental
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.normalizers.identity import Identity
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["MatchSets", "draw_samples"]
+__all__ = ["MatchSets", "draw_samples", "plain_residual"]
+
+RESIDUAL_BATCH = 8192  # samples solved at once, which bounds the memory
 
 
 class MatchSets(NamedTuple):
@@ -38,20 +42,31 @@ class MatchSets(NamedTuple):
         return self if max_residual is None else self.select(plain_residual(self.points1, self.points2) < max_residual)
 
 
+def plain_residual(points1: Tensor, points2: Tensor) -> Tensor:
+    """Return the mean symmetric epipolar distance of samples (S, N, 2) under the un-normalised eight-point algorithm.
+
+    It is in pixels, (S,), float64. Fan et al. drop samples of 60 px and more (section 4, training procedure).
+    """
+    identity, residuals = Identity(), []
+    for x1, x2 in zip(*(torch.split(points.double(), RESIDUAL_BATCH) for points in (points1, points2)), strict=True):
+        F_mat = find_fundamental(x1, x2, normalizer=identity)
+        residuals.append(symmetric_epipolar_distance(x1, x2, F_mat).mean(-1))
+    return torch.cat(residuals)
+
+
 def draw_samples(
     store: CorrespondenceStore,
     generator: torch.Generator,
     size: int = 8,
     max_ratio: float | None = RATIO,
     num_heldout: int = 0,
-    max_residual: float | None = None,
     require_heldout: bool = True,
 ) -> MatchSets:
     """Draw samples: shuffle the correspondences of each pair and split them into sets of ``size``, without the rest.
 
-    The samples are float32, in the order of the pairs. ``max_ratio`` and ``max_residual`` (pixels) are exclusive; None
-    keeps all. The ``num_heldout`` correspondences of a sample are drawn with replacement from its pair; they are not in
-    the sample and pass the ratio test of 0.8, whatever ``max_ratio`` is.
+    The samples are float32, in the order of the pairs. ``max_ratio`` is exclusive; None keeps all. The ``num_heldout``
+    correspondences of a sample are drawn with replacement from its pair; they are not in the sample and pass the ratio
+    test of 0.8, whatever ``max_ratio`` is.
 
     Raises:
         ValueError: if ``size`` is below 8, no pair fills a sample, or, with ``require_heldout``, a pair has no
@@ -82,8 +97,7 @@ def draw_samples(
     cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
     drawable = passing > size
     rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]
-    samples = MatchSets(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)
-    return samples.with_residual_below(max_residual)
+    return MatchSets(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)
 
 
 def _draw_heldout(

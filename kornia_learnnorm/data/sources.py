@@ -9,29 +9,19 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.residual_filter import cached_mask
 from kornia_learnnorm.data.sets import MatchSets, draw_samples
 from kornia_learnnorm.data.store import StoreReader
 from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
 from kornia_learnnorm.protocol import MAX_RESIDUAL, RATIO
 
-__all__ = [
-    "SEEDS_PER_RUN",
-    "Block",
-    "BlockSource",
-    "StoreSamples",
-    "SyntheticSamples",
-    "block_generator",
-    "check_draws",
-    "expand_path",
-]
+__all__ = ["SEEDS_PER_RUN", "Block", "BlockSource", "StoreSamples", "SyntheticSamples", "block_generator"]
+__all__ += ["check_draws", "expand_path"]
 
 SCENES_PER_BLOCK = 8192
 SEEDS_PER_RUN = 1_000_003  # seeds that a run can draw from: one for each epoch
@@ -70,7 +60,6 @@ class StoreSamples:
         num_heldout: held-out correspondences per sample.
         max_residual: drop samples whose ``plain_residual`` is at least this many pixels; None keeps all.
         block_pairs: largest number of image pairs in a block.
-        cache: folder for the results of the residual filter, so that a draw is filtered once; None for no cache.
     """
 
     def __init__(
@@ -81,7 +70,6 @@ class StoreSamples:
         num_heldout: int = 0,
         max_residual: float | None = MAX_RESIDUAL,
         block_pairs: int = 1024,
-        cache: str | None = None,
     ) -> None:
         if not paths or not max_ratios:
             raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
@@ -93,7 +81,6 @@ class StoreSamples:
         self.paths, self.max_ratios = tuple(paths), tuple(max_ratios)
         self.stores = [StoreReader(expand_path(path)) for path in paths]
         self.num_heldout, self.max_residual, self.block_pairs = num_heldout, max_residual, block_pairs
-        self.cache = None if cache is None else Path(cache)
         self._first = np.cumsum([0, *map(len, self.stores)])
         self._passing = [np.concatenate([store.passing(ratio) for store in self.stores]) for ratio in self.max_ratios]
         if max(int(passing.max()) for passing in self._passing) < self.sizes[1]:
@@ -123,12 +110,7 @@ class StoreSamples:
                     part = draw_samples(held, generator, size, ratio, self.num_heldout)
                     parts.append(part._replace(pair=torch.from_numpy(own)[part.pair]))
         samples = MatchSets(*(torch.cat([part[field] for part in parts]) for field in range(5)))  # type: ignore[misc]
-        if self.max_residual is None:
-            return samples
-        files = [(str(s.path.resolve()), s.path.stat().st_mtime_ns, s.offsets[[0, -1]].tolist()) for s in self.stores]
-        options = self.max_ratios, self.sizes, self.num_heldout, self.max_residual, self.block_pairs
-        key = [files, *options, seed, block]
-        return samples.select(cached_mask(self.cache, key, samples.points1, samples.points2, self.max_residual))
+        return samples.with_residual_below(self.max_residual)
 
     def _pairs(self, seed: int) -> list[NDArray[np.int64]]:
         """Return the sorted indices of the image pairs of each block."""

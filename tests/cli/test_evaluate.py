@@ -54,11 +54,8 @@ def read_tables(text):
 
 def samples_of(folder, store, **options):
     """Filtered samples below the limit, and the number before it."""
-    everything, kept = (
-        draw_samples(read_store(f"{folder / store}"), torch.Generator().manual_seed(0), max_residual=limit, **options)
-        for limit in (None, 60.0)
-    )
-    return kept, len(everything.pair)
+    samples = draw_samples(read_store(folder / store), torch.Generator().manual_seed(0), **options)
+    return samples.with_residual_below(60.0), len(samples.pair)
 
 
 def errors_by_hand(folder, samples):

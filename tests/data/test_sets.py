@@ -3,8 +3,8 @@ import pytest
 import torch
 from scenes import eight_point, epipolar_distances, seeded
 
-from kornia_learnnorm.data.residual_filter import plain_residual
-from kornia_learnnorm.data.sets import draw_samples
+from kornia_learnnorm.data import sets
+from kornia_learnnorm.data.sets import draw_samples, plain_residual
 
 
 def test_every_correspondence_is_used_at_most_once_and_passes_the_ratio_test(store, rows_of):
@@ -31,16 +31,15 @@ def test_seed_decides(store):
     assert not torch.equal(first.points1, other.points1)
 
 
-def test_filter_agrees_with_numpy(store):
+def test_filter_agrees_with_numpy(store, monkeypatch):
     """The un-normalised eight-point algorithm and Eq. 7 in NumPy."""
     samples = draw_samples(store, seeded())
     points = samples.points1.double(), samples.points2.double()
     expected = epipolar_distances(*points, eight_point(*points, np.eye(3), np.eye(3))).mean(-1)
-    got = plain_residual(samples.points1, samples.points2, batch_size=7)
+    assert len(samples.with_residual_below(60.0).pair) == (expected < 60).sum()
+    monkeypatch.setattr(sets, "RESIDUAL_BATCH", 7)
     near = expected < 1e3
-    np.testing.assert_allclose(got.numpy()[near], expected[near], rtol=1e-3)
-    kept = draw_samples(store, seeded(), max_residual=60.0)
-    assert len(kept.pair) == (expected < 60).sum()
+    np.testing.assert_allclose(plain_residual(*samples[:2]).numpy()[near], expected[near], rtol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,13 @@
 """Sources of samples: stores on disk and synthetic scenes, block by block."""
 
-import pickle
 from itertools import pairwise
 
 import pytest
 import torch
 
 from kornia_learnnorm.data.random_sets import StoreSets
-from kornia_learnnorm.data.residual_filter import plain_residual
-from kornia_learnnorm.data.sets import draw_samples
+from kornia_learnnorm.data.sets import draw_samples, plain_residual
 from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
-from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic import forward_driving, handheld
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
@@ -114,23 +111,6 @@ def test_a_range_of_sizes(sources):
     assert [block.samples for block in source.blocks(0)] == [len(source.draw(0, block).pair) for block in range(9)]
 
 
-def test_the_filter_is_cached(sources, tmp_path, monkeypatch):
-    folder = tmp_path / "deep" / "cache"
-    plain, cached = sources(max_residual=5.0), sources(max_residual=5.0, cache=str(folder))
-    expected = [plain.draw(0, block) for block in range(4)]
-    for _ in range(2):  # the second time from the files
-        for block in range(4):
-            for got, field in zip(cached.draw(0, block)[:5], expected[block][:5], strict=True):
-                assert torch.equal(got, field)
-        assert len(list(folder.iterdir())) == 4
-        monkeypatch.setattr("kornia_learnnorm.data.residual_filter.plain_residual", None)
-    monkeypatch.undo()
-    assert not torch.equal(cached.draw(1, 0).points1, cached.draw(0, 0).points1)
-    assert len(list(folder.iterdir())) == 5
-    tight = sources(max_residual=0.5, cache=str(folder)).draw(0, 0)
-    assert len(tight.pair) < len(expected[0].pair)
-
-
 def test_blocks_without_samples(store, tmp_path):
     """Pairs of fewer than eight correspondences fill no sample; a block of them is empty."""
     few = synthetic_store(pairs=1, points=8, seed=0, scenes=["orbit"])
@@ -164,9 +144,3 @@ def test_bad_sources(sources, arguments):
 def test_draws_that_cannot_be(sources, arguments, message, kind):
     with pytest.raises(ValueError, match=message):
         kind(sources().paths, **arguments)
-
-
-def test_a_source_does_not_hold_the_stores(sources):
-    """What goes to other processes is small: the points stay on disk."""
-    source = sources()
-    assert len(pickle.dumps(source)) < read_store(source.stores[0].path).points1.nbytes

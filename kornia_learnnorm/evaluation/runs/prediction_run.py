@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.data.residual_filter import plain_residual
-from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.data.sets import MatchSets, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs import results_store

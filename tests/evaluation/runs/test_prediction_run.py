@@ -15,7 +15,7 @@ import torch
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.residual_filter import plain_residual
+from kornia_learnnorm.data.sets import plain_residual
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
