@@ -66,7 +66,7 @@ class TestCheckpoints:
 
     def test_code_is_not_run(self, last, made, tmp_path, rejected):
         torch.save(torch.load(last, weights_only=True) | {"callbacks": Touches(made)}, tmp_path / "forged.ckpt")
-        for command in ("fit", "validate", "test", "predict"):
+        for command in ("fit", "predict"):
             rejected(tmp_path / "forged.ckpt", command)
         (tmp_path / "plain.ckpt").write_bytes(pickle.dumps(Touches(made)))
         rejected(tmp_path / "plain.ckpt")
@@ -79,10 +79,9 @@ class TestCheckpoints:
 
     def test_broken(self, last, tmp_path, rejected):
         path = tmp_path / "broken.ckpt"
-        for content in (b"", last.read_bytes()[:-50], b"text", b"PK\x03\x04"):
-            path.write_bytes(content)
-            rejected(path)
-        for content in ([1], {"state_dict": [1]}, {"state_dict": {"a": "b"}}):
+        path.write_bytes(last.read_bytes()[:-50])
+        rejected(path)
+        for content in ([1], {"state_dict": {"a": "b"}}):
             torch.save(content, path)
             rejected(path)
 
@@ -118,7 +117,6 @@ class TestWeights:
         "content",
         [
             struct.pack("<Q", 2**63) + b"{}",
-            struct.pack("<Q", 62) + b'{"a":{"dtype":"F32","shape":[1000000],"data_offsets":[0,4000000]}}'[:62],
             struct.pack("<Q", 58) + b'{"a":{"dtype":"F32","shape":[9],"data_offsets":[0,99999]}}',
             struct.pack("<Q", 64) + b'{"a":{"dtype":"F32","shape":[4294967296,4294967296],"data_offsets'[:64],
             pickle.dumps(Touches(Path("/nowhere"))),
@@ -147,29 +145,17 @@ class TestWeights:
             kln.LearnedNormalizer.from_pretrained(tmp_path / "forged.safetensors")
 
 
-def png(width, height, pixels):
-    """A grey PNG of a declared size."""
-
+@pytest.mark.parametrize("size", [2**31 - 1, 14_000])
+def test_pixels_that_an_image_declares(tmp_path, size):
     def chunk(name, data):
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    parts = [(b"IHDR", header), (b"IDAT", zlib.compress(pixels)), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
-
-
-class TestImages:
-    def test_control(self, tmp_path):
-        (tmp_path / "small.png").write_bytes(png(3, 2, b"\0abc\0def"))
-        np.testing.assert_array_equal(read_image(tmp_path / "small.png"), [list(b"abc"), list(b"def")])
-
-    @pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (100_000, 100_000), (14_000, 14_000)])
-    def test_declared_pixels(self, tmp_path, size):
-        path = tmp_path / "large.png"
-        path.write_bytes(png(*size, bytes(1000)))
-        with pytest.raises(ValueError, match=r"large\.png .* exceeds limit of 178956970 pixels"):
-            read_image(path)
-        assert image_size(path) == (0, 0)
+    path, header = tmp_path / "large.png", struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
+    parts = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts))
+    with pytest.raises(ValueError, match=r"large\.png .* exceeds limit of 178956970 pixels"):
+        read_image(path)
+    assert image_size(path) == (0, 0)
 
 
 class TestArrays:

@@ -109,12 +109,11 @@ def test_the_commands_agree_with_a_computation_by_hand(folder, tmp_path, capsys,
     assert rows["Hartley"][0] == rows["Hartley"][-1] == rows["whitening"][1] == "-"
 
 
-@pytest.mark.parametrize("size", [8, 20])
-def test_diagnostics(folder, tmp_path, capsys, monkeypatch, size):
+def test_diagnostics(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(example, "TRIALS", 5)
-    words = [str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--size", str(size)]
+    words = [str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--size", "20"]
     rows = tables_of_report(tmp_path / "run", capsys, *words)["Fit and accuracy: known, filtered"]
-    samples, _ = samples_of(folder, "known.h5", size=size)
+    samples, _ = samples_of(folder, "known.h5", size=20)
     columns = ["condition number", "rho", "distance 1", "distance 2", "error due to rank 2 %"]
     for name, normalizer in {"Hartley": kln.Hartley(), "whitening": kln.Whitening()}.items():
         *expected, share = (np.median(v) for v in diagnose(samples.points1, samples.points2, normalizer))
@@ -201,8 +200,6 @@ def test_without_ground_truth_there_are_no_columns_of_it(folder, capsys):
         (["known.h5", "none.h5"], ["tilted"], "no store at"),
         (["tilted"], ["tilted"], "tilted; it is a folder, and learnnorm match folder makes"),
         (["known.h5", "known.h5@2:19"], ["tilted"], "pairs 2:19 were asked for, the store has 0:9"),
-        (["known.h5", "known.h5@2"], ["tilted"], "FILE.h5@FIRST:STOP"),
-        (["known.h5"], ["tilted", "nothing"], "no weights"),
         (["known.h5"], ["known.h5"], "no weights"),
         (["tilted/weights.safetensors"], ["tilted"], "not a readable HDF5 file"),
     ],
