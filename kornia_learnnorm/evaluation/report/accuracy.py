@@ -9,22 +9,11 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.report import numbers
-from kornia_learnnorm.evaluation.report.numbers import BASELINE, better_share, median_number, number
+from kornia_learnnorm.evaluation.report.numbers import BASELINE, better_share, median_number
 from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.evaluation.tables import Cell, Table
-from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.protocol import THRESHOLDS
-
-MAX_FAILURES = 10  # rows of the table of the worst samples
-MIN_PAIRS = 4  # pairs with a known value; fewer are not split in halves
-MIN_RELATIVE_RANGE = 0.01  # of the median; pairs whose values differ less are not split in halves
-MOTIONS = {
-    "rotation": "rotation, degrees",
-    "forward": "forward share of the translation",
-    "parallax": "parallax, px",
-    "inliers": "share of inliers among the matches",
-}
 
 
 def report_tables(run: Run) -> list[Table]:
@@ -32,10 +21,6 @@ def report_tables(run: Run) -> list[Table]:
     tables = rate_tables(run)
     for cell in run.cells:
         tables += [_accuracy(cell), _consensus(cell, run), _tests(cell)]
-    for cell in run.cells:
-        learned = next((name for name in ("crossview", "paper", "whitening") if name in cell.predictions), None)
-        if learned and cell.protocol == "filtered":
-            tables += [by_motion(cell, run, learned), _worst_failures(cell, run, learned)]
     return tables
 
 
@@ -123,68 +108,3 @@ def _tests(cell: RunCell) -> Table:
         f"`held out` use {used}{f', `truth` uses {known}' if len(truth) else ''}."
     )
     return Table(f"Paired tests: {cell.title}", text, header, rows)
-
-
-def by_motion(cell: RunCell, run: Run, learned: str) -> Table:
-    """Return the better rates of a method in two halves of the image pairs, split at the median of each motion."""
-    rows, left_out = list[list[Cell]](), list[str]()
-    truth = _with_truth(cell)
-    for key, name in MOTIONS.items():
-        values = torch.from_numpy(run.pairs[cell.store][key])
-        if reason := _why_not_split(values):
-            left_out.append(f"{name}, {reason}")
-            continue
-        middle = median(values[values.isfinite()])
-        text = _distinct(middle, values)
-        for half, chosen in ((f"up to {text}", values <= middle), (f"above {text}", values > middle)):
-            inside = chosen[cell.pair]
-            rates = [better_share(cell, learned, BASELINE, key, inside) for key in ("own", "heldout", "truth")]
-            counts = [int(chosen.sum()), int(inside.sum()), int((inside & truth).sum())]
-            rows.append([name, half, *counts, *rates])
-    header = ["motion", "half", "pairs", "samples", "with truth", "fit: better %", "held out: better %"]
-    text = (
-        f"Better rate of `{learned}` against {BASELINE} in the halves of the image pairs below and above the median of "
-        "each motion. `with truth` is the number of samples whose pair has ground-truth inliers, which the last column "
-        "is the rate on."
-    )
-    if left_out:
-        text += f" Not shown: {'; '.join(left_out)}."
-    return Table(f"By motion: {cell.title}", text, [*header, "truth: better %"], rows)
-
-
-def _why_not_split(values: Tensor) -> str:
-    """Return why image pairs cannot be split at the median of their values; an empty text where they can."""
-    known = values[values.isfinite()]
-    if len(known) < MIN_PAIRS:
-        return f"known of {len(known)} of {len(values)} pairs, at least {MIN_PAIRS} are needed"
-    low, middle, high = known.quantile(known.new_tensor([0.0, 0.5, 1.0])).tolist()
-    if high - low <= MIN_RELATIVE_RANGE * abs(middle) or high == middle:
-        return f"from {low:.4g} to {high:.4g} in all pairs" if high > low else f"{low:.4g} in all pairs"
-    return ""
-
-
-def _distinct(middle: Tensor, values: Tensor) -> str:
-    """Return a median with as many digits as distinguish it from the next larger value."""
-    above = values[values > middle].min().item()
-    texts = [f"{middle.item():.{digits}g}" for digits in (3, 4, 5, 6)]
-    return next((text for text in texts if float(text) < above), texts[-1])
-
-
-def _worst_failures(cell: RunCell, run: Run, learned: str) -> Table:
-    """Return the samples with the largest ratio of a method's ground-truth error to the baseline's."""
-    mine, other = cell.predictions[learned], cell.predictions[BASELINE]
-    ratio = (mine["truth"] / other["truth"]).nan_to_num(nan=-1.0, posinf=torch.inf)
-    worst = ratio.argsort(descending=True)[:MAX_FAILURES]
-    header = ["pair", "truth px", f"{BASELINE}: truth px", "ratio", "fit px", f"{BASELINE}: fit px"]
-    pairs, rows = run.pairs[cell.store], list[list[Cell]]()
-    for row in worst[ratio[worst] > 0].tolist():
-        pair = int(cell.pair[row])
-        errors = (mine["truth"][row], other["truth"][row], ratio[row], mine["own"][row], other["own"][row])
-        cells = [number(float(error), ".2f") for error in errors]
-        condition, parallax = float(mine["condition_number"][row]), float(pairs["parallax"][pair])
-        rows.append([str(pairs["names"][pair]), *cells, number(condition, ".3g"), number(parallax, ".1f")])
-    text = (
-        f"The {len(rows)} samples of {int((ratio >= 0).sum())} with ground truth with the largest ratio of `truth` "
-        f"under `{learned}` to that under {BASELINE}."
-    )
-    return Table(f"Worst failures: {cell.title}", text, [*header, "condition number", "parallax px"], rows)

@@ -1,27 +1,50 @@
-"""Pictures of a run of predictions."""
+"""Pictures of a run of predictions, drawn with Matplotlib (extra ``report``).
+
+Lines and letters take the colour of the text around them, so that the pictures fit light and dark pages.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import io
+import re
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.evaluation.methods import REFINED
-from kornia_learnnorm.evaluation.report import style
+from kornia_learnnorm.evaluation.methods import CLOSED_FORMS, REFINED, base_name
 from kornia_learnnorm.evaluation.report.rates import papers_data
-from kornia_learnnorm.evaluation.report.style import INK, ReportPicture, line_style, make_figure, make_picture
 from kornia_learnnorm.evaluation.runs.example import TRIALS
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.evaluation.runs.results_store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
-from kornia_learnnorm.two_view.drawing import INLIER, WIDE, draw_line, draw_matches
+from kornia_learnnorm.two_view.drawing import INLIER, WIDE, draw_line, draw_matches, import_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
+INK = "#010203"  # placeholder that _make_picture replaces by the text colour of the page
+# Legible on white and on black; after P. Tol's and Okabe and Ito's palettes for colour blindness.
+HUES = "8b8b8b e69f00 2b9fd9 18a57a d55e00 cc79a7 a0714f 7a6ff0 b8a400 c2443f 5f8f2f"
+WIDTH = 8.0  # inches
+SETTINGS: dict[str, Any] = {
+    **{f"{key}.color": INK for key in ("text", "xtick", "ytick", "grid")},
+    **{f"axes.{key}color": INK for key in ("label", "edge")},
+    **{f"axes.spines.{side}": False for side in ("top", "right")},
+    **{f"{key}.facecolor": "none" for key in ("figure", "axes")},
+    "axes.grid": True,
+    "grid.alpha": 0.15,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "font.size": 10,
+    "font.family": "sans-serif",
+    "svg.fonttype": "none",
+    "svg.hashsalt": "report",
+}
 DOTS: dict[str, Any] = {"marker": "o", "markersize": 3}
 NUM_LINES = 5  # epipolar lines of each matrix
 LINE_METHODS = ("Hartley", "crossview")
@@ -32,11 +55,24 @@ NORMALISATIONS = ("none", "Hartley", "whitening", "reweighted", "paper", "crossv
 BUILT_IN = {*NORMALISATIONS, "crossview-synthetic"}
 
 
-@style.report_style()
+class ReportPicture(NamedTuple):
+    """A picture and its caption."""
+
+    name: str  # of the file, without suffix
+    title: str
+    text: str  # what the picture shows
+    svg: str
+
+
 def report_figures(run: Run) -> list[ReportPicture]:
     """Draw all pictures of a run; those of samples use the first store with filtered samples."""
+    with import_matplotlib().rc_context(SETTINGS):
+        return _report_figures(run)
+
+
+def _report_figures(run: Run) -> list[ReportPicture]:
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
-    colors = style.method_colors(run.about["methods"])
+    colors = _colors(run.about["methods"])
     pictures = [(cell.store, draw(cell, colors)) for draw in (_per_frame, _distribution, _distances)]
     example = [*draw_example(run, colors), *([_by_size(run, colors)] if run.sizes else [])]
     pictures += [(str(run.example["store"]), picture) for picture in example]
@@ -53,7 +89,7 @@ def report_figures(run: Run) -> list[ReportPicture]:
 
 def _per_frame(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     chosen = _present(cell, "Hartley", "paper", "crossview", "Hartley+LM", "crossview+LM")
-    figure, (axes,) = make_figure(1, 1)
+    figure, (axes,) = _make_figure(1, 1)
     pair = cell.pair.numpy()
     frames = np.unique(pair)[:MAX_FRAMES]
     for name in chosen:
@@ -66,24 +102,24 @@ def _per_frame(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     text = f"Mean symmetric epipolar distance of a pair's samples, first {len(frames)} image pairs of {cell.store}."
     if any(name.endswith(REFINED) for name in chosen):
         text += " Dashed: with non-linear refinement."
-    return make_picture(figure, "figure-4a", "Error by frame", text)
+    return _make_picture(figure, "figure-4a", "Error by frame", text)
 
 
 def _distribution(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
-    figure, (axes,) = make_figure(1, 1)
+    figure, (axes,) = _make_figure(1, 1)
     names = _present(cell, *NORMALISATIONS, "Hartley+optimal")
     for name in names:
         own = np.sort(cell.predictions[name]["own"].numpy())
-        axes.plot(own, np.arange(1, len(own) + 1) / len(own), line_style(name), color=colors[name], label=name)
+        axes.plot(own, np.arange(1, len(own) + 1) / len(own), _line_style(name), color=colors[name], label=name)
     axes.set(xlabel="symmetric epipolar distance of a sample, px", ylabel="share of samples below", xscale="log")
     axes.set(xlim=(0.01, 60), ylim=(0, 1))
     text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}."
     text += _dashes(names)
-    return make_picture(figure, "figure-4b", "Distribution of errors", text)
+    return _make_picture(figure, "figure-4b", "Distribution of errors", text)
 
 
 def _distances(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
-    figure, views = make_figure(1, 2)
+    figure, views = _make_figure(1, 2)
     bins = np.geomspace(0.7, 30, 60).tolist()
     for view, axes in enumerate(views, 1):
         for name in _present(cell, "reweighted", "paper", "crossview", "searched"):
@@ -95,11 +131,11 @@ def _distances(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
         axes.minorticks_off()
     views[0].set_ylabel("samples")
     text = f"Mean distances of the normalised points from the origin, {cell.title}. Hartley's is the square root of 2."
-    return make_picture(figure, "figure-5", "Normalised distances", text)
+    return _make_picture(figure, "figure-5", "Normalised distances", text)
 
 
 def _by_size(run: Run, colors: dict[str, str]) -> ReportPicture:
-    figure, panels = make_figure(1, 2)
+    figure, panels = _make_figure(1, 2)
     titles = {"own": "the sample's points", "truth": "ground-truth inliers"}
     for axes, (key, title) in zip(panels, titles.items(), strict=True):
         for name, sizes in run.sizes.items():
@@ -117,11 +153,11 @@ def _by_size(run: Run, colors: dict[str, str]) -> ReportPicture:
         f"farther than {INLIER_THRESHOLD:g} px from the ground truth. Least squares does not reject outliers, so "
         "errors of ground-truth inliers can grow with the size of the sample."
     )
-    return make_picture(figure, "figure-11", "Number of correspondences", text)
+    return _make_picture(figure, "figure-11", "Number of correspondences", text)
 
 
 def _conditions(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
-    figure, (axes,) = make_figure(1, 1)
+    figure, (axes,) = _make_figure(1, 1)
     names = _present(cell, *NORMALISATIONS)[::-1]
     for place, name in enumerate(names):
         low, middle, high = np.nanquantile(cell.predictions[name]["condition_number"].numpy(), [0.25, 0.5, 0.75])
@@ -132,27 +168,27 @@ def _conditions(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     axes.set(xscale="log", xlabel="condition number of the design matrix (no unit)")
     axes.set_ylim(-0.6, len(names) - 0.2)
     text = f"Largest over eighth singular value of the design matrix. Dot: median; bar: quartiles. {cell.title}."
-    return make_picture(figure, "figure-12", "Condition numbers", text, legend=False)
+    return _make_picture(figure, "figure-12", "Condition numbers", text, legend=False)
 
 
 def _rho(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
-    figure, (axes,) = make_figure(1, 1)
+    figure, (axes,) = _make_figure(1, 1)
     names = _present(cell, "Hartley", "whitening", "paper", "crossview")
     for name in names:
         rho = cell.predictions[name]["rho"].numpy()
         means = [np.mean(rho[i : i + RHO_WINDOW]) for i in range(0, len(rho) - RHO_WINDOW + 1, RHO_WINDOW)]
         places = np.arange(len(means)) * RHO_WINDOW
-        axes.plot(places, means, line_style(name), color=colors[name], label=name, **DOTS)
+        axes.plot(places, means, _line_style(name), color=colors[name], label=name, **DOTS)
     axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {RHO_WINDOW} samples (no unit)")
     text = (
         "Second over third singular value of the normalised matrix before the projection to rank 2, which changes the "
         f"less the larger it is. Means of {RHO_WINDOW} successive samples, {cell.title}.{_dashes(names)}"
     )
-    return make_picture(figure, "figure-13", "Singularity ratio", text)
+    return _make_picture(figure, "figure-13", "Singularity ratio", text)
 
 
 def _dashes(names: list[str]) -> str:
-    return " Dashed: learned." if "--" in map(line_style, names) else ""
+    return " Dashed: learned." if "--" in map(_line_style, names) else ""
 
 
 def _present(cell: RunCell, *names: str) -> list[str]:
@@ -173,7 +209,7 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[ReportPicture]:
     errors = {name: cell.predictions[name]["truth"] for name in methods}
     middle = rows[errors[methods[0]][rows].argsort()[(len(rows) - 1) // 2]]
     wide = float((pair["size"][:, 0] / pair["size"][:, 1]).min()) > WIDE
-    figure, (first, second) = make_figure(2, 1, 6.2) if wide else make_figure(1, 2)
+    figure, (first, second) = _make_figure(2, 1, 6.2) if wide else _make_figure(1, 2)
     near = example_inliers(pair)
     draw_matches(first, pair["points1"], pair["points2"], near)
     _frame(first, pair["size"][0], "view 1")
@@ -187,7 +223,7 @@ def draw_example(run: Run, colors: dict[str, str]) -> list[ReportPicture]:
         f"matrices of one sample of eight, the sample with the pair's median error for {methods[0]}. Median distance "
         f"of the ground-truth inliers: {medians}."
     )
-    return [make_picture(figure, "figure-10", "Inliers, outliers and epipolar lines", text)]
+    return [_make_picture(figure, "figure-10", "Inliers, outliers and epipolar lines", text)]
 
 
 def example_inliers(pair: Arrays) -> NDArray[np.bool_]:
@@ -199,7 +235,7 @@ def example_inliers(pair: Arrays) -> NDArray[np.bool_]:
 
 def _draw_lines(axes: Axes, pair: Arrays, near: NDArray[np.bool_], matrices: Arrays, colors: dict[str, str]) -> None:
     """Draw the epipolar lines of some inliers, and the inliers, in the second view."""
-    chosen = np.flatnonzero(near)[_far_apart(pair["points2"][near])]
+    chosen = np.random.default_rng(0).permutation(np.flatnonzero(near))[:NUM_LINES]
     points = np.pad(pair["points1"][chosen], ((0, 0), (0, 1)), constant_values=1.0)
     for order, (name, F_mat) in enumerate(matrices.items()):
         # Ever thinner lines, so that lines that coincide remain visible.
@@ -210,18 +246,43 @@ def _draw_lines(axes: Axes, pair: Arrays, near: NDArray[np.bool_], matrices: Arr
     _frame(axes, pair["size"][1], "view 2")
 
 
-def _far_apart(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices of points far from each other: the first one, then always the farthest from all chosen."""
-    chosen = [0]
-    distance = np.full(len(points), np.inf)
-    while len(chosen) < min(NUM_LINES, len(points)):
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-        chosen.append(int(distance.argmax()))
-    return np.array(chosen)
-
-
 def _frame(axes: Axes, size: NDArray[np.int32], name: str) -> None:
     """Give axes the extent of an image, y down."""
     width, height = size.tolist()
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel=f"x in {name}, px")
     axes.set_ylabel("y, px")
+
+
+def _colors(names: Iterable[str]) -> dict[str, str]:
+    """Return a colour for each method; they repeat after eleven methods."""
+    hues = HUES.split()
+    return {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(names)}
+
+
+def _line_style(name: str) -> str:
+    """Return the line style of a method: dashed for one with weights, which often lies on a closed form."""
+    return "-" if base_name(name) in CLOSED_FORMS or ":" in name else "--"
+
+
+def _make_figure(rows: int, columns: int, height: float = 3.8) -> tuple[Figure, list[Axes]]:
+    """Return a figure of eight inches with axes row by row."""
+    figure = import_matplotlib().figure.Figure(figsize=(WIDTH, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False).flatten().tolist()
+
+
+def _make_picture(figure: Figure, name: str, title: str, text: str, legend: bool = True) -> ReportPicture:
+    """Return a figure as SVG, with one legend of all axes above it."""
+    if legend:
+        entries: dict[str, Any] = {}
+        for axes in figure.axes:
+            handles, labels = axes.get_legend_handles_labels()
+            entries |= dict(zip(labels, handles, strict=True))
+        figure.legend([*entries.values()], [*entries], loc="outside upper center", ncols=5)
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
+    # The pictures share a page, so their identifiers must differ.
+    svg = re.sub(r'id="([^"]+)"', rf'id="{name}-\1"', svg)
+    svg = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)
+    return ReportPicture(name, title, text, svg)

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kornia_learnnorm.evaluation.report.accuracy import report_tables
-from kornia_learnnorm.evaluation.report.figures import report_figures
+from kornia_learnnorm.evaluation.report.figures import ReportPicture, report_figures
 from kornia_learnnorm.evaluation.report.numbers import MIN_BOOTSTRAP_PAIRS
 from kornia_learnnorm.evaluation.report.rates import papers_data, with_baseline
 from kornia_learnnorm.evaluation.report.robust_tables import robust_tables
 from kornia_learnnorm.evaluation.report.run_summary import robust_summary, run_summary
-from kornia_learnnorm.evaluation.report.style import ReportPicture
 from kornia_learnnorm.evaluation.robust.robust_run import RobustRun, read_robust
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, read_run
 from kornia_learnnorm.evaluation.runs.results_store import read_section

@@ -11,7 +11,7 @@ from kornia_learnnorm.data.sets import MatchSets, draw_samples
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.runs.pair_motions import ground_truth_inliers, median_distance, pair_matches
+from kornia_learnnorm.evaluation.runs.pair_matches import ground_truth_inliers, median_distance, pair_matches
 from kornia_learnnorm.evaluation.runs.results_store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose

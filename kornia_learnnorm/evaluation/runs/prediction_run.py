@@ -1,6 +1,6 @@
 """Predictions of methods on stores, computed once and kept in a folder: what ``learnnorm evaluate`` makes.
 
-Each store has a folder with the motion of its pairs, and for each protocol the samples and a file per method.
+Each store has a folder with, for each protocol, the samples and a file per method.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs import results_store
 from kornia_learnnorm.evaluation.runs.example import EXAMPLE, SWEEP, random_pair, sweep
-from kornia_learnnorm.evaluation.runs.pair_motions import PAIRS, pair_motions
 from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS, SampleOptions, predict
 from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, file_name, once, read_arrays
 from kornia_learnnorm.protocol import PROTOCOLS
@@ -52,7 +51,6 @@ class Run:
 
     about: About  # what the run was computed from, its section of run.json
     cells: list[RunCell]
-    pairs: dict[str, Arrays]  # the motion of each store's pairs, (P,) each
     sizes: dict[str, Arrays]  # errors by the number of correspondences, by method
     example: Arrays  # the image pair of these errors, from random_pair; empty where there is none yet
     missing: list[str] = field(default_factory=list)  # what has not been computed yet
@@ -107,10 +105,9 @@ def record_run(
 def _jobs(
     folder: Path, stores: Stores, methods: Mapping[str, Method], options: SampleOptions, complete: bool
 ) -> Iterator[Job]:
-    """Make the files of the stores' motions and samples, and give those of the methods to make."""
+    """Make the files of the stores' samples, and give those of the methods to make."""
     keys = KEYS[complete]
     for name, store in stores.items():
-        once(_path(folder, name, "pairs"), partial(pair_motions, store), PAIRS, len(store))
         for protocol, max_ratio in PROTOCOLS.items():
             place = f"{name}, {protocol}"
             samples = _samples(_path(folder, name, protocol, "samples"), place, options, store, max_ratio)
@@ -171,23 +168,22 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
     about, missing = results_store.read_section(folder, "evaluate"), list[str]()
     if about is None:
         raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
-    cells, pairs = [], {}
+    cells = []
     for store in about["stores"]:
         for protocol in PROTOCOLS:
             absent = ["all methods"]
             if _path(folder, store, protocol, "samples").is_file():
                 cells.append(_read_cell(folder, about, store, protocol, complete))
-                pairs[store] = _read_pairs(_path(folder, store, "pairs"), cells[-1].pair)
                 absent = [name for name in about["methods"] if name not in cells[-1].predictions]
             missing += [f"{name} on {store}, {protocol}" for name in absent]
     if not (folder / "example.npz").is_file():
-        known = any(np.isfinite(motions["inliers"]).any() for motions in pairs.values())
-        return Run(about, cells, pairs, {}, {}, [*missing, *["the example of a pair"] * known])
+        known = any(bool(p["truth"].isfinite().any()) for cell in cells for p in cell.predictions.values())
+        return Run(about, cells, {}, {}, [*missing, *["the example of a pair"] * known])
     example = read_arrays(folder / "example.npz", EXAMPLE)
     swept = {name: _path(folder, "sizes", name) for name in about["methods"] if _is_swept(name)}
     missing += [f"{name} by the number of correspondences" for name, path in swept.items() if not path.is_file()]
     sizes = {name: read_arrays(path, SWEEP) for name, path in swept.items() if path.is_file()}
-    return Run(about, cells, pairs, sizes, example, missing)
+    return Run(about, cells, sizes, example, missing)
 
 
 def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, complete: bool) -> RunCell:
@@ -201,11 +197,3 @@ def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, c
         if path.is_file()
     }
     return RunCell(store, protocol, pair, len(kept), predictions)
-
-
-def _read_pairs(path: Path, pair: Tensor) -> Arrays:
-    pairs = read_arrays(path, PAIRS)
-    number = min(len(pairs[key]) for key in PAIRS)
-    if not 0 <= int(pair.min()) <= int(pair.max()) < number:
-        raise ValueError(f"{path} has {number} image pairs, there are samples of {int(pair.max()) + 1}: remove it")
-    return pairs

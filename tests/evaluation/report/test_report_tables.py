@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation.report.accuracy import by_motion, report_tables
+from kornia_learnnorm.evaluation.report.accuracy import report_tables
 from kornia_learnnorm.evaluation.report.numbers import mean_share, median_number, number, paired_change
 from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
 from kornia_learnnorm.evaluation.report.robust_tables import PRINTED, robust_tables
@@ -30,8 +30,6 @@ def test_accuracy_and_tests(run):
     tests = {row[0]: row for row in as_text(tables["Paired tests: scenes, filtered"].rows)}
     assert tests["none"][1].startswith("+")
     assert tests["Hartley+LM"][1].startswith("-")
-    assert len(tables["By motion: scenes, filtered"].rows) == 8
-    assert 0 < len(tables["Worst failures: scenes, filtered"].rows) <= 10
 
 
 def test_numbers():
@@ -56,9 +54,6 @@ def without_truth(run, robust):
     for results in (*(p for cell in run.cells for p in cell.predictions.values()), *robust_results):
         for key in results.keys() & truth:
             results[key][:] = torch.nan
-    for values in run.pairs["scenes"].values():
-        if values.dtype.kind == "f":
-            values[:] = np.nan
     return run, robust
 
 
@@ -97,44 +92,12 @@ def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_r
     assert rows["whitening"][2].startswith(f"{100 * shares[:, 1].mean():.1f} [")
     header = tables["Fit and accuracy: scenes, filtered"].header[:4]
     assert header == ["method", "fit px", "held out px", "condition number"]
-    assert not any("By motion" in title or "Worst" in title for title in tables)
     robust.about["stores"]["kitti_06"] = "images of a folder, 3 pairs, 990 matches"
     table, time, tests = (table.known_parts() for table in robust_tables(robust)[:3])
     assert table.header == ["estimator", "inliers % @0.1 px", "inliers % @1 px"]
     assert time.header == ["estimator", "ms @0.1 px", "samples @0.1 px", "ms @1 px", "samples @1 px"]
     assert tests.header[2:] == ["inliers @0.1 px: change, p", "inliers @1 px: change, p"]
     assert "ground-truth" not in [row[0] for row in (*table.rows, *time.rows)]
-
-
-def motion_cell(forward, truth):
-    """Six pairs of two samples each; the figures other than ``forward`` are not known."""
-    error = torch.tensor(truth, dtype=torch.float64).repeat_interleave(2)
-    errors = {"own": torch.arange(12) + 1.0, "heldout": torch.arange(12) + 1.0, "truth": error}
-    cell = RunCell("a", "filtered", torch.arange(6).repeat_interleave(2), 12, {"Hartley": errors, "mine": errors})
-    unknown = np.full(6, np.nan)
-    pairs = {"rotation": unknown, "forward": np.array(forward), "parallax": unknown, "inliers": unknown}
-    return cell, Run({}, [cell], {"a": pairs}, {}, {})
-
-
-class TestByMotion:
-    def test_counts_and_digits(self):
-        """A median of 0.999555 that three digits round to 1, among samples of which some have no truth."""
-        nan = float("nan")
-        table = by_motion(*motion_cell([0.2, 0.4, 0.9995, 0.99961, 0.99962, 0.9997], [1, nan, 1, 1, nan, nan]), "mine")
-        assert [row[1:5] for row in table.rows] == [["up to 0.9996", 3, 6, 4], ["above 0.9996", 3, 6, 2]]
-        assert "Not shown: rotation, degrees, known of 0 of 6 pairs, at least 4 are needed; parallax" in table.text
-
-    @pytest.mark.parametrize(
-        ("forward", "text"),
-        [
-            ([0.9995, 0.9996, 0.9997, *3 * [0.9998]], "from 0.9995 to 0.9998 in all pairs"),
-            (6 * [0.5], "0.5 in all pairs"),
-        ],
-    )
-    def test_what_hardly_differs_has_no_halves(self, forward, text):
-        table = by_motion(*motion_cell(forward, 6 * [1]), "mine")
-        assert table.rows == []
-        assert f"forward share of the translation, {text}" in table.text
 
 
 def test_the_rate_of_known_distributions():
@@ -146,7 +109,7 @@ def test_the_rate_of_known_distributions():
     trained_on = {"Hartley": [], "crossview": ["kitti_06@0:3"]}
     about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(own, ""), "trained_on": trained_on}
     about["stores"] = {"kitti_06": "KITTI odometry 06, 200 pairs, 20000 matches"}
-    (table,) = rate_tables(Run(about, [cell], {}, {}, {}))
+    (table,) = rate_tables(Run(about, [cell], {}, {}))
     name, rate, trained_on = table.rows[0]
     (low, high), rate = rate.interval, rate.value
     assert (name, trained_on) == ("crossview", "kitti_06@0:3")

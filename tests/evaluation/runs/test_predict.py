@@ -11,7 +11,6 @@ import torch
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
-from kornia_learnnorm.evaluation.runs.pair_motions import pair_motions
 from kornia_learnnorm.evaluation.runs.predict import consensus, predict
 from kornia_learnnorm.metrics.inliers import f1_score, inlier_share
 from kornia_learnnorm.protocol import THRESHOLDS
@@ -62,15 +61,3 @@ def test_consensus_is_that_of_the_metrics(max_ratio):
     assert found["inliers"][3].tolist() == found["f1"][3].nan_to_num().tolist() == [0, 0]
     assert found["f1"][1].isnan().all()
     assert (found["f1"][0] > 0).any()
-
-
-def test_motions_by_hand():
-    store = synthetic_store(pairs=2, points=100, seed=0, outliers=0.0)
-    found = pair_motions(store)
-    angle = np.degrees(np.arccos((np.trace(store.R, axis1=1, axis2=2) - 1) / 2))
-    np.testing.assert_allclose(found["rotation"], angle, atol=1e-4)
-    np.testing.assert_allclose(found["forward"], np.abs(store.t[:, 2]) / np.linalg.norm(store.t, axis=1))
-    assert (found["parallax"] > 0).all()
-    assert (found["inliers"] > 0.4).all()
-    store.F[0] = np.nan
-    assert np.isnan(pair_motions(store)["parallax"][0])

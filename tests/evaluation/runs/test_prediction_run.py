@@ -107,7 +107,7 @@ def test_damaged_or_of_another_version(copied, reading, refused, name, text, mes
         refused(again, message)
 
 
-@pytest.mark.parametrize("name", ["scenes/filtered/crossview", "scenes/pairs", "sizes/none", "example"])
+@pytest.mark.parametrize("name", ["scenes/filtered/crossview", "sizes/none", "example"])
 def test_damaged_arrays(copied, reading, refused, name):
     path = copied / f"{name}.npz"
     path.write_bytes(path.read_bytes()[:200])
