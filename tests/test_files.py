@@ -7,15 +7,16 @@ import sys
 
 import pytest
 
+from kornia_learnnorm import files
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.files import atomic_write, exclusive
 
+# Without the package, which takes seconds to import.
 HOLD = """
-import sys
-from kornia_learnnorm.files import exclusive
-with exclusive(sys.argv[1]):
+import runpy, sys
+with runpy.run_path(sys.argv[2])["exclusive"](sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -38,7 +39,7 @@ def test_a_lock_is_refused_then_released_also_after_an_error_and_leaves_no_file(
 
 
 def test_a_killed_process_does_not_block(tmp_path):
-    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    command = [sys.executable, "-c", HOLD, str(tmp_path), files.__file__]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "held\n"
         with pytest.raises(BlockingIOError, match=f"{tmp_path} is in use by process {process.pid} on "):

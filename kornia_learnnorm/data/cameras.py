@@ -41,8 +41,6 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
         numbers = np.array(content.replace(",", " ").split(), float)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"camera {text}: no such file; {expected}") from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"camera {text}: not a text file; {expected}") from error
     except ValueError as error:
         raise ValueError(f"camera {text}: {expected}: {error}") from error
     if numbers.size == 4:

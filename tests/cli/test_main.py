@@ -18,8 +18,10 @@ import yaml
 from safetensors.torch import load_file
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.cli import synthesize
 from kornia_learnnorm.cli.main import TOOLS, TRAINING, main, make_parser
 from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from lightning_modules.config_files import find_config
@@ -208,7 +210,8 @@ def test_output_whose_reader_has_ended_is_no_error(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_synthesize(tmp_path, refused):
+def test_synthesize(tmp_path, monkeypatch, refused):
+    monkeypatch.setattr(synthesize, "render_pair", lambda seed: render_pair(seed, 96, 72))
     assert main(["synthesize", str(tmp_path), "--pairs", "2", "--points", "80"]) == 0
     assert len(read_store(tmp_path / "synthetic.h5")) == 6
     assert {path.name for path in tmp_path.glob("[gi]*")} == {"ground_truth.json", "image1.png", "image2.png"}

@@ -23,7 +23,7 @@ def test_calibration_of_kitti(tmp_path):
     path.write_text(f"P0: {rows.format(718.856, 0)}\nP1: {rows.format(700, -386.1448)}\n")
     assert read_camera(str(path)).tolist() == [[718.856, 0, 607.1928], [0, 718.856, 185.2157], [0, 0, 1]]
     path.write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match="not a text file"):
+    with pytest.raises(ValueError, match=r"expected .*codec can't decode"):
         read_camera(str(path))
     path.write_text("P0: 1 2 3\n")
     with pytest.raises(ValueError, match=r"calib\.txt, line 1.*12 numbers"):

@@ -92,19 +92,15 @@ class TestBroken:
         with pytest.raises(ValueError, match=rf"{name} .*: {len(change(data))} bytes, [^\n<]*truncated or corrupt$"):
             read_image(path)
 
-    def test_not_a_file(self, tmp_path):
+    def test_not_a_file(self, tmp_path, monkeypatch):
         for read in (read_image, image_size):
             with pytest.raises(FileNotFoundError, match=r"nothing\.png"):
                 read(tmp_path / "nothing.png")
         with pytest.raises(ValueError, match=r"bytes, Is a directory$"):
             read_image(tmp_path)
-
-    def test_without_pillow(self, tmp_path, monkeypatch):
-        cv2.imwrite(str(tmp_path / "image.png"), texture())
         monkeypatch.setitem(sys.modules, "PIL.Image", None)
-        for read in (read_image, image_size):
-            with pytest.raises(ImportError, match=r"pip install '\.\[images\]'"):
-                read(tmp_path / "image.png")
+        with pytest.raises(ImportError, match=r"pip install '\.\[images\]'"):
+            read_image(tmp_path)
 
 
 class TestSizeAndTurn:
@@ -125,10 +121,6 @@ class TestSizeAndTurn:
     def test_unreadable(self, tmp_path, data):
         (tmp_path / "broken.png").write_bytes(data)
         assert image_size(tmp_path / "broken.png") == (0, 0)
-
-    def test_large_image_is_no_reason_to_warn(self, tmp_path):
-        (tmp_path / "large.pgm").write_bytes(b"P5\n10000 10000\n255\n")
-        assert image_size(tmp_path / "large.pgm") == (10000, 10000)
 
 
 class TestMaxSize:
@@ -234,13 +226,10 @@ class TestReadMask:
         assert read_mask(tmp_path / "m.png", (240, 180), max_size=100).shape == (75, 100)
 
     @pytest.mark.parametrize(
-        ("mask", "size", "message"),
-        [
-            (np.full((4, 5), 255, np.uint8), (4, 5), r"m\.png has 5 x 4 pixels, its image 4 x 5"),
-            (np.ones((4, 5), np.uint8), (5, 4), r"m\.png has no pixel above 127"),
-        ],
+        ("size", "message"),
+        [((4, 5), r"m\.png has 5 x 4 pixels, its image 4 x 5"), ((5, 4), r"m\.png has no pixel above 127")],
     )
-    def test_wrong(self, tmp_path, mask, size, message):
-        cv2.imwrite(str(tmp_path / "m.png"), mask)
+    def test_wrong(self, tmp_path, size, message):
+        cv2.imwrite(str(tmp_path / "m.png"), np.ones((4, 5), np.uint8))
         with pytest.raises(ValueError, match=message):
             read_mask(tmp_path / "m.png", size)
