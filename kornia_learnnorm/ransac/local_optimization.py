@@ -24,6 +24,7 @@ LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has conve
 MANIFOLD_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages by Levenberg-Marquardt
 MANIFOLD_STEPS = 2  # steps of Levenberg-Marquardt in a stage
 SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
+MIN_EFFECT = 0.1  # share of the noise that two more parameters must explain: errors of matches are not independent
 MIN_NOISE = 0.01  # thresholds; smaller distances don't speak against cameras
 
 
@@ -89,7 +90,9 @@ def _contradicts(cost: RobustCost, free: Tensor, gain: float, threshold: float) 
 
     The :math:`\tau` test: the gain over the mean of :math:`\psi^2` and times that of :math:`\psi'`, where
     :math:`\psi(d)` is half of the loss's derivative, is twice an F-distributed number of 2 and :math:`m` degrees of
-    freedom, which is above :math:`x` with probability :math:`(1 + 2x / m)^{-m / 2}`.
+    freedom, which is above :math:`x` with probability :math:`(1 + 2x / m)^{-m / 2}`. It takes the errors of matches to be
+    independent. Those of neighbours are not, and a thousand matches find the cameras of photographs significantly
+    wrong where they are right, so the parameters must also explain a tenth of the noise.
 
     Reference:
         F. Hampel, E. Ronchetti, P. Rousseeuw, W. Stahel, Robust Statistics, 1986, section 7.2.
@@ -103,7 +106,7 @@ def _contradicts(cost: RobustCost, free: Tensor, gain: float, threshold: float) 
     noise = (squares + (MIN_NOISE * threshold) ** 2) * weights.square()
     slope = weights * (4 * weights.sqrt() - 3)  # of Geman and McClure's psi
     statistic = gain * float(slope.sum() / noise.sum())
-    return statistic > freedom * (math.pow(SIGNIFICANCE, -2 / freedom) - 1)
+    return statistic > freedom * max(math.pow(SIGNIFICANCE, -2 / freedom) - 1, MIN_EFFECT)
 
 
 def _cost(
