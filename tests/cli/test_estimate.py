@@ -196,19 +196,16 @@ class TestManyPairs:
             many(*options)
         assert not Path("found").exists()
 
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            ("'a.png b.png\n", "line 1: No closing quotation"),
-            ("a.png b.png c.png\n", "line 1: two image files expected, got 3"),
-            ("\n", "lists no pairs"),
-        ],
-    )
-    def test_lists(self, tmp_path, text, message):
+    def test_lists(self, tmp_path):
         """Of names with spaces and comments, and bad ones."""
         path = tmp_path / "list.txt"
         path.write_text("# two images\n'a b.png' c.png\n")
         assert read_pair_list(path) == [(tmp_path / "a b.png", tmp_path / "c.png")]
-        path.write_text(text)
-        with pytest.raises(ValueError, match=message):
-            read_pair_list(path)
+        for text, message in (
+            ("'a.png b.png\n", "line 1: No clos"),
+            ("a b c\n", "line 1: .* got 3"),
+            ("\n", "no pairs"),
+        ):
+            path.write_text(text)
+            with pytest.raises(ValueError, match=message):
+                read_pair_list(path)

@@ -18,7 +18,6 @@ from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.diagnostics import diagnose
-from kornia_learnnorm.evaluation.methods import CLOSED_FORMS, SHIPPED
 from kornia_learnnorm.evaluation.report.accuracy import report_tables
 from kornia_learnnorm.evaluation.runs import example
 from kornia_learnnorm.evaluation.runs.prediction_run import read_run
@@ -44,8 +43,8 @@ def folder(tmp_path_factory):
 
 def read_tables(text):
     """Titles, and of each table the columns' names and the cells by row; texts that no table follows are left out."""
-    parts, read = text.strip().split("\n\n"), {}
-    for title, table in itertools.pairwise(parts):
+    read = {}
+    for title, table in itertools.pairwise(text.strip().split("\n\n")):
         if table.startswith("|"):
             header, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines())
             read[title] = header, {row[0]: row[1:] for row in rows}
@@ -138,16 +137,6 @@ def test_evaluate_says_what_its_rows_are(folder, tmp_path, capsys):
     assert "mean, median: symmetric epipolar distance" in printed.out
 
 
-def test_weights_are_added_to_the_default_methods(folder, capsys, monkeypatch):
-    monkeypatch.setitem(CLOSED_FORMS, "searched", kln.Hartley)  # takes no time
-    words = ["--max-samples", "8", "--weights", str(folder / "tilted/weights.safetensors")]
-    assert main(["evaluate", str(folder / "known.h5"), *words]) == 0
-    for _, rows in read_tables(capsys.readouterr().out).values():
-        *names, last = rows
-        assert last == "searched"
-        assert names == ["none", "Hartley", "whitening", "reweighted", *SHIPPED, "tilted"]
-
-
 def test_json_has_the_numbers_of_the_tables(folder, tmp_path, capsys):
     words = ["evaluate", str(folder / "known.h5"), "--methods", "Hartley", "crossview"]
     path = tmp_path / "tables.json"
@@ -195,12 +184,10 @@ def test_without_ground_truth_there_are_no_columns_of_it(folder, capsys):
     ("stores", "weights", "message"),
     [
         (["known.h5"], ["tilted", "other/tilted"], "two methods have the same name, tilted: "),
-        (["known.h5"], ["Hartley.safetensors"], "two methods have the same name, Hartley: "),
         (["known.h5", "other/known.h5"], ["tilted"], "two files have the same name, known: "),
         (["known.h5", "none.h5"], ["tilted"], "no store at"),
         (["tilted"], ["tilted"], "tilted; it is a folder, and learnnorm match folder makes"),
         (["known.h5", "known.h5@2:19"], ["tilted"], "pairs 2:19 were asked for, the store has 0:9"),
-        (["known.h5"], ["known.h5"], "no weights"),
         (["tilted/weights.safetensors"], ["tilted"], "not a readable HDF5 file"),
     ],
 )
