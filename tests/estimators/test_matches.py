@@ -41,12 +41,15 @@ def test_by_keypoint_is_the_same_as_pairs(index):
         assert torch.equal(got, expected)
 
 
-def test_at_least_eight_rows():
-    nothing = torch.full((2, 30), -1)
-    points1, _, weights, mask = correspondences_from_matches(*KEYPOINTS, nothing)
-    assert points1.shape == (2, 8, 2)
-    assert weights is None
-    assert not mask.any()
+@pytest.mark.parametrize("empty", [(), (0,), (1,), (0, 1)])
+def test_at_least_eight_rows_of_views_without_keypoints_or_matches(empty):
+    keypoints = [torch.rand(2, 0 if k in empty else 30, 2) for k in range(2)]
+    nothing = torch.zeros(0, 2, dtype=torch.int64)
+    for matches in ([nothing, nothing], torch.full(keypoints[0].shape[:2], -1)):
+        points1, _, weights, mask = correspondences_from_matches(*keypoints, matches)
+        assert points1.shape == (2, 8, 2)
+        assert weights is None
+        assert not mask.any()
 
 
 def test_gradients_reach_keypoints_and_scores():
@@ -86,12 +89,3 @@ def test_wrong_keypoints():
         correspondences_from_matches([[0.0, 0.0]], KEYPOINTS[1], FIRST)
     with pytest.raises(ShapeError):
         correspondences_from_matches(KEYPOINTS[0][0], KEYPOINTS[1][0], FIRST[:1])
-
-
-@pytest.mark.parametrize("empty", [(0,), (1,), (0, 1)])
-def test_views_without_keypoints(empty):
-    keypoints = [torch.rand(2, 0 if k in empty else 30, 2) for k in range(2)]
-    nothing = torch.zeros(0, 2, dtype=torch.int64)
-    assert not correspondences_from_matches(*keypoints, [nothing, nothing]).mask.any()
-    by_keypoint = torch.full(keypoints[0].shape[:2], -1)
-    assert not correspondences_from_matches(*keypoints, by_keypoint).mask.any()

@@ -157,7 +157,7 @@ class TestRefineFundamental:
         gradients = []
         for count in (1, 3):
             values = [value.repeat(count, 1, 1).requires_grad_() for value in points]
-            found = refine_fundamental(*values, F0, max_iterations=200)
+            found = refine_fundamental(*values, F0, max_iterations=60)
             assert found.converged.all()
             gradients.append([g.sum(0) for g in torch.autograd.grad(signless(found.F_mat).sum(), values)])
         for one, many in zip(*gradients, strict=True):

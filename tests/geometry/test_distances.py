@@ -141,17 +141,6 @@ class TestDistanceScales:
             torch.testing.assert_close(got.detach(), want)
         assert torch.equal(scale(*norms, slopes=False)[0], value)
 
-    @pytest.mark.parametrize(
-        ("scale", "distance"), [(sampson_scale, sampson_distance), (symmetric_scale, symmetric_epipolar_distance)]
-    )
-    def test_scales_the_algebraic_residual(self, scale, distance):
-        scene = scenes("handheld", 3, 12)
-        F_mat = scene.F_mat / torch.linalg.matrix_norm(scene.F_mat, keepdim=True)
-        x1, x2 = (torch.from_numpy(homogeneous(x.numpy())) for x in (scene.points1, scene.points2))
-        sq_norms = [(x2 @ F_mat)[..., :2].square().sum(-1), (x1 @ F_mat.mT)[..., :2].square().sum(-1)]
-        expected = algebraic_distance(scene.points1, scene.points2, F_mat) * scale(*sq_norms)[0]
-        torch.testing.assert_close(distance(scene.points1, scene.points2, F_mat), expected)
-
 
 class TestLineNorms:
     @pytest.mark.parametrize("weighted", [False, True])

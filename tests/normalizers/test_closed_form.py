@@ -67,11 +67,3 @@ class TestWhitening:
             covariance = torch.tensor([[1 + step, step], [step, 1]], dtype=torch.float64).requires_grad_()
             (gradient,) = torch.autograd.grad((inverse_sqrt(covariance) * uniform(2, 2)).sum(), [covariance])
             assert gradient.abs().max() < 2  # half of the weights at most, and no division by the gap
-
-    @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
-    def test_inverse_sqrt(self, scale):
-        A = uniform(50, 2, 2, low=-1)
-        covariance = scale * (A @ A.mT + 1e-3 * torch.eye(2))
-        root = inverse_sqrt(covariance)
-        np.testing.assert_allclose((root @ covariance @ root).numpy(), np.tile(np.eye(2), (50, 1, 1)), atol=1e-8)
-        assert torch.equal(inverse_sqrt(torch.zeros(2, 2)), torch.eye(2))

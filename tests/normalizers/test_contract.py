@@ -83,21 +83,6 @@ def test_coincident_points_keep_their_scale(name, num_points, value, weighted, d
         np.testing.assert_allclose(T[0].numpy(), [[1, 0, -value], [0, 1, -value], [0, 0, 1]], rtol=1e-5)
 
 
-@pairwise(name=["hartley", "whitening"], kind=["coincident", "horizontal", "diagonal", "two places"], dtype=DTYPES)
-def test_degenerate_points(name, kind, dtype):
-    t = uniform(4, 9, 1, dtype=dtype)
-    points = {
-        "coincident": torch.full((4, 9, 2), 320.0, dtype=dtype),
-        "horizontal": 600 * torch.cat([t, torch.zeros_like(t)], -1),
-        "diagonal": 600 * torch.cat([t, 0.3 * t], -1) + 17,
-        "two places": 600 * (t > 0.5).to(dtype).repeat(1, 1, 2),
-    }[kind].requires_grad_()
-    weights = uniform(4, 9, dtype=dtype).requires_grad_()
-    T1, T2 = ALL[name]()(points, points, weights)
-    gradients = torch.autograd.grad((T1 * uniform(3, 3, dtype=dtype)).sum() + T2.sum(), [points, weights])
-    assert all(torch.isfinite(value).all() for value in (T1, T2, *gradients))
-
-
 @pytest.mark.parametrize("name", ["reweighted", *LEARNED, "searched"])
 def test_exceptions(name):
     check_refuses(ALL[name]())
