@@ -53,9 +53,7 @@ def rank2_projection(F_mat: Tensor) -> Tensor:
     return nearest_rank2(F_mat)
 
 
-def optimal_rank2(
-    F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None, iterations: int = ITERATIONS
-) -> Tensor:
+def optimal_rank2(F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:
     r"""Correct matrices to rank 2 along the directions that the correspondences leave uncertain.
 
     With :math:`u = \mathrm{vec}(F)`, :math:`\|u\| = 1`, :math:`\xi_i = x_{2,i} \otimes x_{1,i}` and :math:`V_i` the
@@ -70,14 +68,13 @@ def optimal_rank2(
     .. math:: u \leftarrow N\Big[ u - \frac{(u, u^\dagger)}{3\, (u^\dagger, V_0 u^\dagger)} V_0 u^\dagger \Big], \quad
               V_0 \leftarrow P_u V_0 P_u .
 
-    A projection in Hartley's coordinates removes the rest of the determinant.
+    After three iterations, a projection in Hartley's coordinates removes the rest of the determinant.
 
     Args:
         F_mat: matrices in pixels with shape :math:`(B, 3, 3)`, any scale but zero, such as null vectors of the DLT.
         points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 8`, float32 or float64.
         points2: pixels in the second image with shape :math:`(B, N, 2)`.
         weights: optional non-negative weights :math:`(B, N)`, inverse variances up to scale; zero means absent.
-        iterations: number of steps; 0 projects in Hartley's coordinates and nothing else.
 
     Returns:
         fundamental matrices with shape :math:`(B, 3, 3)` in the dtype of the points, of rank 2 and unit Frobenius norm.
@@ -88,7 +85,7 @@ def optimal_rank2(
         TypeError: if an argument is not a floating-point tensor or the points are not of one dtype.
         ShapeError: if a shape is wrong.
         ValueError: if there are fewer than eight correspondences, shapes do not pair up, a value is not finite, a
-            matrix is zero, or ``iterations`` is negative.
+            matrix is zero.
 
     Reference:
         K. Kanatani, Y. Sugaya, Fundamental matrix computation: theory and practice, Memoirs of the Faculty of
@@ -103,27 +100,22 @@ def optimal_rank2(
     """
     check_correspondences(points1, points2, weights)
     check_matrices("F_mat", F_mat, len(points1))
-    if iterations < 0:
-        raise ValueError(f"iterations must be >= 0, got {iterations}")
     dtype = solve_dtype(points1.device)
     weights = None if weights is None else weights.to(dtype)
     (x1, x2), (T1, T2) = hartley_coordinates(torch.stack([points1, points2]).to(dtype), weights)
     F_hat = transform_fundamental(F_mat.to(x1), inverse(T1), inverse(T2))
-    F_hat = correct_rank2(F_hat, x1, x2, weights, T1[:, 0, 0] / T2[:, 0, 0], iterations)
+    F_hat = correct_rank2(F_hat, x1, x2, weights, T1[:, 0, 0] / T2[:, 0, 0])
     return unit_matrix(transform_fundamental(F_hat, T1, T2)).to(points1.dtype)
 
 
-def correct_rank2(
-    F_hat: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor, iterations: int = ITERATIONS
-) -> Tensor:
+def correct_rank2(F_hat: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale: Tensor) -> Tensor:
     """Return the optimal correction of matrices (B, 3, 3) in Hartley's coordinates; see :func:`optimal_rank2`.
 
     Points are homogeneous, (B, N, 3). ``scale`` is that of view 1 over that of view 2, (B,): noise that is equal in
     pixels is not equal there.
     """
     u = normalize(F_hat.flatten(-2), dim=-1)
-    if iterations:
-        u = _correct(u, _covariance(u, x1, x2, weights, scale[:, None]), iterations)
+    u = _correct(u, _covariance(u, x1, x2, weights, scale[:, None]))
     return nearest_rank2(torch.unflatten(u, -1, (3, 3)))
 
 
@@ -146,9 +138,9 @@ def _covariance(u: Tensor, x1: Tensor, x2: Tensor, weights: Tensor | None, scale
     return torch.where(held, covariance.detach(), covariance)
 
 
-def _correct(u: Tensor, covariance: Tensor, iterations: int) -> Tensor:
+def _correct(u: Tensor, covariance: Tensor) -> Tensor:
     visited: list[Tensor] = []
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         visited.append(u)
         gradient = step = cofactors(torch.unflatten(u, -1, (3, 3))).flatten(-2)
         # Projecting the vectors costs less than projecting V_0.
