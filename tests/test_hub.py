@@ -93,7 +93,6 @@ def test_weights_of_another_class_or_none_are_refused(folder):
         hub.HubModel.from_pretrained(folder)
 
 
-@pytest.mark.parametrize("layer", [torch.nn.Linear(2, 2), kln.EightPoint(), None])
-def test_other_modules_are_refused(layer):
-    with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedNormalizer, got "):
-        hub.HubModel(layer)
+def test_other_modules_are_refused():
+    with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedNormalizer, got EightPoint"):
+        hub.HubModel(kln.EightPoint())

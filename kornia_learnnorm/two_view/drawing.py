@@ -33,6 +33,7 @@ DPI = 150  # pixels per inch: pictures are 1,200 pixels wide
 MAX_HEIGHT = 6.0  # inches, of an image above another
 WIDE = 1.8  # width over height from which two images are stacked
 UNEQUAL = 2.5  # ratio of the images' aspects from which they are stacked
+NUM_LINES = 24  # epipolar lines at most
 LINE = 0.17  # inches, height of a line of text
 COLUMNS = 120  # characters in a line of text
 
@@ -70,8 +71,6 @@ def draw_pair(
     image2: npt.NDArray[np.uint8],
     estimate: PairEstimate,
     path: str | Path,
-    num_lines: int = 24,
-    seed: int = 0,
 ) -> None:
     """Draw the matches in image 1 and epipolar lines in image 2, and write the picture whole or not at all.
 
@@ -83,9 +82,7 @@ def draw_pair(
     for image, size in ((image1, estimate.size1), (image2, estimate.size2)):
         if abs(image.shape[1] * size[1] - image.shape[0] * size[0]) > max(size) + max(image.shape[:2]):
             raise ValueError(f"the estimate is of an image of {size[0]} x {size[1]} pixels, got shape {image.shape}")
-    if num_lines < 0:
-        raise ValueError(f"num_lines must not be negative, got {num_lines}")
-    outliers, num_lines = estimate.num_matches - estimate.num_inliers, min(num_lines, estimate.num_inliers)
+    outliers, num_lines = estimate.num_matches - estimate.num_inliers, min(NUM_LINES, estimate.num_inliers)
     above = (
         f"Image 1: {estimate.num_inliers} inliers and their motion in blue, {outliers} outliers in red\n"
         f"Image 2: {num_lines} epipolar lines; predicted error of F: typically {estimate.predicted_error:.2f} px"
@@ -97,7 +94,7 @@ def draw_pair(
     if below:
         figure.supxlabel("\n".join(below), x=0.01, ha="left", color=OUTLIER, fontsize=9, linespacing=1.2)
     draw_matches(axes1, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
-    _draw_lines(axes2, estimate, num_lines, seed)
+    _draw_lines(axes2, estimate)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor=figure.get_facecolor())
 
@@ -123,9 +120,9 @@ def _panels(
     return figure, panels
 
 
-def _draw_lines(axes: Axes, estimate: PairEstimate, num_lines: int, seed: int) -> None:
+def _draw_lines(axes: Axes, estimate: PairEstimate) -> None:
     rows = torch.nonzero(estimate.inliers).flatten().numpy()
-    chosen = np.random.default_rng(seed).permutation(rows)[:num_lines]
+    chosen = np.random.default_rng(0).permutation(rows)[:NUM_LINES]
     points1, points2 = estimate.points1[chosen].numpy(), estimate.points2[chosen].numpy()
     lines = np.pad(points1, ((0, 0), (0, 1)), constant_values=1.0) @ estimate.F_mat.numpy().T
     hues = np.linspace(0, 1, len(chosen), endpoint=False)

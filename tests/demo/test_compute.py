@@ -9,7 +9,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import epipolar_distances
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import epipolar_distances, uniform
 
 from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.demo import compute as module
@@ -50,8 +52,6 @@ class TestFiles:
         ("content", "message"),
         [
             (b"", "0 bytes"),
-            (b"no pixels at all", "not an image"),
-            (png(200, 100)[:60], "truncated or corrupt"),
             (png(200, 100) + bytes(3000), "at most 0 MB"),
             (png(400, 300), "exceeds limit of 100000 pixels"),
         ],
@@ -78,13 +78,6 @@ class TestCompare:
         assert content.keys() == expected.as_dict().keys()
         assert content["image1"] == {"file": "image1.png", "width": 320, "height": 240}
 
-    def test_hartley_takes_all_matches_and_predicts_nothing(self, results):
-        estimate = results["Hartley"].estimate
-        distances = epipolar_distances(estimate.points1, estimate.points2, estimate.F_mat)
-        assert np.array_equal(estimate.inliers.numpy(), distances < 1)
-        assert results["Hartley"].as_dict()["predicted_error_px"] is None
-        assert estimate.warnings == ()
-
     def test_the_robust_methods_are_nearer_to_the_truth(self, example, results):
         ransac = results["RANSAC"].estimate
         inliers = ransac.points1[ransac.inliers], ransac.points2[ransac.inliers]
@@ -95,6 +88,7 @@ class TestCompare:
             assert (error < 0.5) == (method != "Hartley")
             assert (result.median_distance(*inliers) < 0.5) == (method != "Hartley")
             assert result.seconds > 0
+        assert results["Hartley"].as_dict()["predicted_error_px"] is None
 
     def test_a_method_without_a_matrix_says_why(self, example, results, monkeypatch):
         def estimate(matched, layer):
@@ -118,10 +112,9 @@ class TestCompare:
 
 
 class TestEpipolarSegments:
-    @pytest.mark.parametrize("seed", range(20))
+    @given(st.integers(0, 2**31))
     def test_the_ends_lie_on_the_line_and_on_the_border(self, seed):
-        generator = torch.Generator().manual_seed(seed)
-        F_mat = torch.rand(3, 3, dtype=torch.float64, generator=generator) - 0.5
+        F_mat = uniform(3, 3, low=-0.5, high=0.5, seed=seed)
         F_mat[2] *= 20  # so that some lines meet the image
         line = F_mat.numpy() @ [3.0, 5.0, 1.0]
         ends = epipolar_segment(F_mat, (3.0, 5.0), (40, 30))

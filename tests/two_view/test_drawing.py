@@ -37,8 +37,8 @@ def draw(tmp_path_factory):
     """A function that draws a pair and returns the picture, (H, W, 3)."""
     folder = tmp_path_factory.mktemp("pictures")
 
-    def call(image1, image2, estimate, **options):
-        draw_pair(image1, image2, estimate, folder / "pair.png", **options)
+    def call(image1, image2, estimate):
+        draw_pair(image1, image2, estimate, folder / "pair.png")
         assert [path.name for path in folder.iterdir()] == ["pair.png"]
         return image_module.imread(folder / "pair.png")[..., :3]
 
@@ -47,7 +47,7 @@ def draw(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def picture(draw):
-    return draw(*make_pair(), num_lines=0)
+    return draw(*make_pair())
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_draw_line_from_border_to_border(line, ends):
 
 
 class TestDrawPair:
-    @pytest.mark.parametrize(("width", "height", "ratio"), [(160, 120, 0.42), (300, 100, 0.75), (90, 120, 0.72)])
+    @pytest.mark.parametrize(("width", "height", "ratio"), [(160, 120, 0.42), (300, 100, 0.75)])
     def test_layout_follows_the_shape(self, draw, width, height, ratio):
         picture = draw(*make_pair(width, height))
         assert picture.shape[1] == 1200
@@ -81,25 +81,15 @@ class TestDrawPair:
         assert blue > 200
         assert red > 20
 
-    def test_deterministic_and_seeded(self, draw):
-        a, b, c = (draw(*make_pair(), num_lines=5, seed=seed) for seed in (0, 0, 1))
-        assert np.array_equal(a, b)
-        assert not np.array_equal(a, c)
-
     def test_images_of_different_shapes_and_no_outliers(self, draw):
         """Image 1 is three times as wide as high and fills the width, image 2 stands below in its own shape."""
         image1, _, estimate = make_pair(300, 100)
         estimate = dataclasses.replace(estimate, size2=(70, 100), inliers=torch.ones(30, dtype=torch.bool))
         green = np.tile(np.uint8([0, 255, 0]), (100, 70, 1))
-        picture = draw(image1, green, estimate, num_lines=0)
-        rows, columns = ((picture == [0, 1, 0]).all(2).any(axis) for axis in (1, 0))
-        assert columns.sum() / rows.sum() == pytest.approx(0.7, abs=0.02)
-        assert picture.shape[0] > 1200 / 3 + rows.sum()
-
-    def test_colours_of_the_images(self, draw):
-        _, image2, estimate = make_pair()
-        green = np.tile(np.uint8([0, 255, 0]), (60, 80, 1))  # half of the size: where the image was large
-        assert (draw(green, image2, estimate) == [0, 1, 0]).all(2).mean() > 0.3
+        picture = draw(image1, green, estimate)
+        height, width = (np.ptp(places) for places in (picture == [0, 1, 0]).all(2).nonzero())
+        assert width / height == pytest.approx(0.7, abs=0.02)
+        assert picture.shape[0] > 1200 / 3 + height
 
     def test_warnings_are_written_below(self, draw, picture):
         image1, image2, estimate = make_pair()
@@ -108,24 +98,23 @@ class TestDrawPair:
         assert bad.shape[0] > picture.shape[0] + 40
         assert (np.abs(bad[picture.shape[0] :] - np.array([0xFF, 0x5C, 0x5C]) / 255).max(2) < 0.1).any()
 
-    @pytest.mark.parametrize("suffix", ["jpg", "webp", "svg"])
+    @pytest.mark.parametrize("suffix", ["jpg", "svg"])
     def test_formats(self, tmp_path, suffix):
         draw_pair(*make_pair(), tmp_path / f"pair.{suffix}")
         assert (tmp_path / f"pair.{suffix}").stat().st_size > 1000
 
     @pytest.mark.parametrize(
-        ("name", "width", "num_lines", "error", "message"),
+        ("name", "width", "error", "message"),
         [
-            ("pair.xyz", 160, 24, ValueError, "not supported"),
-            ("none/pair.png", 160, 24, FileNotFoundError, "does not exist"),
-            ("pair.png", 80, 24, ValueError, r"160 x 120 pixels, got shape \(120, 80\)"),
-            ("pair.png", 160, -1, ValueError, "num_lines must not be negative, got -1"),
+            ("pair.xyz", 160, ValueError, "not supported"),
+            ("none/pair.png", 160, FileNotFoundError, "does not exist"),
+            ("pair.png", 80, ValueError, r"160 x 120 pixels, got shape \(120, 80\)"),
         ],
     )
-    def test_what_is_refused(self, tmp_path, name, width, num_lines, error, message):
+    def test_what_is_refused(self, tmp_path, name, width, error, message):
         image1, image2, estimate = make_pair()
         with pytest.raises(error, match=message):
-            draw_pair(image1, image2[:, :width], estimate, tmp_path / name, num_lines)
+            draw_pair(image1, image2[:, :width], estimate, tmp_path / name)
         assert not list(tmp_path.iterdir())
 
     def test_without_matplotlib(self, tmp_path, monkeypatch):

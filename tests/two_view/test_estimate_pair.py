@@ -153,15 +153,12 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("options", "error", "message"),
         [
-            ({"K1": np.zeros((3, 3)), "K2": K}, ValueError, "K1 must be finite and invertible"),
             ({"K1": K, "K2": K * np.nan}, ValueError, "K2 must be finite and invertible"),
-            ({"threshold": "x"}, TypeError, "threshold must be a number, got 'x'"),
-            *(({"threshold": t}, ValueError, "threshold must be positive") for t in (0.0, -1.0, np.inf, np.nan)),
+            *(({"threshold": t}, ValueError, "threshold must be positive") for t in (0.0, np.inf, np.nan)),
             ({"ratio": "x"}, TypeError, "ratio must be a number, got 'x'"),
             *(({"ratio": ratio}, ValueError, "ratio must be above 0") for ratio in (0.0, -1.0, 1.5, np.nan)),
             ({"max_size": 99.5}, TypeError, "max_size must be a whole number, got 99.5"),
             ({"max_size": 10}, ValueError, "max_size must be at least 64"),
-            ({"seed": -1}, ValueError, "seed must lie in"),
             ({"detector": "surf"}, ValueError, "detector must be one of sift, .*, got 'surf'"),
             ({"matcher": "lightglue"}, ValueError, "matcher lightglue needs detector disk, got sift"),
         ],

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 from rendered import render_kind
-from scenes import WALL_SHIFT, epipolar_distances, homogeneous, repeated_wall, seeded, uniform
+from scenes import WALL_SHIFT, epipolar_distances, repeated_wall, seeded, uniform
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.metrics.poses import pose_error
-from kornia_learnnorm.two_view.repeated_texture import coherent_matches, fitting_share, mutual_share, resolve_ambiguity
+from kornia_learnnorm.two_view.repeated_texture import coherent_matches, fitting_share, resolve_ambiguity
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
@@ -74,21 +73,6 @@ class TestCoherentMatches:
         turned = (points2 @ turn[:2, :2].mT)[order]
         assert (coherent_matches(points1[order], turned, turn @ wall_homography(), 1.0) == expected[order]).all()
 
-    def test_homography_of_a_slanted_wall(self):
-        """Images 1 that are warped by a homography leave the parallax as it was."""
-        points1, points2, _ = repeated_wall()
-        slant = torch.tensor([[1.0, 0.1, 5], [0, 1.1, 0], [8e-4, 2e-4, 1]], dtype=torch.float64)
-        warped = homogeneous(points1.numpy()) @ slant.numpy().T
-        warped1 = torch.from_numpy(warped[:, :2] / warped[:, 2:])
-        expected = coherent_rows(warped1.numpy(), points2.numpy(), (points2 - points1).numpy() - WALL_SHIFT)
-        H = wall_homography() @ torch.linalg.inv(slant)
-        np.testing.assert_array_equal(coherent_matches(warped1, points2, H, 1.0).numpy(), expected)
-
-    @pytest.mark.parametrize("number", [1, 2, 9])
-    def test_few_matches(self, number):
-        points = uniform(number, 2, high=100)
-        assert coherent_matches(points, points, torch.eye(3).double(), 1.0).shape == (number,)
-
 
 def test_fitting_share():
     """Of 40 matches off the plane of no motion, 30 move along the rows, as under a sideways motion; 10 are on it."""
@@ -100,15 +84,6 @@ def test_fitting_share():
     plane = torch.eye(3).double()
     assert fitting_share(points1, points2, plane, sideways, 1.0) == pytest.approx(0.75)
     assert fitting_share(points1[25:], points2[25:], plane, sideways, 1.0) == 1.0  # only 15 off the plane
-
-
-def test_share_of_mutual_matches():
-    """Of the matches that fit and lie off the plane, every second one is mutual."""
-    scene = handheld(1, 100, seeded(), noise=0.0)
-    mutual = torch.arange(100) % 2 == 0
-    share = mutual_share(scene.points1[0], scene.points2[0], mutual, scene.F_mat[0], 1.0)
-    assert 0.3 < share < 0.7
-    assert mutual_share(scene.points1[0], scene.points2[0], mutual, torch.eye(3).double(), 1e-9) == 1.0
 
 
 @pytest.fixture(scope="module")

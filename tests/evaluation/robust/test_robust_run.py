@@ -53,12 +53,12 @@ def test_again_computes_nothing_but_what_is_missing(robust_copied, robust_again,
 def test_redo(robust_copied, robust_again, refused):
     before = times(robust_copied)
     about = json.loads((robust_copied / "run.json").read_text())
-    about["robust"]["estimators"]["RANSAC"] = "RANSAC of old"
+    about["robust"]["estimators"]["opencv-usac"] = "opencv 1"
     (robust_copied / "run.json").write_text(json.dumps(about))
-    refused(robust_again, "is a run of other options, remove it or write elsewhere: RANSAC 'RANSAC of old'")
-    assert main([*robust_again, "--redo", "RANSAC"]) == 0
+    refused(robust_again, "is a run of other options, remove it or write elsewhere: opencv-usac 'opencv 1'")
+    assert main([*robust_again, "--redo", "opencv-usac"]) == 0
     changed = {path.name for path, time in times(robust_copied).items() if time != before[path]}
-    assert changed == {"RANSAC.npz"}
+    assert changed == {"opencv-usac.npz"}
     refused([*robust_again, "--redo", "poselib"], "--redo poselib: not among the estimators of this command")
 
 

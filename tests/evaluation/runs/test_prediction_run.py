@@ -74,9 +74,7 @@ def test_another_run_computes_nothing_and_adds_what_is_new(copied, command, monk
 @pytest.mark.parametrize(
     ("options", "differs"),
     [
-        (["--seed", "1"], "seed 0, now 1"),
         (["--max-samples", "9"], "max_samples 16000, now 9"),
-        (["--max-residual", "30"], "max_residual 60.0, now 30.0"),
         (["--size", "9"], "size 8, now 9"),
         ([], "crossview 'crossview 0000', now 'crossview "),
     ],
@@ -94,7 +92,6 @@ def test_a_run_of_other_options_is_refused(copied, command, refused, options, di
     ("name", "text", "message"),
     [
         ("run.json", "{", "run.json is damaged, it is not JSON"),
-        ("run.json", "[1]", "run.json is damaged: expected an object of JSON, got list"),
         ("run.json", "{}", "a run of format None, expected 4: another version of the package made it, remove it"),
         ("robust.json", "{}", "a run of format 1 with a robust.json, expected 4"),
         ("run.json", '{"format": 4, "evaluate": 1}', "evaluate must be an object, got 1"),
@@ -149,10 +146,13 @@ class TestOwnCode:
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
         monkeypatch.chdir(tmp_path)
 
-    def evaluate(self, store, text):
+    def write(self, text):
         Path("own_normaliser.py").write_text(text)
         sys.modules.pop("own_normaliser", None)
         importlib.invalidate_caches()
+
+    def evaluate(self, store, text):
+        self.write(text)
         methods = ["own_normaliser:Mine", "Hartley"]
         return main(["evaluate", str(store), "--out", "run", "--methods", *methods, "--max-samples", "40"])
 
@@ -168,9 +168,7 @@ class TestOwnCode:
         ],
     )
     def test_one_that_is_no_normaliser(self, text, message):
-        Path("own_normaliser.py").write_text(text)
-        sys.modules.pop("own_normaliser", None)
-        importlib.invalidate_caches()
+        self.write(text)
         before = [*sys.path]
         with pytest.raises(ValueError, match=re.escape(message)):
             find_method("own_normaliser:Mine").estimate(*torch.rand(2, 3, 8, 2, dtype=torch.float64))
