@@ -30,8 +30,8 @@ NUMERICAL |= {"test_losses.py", "test_diagnostics.py", "test_search.py"}
 NUMERICAL |= {"test_parallax.py", "test_repeated_texture.py"}
 # Tests that do not depend on the order of rounding: shapes, errors, files, random draws, and derivatives against
 # differences, whose tolerance is far above it.
-STEADY = r"smoke|wrong|exceptions|TestFiles|TestStrictness|gradcheck|::test_gradients(\[|$)|TestGradients::test_(first|second)"
-STEADY += r"|test_(bootstrap|call_counts|matches|samplers|threads)\.py"
+STEADY = r"smoke|wrong|exceptions|TestFiles|TestStrictness|gradcheck|::test_gradients(\[|$)"
+STEADY += r"|TestGradients::test_(first|second)|test_(bootstrap|call_counts|matches|samplers|threads)\.py"
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
 
