@@ -53,7 +53,10 @@ class Blocks(SyntheticSamples):
 
 
 class Spoil(pl.Callback):
-    """Put NaN into batches: all samples of the last process, one of them, and all samples of all."""
+    """Put NaN into batches: all samples of the last process, one of them, and all samples of all.
+
+    In the fifth step the gradient of the last process is infinite.
+    """
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
         # Of two processes, the last one has every second sample.
@@ -64,10 +67,6 @@ class Spoil(pl.Callback):
 
     def on_validation_batch_start(self, trainer, pl_module, batch, batch_idx, dataloader_idx=0):
         self.on_train_batch_start(trainer, pl_module, batch, batch_idx)
-
-
-class BlowUp(pl.Callback):
-    """Make the gradient of the fifth step infinite, in the last process."""
 
     def on_before_backward(self, trainer, pl_module, loss):
         if trainer.global_rank == trainer.world_size - 1 and trainer.global_step == 4:
@@ -147,9 +146,8 @@ def run(case, processes, folder):
         callbacks = [Checkpoints(every_n_train_steps=1), Stop(3, kill=case == "killed")]
         with contextlib.suppress(InterruptedError):
             make_trainer(folder, callbacks, **options).fit(*task_and_data(case))
-    watch, more = Watch(), [Spoil(), BlowUp()] if case == "spoiled" else []
-    resume = last.exists()
-    more += [Checkpoints(every_n_train_steps=1)] if resume else []
+    watch, resume = Watch(), last.exists()
+    more = [Spoil()] if case == "spoiled" else [Checkpoints(every_n_train_steps=1)] if resume else []
     trainer = make_trainer(folder, [watch, *more, WritePredictions()], enable_checkpointing=resume, **options)
     task, data = task_and_data(case)
     trainer.fit(task, data, ckpt_path=last if resume else None)
