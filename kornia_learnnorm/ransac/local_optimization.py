@@ -90,8 +90,8 @@ def _contradicts(cost: RobustCost, free: Tensor, gain: float, threshold: float) 
 
     The :math:`\tau` test: the gain over the mean of :math:`\psi^2` and times that of :math:`\psi'`, where
     :math:`\psi(d)` is half of the loss's derivative, is twice an F-distributed number of 2 and :math:`m` degrees of
-    freedom, which is above :math:`x` with probability :math:`(1 + 2x / m)^{-m / 2}`. It takes the errors of matches to be
-    independent. Those of neighbours are not, and a thousand matches find the cameras of photographs significantly
+    freedom, which is above :math:`x` with probability :math:`(1 + 2x / m)^{-m / 2}`. It takes the errors of matches to
+    be independent. Those of neighbours are not, and a thousand matches find the cameras of photographs significantly
     wrong where they are right, so the parameters must also explain a tenth of the noise.
 
     Reference:
