@@ -22,7 +22,7 @@ from kornia_learnnorm.evaluation.methods import Method, find_method, identify_me
 from kornia_learnnorm.evaluation.runs import results_store
 from kornia_learnnorm.evaluation.runs.example import EXAMPLE, SWEEP, random_pair, sweep
 from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS, SampleOptions, predict
-from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, file_name, once, read_arrays
+from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, file_name, read_arrays
 from kornia_learnnorm.protocol import PROTOCOLS
 
 SAMPLES = ("pair", "plain_residual")  # arrays in the file of samples
@@ -137,15 +137,13 @@ def _samples(
 ) -> MatchSets:
     """Return the samples within the limit on the residual; write all that were drawn."""
     drawn, limit = options.draw(store, max_ratio), options.max_residual
-
-    def describe() -> Arrays:
+    if not path.is_file():
         residual = plain_residual(drawn.points1, drawn.points2).numpy()
         if not (residual < limit).any():
             few = f"none of {len(residual)} samples has an un-normalised residual below {limit:g} px"
             raise ValueError(f"{place}: {few}")
-        return {"pair": drawn.pair.numpy(), "plain_residual": residual}
-
-    found = once(path, describe, SAMPLES, len(drawn.pair))
+        results_store.write_arrays(path, {"pair": drawn.pair.numpy(), "plain_residual": residual})
+    found = read_arrays(path, SAMPLES, len(drawn.pair))
     if not np.array_equal(found["pair"], drawn.pair.numpy()):
         raise ValueError(f"{path.parent} is of other samples than the run's seed draws of the store, remove it")
     return drawn.select(torch.from_numpy(found["plain_residual"] < limit))

@@ -193,13 +193,6 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
         np.savez_compressed(temporary, **arrays)
 
 
-def once(path: Path, compute: Callable[[], Arrays], keys: Sequence[str], rows: int | None = None) -> Arrays:
-    """Return the arrays of a file, after computing and writing them if it does not exist."""
-    if not path.is_file():
-        write_arrays(path, compute())
-    return read_arrays(path, keys, rows)
-
-
 def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> Arrays:
     """Return the arrays of a file; raise ValueError if it is damaged, lacks ``keys`` or these have not ``rows``."""
     if not path.is_file():
