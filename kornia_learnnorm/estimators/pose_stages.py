@@ -6,6 +6,7 @@ alone, :math:`\sum_i w_i a_i a_i^\top`: what follows costs the same for ten matc
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -22,23 +23,28 @@ from kornia_learnnorm.estimators.match_features import (
 )
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.models.essential import Calibrated, Essential
+from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
 
 __all__ = ["POSE_OUTPUTS", "POSE_POINT_FEATURES", "POSE_RESIDUAL_FEATURES", "run_pose_stages"]
 
 POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
-EARLY_STEPS = 2  # largest number of reweightings in all stages but the last
-INNER_STEPS = 2  # Gauss-Newton steps between two reweightings
-SCALE = 3.0  # of the robust loss over the geometric mean of the distances, times the network's factor
+EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of the last stage's candidates
+EARLY_SCALE, LAST_SCALE = (
+    3.0,
+    1.0,
+)  # of the robust loss over the geometric mean of distances, times the network's factor
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
-WEIGHTED_PIXELS, FINAL_PIXELS = 2.0, 1.0  # scales of the losses that candidates are compared by
+LAST_POWER = 0.25  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
+RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
+EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
 PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
 NORMAL_FLOOR = 1e-4  # of the root mean square norm of the lines' normals, added to each
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 DAMPING = 1e-9  # of the mean diagonal of the normal matrix, added to it
 GOLDEN = 1.1347241384015194  # root of x^6 = x + 1: multiples of its powers spread evenly (M. Roberts, 2018)
-MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared
+MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
+SHORTLIST = 4  # matrices of minimal samples that are compared on all matches
 
 
 class _Evidence(NamedTuple):
@@ -62,40 +68,36 @@ class _Evidence(NamedTuple):
         x1, x2, rows = (values.gather(2, index[:, None].expand(-1, values.shape[1], -1)) for values in self[1:4])
         return _Evidence(self.model, x1, x2, rows, self.unit)
 
+    def repeat(self, number: int) -> _Evidence:
+        """Return each set so many times."""
+        model = Essential(*(C.repeat_interleave(number, 0) for C in (self.model.C1, self.model.C2)))
+        return _Evidence(model, *(values.repeat_interleave(number, 0) for values in self[1:]))
+
+    def single(self) -> _Evidence:
+        """Return the same in float32, which is enough to compare matrices."""
+        model = Essential(self.model.C1.float(), self.model.C2.float())
+        return _Evidence(model, *(values.float() for values in self[1:]))
+
     def squares(self, E_mat: Tensor) -> tuple[Tensor, Tensor]:
         """Return squared Sampson distances under matrices (B, S, 3, 3) and gradient factors, each (B, S, N).
 
         Distances are in the frame's unit; the factors turn squared algebraic residuals into their squares.
         """
         F_mat = self.model.C2.mT[:, None] @ E_mat @ self.model.C1[:, None]
-        number = E_mat.shape[1]
-        line2 = torch.unflatten(F_mat[:, :, :2].flatten(1, 2) @ self.x1, 1, (number, 2))
-        line1 = torch.unflatten(F_mat.mT[:, :, :2].flatten(1, 2) @ self.x2, 1, (number, 2))
-        norms = line2.square().sum(2) + line1.square().sum(2)
-        norms = norms + NORMAL_FLOOR**2 * norms.mean(-1, keepdim=True) + torch.finfo(norms.dtype).tiny
-        algebraic = E_mat.mT.flatten(2) @ self.rows
-        factor = 1 / norms
-        return algebraic.square() * factor, factor
+        lines = torch.cat([F_mat[:, :, :2].flatten(1, 2) @ self.x1, F_mat.mT[:, :, :2].flatten(1, 2) @ self.x2], 1)
+        norms = torch.unflatten(lines.square(), 1, (2, -1, 2)).sum((1, 3))
+        factor = 1 / (norms + (NORMAL_FLOOR**2 * norms.mean(-1, keepdim=True) + torch.finfo(norms.dtype).tiny))
+        return (E_mat.mT.flatten(2) @ self.rows).square() * factor, factor
 
-    def cost(self, E_mat: Tensor, weights: Tensor, pixels: float) -> Tensor:
-        """Return the weighted sums (B, S) of Geman and McClure's loss of a scale in pixels.
-
-        A match on the other side of its epipole than most counts as one far from its line (O. Chum, T. Werner,
-        J. Matas, Epipolar geometry estimation via RANSAC benefits from the oriented epipolar constraint, ICPR 2004).
-        """
+    def losses(self, E_mat: Tensor, pixels: float) -> Tensor:
+        """Return Geman and McClure's loss (B, S, N) of a scale in pixels."""
         relative = self.squares(E_mat)[0] * (self.unit[:, None] / pixels).square()
-        first, second, third = E_mat.unbind(-1)
-        crossed = torch.stack([torch.linalg.cross(a, b) for a, b in ((first, second), (second, third), (third, first))])
-        largest = crossed.square().sum(-1).argmax(0)[None, ..., None].expand(1, *first.shape)
-        oriented = cross_product_matrix(crossed.gather(0, largest)[0]).mT @ E_mat
-        side = (oriented.mT.flatten(2) @ self.rows).sign()
-        wrong = side * (side * weights[:, None]).sum(-1, keepdim=True) < 0
-        return (torch.where(wrong, 1.0, relative / (1 + relative)) * weights[:, None]).sum(-1)
+        return relative / (1 + relative)
 
     def moments(self, weights: Tensor) -> Tensor:
-        """Return the second moments of the design rows, (B, 9, 9), of trace one."""
-        M = (self.rows * weights[:, None]) @ self.rows.mT
-        trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+        """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9), of trace one."""
+        M = (self.rows[:, None] * weights[:, :, None]) @ self.rows.mT[:, None]
+        trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
         return M / (trace + (trace == 0))
 
 
@@ -116,7 +118,7 @@ def run_pose_stages(
     features = torch.cat([match_features(frame, scores, present), _rays(frame, evidence)], -1)
     states: list[Calibrated] = []
     found: list[Tensor] = []
-    dtype = next(networks.parameters()).dtype
+    dtype, tiny = next(networks.parameters()).dtype, torch.finfo(problem.x1.dtype).tiny
     for number, network in enumerate(networks, 1):
         seen, factor = features, None
         if states:
@@ -131,14 +133,17 @@ def run_pose_stages(
         weights = logits.sigmoid()
         weights = weights / weights.detach().amax(1, keepdim=True) + MIN_WEIGHT
         weights = weights if problem.weights is None else weights * problem.weights
-        last = number == len(networks)
-        with torch.no_grad():
-            E_mat = _best_candidate(
-                evidence, weights, factor, states[-1:], samples if last and not detach_stages else 0
-            )
-            state = evidence.model.calibrated(E_mat)
-        factor = (SCALE_BOUND * torch.tanh(outputs / SCALE_BOUND)).exp()
-        states.append(_reweight(evidence, state, weights, SCALE * factor, refine_steps if last else EARLY_STEPS))
+        scale = (SCALE_BOUND * torch.tanh(outputs / SCALE_BOUND)).exp()
+        if number < len(networks):
+            with torch.no_grad():
+                axes = _axes(_likeliest(evidence, weights, factor, states[-1:]))
+            axes = _reweight(evidence, axes, weights, weights, EARLY_SCALE * scale, EARLY_STEPS)
+        else:
+            share = torch.where(weights > 0, weights.clamp(min=tiny) ** LAST_POWER, 0.0)
+            with torch.no_grad():
+                axes = _most_consistent(evidence, weights, factor, states[-1:], 0 if detach_stages else samples)
+            axes = _reweight(evidence, axes, share, weights, LAST_SCALE * scale, refine_steps)
+        states.append(Calibrated(axes, _EQUAL.to(axes).expand(len(axes), 2, 2), evidence.model.C1, evidence.model.C2))
         found.append(logits)
     return states, found
 
@@ -152,43 +157,75 @@ def _rays(frame: CommonFrame, evidence: _Evidence) -> Tensor:
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
 
 
-def _best_candidate(
+def _suggested(evidence: _Evidence, weights: Tensor, before: list[Calibrated]) -> tuple[Tensor, Tensor]:
+    """Return the matrices of moments under weights (B, S, N) and of the stage before, and which of them are real."""
+    E_mat, real = _span_moments(evidence, weights)
+    if before:
+        E_mat = torch.cat([E_mat, before[0].essential()[:, None]], 1)
+        real = torch.cat([real, torch.ones_like(real[:, :1])], 1)
+    return E_mat, real
+
+
+def _likeliest(evidence: _Evidence, weights: Tensor, factor: Tensor | None, before: list[Calibrated]) -> Tensor:
+    """Return the essential matrices (B, 3, 3) of least weighted cost among those that the weights suggest."""
+    suggested = weights if factor is None else weights * factor
+    E_mat, real = _suggested(evidence, suggested[:, None], before)
+    losses = evidence.single().losses(E_mat.float(), EARLY_PIXELS)
+    return _least(E_mat, real, losses, weights, 1)[0][:, 0]
+
+
+def _most_consistent(
     evidence: _Evidence, weights: Tensor, factor: Tensor | None, before: list[Calibrated], samples: int
 ) -> Tensor:
-    """Return the essential matrices (B, 3, 3) of least robust cost among those that the weights suggest."""
-    E_mat, real = _span_moments(evidence, weights if factor is None else weights * factor)
-    if before:
-        E_mat = torch.cat([E_mat, torch.stack([state.essential() for state in before], 1)], 1)
-        real = torch.cat([real, real.new_ones(len(real), len(before))], 1)
-    if not samples:
-        return _least(evidence, E_mat, real, weights, WEIGHTED_PIXELS)[:, 0]
-    # Matches in the order of their weights: samples and choices then don't depend on the order that they came in.
-    order = weights.argsort(dim=1, descending=True, stable=True)
-    present = (weights > 0).to(weights)
-    drawn, drawn_real = _solve_samples(evidence, weights, order, samples)
-    number = order.shape[1]
-    some = order[:, torch.arange(min(number, MAX_SCORED), device=order.device) * number // min(number, MAX_SCORED)]
-    drawn = _least(evidence.select(some), drawn, drawn_real, present.gather(1, some), FINAL_PIXELS, 4)
-    plain, plain_real = _span_moments(evidence, present)
-    E_mat = torch.cat([E_mat, drawn, plain], 1)
-    real = torch.cat([real, real.new_ones(drawn.shape[:2]), plain_real], 1)
-    return _least(evidence, E_mat, real, present, FINAL_PIXELS)[:, 0]
+    """Return the axes (B, 2, 3, 3) of least cost of all matches, whatever their weights, after some steps.
+
+    Candidates come from the moments with and without weights, and from minimal samples drawn by the weights.
+    """
+    single, present = evidence.single(), (weights > 0).to(weights)
+    suggested = weights if factor is None else weights * factor
+    E_mat, real = _suggested(evidence, torch.stack([suggested, present], 1), before)
+    best, _ = _least(E_mat, real, single.losses(E_mat.float(), LAST_PIXELS), present, 2)
+    if samples:
+        # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
+        order = weights.argsort(dim=1, descending=True, stable=True)
+        drawn, real = _solve_samples(evidence, weights, order, samples)
+        number = order.shape[1]
+        some = order[:, torch.arange(min(number, MAX_SCORED), device=order.device) * number // min(number, MAX_SCORED)]
+        losses = single.select(some).losses(drawn.float(), LAST_PIXELS)
+        best = torch.cat([best, _least(drawn, real, losses, present.gather(1, some), SHORTLIST)[0]], 1)
+    count = best.shape[1]
+    repeated = evidence.repeat(count)
+    axes, weights = _axes(best.flatten(0, 1)), present.repeat_interleave(count, 0)
+    scale = (LAST_PIXELS / repeated.unit).square()
+    axes = _descend(repeated, axes, weights, lambda _: scale, LOCAL_STEPS)
+    axes = axes.view(-1, count, 2, 3, 3)
+    E_mat = _essential(axes.flatten(0, 1)).view(-1, count, 3, 3)
+    real = torch.ones_like(E_mat[..., 0, 0], dtype=torch.bool)
+    cost = _cost(real, single.losses(E_mat.float(), LAST_PIXELS), present)
+    return axes.gather(1, cost.argmin(1)[:, None, None, None, None].expand(-1, 1, 2, 3, 3))[:, 0]
 
 
 def _span_moments(evidence: _Evidence, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the essential matrices (B, 11, 3, 3) that a matrix of moments suggests, and which of them are real."""
-    basis = torch.linalg.eigh(evidence.moments(weights))[1][..., :4].flip(-1).mT
+    """Return the matrices (B, 11 S, 3, 3) that moments under weights (B, S, N) suggest, and which of them are real."""
+    basis = torch.linalg.eigh(evidence.moments(weights).flatten(0, 1))[1][..., :4].flip(-1).mT
     basis = torch.unflatten(basis, -1, (3, 3)).mT
     E_mat, real = essential_in_span(basis)
-    nearest = evidence.model.calibrated(basis[:, 3]).essential()[:, None]
-    return torch.cat([E_mat, nearest], 1), torch.cat([real, real.new_ones(len(real), 1)], 1)
+    nearest = nearest_essential(basis[:, 3])[:, None]
+    E_mat, real = torch.cat([E_mat, nearest], 1), torch.cat([real, real.new_ones(len(real), 1)], 1)
+    number = 11 * weights.shape[1]
+    return E_mat.view(-1, number, 3, 3), real.view(-1, number)
 
 
-def _least(evidence: _Evidence, E_mat: Tensor, real: Tensor, weights: Tensor, pixels: float, number: int = 1) -> Tensor:
-    """Return the real matrices of least cost, (B, number, 3, 3)."""
-    cost = torch.where(real, evidence.cost(E_mat, weights, pixels), torch.inf)
-    best = cost.topk(min(number, cost.shape[1]), 1, largest=False).indices
-    return E_mat.gather(1, best[..., None, None].expand(-1, -1, 3, 3))
+def _least(E_mat: Tensor, real: Tensor, losses: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Tensor]:
+    """Return the real matrices of least cost, (B, number, 3, 3), and their costs."""
+    least, best = _cost(real, losses, weights).topk(min(number, real.shape[1]), 1, largest=False)
+    return E_mat.gather(1, best[..., None, None].expand(-1, -1, 3, 3)), least
+
+
+def _cost(real: Tensor, losses: Tensor, weights: Tensor) -> Tensor:
+    """Return the weighted sums (B, S) of losses (B, S, N), infinite for matrices that are not real."""
+    cost = (losses @ weights.to(losses)[..., None])[..., 0]
+    return torch.where(real & cost.isfinite(), cost, torch.inf)
 
 
 def _solve_samples(evidence: _Evidence, weights: Tensor, order: Tensor, number: int) -> tuple[Tensor, Tensor]:
@@ -202,42 +239,87 @@ def _solve_samples(evidence: _Evidence, weights: Tensor, order: Tensor, number: 
     rows = torch.unflatten(rows, 2, (number, 5)).transpose(1, 2).flatten(0, 1)  # (B S, 9, 5)
     basis = torch.linalg.qr(rows, mode="complete")[0][..., 5:]
     E_mat, real = essential_in_span(torch.unflatten(basis.mT, -1, (3, 3)).mT)
-    return torch.unflatten(E_mat.flatten(0, 1), 0, (-1, 10 * number)), torch.unflatten(
-        real.flatten(), 0, (-1, 10 * number)
+    return E_mat.view(-1, 10 * number, 3, 3), real.view(-1, 10 * number)
+
+
+def _reweight(evidence: _Evidence, axes: Tensor, weights: Tensor, inliers: Tensor, scale: Tensor, steps: int) -> Tensor:
+    r"""Return axes after steps of reweighted least squares of the Sampson distances, differentiable.
+
+    The loss is Geman and McClure's with a scale (B, 1) in geometric means of the distances, weighted by the
+    probabilities of inliers, as in :func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`.
+    """
+    share = inliers / inliers.sum(1, keepdim=True)
+    effective = (1 / share.square().sum(1, keepdim=True)).clamp(min=6.0)
+    scale = scale.square() * (effective / (effective - 5))
+    floor = (PIXEL_FLOOR / evidence.unit).square()
+
+    def square_scale(squares: Tensor) -> Tensor:
+        return scale * (share * (squares + floor).log()).sum(1, keepdim=True).exp()
+
+    return _descend(evidence, axes, weights, square_scale, steps)
+
+
+def _descend(
+    evidence: _Evidence, axes: Tensor, weights: Tensor, square_scale: Callable[[Tensor], Tensor], steps: int
+) -> Tensor:
+    r"""Return axes after Gauss-Newton steps, each on the moments :math:`e^\top M e` of new weights and factors.
+
+    ``square_scale`` gives the squared scale of Geman and McClure's loss, (B, 1), from the squared distances.
+    """
+    for _ in range(steps):
+        squares, factor = (value[:, 0] for value in evidence.squares(_essential(axes)[:, None]))
+        slope = (1 + squares / square_scale(squares)).square().reciprocal()
+        axes = _gauss_newton(evidence.moments((weights * slope * factor)[:, None])[:, 0], axes)
+    return axes
+
+
+def _axes(E_mat: Tensor) -> Tensor:
+    """Return the axes (B, 2, 3, 3) of the nearest essential matrices."""
+    U, _, Vh = torch.linalg.svd(E_mat)
+    return torch.stack([U, Vh.mT], 1)
+
+
+def _essential(axes: Tensor) -> Tensor:
+    """Return the essential matrices of axes (B, 2, 3, 3) of both views."""
+    E_mat: Tensor = axes[:, 0, :, :2] @ axes[:, 1, :, :2].mT * 0.5**0.5
+    return E_mat
+
+
+def _gauss_newton(M: Tensor, axes: Tensor) -> Tensor:
+    """Return the axes after a step that lowers the algebraic cost of moments (B, 9, 9), or unchanged."""
+    U, V = axes.unbind(1)
+    local = (V[:, :, None, :, None] * U[:, None, :, None, :]).view(-1, 9, 9) @ _LOCAL.to(M)
+    G = local.mT @ M @ local
+    normal, gradient, cost = G[:, :5, :5], G[:, :5, 5], G[:, 5:, 5:]
+    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1) + torch.finfo(M.dtype).tiny
+    damped = normal + damping[:, None, None] * torch.eye(5, dtype=M.dtype, device=M.device)
+    step = RELAXATION * torch.linalg.solve_ex(damped, gradient)[0]
+    S = torch.unflatten(step @ _SKEW.to(M), 1, (2, 3, 3))
+    square = S @ S
+    angle = square.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / -2
+    moved = axes - axes @ ((S - square / 2) / (1 + angle / 4))  # Cayley's map of the negative step
+    e = _essential(moved).mT.flatten(1)[..., None]
+    # A step at the optimum, whose derivative is the optimum's, may raise the cost by rounding.
+    return torch.where((e.mT @ M @ e <= cost + torch.finfo(M.dtype).eps)[..., None], moved, axes)
+
+
+def _skew(*vector: float) -> Tensor:
+    return cross_product_matrix(torch.tensor([vector], dtype=torch.float64))[0]
+
+
+def _steps() -> tuple[Tensor, Tensor]:
+    """Return the skew matrices (5, 18) of both views' axes for a step, and the derivatives of E and E itself, (9, 6).
+
+    Two tilts of each view, and a turn of both against each other: swapping the views swaps the steps.
+    """
+    zero, unit = _skew(0, 0, 0), torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)) * 0.5**0.5
+    x, y, turn = _skew(1, 0, 0), _skew(0, 1, 0), _skew(0, 0, 0.5)
+    skews = [(x, zero), (y, zero), (zero, x), (zero, y), (turn, -turn)]
+    columns = [*(S2 @ unit + unit @ S1.mT for S2, S1 in skews), unit]
+    return torch.stack([torch.cat([*pair]).flatten() for pair in skews]), torch.stack(
+        [column.mT.flatten() for column in columns], 1
     )
 
 
-def _reweight(evidence: _Evidence, state: Calibrated, weights: Tensor, scale: Tensor, steps: int) -> Calibrated:
-    r"""Return states after steps of reweighted least squares of the Sampson distances, differentiable.
-
-    The loss is Geman and McClure's with a scale (B, 1) in weighted geometric means of the distances, as in
-    :func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`. Between two reweightings the weights and the gradient
-    factors are held, and Gauss-Newton steps on the manifold minimise :math:`e^\top M e`.
-    """
-    share = weights / weights.sum(1, keepdim=True)
-    effective = (1 / share.square().sum(1, keepdim=True)).clamp(min=6.0)
-    scale = scale * (effective / (effective - 5)).sqrt()
-    for _ in range(steps):
-        squares, factor = (value[:, 0] for value in evidence.squares(state.essential()[:, None]))
-        floor = (PIXEL_FLOOR / evidence.unit).square()
-        mean = (share * (squares + floor).log()).sum(1, keepdim=True).exp()
-        slope = (1 + squares / (scale.square() * mean)).square().reciprocal()
-        M = evidence.moments(share * slope * factor)
-        for _ in range(INNER_STEPS):
-            state = _gauss_newton(M, state)
-    return state
-
-
-def _gauss_newton(M: Tensor, state: Calibrated) -> Calibrated:
-    """Return the states after a step that lowers the algebraic cost of moments (B, 9, 9), or unchanged."""
-    e, D = state.essential().mT.flatten(1)[..., None], state.essential_tangents()
-    DM = D.mT @ M
-    normal, gradient = DM @ D, (DM @ e)[..., 0]
-    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1) + torch.finfo(M.dtype).tiny
-    eye = torch.eye(5, dtype=M.dtype, device=M.device)
-    moved = state.retract(-torch.linalg.solve_ex(normal + damping[:, None, None] * eye, gradient)[0])
-    e_new = moved.essential().mT.flatten(1)[..., None]
-    # A step at the optimum, whose derivative is the optimum's, may raise the cost by rounding.
-    better = ((e_new.mT @ M @ e_new) <= (e.mT @ M @ e) + torch.finfo(M.dtype).eps)[:, 0]
-    axes = torch.where(better[..., None, None], moved.axes, state.axes)
-    return moved._replace(axes=axes, A=torch.where(better[..., None], moved.A, state.A))
+_SKEW, _LOCAL = _steps()
+_EQUAL = torch.eye(2, dtype=torch.float64) * 0.5**0.5

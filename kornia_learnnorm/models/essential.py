@@ -108,13 +108,9 @@ class Calibrated(NamedTuple):
         t = U[..., 2]
         return torch.stack([R[0], R[0], R[1], R[1]], 1), torch.stack([t, -t, t, -t], 1)
 
-    def essential_tangents(self) -> Tensor:
-        """Return the derivatives (B, 9, 5) of the essential matrices' column-major entries by a step."""
-        return Rank2(self.axes, self.A).tangents()[..., :5]
-
     def tangents(self) -> Tensor:
         """Return the derivatives (B, 9, 5) of the fundamental matrices' column-major entries by a step."""
-        D = self.essential_tangents()
+        D = Rank2(self.axes, self.A).tangents()[..., :5]
         columns = self.C2.mT[:, None] @ torch.unflatten(D, 1, (3, 3))  # (B, column of E, row of F, 5)
         return (self.C1.mT @ columns.flatten(2)).view_as(D)
 
