@@ -32,6 +32,7 @@ __all__ = [
     "shipped_weights",
     "weights_digest",
     "weights_format",
+    "weights_model",
 ]
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -127,6 +128,19 @@ def weights_format(name: str | Path) -> str | None:
             return str((file.metadata() or {}).get("format", ""))
     except SafetensorError:
         return ""
+
+
+def weights_model(name: str | Path) -> str:
+    """Return the two-view model of a learned estimator's weights; that of fundamental matrices where none is named."""
+    path = weights_path(name)
+    if not path.is_file():
+        return "fundamental"
+    try:
+        with safe_open(path, "pt") as file:
+            architecture = json.loads((file.metadata() or {}).get("architecture", "{}"))
+    except (SafetensorError, ValueError):
+        return "fundamental"
+    return str(architecture.get("model", "fundamental")) if isinstance(architecture, dict) else "fundamental"
 
 
 def weights_digest(name: str | Path) -> str:

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.refinement import refine_fundamental
+from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
-from kornia_learnnorm.pretrained import weights_digest
+from kornia_learnnorm.models.essential import Essential
+from kornia_learnnorm.pretrained import weights_digest, weights_model
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 
@@ -27,6 +29,7 @@ TRUTH = "ground-truth"
 MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network
 DEFAULTS = "RANSAC"  # RANSAC with its default options
 LEARNED, GUIDED = "learned:", "guided:"  # followed by the name of weights of an estimator
+SCORED = "+scores"  # suffix of a learned estimator that reads the scores of the matches
 KINDS = (LEARNED, GUIDED, f"{DEFAULTS}:")
 DEFAULT_ESTIMATORS = (
     *(name for name in PEERS if not name.endswith(CALIBRATED)),
@@ -47,6 +50,7 @@ class EvaluatedPair(NamedTuple):
     R: Tensor  # true rotation, (3, 3)
     t: Tensor  # true translation, (3,)
     size: NDArray[np.int32]  # (width, height) of both images, (2, 2)
+    scores: Tensor  # of the correspondences, 1 minus Lowe's ratio, (N,)
 
 
 class Estimate(NamedTuple):
@@ -77,8 +81,10 @@ def find_estimator(name: str) -> Estimator:
         name: one of
 
             - a name in :data:`~kornia_learnnorm.evaluation.robust.peers.PEERS`;
-            - ``learned:WEIGHTS``, a :class:`~kornia_learnnorm.LearnedEightPoint`; ``learned:WEIGHTS+LM``, refined with
-              Geman and McClure's loss at the threshold;
+            - ``learned:WEIGHTS``, a :class:`~kornia_learnnorm.LearnedEightPoint`, or a
+              :class:`~kornia_learnnorm.LearnedRelativePose` with the cameras of the store; ``learned:WEIGHTS+scores``
+              reads the scores of the matches; ``learned:WEIGHTS+LM`` is refined with Geman and McClure's loss at the
+              threshold;
             - ``guided:WEIGHTS``, RANSAC with the probabilities of the learned estimator as weights of the matches;
             - ``RANSAC``, :class:`~kornia_learnnorm.RANSAC` with its defaults;
             - ``RANSAC-calibrated``, RANSAC with the cameras of the store;
@@ -93,8 +99,13 @@ def find_estimator(name: str) -> Estimator:
     if name in (DEFAULTS, DEFAULTS + CALIBRATED):
         return partial(_ransac, {}, name != DEFAULTS)
     if kind == LEARNED and method:
-        weights = method.removesuffix(REFINED)
-        return partial(_learned, LearnedEightPoint.from_pretrained(weights), weights != method)
+        weights = _weights_of(method)
+        if weights_model(weights) == Essential.name:
+            if method.endswith(REFINED):
+                raise ValueError(f"relative poses are refined by themselves: expected {weights!r}, got {method!r}")
+            return partial(_relative_pose, LearnedRelativePose.from_pretrained(weights), method.endswith(SCORED))
+        layer = LearnedEightPoint.from_pretrained(weights)
+        return partial(_learned, layer, method.endswith(REFINED), method.removesuffix(REFINED).endswith(SCORED))
     if kind == GUIDED and method:
         return partial(_guided, LearnedEightPoint.from_pretrained(method))
     if kind and method:
@@ -104,7 +115,7 @@ def find_estimator(name: str) -> Estimator:
         options = {"normalizer": find_method(method).normalizer, "max_samples": MAX_SAMPLES, **rank2}
         return partial(_ransac, options, False)
     raise ValueError(
-        f"no estimator {name!r}: expected {', '.join(PEERS)}, learned:WEIGHTS, learned:WEIGHTS{REFINED},"
+        f"no estimator {name!r}: expected {', '.join(PEERS)}, learned:WEIGHTS, learned:WEIGHTS{REFINED} and {SCORED},"
         f" guided:WEIGHTS, RANSAC, RANSAC{CALIBRATED}, RANSAC:METHOD or {TRUTH}"
     )
 
@@ -129,12 +140,23 @@ def _ransac(
     return found.F_mat if bool(found.F_mat.any()) else None, found.num_samples
 
 
-def _learned(layer: LearnedEightPoint, refined: bool, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
+def _learned(
+    layer: LearnedEightPoint, refined: bool, scored: bool, pair: EvaluatedPair, seed: int, threshold: float
+) -> Found:
     points1, points2 = pair.points1[None], pair.points2[None]
-    F_mat = layer(points1, points2)
+    F_mat = layer(points1, points2, scores=pair.scores[None] if scored else None)
     if refined:
         F_mat = refine_fundamental(points1, points2, F_mat, loss=GemanMcClure(threshold)).F_mat
     return F_mat[0], math.nan
+
+
+def _relative_pose(layer: LearnedRelativePose, scored: bool, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
+    if not bool(pair.K.isfinite().all()):
+        return None, math.nan
+    scores = pair.scores[None] if scored else None
+    E_mat = layer(pair.points1[None], pair.points2[None], pair.K[0], pair.K[1], scores=scores)[0]
+    inverse1, inverse2 = torch.linalg.inv_ex(pair.K)[0]
+    return inverse2.mT @ E_mat @ inverse1, math.nan
 
 
 def _guided(layer: LearnedEightPoint, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
@@ -153,13 +175,17 @@ def identify_estimator(name: str) -> str:
         return peer_version(name)
     kind, method = _split(name)
     if kind in (LEARNED, GUIDED):
-        return f"{name} {weights_digest(method.removesuffix(REFINED))}"
+        return f"{name} {weights_digest(_weights_of(method))}"
     return f"{kind}{identify_method(method)}" if kind else name
 
 
 def estimator_names(names: Sequence[str]) -> dict[str, str]:
     """Return short names of estimators for tables and files; raise ValueError if two are equal."""
     return names_of(names, lambda name: "".join((_split(name)[0], short_name_of(_split(name)[1]))), "estimators")
+
+
+def _weights_of(method: str) -> str:
+    return method.removesuffix(REFINED).removesuffix(SCORED)
 
 
 def _split(name: str) -> tuple[str, str]:

@@ -64,6 +64,22 @@ def test_learned_weights_in_a_file(name, matches, tmp_path):
     assert file.name in robust_estimators.identify_estimator(name.format(file))
 
 
+def test_learned_relative_pose_takes_cameras_and_scores(matches, tmp_path):
+    layer, drawn = kln.LearnedRelativePose(width=16, depth=1).eval(), matches(outliers=0.2)
+    layer.save_pretrained(tmp_path / "pose.safetensors")
+    name = f"learned:{tmp_path / 'pose.safetensors'}"
+    found = run_estimator(find_estimator(f"{name}+scores"), drawn, 0, 1.0).F_mat
+    with torch.no_grad():
+        points = drawn.points1[None], drawn.points2[None]
+        expected = layer.estimate(*points, *drawn.K, scores=drawn.scores[None]).F_mat[0]
+    assert torch.allclose(found / found.norm(), expected) or torch.allclose(-found / found.norm(), expected)
+    unknown = drawn._replace(K=drawn.K * torch.nan)
+    assert run_estimator(find_estimator(name), unknown, 0, 1.0).F_mat.isnan().all()
+    assert robust_estimators.identify_estimator(f"{name}+scores").startswith(f"{name}+scores ")
+    with pytest.raises(ValueError, match="refined by themselves"):
+        find_estimator(f"{name}+LM")
+
+
 def test_the_seed_decides(matches):
     drawn, estimator = matches(noise=0.5, outliers=0.4), find_estimator("RANSAC:Hartley")
     first, again, other = (run_estimator(estimator, drawn, seed, 1.0).F_mat for seed in (0, 0, 1))

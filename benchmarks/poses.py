@@ -1,0 +1,89 @@
+"""Compare estimators by the relative pose, on whole image pairs of stores with cameras and poses.
+
+The pose error is the larger of the angles of rotation and translation; failures count. Table: AUC up to 5, 10 and 20
+degrees, %, median error, degrees, and median time, ms, of one thread. Every estimator gets all matches of a pair, at a
+threshold of 1 px, and the scores of the matches where its name ends in +scores.
+
+    python benchmarks/poses.py STORE.h5 [STORE.h5 ...] [--pairs 0] [--estimators NAME ...] [--csv FILE]
+
+An estimator is one of learnnorm robust; what is not installed is left out.
+"""
+
+import argparse
+import csv
+import math
+
+import torch
+
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.evaluation.robust.robust_estimators import find_estimator, run_estimator
+from kornia_learnnorm.evaluation.robust.robust_run import even_pairs, measure, shuffled_pair
+from kornia_learnnorm.evaluation.tables import format_table, names_of
+from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.metrics.poses import pose_auc
+
+ESTIMATORS = (
+    *("opencv-usac-magsac", "poselib", "pysuperansac", "kornia", "RANSAC"),
+    *("learned:robust-synthetic", "learned:robust-synthetic+scores", "guided:robust-synthetic"),
+    *("opencv-usac-magsac-calibrated", "poselib-calibrated", "RANSAC-calibrated"),
+    *("learned:robust-pose-synthetic", "learned:robust-pose-synthetic+scores"),
+    *("learned:robust-pose", "learned:robust-pose+scores"),
+)
+HEADER = ["estimator", "AUC 5", "10", "20", "median", "ms"]
+THRESHOLD = 1.0  # pixels
+
+
+def find_installed(names: list[str]) -> dict:
+    """Return the estimators whose packages are installed, by their names; print the others."""
+    found = {}
+    for name in names:
+        try:
+            found[name] = find_estimator(name)
+        except ImportError as error:
+            print(f"left out: {error}")
+    return found
+
+
+def measure_store(path: str, number: int, estimators: dict) -> list[list[str]]:
+    """Return the rows of a store's table; estimators take turns on every pair."""
+    store = read_store(path)
+    errors: dict[str, list[float]] = {name: [] for name in estimators}
+    seconds: dict[str, list[float]] = {name: [] for name in estimators}
+    for index in even_pairs(len(store), number):
+        pair = shuffled_pair(store, index, "unfiltered", seed=0)
+        for name, estimator in estimators.items():
+            if not seconds[name]:  # the first call loads and compiles
+                run_estimator(estimator, pair, 0, THRESHOLD)
+            found = run_estimator(estimator, pair, 0, THRESHOLD)
+            results = measure(pair, found.F_mat, THRESHOLD)
+            seconds[name].append(found.seconds)
+            if not math.isnan(error := max(results["rotation_error"], results["translation_error"])):
+                errors[name].append(error)
+    rows = []
+    for name, values in errors.items():
+        error, ms = torch.tensor(values).double(), 1000 * torch.tensor(seconds[name]).median().item()
+        cells = [f"{100 * share:.1f}" for share in pose_auc(error)]
+        rows.append([name, *cells, f"{error.median().item():.2f}", f"{ms:.1f}"])
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("stores", nargs="+")
+    parser.add_argument("--pairs", type=int, default=0, help="of each store, evenly spaced; 0: all")
+    parser.add_argument("--estimators", nargs="+", default=[*ESTIMATORS])
+    parser.add_argument("--csv", help="write all tables to this file")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    estimators, rows = find_installed(args.estimators), []
+    for path, name in names_of(args.stores).items():
+        found = measure_store(path, args.pairs, estimators)
+        print(f"{name}\n\n{format_table(HEADER, found)}\n", flush=True)
+        rows += [[name, *row] for row in found]
+    if args.csv:
+        with atomic_write(args.csv) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([["store", *HEADER], *rows])
+
+
+if __name__ == "__main__":
+    main()
