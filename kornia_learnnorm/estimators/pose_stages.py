@@ -48,25 +48,26 @@ SHORTLIST = 4  # matrices of minimal samples that are compared on all matches
 
 
 class _Evidence(NamedTuple):
-    """Correspondences of calibrated views, and what their distances under essential matrices need."""
+    """Correspondences of calibrated views, and what their distances under essential matrices are made of."""
 
     model: Essential  # in the frame
-    x1: Tensor  # homogeneous points in the frame, (B, 3, N)
-    x2: Tensor
     rows: Tensor  # of the design matrix of directions, for the column-major entries of E, (B, 9, N)
+    products: (
+        Tensor  # x1 x1^T and x2 x2^T of the points in the frame, which the lines' squared normals need, (B, 18, N)
+    )
     unit: Tensor  # of the frame, in pixels, (B, 1)
 
     @classmethod
-    def from_frame(cls, frame: CommonFrame, K1: Tensor, K2: Tensor) -> _Evidence:
-        x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
-        model = Essential.of_cameras(K1, K2, frame.T, frame.T)
+    def from_frame(cls, model: Essential, frame: CommonFrame, x1: Tensor, x2: Tensor) -> _Evidence:
+        """Return the evidence of homogeneous points (B, 3, N) in the frame."""
         rows = ((model.C1 @ x1)[:, :, None] * (model.C2 @ x2)[:, None]).flatten(1, 2)
-        return cls(model, x1, x2, rows, frame.inverse[:, 0, 0, None])
+        products = torch.cat([(x[:, :, None] * x[:, None]).flatten(1, 2) for x in (x1, x2)], 1)
+        return cls(model, rows, products, frame.inverse[:, 0, 0, None])
 
     def select(self, index: Tensor) -> _Evidence:
         """Return the correspondences of given indices (B, M)."""
-        x1, x2, rows = (values.gather(2, index[:, None].expand(-1, values.shape[1], -1)) for values in self[1:4])
-        return _Evidence(self.model, x1, x2, rows, self.unit)
+        rows, products = (v.gather(2, index[:, None].expand(-1, v.shape[1], -1)) for v in (self.rows, self.products))
+        return self._replace(rows=rows, products=products)
 
     def repeat(self, number: int) -> _Evidence:
         """Return each set so many times."""
@@ -84,8 +85,8 @@ class _Evidence(NamedTuple):
         Distances are in the frame's unit; the factors turn squared algebraic residuals into their squares.
         """
         F_mat = self.model.C2.mT[:, None] @ E_mat @ self.model.C1[:, None]
-        lines = torch.cat([F_mat[:, :, :2].flatten(1, 2) @ self.x1, F_mat.mT[:, :, :2].flatten(1, 2) @ self.x2], 1)
-        norms = torch.unflatten(lines.square(), 1, (2, -1, 2)).sum((1, 3))
+        forms = torch.stack([F_mat[:, :, :2].mT @ F_mat[:, :, :2], F_mat[..., :2] @ F_mat[..., :2].mT], 2).flatten(2)
+        norms = forms @ self.products
         factor = 1 / (norms + (NORMAL_FLOOR**2 * norms.mean(-1, keepdim=True) + torch.finfo(norms.dtype).tiny))
         return (E_mat.mT.flatten(2) @ self.rows).square() * factor, factor
 
@@ -114,8 +115,10 @@ def run_pose_stages(
     """Return the states of the stages and their logits (B, N), for sets that determine their matrix."""
     present = problem.present
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
-    evidence = _Evidence.from_frame(frame, K1, K2)
-    features = torch.cat([match_features(frame, scores, present), _rays(frame, evidence)], -1)
+    x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
+    model = Essential.of_cameras(K1, K2, frame.T, frame.T)
+    evidence = _Evidence.from_frame(model, frame, x1, x2)
+    features = torch.cat([match_features(frame, scores, present), _rays(frame, model, x1, x2)], -1)
     states: list[Calibrated] = []
     found: list[Tensor] = []
     dtype, tiny = next(networks.parameters()).dtype, torch.finfo(problem.x1.dtype).tiny
@@ -124,7 +127,7 @@ def run_pose_stages(
         if states:
             with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
                 F_mat = states[-1].matrix()
-                residuals, _ = residual_features(evidence.model, evidence.x1, evidence.x2, F_mat, found[-1], present)
+                residuals, _ = residual_features(model, x1, x2, F_mat, found[-1], present)
                 squares, factor = (value[:, 0] for value in evidence.squares(states[-1].essential()[:, None]))
                 pixels = evidence.unit * (squares + torch.finfo(squares.dtype).tiny).sqrt()
             seen = torch.cat([features, residuals, (pixels + PIXEL_FLOOR).log()[..., None] / 2], -1)
@@ -143,17 +146,17 @@ def run_pose_stages(
             with torch.no_grad():
                 axes = _most_consistent(evidence, weights, factor, states[-1:], 0 if detach_stages else samples)
             axes = _reweight(evidence, axes, share, weights, LAST_SCALE * scale, refine_steps)
-        states.append(Calibrated(axes, _EQUAL.to(axes).expand(len(axes), 2, 2), evidence.model.C1, evidence.model.C2))
+        states.append(Calibrated(axes, _EQUAL.to(axes).expand(len(axes), 2, 2), model.C1, model.C2))
         found.append(logits)
     return states, found
 
 
-def _rays(frame: CommonFrame, evidence: _Evidence) -> Tensor:
+def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tensor:
     """Return the directions of both points and the frame's unit in pixels as features, (B, N, 5)."""
-    rays = torch.stack([evidence.model.C1 @ evidence.x1, evidence.model.C2 @ evidence.x2], 1)
+    rays = torch.stack([model.C1 @ x1, model.C2 @ x2], 1)
     rays = torch.where(frame.swapped[:, None, None, None], rays.flip(1), rays)
     rays = rays[:, :, :2] / rays[:, :, 2:]
-    unit = (evidence.unit / 100).log()[..., None].expand(-1, 1, rays.shape[-1])
+    unit = (frame.inverse[:, :1, :1] / 100).log().expand(-1, 1, rays.shape[-1])
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
 
 
