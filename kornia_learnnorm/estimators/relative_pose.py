@@ -94,7 +94,7 @@ class LearnedRelativePose(LearnedLayer):
     features, residual_features, outputs = POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES, POSE_OUTPUTS
 
     def __init__(
-        self, width: int = 48, depth: int = 4, stages: int = 3, refine_steps: int = 5, samples: int = 32
+        self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 5, samples: int = 32
     ) -> None:
         eye = torch.eye(3)[None]
         super().__init__(Essential(eye, eye), width, depth, stages, False, refine_steps)
@@ -121,15 +121,15 @@ class LearnedRelativePose(LearnedLayer):
 
     @classmethod
     def from_eight_point(
-        cls, layer: LearnedEightPoint, refine_steps: int = 5, samples: int = 32
+        cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 5, samples: int = 32
     ) -> LearnedRelativePose:
-        """Return an untrained estimator whose networks start from those of an estimator of fundamental matrices.
+        """Return an untrained estimator whose networks start from the first ones of one of fundamental matrices.
 
         What only they read, directions and distances in pixels, has no effect yet.
         """
-        started = cls(layer.width, layer.depth, layer.stages, refine_steps, samples)
+        started = cls(layer.width, layer.depth, stages, refine_steps, samples)
         columns = torch.tensor([*range(POINT_FEATURES), *range(cls.features, cls.features + RESIDUAL_FEATURES)])
-        for own, other in zip(started.networks, layer.networks, strict=True):
+        for own, other in zip(started.networks, layer.networks, strict=False):
             state = {k: v for k, v in other.state_dict().items() if not k.startswith("head.2.")}
             new, old = own.state_dict(), state.pop("stem.weight")
             new["stem.weight"] = torch.zeros_like(new["stem.weight"]).index_copy(1, columns[: old.shape[1]], old)
