@@ -7,11 +7,13 @@ serves more points, weights, any normaliser and gradients, and takes several tim
 from __future__ import annotations
 
 import torch
-from kornia.geometry.epipolar import find_essential
 from torch import Tensor
 
 from kornia_learnnorm.geometry.dlt import design_matrix
+from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.matrices import cofactors
+
+MIN_PIVOT = 1e-12  # of the largest one, of a sample of five correspondences that determine finitely many matrices
 
 __all__ = ["are_independent", "solve_calibrated_samples", "solve_samples"]
 
@@ -54,13 +56,15 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
 
 
 def solve_calibrated_samples(rays1: Tensor, rays2: Tensor) -> Tensor:
-    """Return the essential matrices of minimal samples of five correspondences, by Kornia's five-point solver.
+    """Return the essential matrices of minimal samples of five correspondences.
 
     Rays are directions :math:`K^{-1} x` (K, 5, 3) of any length. All real solutions come back, of unit norm, (M, 3, 3),
     M <= 10 K; degenerate samples, as with a repeated correspondence, have none. Five points on one plane have.
     """
-    E_mat: Tensor = find_essential(*(rays[..., :2] / rays[..., 2:] for rays in (rays1, rays2))).flatten(0, 1)
-    return E_mat[E_mat.isfinite().flatten(1).all(1)]
+    Q, R = torch.linalg.qr(design_matrix(rays1, rays2).mT, mode="complete")
+    E_mat, real = essential_in_span(torch.unflatten(Q[..., 5:].mT, -1, (3, 3)))
+    pivots = R.diagonal(dim1=-2, dim2=-1).abs()
+    return E_mat[real & (pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1))[:, None]]
 
 
 def _deviation(u: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
