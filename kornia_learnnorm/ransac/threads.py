@@ -22,9 +22,8 @@ def one_thread() -> Iterator[None]:
     """Hold PyTorch's operations on the CPU to one thread.
 
     Where matrices are small, waking further threads costs more than they save, and on a busy machine many times more
-    than the work itself. The number of threads belongs to the process: other threads that run meanwhile are held to one
-    too, and the last caller that leaves restores the number. A thread that uses PyTorch for the first time meanwhile
-    keeps to one thread until it sets the number itself.
+    than the work itself. PyTorch keeps the number for each thread that uses it, so every caller restores it as it
+    leaves. A thread that uses PyTorch for the first time meanwhile keeps to one thread until it sets the number itself.
     """
     with _Held.lock:
         if _Held.callers == 0:

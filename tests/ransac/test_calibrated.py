@@ -57,14 +57,10 @@ class TestSmoke:
 
     def test_forward_and_estimate(self):
         points, (K1, K2), _, _ = pair()
-        found = estimate(points, (K1, K2))
-        F_mat, inliers = RANSAC(seed=0)(*points, K1=K1, K2=K2)
+        found, (F_mat, inliers) = estimate(points, (K1, K2)), RANSAC(seed=0)(*points, K1=K1, K2=K2)
         assert torch.equal(found.F_mat, F_mat)
         assert torch.equal(found.inliers, inliers)
-        assert up_to_sign(F_mat[None], of_pixels(found.E_mat, K1, K2)) < 1e-10
-        distances = kln.sampson_distance(*points, F_mat)
-        assert torch.equal(inliers, distances <= 1)
-        assert found.score == pytest.approx((1 - distances.square()).clamp(min=0).sum().item(), rel=1e-6)
+        assert torch.equal(inliers, kln.sampson_distance(*points, F_mat) <= 1)
 
     @pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
     def test_weights(self, sampler):
@@ -80,8 +76,6 @@ class TestExceptions:
         """What else is refused is tested with check_cameras."""
         with pytest.raises(ValueError, match=r"K1 .* got \[1, 3, 3\]"):
             RANSAC().estimate(uniform(20, 2), uniform(20, 2, seed=1), None, torch.eye(3)[None], torch.eye(3))
-
-    def test_fewer_than_five(self):
         with pytest.raises(ValueError, match="at least 5 correspondences are needed, got 4"):
             RANSAC()(uniform(4, 2), uniform(4, 2, seed=1), K1=torch.eye(3), K2=torch.eye(3))
 
@@ -120,13 +114,6 @@ class TestAccuracy:
         _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
         solutions = [cross(t[:, 0]) @ R for R, t in zip(rotations, translations, strict=True)]
         assert min(up_to_sign(found.E_mat[None], E[None]) for E in solutions) < 1e-5
-
-    @pytest.mark.long
-    def test_many_matches_and_few_inliers(self):
-        points, cameras, E, true = pair(num_points=2000, outliers=0.8)
-        found = estimate(points, cameras)
-        assert found.inliers[true].float().mean() > 0.9
-        assert up_to_sign(found.E_mat[None], E[None]) < 0.02
 
     def test_final_fit_is_the_optimum_of_its_loss(self):
         points, cameras, _, _ = pair(outliers=0.2)

@@ -103,9 +103,7 @@ class TestExceptions:
             (POINTS[None], POINTS[None], None, ShapeError, r"\[1, 20, 2\]"),
             (POINTS, POINTS[1:], None, ValueError, r"\[20, 2\] and \[19, 2\]"),
             (POINTS[:7], POINTS[:7], None, ValueError, "at least 8 .* got 7"),
-            (POINTS, POINTS, torch.ones(20).bool(), TypeError, "got torch.bool"),
             (POINTS, POINTS, torch.ones(19), ValueError, r"weights .* \[20\], got \[19\]"),
-            (POINTS, POINTS, -torch.ones(20), ValueError, "finite and not negative"),
             (POINTS, POINTS, torch.full((20,), NAN), ValueError, "finite and not negative"),
         ]:
             with pytest.raises(error, match=message):
@@ -215,13 +213,6 @@ class TestHardInput:
     @pytest.mark.parametrize("normalizer", [None, kln.Whitening()])
     def test_what_determines_no_matrix(self, arguments, normalizer):
         assert failed(RANSAC(seed=0, normalizer=normalizer, max_samples=2000)(*arguments))
-
-    @pytest.mark.long
-    def test_many(self):
-        points1, points2, _, true = pair(num_points=100_000, outliers=0.3)
-        F_mat, inliers = RANSAC(seed=0)(points1.float(), points2.float())
-        assert inliers[true].float().mean() > 0.9
-        assert np.median(epipolar_distances(points1[true], points2[true], F_mat.double())) < 0.6
 
     @pytest.mark.parametrize("value", [None, 0.0, 5.0, 1e6])
     def test_all_outliers_or_all_identical(self, value):
