@@ -80,6 +80,23 @@ def written(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="session")
+def planes(tmp_path_factory):
+    """The folder of the images of two planes, not to be changed."""
+    pytest.importorskip("cv2", reason="OpenCV is not installed")
+    from two_planes import write_images
+
+    return write_images(tmp_path_factory.mktemp("planes"))
+
+
+@pytest.fixture(scope="session")
+def result(planes):
+    """The estimate of two images of the planes."""
+    from kornia_learnnorm.two_view.estimate_pair import estimate_pair
+
+    return estimate_pair(planes / "left.png", planes / "right.png")
+
+
 @pytest.fixture
 def refused(capsys):
     """A function that checks that a command ends with one line, which has a message in it, and prints nothing else."""

@@ -13,33 +13,22 @@ import pytest
 
 from kornia_learnnorm.cli import estimate as command_module
 from kornia_learnnorm.cli.estimate import add_arguments, run
-from kornia_learnnorm.two_view.estimate_pair import estimate_pair
 from kornia_learnnorm.two_view.many_pairs import read_pair_list
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
-from two_planes import HEIGHT, WIDTH, write_images  # noqa: E402 (needs OpenCV)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_images(tmp_path_factory.mktemp("scene"))
-
-
-@pytest.fixture(scope="module")
-def result(folder):
-    return estimate_pair(folder / "left.png", folder / "right.png")
+from two_planes import HEIGHT, WIDTH  # noqa: E402 (needs OpenCV)
 
 
 @pytest.fixture
-def command(folder, tmp_path, monkeypatch):
+def command(planes, tmp_path, monkeypatch):
     """Run the command in an empty folder."""
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments, images=("left", "right")):
         parser = argparse.ArgumentParser()
         add_arguments(parser)
-        return run(parser.parse_args([*(f"{folder}/{name}.png" for name in images), *arguments]))
+        return run(parser.parse_args([*(f"{planes}/{name}.png" for name in images), *arguments]))
 
     return call
 
@@ -67,7 +56,7 @@ class TestOnePair:
         assert printed.splitlines()[-2:] == ["wrote    pair.png", "wrote    F.json"]
         assert all(text in printed for text in ("by       LearnedEightPoint", "(ratio test 0.7)", "< 2 px"))
 
-    def test_exit_codes(self, command, folder, capsys):
+    def test_exit_codes(self, command, planes, capsys):
         """3 with a warning, and where there is no matrix; no picture is written in the latter case."""
         assert command("--json", "F.json", images=("left", "plane")) == 3
         assert "\nwarning  planar: one homography explains" in capsys.readouterr().out
@@ -79,7 +68,7 @@ class TestOnePair:
         failure = json.loads(Path("F.json").read_text())
         assert [failure[name] for name in ("F", "E", "R", "t", "predicted_error_px")] == [None] * 5
         assert [warning["code"] for warning in failure["warnings"]] == ["no_motion"]
-        assert failure["image1"] == {"file": f"{folder}/left.png", "width": WIDTH, "height": HEIGHT}
+        assert failure["image1"] == {"file": f"{planes}/left.png", "width": WIDTH, "height": HEIGHT}
         assert [failure[name] for name in ("estimator", "seed", "ratio", "threshold_px")] == ["RANSAC", 0, 0.8, 1]
         assert [path.name for path in Path().iterdir()] == ["F.json"]
 
@@ -108,11 +97,11 @@ class TestOnePair:
             (["--weights", "robust"], ValueError, "--weights robust: only --estimator learned has weights"),
         ],
     )
-    def test_bad_options_are_refused_before_the_work(self, command, folder, arguments, error, message, monkeypatch):
+    def test_bad_options_are_refused_before_the_work(self, command, planes, arguments, error, message, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: pytest.fail("the work was begun"))
         with pytest.raises(error, match=message):
-            command(*(f"{folder}/left.png" if text == "IMAGE" else text for text in arguments))
+            command(*(f"{planes}/left.png" if text == "IMAGE" else text for text in arguments))
         assert not list(Path().iterdir())
 
     def test_seeds_are_checked_while_parsing(self, command, capsys):
@@ -137,20 +126,20 @@ class TestOnePair:
 
 class TestManyPairs:
     @pytest.fixture
-    def many(self, command, folder):
+    def many(self, command, planes):
         """Run the command on a list of pairs."""
-        Path("list.txt").write_text(f"{folder}/left.png {folder}/right.png\n")
+        Path("list.txt").write_text(f"{planes}/left.png {planes}/right.png\n")
         return lambda *arguments: command("--pairs", "list.txt", *arguments, images=())
 
-    def test_one_line_a_pair_and_what_is_done_stays(self, many, folder, result, capsys):
+    def test_one_line_a_pair_and_what_is_done_stays(self, many, planes, result, capsys):
         options, path = ("--out", "found", "--jobs", "1"), Path("found/pairs.jsonl")
         with Path("list.txt").open("a") as file:
-            file.write(f"\n{folder}/left.png late.png\n")
-        Path("late.png").write_bytes((folder / "half.png").read_bytes())
+            file.write(f"\n{planes}/left.png late.png\n")
+        Path("late.png").write_bytes((planes / "half.png").read_bytes())
         assert many(*options) == 3
         printed = capsys.readouterr()
         assert printed.out.endswith("wrote found: 1 of 2 pairs solved, 1 failed\n")
-        assert f"failed: {folder}/left.png late.png: " in printed.err
+        assert f"failed: {planes}/left.png late.png: " in printed.err
         first = path.read_text()
         lines = [json.loads(line) for line in first.splitlines()]
         assert [[warning["code"] for warning in line["warnings"]] for line in lines] == [[], ["unreadable"]]
@@ -161,7 +150,7 @@ class TestManyPairs:
             many(*options, "--ratio", "0.7")
         path.write_text(first + '{"F": nu')  # as a killed run leaves it
         # what was unreadable is tried again
-        Path("late.png").write_bytes((folder / "blank.png").read_bytes())
+        Path("late.png").write_bytes((planes / "blank.png").read_bytes())
         assert many(*options) == 3
         solved, failed = path.read_text().splitlines()
         assert solved == first.splitlines()[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
@@ -13,8 +12,7 @@ from kornia_learnnorm.two_view.drawing import draw_line, draw_pair, import_matpl
 from kornia_learnnorm.two_view.result import PairEstimate
 from kornia_learnnorm.two_view.warnings import PairWarning
 
-pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
-image_module = pytest.importorskip("matplotlib.image")
+image_module = pytest.importorskip("matplotlib.image")  # Matplotlib may not be installed
 
 
 def make_pair(width: int = 160, height: int = 120, points: int = 30) -> tuple[np.ndarray, np.ndarray, PairEstimate]:
@@ -98,26 +96,10 @@ class TestDrawPair:
         assert bad.shape[0] > picture.shape[0] + 40
         assert (np.abs(bad[picture.shape[0] :] - np.array([0xFF, 0x5C, 0x5C]) / 255).max(2) < 0.1).any()
 
-    @pytest.mark.parametrize("suffix", ["jpg", "svg"])
-    def test_formats(self, tmp_path, suffix):
-        draw_pair(*make_pair(), tmp_path / f"pair.{suffix}")
-        assert (tmp_path / f"pair.{suffix}").stat().st_size > 1000
-
-    @pytest.mark.parametrize(
-        ("name", "width", "error", "message"),
-        [
-            ("pair.xyz", 160, ValueError, "not supported"),
-            ("none/pair.png", 160, FileNotFoundError, "does not exist"),
-            ("pair.png", 80, ValueError, r"160 x 120 pixels, got shape \(120, 80\)"),
-        ],
-    )
-    def test_what_is_refused(self, tmp_path, name, width, error, message):
+    def test_what_is_refused(self, tmp_path):
         image1, image2, estimate = make_pair()
-        with pytest.raises(error, match=message):
-            draw_pair(image1, image2[:, :width], estimate, tmp_path / name)
+        with pytest.raises(ValueError, match=r"160 x 120 pixels, got shape \(120, 80\)"):
+            draw_pair(image1, image2[:, :80], estimate, tmp_path / "pair.png")
+        with pytest.raises(ValueError, match="not supported"):
+            draw_pair(image1, image2, estimate, tmp_path / "pair.xyz")
         assert not list(tmp_path.iterdir())
-
-    def test_without_matplotlib(self, tmp_path, monkeypatch):
-        monkeypatch.setitem(sys.modules, "matplotlib", None)
-        with pytest.raises(ImportError, match=r"pip install '\.\[report\]'"):
-            draw_pair(*make_pair(), tmp_path / "pair.png")
