@@ -44,11 +44,6 @@ class TestPixels:
         colour, expected = read_colour(path), cv2.imread(str(path))[..., ::-1]
         assert np.abs(colour.astype(int) - expected).max() <= max(limit, suffix == ".jpg")
 
-    @pytest.mark.parametrize("folder", ["kitti/sequences/06/image_0", "tum"])
-    def test_real_images_as_opencv_reads_them(self, real_data, folder):
-        for path in sorted((real_data / folder).rglob("*.png"))[:3]:
-            assert np.array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
-
     @pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32])
     def test_more_than_eight_bits_are_refused(self, tmp_path, dtype):
         Image.fromarray(np.ones((1, 2), dtype)).save(tmp_path / "a.tif")

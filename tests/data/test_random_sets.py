@@ -110,18 +110,6 @@ class TestStoreSets:
         assert source.draw(2, 500, seeded()).points1.shape == (2, 500, 2)  # repeated where no pair has enough
         assert_equal(source.draw(4, 20, seeded(1)), source.draw(4, 20, seeded(1)))
 
-    @pytest.mark.parametrize(
-        ("arguments", "error", "message"),
-        [
-            (([],), ValueError, "at least one store"),
-            ((["$NO_SUCH_FOLDER/store.h5"],), ValueError, "NO_SUCH_FOLDER"),
-            ((["no_such.h5"],), FileNotFoundError, "no store at no_such.h5"),
-        ],
-    )
-    def test_exceptions(self, arguments, error, message):
-        with pytest.raises(error, match=message):
-            StoreSets(*arguments)
-
 
 class TestSyntheticSets:
     def test_without_labels_further_matches_supervise(self):

@@ -13,18 +13,19 @@ from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 
-def test_paths(store, tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", [StoreSamples, StoreSets])
+def test_paths(store, tmp_path, monkeypatch, kind):
     write_store(tmp_path / "a.h5", store)
     monkeypatch.setenv("SOME_DATA", str(tmp_path))
-    assert len(StoreSamples(["$SOME_DATA/a.h5", "${SOME_DATA}/a.h5@0:2"]).stores) == 2
+    assert len(kind(["$SOME_DATA/a.h5", "${SOME_DATA}/a.h5@0:2"]).paths) == 2
     for unset in ("$UNSET_DATA", "${EMPTY_DATA}"):
         monkeypatch.setenv("EMPTY_DATA", "")
         with pytest.raises(ValueError, match=rf"environment variable {unset.strip('${}')}.* is not set; data\.train, "):
-            StoreSamples([f"{unset}/a.h5"])
+            kind([f"{unset}/a.h5"])
     with pytest.raises(FileNotFoundError, match=r"c\.h5"):
-        StoreSamples(["$SOME_DATA/c.h5@0:1"])
+        kind(["$SOME_DATA/c.h5@0:1"])
     with pytest.raises(ValueError, match="at least one store"):
-        StoreSamples([])
+        kind([])
 
 
 def test_synthetic_source():

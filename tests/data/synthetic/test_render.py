@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scenes import epipolar_distances
 
+from kornia_learnnorm.data.matching.matchers import match_images
 from kornia_learnnorm.data.synthetic.render import correspondences, render_pair, room, rotation, write_pair
 
 cv2 = pytest.importorskip("cv2")
@@ -12,16 +13,6 @@ cv2 = pytest.importorskip("cv2")
 @pytest.fixture(scope="module")
 def pair():
     return render_pair()
-
-
-@pytest.fixture(scope="module")
-def matches(pair):
-    """SIFT with the ratio test, in plain OpenCV and numpy."""
-    sift = cv2.SIFT_create()
-    (keys1, desc1), (keys2, desc2) = (sift.detectAndCompute(image, None) for image in (pair.image1, pair.image2))
-    good = [a for a, b in cv2.BFMatcher().knnMatch(desc1, desc2, k=2) if a.distance < 0.8 * b.distance]
-    points1 = np.array([keys1[match.queryIdx].pt for match in good], np.float64)
-    return points1, np.array([keys2[match.trainIdx].pt for match in good], np.float64)
 
 
 def test_images(pair):
@@ -46,14 +37,12 @@ def test_ground_truth_is_that_of_the_cameras(pair):
     assert np.linalg.norm(pair.F_mat) == pytest.approx(1)
 
 
-def test_matches_agree_with_the_ground_truth_and_determine_it(pair, matches):
-    assert len(matches[0]) >= 300
-    distance = epipolar_distances(*matches, pair.F_mat)
+def test_matches_agree_with_the_ground_truth(pair):
+    *points, ratio = match_images(pair.image1, pair.image2)
+    distance = epipolar_distances(*(p[ratio < 0.8] for p in points), pair.F_mat)
+    assert len(distance) >= 300
     assert np.mean(distance < 1) >= 0.8
     assert np.median(distance) < 0.3  # images and F agree to a fraction of a pixel
-    F_mat, _ = cv2.findFundamentalMat(*matches, cv2.FM_RANSAC, 0.5, 0.999, 2000)
-    good = distance < 1
-    assert np.median(epipolar_distances(matches[0][good], matches[1][good], F_mat)) < 0.5
 
 
 def test_the_seed_determines_the_pair():
