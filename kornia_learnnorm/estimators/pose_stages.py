@@ -55,14 +55,16 @@ class _Evidence(NamedTuple):
     products: (
         Tensor  # x1 x1^T and x2 x2^T of the points in the frame, which the lines' squared normals need, (B, 18, N)
     )
+    rays: Tensor  # directions in view 1 and in view 2, (B, 6, N)
     unit: Tensor  # of the frame, in pixels, (B, 1)
 
     @classmethod
     def from_frame(cls, model: Essential, frame: CommonFrame, x1: Tensor, x2: Tensor) -> _Evidence:
         """Return the evidence of homogeneous points (B, 3, N) in the frame."""
-        rows = ((model.C1 @ x1)[:, :, None] * (model.C2 @ x2)[:, None]).flatten(1, 2)
+        rays = torch.cat([model.C1 @ x1, model.C2 @ x2], 1)
+        rows = (rays[:, :3, None] * rays[:, None, 3:]).flatten(1, 2)
         products = torch.cat([(x[:, :, None] * x[:, None]).flatten(1, 2) for x in (x1, x2)], 1)
-        return cls(model, rows, products, frame.inverse[:, 0, 0, None])
+        return cls(model, rows, products, rays, frame.inverse[:, 0, 0, None])
 
     def select(self, index: Tensor) -> _Evidence:
         """Return the correspondences of given indices (B, M)."""
@@ -95,6 +97,24 @@ class _Evidence(NamedTuple):
         relative = self.squares(E_mat)[0] * (self.unit[:, None] / pixels).square()
         return relative / (1 + relative)
 
+    def in_front(self, axes: Tensor, weights: Tensor) -> Tensor:
+        """Return which matches are in front of both cameras, (B, N) bool, under the pose of most weight (B, N).
+
+        The essential matrix of axes (B, 2, 3, 3) has two rotations, and translations along the last axis of view 2.
+        """
+        U, V = axes.unbind(1)
+        last = (torch.linalg.det(U) * torch.linalg.det(V))[:, None, None] * V[..., 2:]
+        turned = U[..., :2] @ torch.stack([V[..., 1], -V[..., 0]], 1)
+        kept = U[..., 2:] @ last.mT
+        R = torch.stack([kept + turned, kept - turned], 1)
+        between = R.mT.flatten(2) @ self.rows  # x2^T R x1, (B, 2, N)
+        along1, along2 = last.mT @ self.rays[:, :3], U[..., 2:].mT @ self.rays[:, 3:]  # (B, 1, N)
+        square1, square2 = torch.unflatten(self.rays.square(), 1, (2, 3)).sum(2)[:, :, None].unbind(1)
+        depth1, depth2 = along2 * between - along1 * square2, along2 * square1 - along1 * between
+        front = torch.cat([(depth1 > 0) & (depth2 > 0), (depth1 < 0) & (depth2 < 0)], 1)
+        best = (front.to(weights) @ weights[..., None]).argmax(1, keepdim=True)
+        return front.gather(1, best.expand(-1, 1, front.shape[-1]))[:, 0]
+
     def moments(self, weights: Tensor) -> Tensor:
         """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9), of trace one."""
         M = (self.rows[:, None] * weights[:, :, None]) @ self.rows.mT[:, None]
@@ -118,7 +138,7 @@ def run_pose_stages(
     x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
     model = Essential.of_cameras(K1, K2, frame.T, frame.T)
     evidence = _Evidence.from_frame(model, frame, x1, x2)
-    features = torch.cat([match_features(frame, scores, present), _rays(frame, model, x1, x2)], -1)
+    features = torch.cat([match_features(frame, scores, present), _rays(frame, evidence)], -1)
     states: list[Calibrated] = []
     found: list[Tensor] = []
     dtype, tiny = next(networks.parameters()).dtype, torch.finfo(problem.x1.dtype).tiny
@@ -142,21 +162,22 @@ def run_pose_stages(
                 axes = _axes(_likeliest(evidence, weights, factor, states[-1:]))
             axes = _reweight(evidence, axes, weights, weights, EARLY_SCALE * scale, EARLY_STEPS)
         else:
-            share = torch.where(weights > 0, weights.clamp(min=tiny) ** LAST_POWER, 0.0)
             with torch.no_grad():
-                axes = _most_consistent(evidence, weights, factor, states[-1:], 0 if detach_stages else samples)
+                drawn = 0 if detach_stages else samples
+                axes, front = _most_consistent(evidence, weights, factor, states[-1:], drawn)
+            share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
             axes = _reweight(evidence, axes, share, weights, LAST_SCALE * scale, refine_steps)
         states.append(Calibrated(axes, _EQUAL.to(axes).expand(len(axes), 2, 2), model.C1, model.C2))
         found.append(logits)
     return states, found
 
 
-def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tensor:
+def _rays(frame: CommonFrame, evidence: _Evidence) -> Tensor:
     """Return the directions of both points and the frame's unit in pixels as features, (B, N, 5)."""
-    rays = torch.stack([model.C1 @ x1, model.C2 @ x2], 1)
+    rays = torch.unflatten(evidence.rays, 1, (2, 3))
     rays = torch.where(frame.swapped[:, None, None, None], rays.flip(1), rays)
     rays = rays[:, :, :2] / rays[:, :, 2:]
-    unit = (frame.inverse[:, :1, :1] / 100).log().expand(-1, 1, rays.shape[-1])
+    unit = (evidence.unit / 100).log()[..., None].expand(-1, 1, rays.shape[-1])
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
 
 
@@ -174,20 +195,21 @@ def _likeliest(evidence: _Evidence, weights: Tensor, factor: Tensor | None, befo
     suggested = weights if factor is None else weights * factor
     E_mat, real = _suggested(evidence, suggested[:, None], before)
     losses = evidence.single().losses(E_mat.float(), EARLY_PIXELS)
-    return _least(E_mat, real, losses, weights, 1)[0][:, 0]
+    return _least(E_mat, real, losses, weights, 1)[:, 0]
 
 
 def _most_consistent(
     evidence: _Evidence, weights: Tensor, factor: Tensor | None, before: list[Calibrated], samples: int
-) -> Tensor:
-    """Return the axes (B, 2, 3, 3) of least cost of all matches, whatever their weights, after some steps.
+) -> tuple[Tensor, Tensor]:
+    """Return the axes (B, 2, 3, 3) of least cost of all matches, whatever their weights, and which are in front.
 
-    Candidates come from the moments with and without weights, and from minimal samples drawn by the weights.
+    Candidates come from the moments with and without weights, and from minimal samples drawn by the weights. The best
+    are fitted to all matches. A match behind a camera, (B, N) bool, costs as much as one far away.
     """
     single, present = evidence.single(), (weights > 0).to(weights)
     suggested = weights if factor is None else weights * factor
     E_mat, real = _suggested(evidence, torch.stack([suggested, present], 1), before)
-    best, _ = _least(E_mat, real, single.losses(E_mat.float(), LAST_PIXELS), present, 2)
+    best = _least(E_mat, real, single.losses(E_mat.float(), LAST_PIXELS), present, 2)
     if samples:
         # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
         order = weights.argsort(dim=1, descending=True, stable=True)
@@ -195,17 +217,16 @@ def _most_consistent(
         number = order.shape[1]
         some = order[:, torch.arange(min(number, MAX_SCORED), device=order.device) * number // min(number, MAX_SCORED)]
         losses = single.select(some).losses(drawn.float(), LAST_PIXELS)
-        best = torch.cat([best, _least(drawn, real, losses, present.gather(1, some), SHORTLIST)[0]], 1)
+        best = torch.cat([best, _least(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
     count = best.shape[1]
-    repeated = evidence.repeat(count)
-    axes, weights = _axes(best.flatten(0, 1)), present.repeat_interleave(count, 0)
-    scale = (LAST_PIXELS / repeated.unit).square()
-    axes = _descend(repeated, axes, weights, lambda _: scale, LOCAL_STEPS)
-    axes = axes.view(-1, count, 2, 3, 3)
-    E_mat = _essential(axes.flatten(0, 1)).view(-1, count, 3, 3)
-    real = torch.ones_like(E_mat[..., 0, 0], dtype=torch.bool)
-    cost = _cost(real, single.losses(E_mat.float(), LAST_PIXELS), present)
-    return axes.gather(1, cost.argmin(1)[:, None, None, None, None].expand(-1, 1, 2, 3, 3))[:, 0]
+    repeated, present = evidence.repeat(count), present.repeat_interleave(count, 0)
+    scale, axes = (LAST_PIXELS / repeated.unit).square(), _axes(best.flatten(0, 1))
+    front = repeated.in_front(axes, present)
+    axes = _descend(repeated, axes, present * front, lambda _: scale, LOCAL_STEPS)
+    losses = torch.where(front, repeated.losses(_essential(axes)[:, None], LAST_PIXELS)[:, 0], 1.0)
+    least = (losses * present).sum(1).view(-1, count).argmin(1)
+    chosen = least + count * torch.arange(len(least), device=least.device)
+    return axes[chosen], front[chosen]
 
 
 def _span_moments(evidence: _Evidence, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -219,16 +240,12 @@ def _span_moments(evidence: _Evidence, weights: Tensor) -> tuple[Tensor, Tensor]
     return E_mat.view(-1, number, 3, 3), real.view(-1, number)
 
 
-def _least(E_mat: Tensor, real: Tensor, losses: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Tensor]:
-    """Return the real matrices of least cost, (B, number, 3, 3), and their costs."""
-    least, best = _cost(real, losses, weights).topk(min(number, real.shape[1]), 1, largest=False)
-    return E_mat.gather(1, best[..., None, None].expand(-1, -1, 3, 3)), least
-
-
-def _cost(real: Tensor, losses: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted sums (B, S) of losses (B, S, N), infinite for matrices that are not real."""
+def _least(E_mat: Tensor, real: Tensor, losses: Tensor, weights: Tensor, number: int) -> Tensor:
+    """Return the real matrices of least weighted sums of losses (B, S, N), (B, number, 3, 3)."""
     cost = (losses @ weights.to(losses)[..., None])[..., 0]
-    return torch.where(real & cost.isfinite(), cost, torch.inf)
+    cost = torch.where(real & cost.isfinite(), cost, torch.inf)
+    best = cost.topk(min(number, cost.shape[1]), 1, largest=False).indices
+    return E_mat.gather(1, best[..., None, None].expand(-1, -1, 3, 3))
 
 
 def _solve_samples(evidence: _Evidence, weights: Tensor, order: Tensor, number: int) -> tuple[Tensor, Tensor]:
