@@ -30,10 +30,8 @@ __all__ = ["POSE_OUTPUTS", "POSE_POINT_FEATURES", "POSE_RESIDUAL_FEATURES", "run
 POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
 EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of the last stage's candidates
-EARLY_SCALE, LAST_SCALE = (
-    3.0,
-    1.0,
-)  # of the robust loss over the geometric mean of distances, times the network's factor
+# Scales of the robust loss in geometric means of the distances, times the network's factor.
+EARLY_SCALE, LAST_SCALE = 3.0, 1.0
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.25  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
@@ -52,9 +50,7 @@ class _Evidence(NamedTuple):
 
     model: Essential  # in the frame
     rows: Tensor  # of the design matrix of directions, for the column-major entries of E, (B, 9, N)
-    products: (
-        Tensor  # x1 x1^T and x2 x2^T of the points in the frame, which the lines' squared normals need, (B, 18, N)
-    )
+    products: Tensor  # x1 x1^T and x2 x2^T of points in the frame, for the squared normals of lines, (B, 18, N)
     rays: Tensor  # directions in view 1 and in view 2, (B, 6, N)
     unit: Tensor  # of the frame, in pixels, (B, 1)
 
