@@ -176,6 +176,16 @@ def sizes_table(
     return Markdown(format_table([corner, *(f"N = {size}" for size in sizes)], sizes_rows(title, methods, sizes)))
 
 
+def poses_table(column: str, matcher: str) -> Markdown:
+    """Return a number of poses.csv by estimator and store, of the stores that a matcher's name ends."""
+    header, *rows = read_rows("poses")
+    stores = dict.fromkeys(row[0] for row in rows if row[0].endswith(matcher))
+    found = {(row[0], row[1]): row[header.index(column)] for row in rows}
+    names = dict.fromkeys(row[1] for row in rows)
+    cells = [[name, *(found[store, name] for store in stores)] for name in names]
+    return Markdown(format_table([column, *(store.removesuffix(f"_{matcher}") for store in stores)], cells))
+
+
 def scores_table(title: str) -> Markdown:
     """Return the median errors of one store and protocol where the estimators get Lowe's ratio as scores."""
     names = ["RANSAC", *(name for name in ESTIMATORS if name.startswith("learned"))]

@@ -31,9 +31,9 @@ POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATU
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
 EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of the last stage's candidates
 # Scales of the robust loss in geometric means of the distances, times the network's factor.
-EARLY_SCALE, LAST_SCALE = 3.0, 1.0
+EARLY_SCALE, LAST_SCALE = 3.0, 0.7
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
-LAST_POWER = 0.25  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
+LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
 PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm

@@ -29,7 +29,7 @@ from lightning_modules.config_files import find_config
 pytestmark = pytest.mark.usefixtures("program")
 
 FOLDER = Path(__file__).parents[2] / "configs"
-OF_SETS = ("crossview-sets", "robust", "robust-synthetic")
+OF_SETS = ("crossview-sets", "robust", "robust-pose", "robust-synthetic", "robust-pose-synthetic")
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 SMALL += ["--trainer.num_sanity_val_steps=0"]
 NETWORK = "model.estimator.init_args.normalizer.init_args.network.init_args"
@@ -94,14 +94,15 @@ def test_every_config_of_an_estimator_runs(name, request, tmp_path, monkeypatch,
     """Those of real stores are only made."""
     config = ["--config", str(FOLDER / f"{name}.yaml")]
     config += ["--trainer.enable_progress_bar=false", f"--trainer.default_root_dir={tmp_path}"]
-    if name != "robust-synthetic":
+    if not name.endswith("synthetic"):
         monkeypatch.setenv("LEARNNORM_DATA", str(request.getfixturevalue("real_data")))
         refused(["fit", *config, "--trainer.max_steps=0"], "trainer.max_steps is 0")
         return
     for stage in ("train", "val"):
         config += [f"--data.{stage}.init_args.correspondences=128", f"--data.{stage}.init_args.batches=2"]
     assert main(["fit", *config, "--trainer.max_steps=2"]) == 0
-    layer = kln.LearnedEightPoint.from_pretrained(tmp_path / "weights.safetensors")
+    kind = kln.LearnedRelativePose if "pose" in name else kln.LearnedEightPoint
+    layer = kind.from_pretrained(tmp_path / "weights.safetensors")
     assert layer.trained_on == ("synthetic scenes",)
     assert all(bool(value.any()) for key, value in layer.state_dict().items() if "logit.weight" in key)
     checkpoint = f"--ckpt_path={tmp_path / 'checkpoints/last.ckpt'}"
