@@ -8,7 +8,8 @@ from typing import Any
 
 from torch import nn
 
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
 
@@ -18,7 +19,9 @@ from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download  # 
 
 __all__ = ["HubModel"]
 
-LAYERS = {layer.__name__: layer for layer in (LearnedEightPoint, LearnedNormalizer)}  # what a repository may hold
+LAYERS = {
+    layer.__name__: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedNormalizer)
+}  # what a repository may hold
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 
@@ -29,7 +32,7 @@ CARD = """\
 
 # A layer of kornia_learnnorm
 
-`{{ class_name }}` for the normalised eight-point algorithm, trained on: {{ trained_on }}.
+`{{ class_name }}`, trained on: {{ trained_on }}.
 
 With the name of this repository:
 
@@ -55,8 +58,8 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
         layer: the layer, with all methods of its class.
 
     Raises:
-        TypeError: if the layer is neither a :class:`~kornia_learnnorm.LearnedEightPoint` nor a
-            :class:`~kornia_learnnorm.LearnedNormalizer`.
+        TypeError: if the layer is none of :class:`~kornia_learnnorm.LearnedEightPoint`,
+            :class:`~kornia_learnnorm.LearnedRelativePose` and :class:`~kornia_learnnorm.LearnedNormalizer`.
 
     Example:
         >>> import tempfile
@@ -69,7 +72,7 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
 
     """
 
-    def __init__(self, layer: LearnedEightPoint | LearnedNormalizer) -> None:
+    def __init__(self, layer: LearnedLayer | LearnedNormalizer) -> None:
         super().__init__()
         if type(layer) not in LAYERS.values():
             raise TypeError(f"the layer must be one of {', '.join(LAYERS)}, got {type(layer).__name__}")

@@ -11,7 +11,8 @@ import torch
 import kornia_learnnorm as kln
 
 hub = pytest.importorskip("kornia_learnnorm.hub")
-LAYERS = [(kln.LearnedEightPoint, "robust-tiny"), (kln.LearnedNormalizer, "crossview-synthetic")]
+LAYERS = [(kln.LearnedEightPoint, "robust-tiny"), (kln.LearnedRelativePose, "robust-pose-synthetic")]
+LAYERS += [(kln.LearnedNormalizer, "crossview-synthetic")]
 COMMIT = "0" * 40
 
 
@@ -28,11 +29,12 @@ def test_a_layer_returns_from_a_folder(layer_class, name, tmp_path):
     hub.HubModel(layer).save_pretrained(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "config.json", "model.safetensors"]
     loaded = hub.HubModel.from_pretrained(tmp_path)
-    points1, points2 = torch.rand(2, 2, 9, 2) * 600
+    values = [torch.rand(2, 9, 2) * 600, torch.rand(2, 9, 2) * 600]
+    values += [torch.eye(3)] * 2 if layer_class is kln.LearnedRelativePose else []
     assert type(loaded.layer) is layer_class
     assert not loaded.training
     assert loaded.layer.trained_on == layer.trained_on
-    torch.testing.assert_close(loaded(points1, points2), layer(points1, points2))
+    torch.testing.assert_close(loaded(*values), layer(*values))
     assert layer_class.from_pretrained(tmp_path / "model.safetensors").trained_on == layer.trained_on
 
 
@@ -94,5 +96,5 @@ def test_weights_of_another_class_or_none_are_refused(folder):
 
 
 def test_other_modules_are_refused():
-    with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedNormalizer, got EightPoint"):
+    with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedRelativePose, LearnedNormalizer, got EightPoint"):
         hub.HubModel(kln.EightPoint())
