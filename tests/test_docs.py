@@ -28,6 +28,7 @@ COMMANDS = tomllib.loads((DOCS / "results/commands.toml").read_text(encoding="ut
 FENCE = re.compile(r"^ *```([^\n]*)\n(.*?)^ *```$", flags=re.DOTALL | re.MULTILINE)
 COMMAND = re.compile(r"^ *(?:[A-Z_]+=\S+ )*((?:learnnorm|make|python) [^#>|;&\n]+)", flags=re.MULTILINE)
 TABLE = re.compile(r"^<!-- (?:rows of )?docs/results/(\S+)\.(?:csv|json)(?:, (.*?))? -->\n((?:\|.*\n)+)", re.MULTILINE)
+DETECTORS = ("xfeat", "aliked")
 NUMBER = r"\d+\.\d+|\d+"
 
 
@@ -116,6 +117,17 @@ def test_the_readme_has_errors_of_the_results():
         [f"{store[row].get(n, [0])[0]:.3f}" for store in stores for n in ("16", "64", "512")] for row in stores[0]
     ]
     assert len(table) == 6
+    assert [row for row in table if row.split(" | ") not in expected] == []
+
+
+def test_the_readme_has_poses_of_the_results():
+    found = {(row[0], row[1]): row[2] for row in read_rows("poses")}
+    stores = [
+        f"{name}_{detector}_lightglue" for name in ("photographs", "kitti_06") for detector in ("xfeat", "aliked")
+    ]
+    expected = [[found[store, name] for store in stores] for name in {name for _, name in found} - {"estimator"}]
+    table = re.findall(r"^\| [^|]+ \| (\d+\.\d \| .*) \|$", TEXTS["README.md"], flags=re.MULTILINE)
+    assert len(table) == 7
     assert [row for row in table if row.split(" | ") not in expected] == []
 
 
