@@ -10,7 +10,6 @@ import torch
 from kornia.feature import DISK, LightGlue
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic import orbit
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -38,29 +37,6 @@ def test_learns_from_synthetic_pairs(name, steps, points, gain, example, synthet
 def test_runs_on_real_pairs(example, real_data):
     before, after = example("predict_weights").main(["--steps", "2", "--points", "64", "--pairs", "2"])
     assert 0 < min(before, after) <= max(before, after) < 10
-
-
-class Counting(torch.nn.Module):
-    """Hartley's normalisation that counts its calls by the number of points."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.sizes: list[int] = []
-
-    def forward(self, points1, points2, weights=None):
-        self.sizes.append(points1.shape[1])
-        return kln.Hartley()(points1, points2, weights)
-
-
-def test_kornia_ransac_solves_and_refits_by_the_layer(example):
-    pair = orbit(1, 200, torch.Generator().manual_seed(0), noise=0.2, outliers=0.2)
-    counting = Counting()
-    F_mat, inliers = example("kornia_ransac").kornia_ransac(counting, 200)(pair.points1[0], pair.points2[0])
-    assert 8 in counting.sizes
-    assert max(counting.sizes) > 8
-    assert (inliers == pair.inliers[0]).float().mean() > 0.9
-    distance = kln.symmetric_epipolar_distance(pair.points1, pair.points2, F_mat[None])
-    assert distance[pair.inliers].median() < 1
 
 
 def test_kornia_ransac_example(example, synthetic):

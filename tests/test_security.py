@@ -11,7 +11,6 @@ import zipfile
 import zlib
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import torch
@@ -20,9 +19,6 @@ from safetensors.torch import save_file
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.images import image_size, read_image
-from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.runs.results_store import read_arrays
 
 ROOT = Path(__file__).parent.parent
@@ -153,19 +149,10 @@ def test_pixels_that_an_image_declares(tmp_path, size):
     assert image_size(path) == (0, 0)
 
 
-class TestArrays:
-    """Arrays that runs leave on disk, and attributes of stores: no pickle in them is read."""
-
-    def test_npz(self, made, tmp_path):
-        np.savez(tmp_path / "forged.npz", plain_residual=np.array([Touches(made)], object))
-        with pytest.raises(ValueError, match=r"forged\.npz is damaged"):
-            read_arrays(tmp_path / "forged.npz")
-
-    def test_attributes_of_a_store(self, made, tmp_path):
-        write_store(tmp_path / "store.h5", synthetic_store(pairs=2, points=30, seed=1))
-        with h5py.File(tmp_path / "store.h5", "r+") as file:
-            file.attrs["dataset"] = np.void(pickle.dumps(Touches(made)))
-        read_store(tmp_path / "store.h5")
+def test_no_pickle_in_arrays_is_read(made, tmp_path):
+    np.savez(tmp_path / "forged.npz", plain_residual=np.array([Touches(made)], object))
+    with pytest.raises(ValueError, match=r"forged\.npz is damaged"):
+        read_arrays(tmp_path / "forged.npz")
 
 
 def test_no_load_path_unpickles():

@@ -157,18 +157,6 @@ class TestManyPairs:
         assert [warning["code"] for warning in json.loads(failed)["warnings"]] == ["blank"]
         assert json.loads(failed)["image2"] == {"file": "late.png", "width": WIDTH, "height": HEIGHT}
 
-    def test_failures_and_warnings_are_counted_apart(self, capsys):
-        warning, images = [{"code": "why", "text": "A reason"}], {"image1": {"file": "a"}, "image2": {"file": "b"}}
-        solved, doubtful, failed = (
-            {"F": F, "warnings": w, **images} for F, w in ((1, []), (1, warning), (None, warning))
-        )
-        command_module._print_pairs([solved, doubtful, *7 * [failed]], Path("found"))
-        printed = capsys.readouterr()
-        assert printed.out == "wrote found: 2 of 9 pairs solved, 7 failed; 1 solved with warnings\n"
-        *named, more = printed.err.splitlines()
-        assert named == 5 * ["failed: a b: A reason (why)"]
-        assert more.startswith("and 2 more: ")
-
     @pytest.mark.parametrize(
         ("options", "error", "message"),
         [

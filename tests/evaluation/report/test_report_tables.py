@@ -151,13 +151,6 @@ def test_numbers_of_robust_estimators(robust_run):
     assert changes[3] == f"{100 * (mine - other).mean().item():+.3f}"  # too few pairs for an interval
 
 
-def test_parts_of_a_table():
-    rows = [["a", "-", Number(1.5, ".1f"), ""], ["b", "-", "", ""], ["c", "-", "-", "-"]]
-    known = Table("", "", ["method", "own", "truth", "angle"], rows).known_parts()
-    assert (known.header, as_text(known.rows)) == (["method", "truth"], [["a", "1.5"]])
-    assert Table("", "", ["method", "own"], [["a", "-"], ["b", ""]]).known_parts() is None
-
-
 def test_cells_as_json():
     numbers = [Number(1.499, "+.2f"), Number(2.5e6, ".3g"), Number(-3, ".1f", (-4, -2), 0.0004)]
     numbers += [Number(7, ".2f", std=0.1), Number(99.9, ".1f", (99.0, 100.0), trained_on=True)]
