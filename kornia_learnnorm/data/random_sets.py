@@ -50,9 +50,7 @@ class StoreSets:
         max_ratios: Sequence[float | None] = (RATIO, None),
         labels: bool = True,
     ) -> None:
-        if not paths or not max_ratios:
-            raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
-        check_draws(num_heldout, max_ratios)
+        check_draws(paths, num_heldout, max_ratios)
         self.paths, self.num_heldout, self.max_ratios = tuple(paths), num_heldout, tuple(max_ratios)
         self._pairs = [pair for path in paths for pair in _read_pairs(path, labels)]
         if not self._pairs:

@@ -71,13 +71,11 @@ class StoreSamples:
         max_residual: float | None = MAX_RESIDUAL,
         block_pairs: int = 1024,
     ) -> None:
-        if not paths or not max_ratios:
-            raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
         self.sizes = (size, size) if isinstance(size, int) else tuple(size)
         if len(self.sizes) != 2 or not 8 <= self.sizes[0] <= self.sizes[1] or block_pairs < 1:
             got = f"size={size}, block_pairs={block_pairs}"
             raise ValueError(f"a sample needs at least 8 correspondences, a block at least one pair, got {got}")
-        check_draws(num_heldout, max_ratios)
+        check_draws(paths, num_heldout, max_ratios)
         self.paths, self.max_ratios = tuple(paths), tuple(max_ratios)
         self.stores = [StoreReader(expand_path(path)) for path in paths]
         self.num_heldout, self.max_residual, self.block_pairs = num_heldout, max_residual, block_pairs
@@ -162,8 +160,10 @@ class SyntheticSamples:
         return MatchSets(points1, points2, heldout1, heldout2, pair).with_residual_below(self.max_residual)
 
 
-def check_draws(num_heldout: int, max_ratios: Sequence[float | None]) -> None:
-    """Raise ValueError for a negative number of held-out matches, or a limit of Lowe's ratio outside (0, 1]."""
+def check_draws(paths: Sequence[str], num_heldout: int, max_ratios: Sequence[float | None]) -> None:
+    """Raise ValueError without a store or a ratio, for held-out matches below 0, or Lowe's ratio outside (0, 1]."""
+    if not paths or not max_ratios:
+        raise ValueError(f"at least one store and one ratio expected, got {paths!r} and {max_ratios!r}")
     if num_heldout < 0:
         raise ValueError(f"num_heldout must be 0 or more, got {num_heldout}")
     if wrong := [ratio for ratio in max_ratios if ratio is not None and not 0 < ratio <= 1]:

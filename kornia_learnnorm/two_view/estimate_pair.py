@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size, content_mask, image_size, import_cv2, read_image, resize_image, scaling
-from kornia_learnnorm.data.matching.features import DETECTORS, Features, keep_features
-from kornia_learnnorm.data.matching.matchers import MATCHERS, match_both_ways
+from kornia_learnnorm.data.matching.features import DETECTORS, Features, check_mask, keep_features
+from kornia_learnnorm.data.matching.matchers import MATCHERS, check_methods, match_both_ways
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points
@@ -189,11 +189,7 @@ def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> 
     check_whole("max_size", max_size)
     if max_size < MIN_SIZE:
         raise ValueError(f"max_size must be at least {MIN_SIZE} pixels, got {max_size}")
-    for name, given, known in (("detector", detector, DETECTORS), ("matcher", matcher, MATCHERS)):
-        if given not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, got {given!r}")
-    if matcher == "lightglue" and detector != "disk":
-        raise ValueError(f"matcher lightglue needs detector disk, got {detector}")
+    check_methods(detector, matcher)
 
 
 def _named(error: NoReliableMatrixError, paths: tuple[Path | None, Path | None]) -> NoReliableMatrixError:
@@ -208,10 +204,7 @@ def _features(image: Image, mask: Mask | None, max_size: int, detector: str) -> 
     frame = content_mask(grey)
     if mask is not None:
         mask = mask.cpu().numpy() if isinstance(mask, Tensor) else mask
-        if not isinstance(mask, np.ndarray) or mask.dtype != bool:
-            raise TypeError(f"a mask must be an array of bool, got {getattr(mask, 'dtype', type(mask))}")
-        if mask.shape != size[::-1]:
-            raise ValueError(f"a mask must have the shape of its image, {size[::-1]}, got {mask.shape}")
+        check_mask(mask, size)
         small = import_cv2().resize(mask.astype(np.uint8), grey.shape[::-1], interpolation=0) > 0
         frame = small if frame is None else small & frame
     features = DETECTORS[detector](grey, NUM_FEATURES)

@@ -155,11 +155,7 @@ class TwoViewSolver:
         return found[1:]
 
     def _search_near(self, F_mat: Tensor) -> Tensor:
-        """Return a matrix (3, 3), or a better one that is found among the matches near it, where most are no inliers.
-
-        Among 80 % of outliers and more, the matrix of a search is often one of a few inliers and some outliers. Near it
-        lie most of the true matches and few of the outliers, so that a search among them finds the best matrix.
-        """
+        """Return a matrix (3, 3), or a better one of the matches near it, which has most true ones and few others."""
         for _ in range(MAX_NEAR_SEARCHES):
             distance = self.distance(F_mat)
             near = distance < NEAR * self.threshold
@@ -188,10 +184,7 @@ class TwoViewSolver:
         return refine_fundamental(self.points1[None], self.points2[None], F_mat[None], loss=loss).F_mat[0]
 
     def _try_plane_and_parallax(self, F_mat: Tensor) -> Tensor:
-        """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher.
-
-        It is refined at the scale of the noise where no parallax exceeds the threshold.
-        """
+        """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher."""
         inliers = self.inliers(F_mat)
         if int(inliers.sum()) < 8:
             return F_mat

@@ -12,16 +12,8 @@ from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 from kornia_learnnorm.two_view.parallax import parallax_evidence
 
-__all__ = [
-    "MAX_LOG_CHANCE_PARALLAX",
-    "MAX_LOG_FALSE_ALARMS",
-    "MIN_INLIERS",
-    "MIN_PLANAR_SHARE",
-    "PairWarning",
-    "find_warnings",
-    "log_false_alarms",
-    "log_false_samples",
-]
+__all__ = ["MAX_LOG_CHANCE_PARALLAX", "MAX_LOG_FALSE_ALARMS", "MIN_INLIERS", "MIN_PLANAR_SHARE", "PairWarning"]
+__all__ += ["find_warnings", "log_false_alarms", "log_false_samples"]
 
 MAX_ANGLE = 8.0  # degrees; a pose that moves by more in half of the parts is unstable
 MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either

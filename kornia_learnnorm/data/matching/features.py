@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import check_grey, import_cv2
 
-__all__ = ["DETECTORS", "Features", "detect_disk", "detect_keynet", "detect_rootsift", "detect_sift", "keep_features"]
-__all__ += ["pretrained"]
+__all__ = ["DETECTORS", "Features", "check_mask", "detect_disk", "detect_keynet", "detect_rootsift", "detect_sift"]
+__all__ += ["keep_features", "pretrained"]
 
 MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is of the mask's edge
 
@@ -85,16 +85,21 @@ def keep_features(features: Features, mask: NDArray[np.bool_]) -> Features:
     ``mask`` is true for the pixels that count, (H, W) bool; TypeError or ValueError for other arrays. The border of the
     image itself drops nothing.
     """
-    if not isinstance(mask, np.ndarray) or mask.dtype != bool:
-        raise TypeError(f"a mask must be an array of bool, got {getattr(mask, 'dtype', type(mask))}")
+    check_mask(mask, features.size)
     width, height = features.size
-    if mask.shape != (height, width):
-        raise ValueError(f"a mask must have the shape of its image, {(height, width)}, got {mask.shape}")
     side = 2 * MASK_MARGIN + 1
     inner = import_cv2().erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
     x, y = np.rint(features.points).astype(int).clip(0, (width - 1, height - 1)).T
     kept = inner[y, x]
     return features._replace(points=features.points[kept], descriptors=features.descriptors[kept])
+
+
+def check_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> None:
+    """Raise TypeError or ValueError unless a mask is an array of bool with the (width, height) of its image."""
+    if not isinstance(mask, np.ndarray) or mask.dtype != bool:
+        raise TypeError(f"a mask must be an array of bool, got {getattr(mask, 'dtype', type(mask))}")
+    if mask.shape != size[::-1]:
+        raise ValueError(f"a mask must have the shape of its image, {size[::-1]}, got {mask.shape}")
 
 
 # names on the command line

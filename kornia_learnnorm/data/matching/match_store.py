@@ -22,7 +22,7 @@ import numpy as np
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair, read_frame
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.features import DETECTORS, Features
-from kornia_learnnorm.data.matching.matchers import MATCHERS, one_to_one
+from kornia_learnnorm.data.matching.matchers import MATCHERS, check_methods, one_to_one
 from kornia_learnnorm.data.matching.workers import Workers, open_workers, restart_crashed
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.writer import StoreWriter, check_target
@@ -50,17 +50,13 @@ class MatchOptions:
     seed: int = 0  # of this draw and of the order of a pair's matches
 
     def __post_init__(self) -> None:
-        for kind, given, known in (("detector", self.detector, DETECTORS), ("matcher", self.matcher, MATCHERS)):
-            if given not in known:
-                raise ValueError(f"{kind} must be one of {', '.join(known)}, got {given!r}")
+        check_methods(self.detector, self.matcher)
         if self.num_features < 2:
             raise ValueError(f"num_features must be at least 2, got {self.num_features}")
         if self.max_matches is not None and self.max_matches < 8:
             raise ValueError(f"max_matches must be at least 8, or None (a command's 0) for all, got {self.max_matches}")
         if self.seed < 0:
             raise ValueError(f"seed must be 0 or more, got {self.seed}")
-        if self.matcher == "lightglue" and self.detector != "disk":
-            raise ValueError(f"the matcher lightglue needs features of the detector disk, got {self.detector}")
 
 
 def match_frames(

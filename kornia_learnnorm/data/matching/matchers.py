@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_learnnorm.data.images import import_cv2
-from kornia_learnnorm.data.matching.features import Features, detect_sift, pretrained
+from kornia_learnnorm.data.matching.features import DETECTORS, Features, detect_sift, pretrained
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 
-__all__ = ["MATCHERS", "Matches", "match_both_ways", "match_images", "match_lightglue", "match_nearest", "one_to_one"]
+__all__ = ["MATCHERS", "Matches", "check_methods", "match_both_ways", "match_images", "match_lightglue"]
+__all__ += ["match_nearest", "one_to_one"]
 
 
 class Matches(NamedTuple):
@@ -83,6 +84,15 @@ def match_lightglue(features1: Features, features2: Features) -> Matches:
 
 # names on the command line
 MATCHERS: dict[str, Callable[[Features, Features], Matches]] = {"nearest": match_nearest, "lightglue": match_lightglue}
+
+
+def check_methods(detector: str, matcher: str) -> None:
+    """Raise ValueError for an unknown detector or matcher, or two that do not go together."""
+    for name, given, known in (("detector", detector, DETECTORS), ("matcher", matcher, MATCHERS)):
+        if given not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {given!r}")
+    if matcher == "lightglue" and detector != "disk":
+        raise ValueError(f"matcher lightglue needs detector disk, got {detector}")
 
 
 def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_features: int = 4000) -> Matches:

@@ -105,11 +105,8 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when ``parent`` has been killed; otherwise it would wait forever to write to a pipe.
-
-    An interrupt from the keyboard reaches all processes; the workers ignore it, and the parent ends them.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """End this process when ``parent`` has been killed; otherwise it would wait forever to write to a pipe."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, and the parent ends the workers
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -187,10 +187,7 @@ def _scores(inliers: Tensor, clean: Tensor, generator: Generator) -> Tensor:
 
 
 def _learned_scores(inliers: Tensor, quality: Tensor, clean: Tensor, generator: Generator) -> Tensor:
-    """Return scores (B, N) as of LightGlue, in sets marked ``clean`` (B, 1), and of ratios of nearest neighbours.
-
-    ``quality`` (B, N) is the logarithm of the noise of each match, with a normal distribution.
-    """
+    """Return scores (B, N) as of LightGlue, in sets marked ``clean`` (B, 1), and of ratios, by the log of the noise."""
     chance = draws.normal(tuple(inliers.shape), generator)
     good = torch.where(clean, 3 - 1.7 * quality + 0.7 * chance, -0.7 - 0.6 * quality + 0.5 * chance)
     bad = torch.where(clean, 1.5 * chance, chance - 2.2)

@@ -90,9 +90,8 @@ def forward_driving(
     size, K = draws.fixed_camera(batch_size, (1241.0, 376.0), 718.856, (607.1928, 185.2157), generator)
     points1 = draws.spread_points(size, 2 * num_points + 16, generator)
     depths = draws.draw_depths(points1, K, 4.0, 75.0, torch.full_like(size[:, :1], 1.65), generator)
-    forward = draws.normal((batch_size, 1, 3), generator) * size.new_tensor([0.03, 0.01, 0.0]) + size.new_tensor(
-        [0.0, 0, 1]
-    )
+    ahead = size.new_tensor([0.0, 0.0, 1.0])
+    forward = ahead + draws.normal((batch_size, 1, 3), generator) * size.new_tensor([0.03, 0.01, 0.0])
     axes = draws.normal((batch_size, 1, 3), generator) * size.new_tensor([0.2, 1.0, 0.2])
     baseline = draws.uniform((batch_size, 1), 0.6, 1.4, generator)
     R, t = draws.motions(axes, draws.log_uniform((batch_size, 1), 0.002, 0.05, generator), forward, baseline)

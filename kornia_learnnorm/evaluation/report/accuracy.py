@@ -28,7 +28,9 @@ def _accuracy(cell: RunCell) -> Table:
     header = ["method", "fit px", "held out px", "truth px", f"truth: better than {BASELINE} %"]
     header += ["rotation deg", "translation deg", *numbers.POSE_HEADER, "condition number", "rho"]
     header += ["distance 1", "distance 2", "error due to rank 2 %"]
-    posed, rows = _posed(cell), list[list[Cell]]()
+    errors = torch.stack([p["translation_error"] for p in cell.predictions.values()])
+    # Samples whose pair has a ground-truth pose: any method has an error on any of them.
+    posed, rows = torch.isin(cell.pair, cell.pair[errors.isfinite().any(0)]), list[list[Cell]]()
     for name, p in cell.predictions.items():
         angles = [p[key] for key in ("rotation_error", "translation_error")]
         row = [name, *(median_number(p[key]) for key in ("own", "heldout", "truth"))]
@@ -83,12 +85,6 @@ def _consensus(cell: RunCell, run: Run) -> Table:
 def _with_truth(cell: RunCell) -> Tensor:
     """Return a mask of the samples whose pair has ground-truth inliers, (S,)."""
     return ~cell.predictions[BASELINE]["truth"].isnan()
-
-
-def _posed(cell: RunCell) -> Tensor:
-    """Return a mask of the samples whose pair has a ground-truth pose, (S,): any method has an error on any of them."""
-    errors = torch.stack([p["translation_error"] for p in cell.predictions.values()])
-    return torch.isin(cell.pair, cell.pair[errors.isfinite().any(0)])
 
 
 def _tests(cell: RunCell) -> Table:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK = "#010203"  # placeholder that _make_picture replaces by the text colour of the page
-# Legible on white and on black; after P. Tol's and Okabe and Ito's palettes for colour blindness.
+# Of methods, in turn. Legible on white and on black; after P. Tol's and Okabe and Ito's palettes for colour blindness.
 HUES = "8b8b8b e69f00 2b9fd9 18a57a d55e00 cc79a7 a0714f 7a6ff0 b8a400 c2443f 5f8f2f"
 WIDTH = 8.0  # inches
 SETTINGS: dict[str, Any] = {
@@ -66,18 +65,15 @@ class ReportPicture(NamedTuple):
 
 def report_figures(run: Run) -> list[ReportPicture]:
     """Draw all pictures of a run; those of samples use the first store with filtered samples."""
-    with import_matplotlib().rc_context(SETTINGS):
-        return _report_figures(run)
-
-
-def _report_figures(run: Run) -> list[ReportPicture]:
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
-    colors = _colors(run.about["methods"])
-    pictures = [(cell.store, draw(cell, colors)) for draw in (_per_frame, _distribution, _distances)]
-    example = [*draw_example(run, colors), *([_by_size(run, colors)] if run.sizes else [])]
-    pictures += [(str(run.example["store"]), picture) for picture in example]
+    hues = HUES.split()
+    colors = {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(run.about["methods"])}
     last = [_conditions, _rho] if len(cell.pair) >= RHO_WINDOW else [_conditions]
-    pictures += [(cell.store, draw(cell, colors)) for draw in last]
+    with import_matplotlib().rc_context(SETTINGS):
+        pictures = [(cell.store, draw(cell, colors)) for draw in (_per_frame, _distribution, _distances)]
+        example = [*draw_example(run, colors), *([_by_size(run, colors)] if run.sizes else [])]
+        pictures += [(str(run.example["store"]), picture) for picture in example]
+        pictures += [(cell.store, draw(cell, colors)) for draw in last]
     # The numbers of Fan et al. are in the titles where a store has their test data.
     return [
         p._replace(title=f"{p.title} (Figure {p.name.removeprefix('figure-')})")
@@ -251,12 +247,6 @@ def _frame(axes: Axes, size: NDArray[np.int32], name: str) -> None:
     width, height = size.tolist()
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel=f"x in {name}, px")
     axes.set_ylabel("y, px")
-
-
-def _colors(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each method; they repeat after eleven methods."""
-    hues = HUES.split()
-    return {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(names)}
 
 
 def _line_style(name: str) -> str:

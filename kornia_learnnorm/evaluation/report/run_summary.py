@@ -54,11 +54,7 @@ def robust_summary(run: RobustRun) -> list[str]:
 
 
 def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> _Ranking:
-    """Rank methods by their values, and compare the mean score of the winner with each other one's.
-
-    ``values`` are what the summary quotes, less is better; NaN comes last. ``scores`` (S,) of each method and ``pair``
-    (S,), the image pair of each sample, are for the comparison; the samples count that all methods have.
-    """
+    """Rank methods by the values that the summary quotes, and compare the winner's scores (S,) with each other's."""
     valid = torch.stack([*scores.values()]).isfinite().all(0)
     winner, *others = sorted(values, key=lambda name: math.inf if math.isnan(values[name]) else values[name])
     differences, pair = {}, pair[valid]

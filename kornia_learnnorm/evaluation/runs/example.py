@@ -9,7 +9,7 @@ import torch
 
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.runs.pair_matches import ground_truth_inliers, median_distance, pair_matches
+from kornia_learnnorm.evaluation.runs.predict import ground_truth_inliers, median_distance, pair_matches
 from kornia_learnnorm.evaluation.runs.results_store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.median import median

@@ -1,4 +1,4 @@
-"""The samples of a run, and what it keeps of each method's matrices of them."""
+"""The samples of a run, what it keeps of each method's matrices of them, and matches of image pairs."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from kornia_learnnorm.data.sets import MatchSets, draw_samples
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method
-from kornia_learnnorm.evaluation.runs.pair_matches import ground_truth_inliers, median_distance, pair_matches
 from kornia_learnnorm.evaluation.runs.results_store import Arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.metrics.inliers import f1_from_masks, finite_distance
+from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.metrics.poses import rotation_error, translation_error
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.normalizer import normalizing_transforms
-from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, MAX_RESIDUAL, RATIO, THRESHOLDS
 
 # What a run keeps of each sample, by name.
 DIAGNOSTICS = ("condition_number", "rho", "distance1", "distance2", "rank2_share")  # in the order of Diagnostics
@@ -28,6 +28,8 @@ ERRORS = ("F_mat", "own", "heldout", "truth", "rotation_error", "translation_err
 AGREEMENT = ("inliers", "f1")  # takes longer than all others together
 NUM_HELDOUT = 16  # held-out matches of a sample
 BATCH_SIZE = 2048  # samples solved at once
+MIN_INLIERS = 16  # a pair with fewer has no ground-truth inliers to measure with
+MAX_INLIERS = 200  # of a pair, the first in the store's random order
 
 
 @dataclass(frozen=True)
@@ -114,3 +116,32 @@ def _within(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
     """Return which points lie within each threshold, (S, thresholds, N); none do under a matrix of NaN."""
     distance = finite_distance(points1, points2, F_mat)
     return distance[:, None] < distance.new_tensor(THRESHOLDS)[:, None]
+
+
+def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
+    """Return the matches of an image pair in both views below Lowe's ratio, pixels, (M, 2) float64 each."""
+    points1, points2, _ = store.matches(pair, max_ratio)
+    return torch.from_numpy(points1).double(), torch.from_numpy(points2).double()
+
+
+def ground_truth_inliers(store: CorrespondenceStore) -> Tensor:
+    """Return each pair's matches that pass the ratio test and lie within 1 px of their ground-truth epipolar lines.
+
+    They are points (x1, y1, x2, y2), (P, 200, 4) float64, padded with NaN; all NaN for a pair with fewer than 16.
+    """
+    result = torch.full((len(store), MAX_INLIERS, 4), torch.nan, dtype=torch.float64)
+    for pair, F_mat in enumerate(torch.from_numpy(store.F)):
+        x1, x2 = pair_matches(store, pair, RATIO)
+        near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD  # none if F_mat is NaN, not known
+        points = torch.cat([x1, x2], -1)[near][:MAX_INLIERS]
+        if len(points) >= MIN_INLIERS:
+            result[pair, : len(points)] = points
+    return result
+
+
+def median_distance(points: Tensor, F_mat: Tensor) -> Tensor:
+    """Return the median symmetric epipolar distance (S,) of sets (S, N, 4), pixels; rows of NaN are left out."""
+    known = points.nan_to_num()
+    distance = symmetric_epipolar_distance(known[..., :2], known[..., 2:], F_mat)
+    distance[points.isnan().any(-1)] = torch.nan
+    return median(distance)
