@@ -46,7 +46,7 @@ def test_kornia_ransac_example(example, synthetic):
 
 
 def test_lightglue_learns_through_the_layer_and_the_learned_one_needs_no_scores(example, synthetic):
-    before, after = example("match_and_estimate").main(["--steps", "60"])
+    before, after = example("match_and_estimate").main(["--steps", "25"])
     assert after < 0.9 * before
     before, _ = example("match_and_estimate").main(["--layer", "learned", "--steps", "1"])
     assert before < 1
