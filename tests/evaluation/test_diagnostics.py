@@ -120,6 +120,11 @@ class TestDiagnose:
         np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=1e-2 if loose else 1e-5)
         np.testing.assert_allclose(found[:, 1:], expected[:, 1:], rtol=1e-3 if loose else 1e-6, atol=1e-6)
 
+    @pytest.mark.parametrize("normalizer", NORMALIZERS[1:])
+    def test_eight_points_leave_all_to_the_projection(self, normalizer):
+        points = correspondences("handheld", 50, noise=1.0)
+        np.testing.assert_allclose(diagnose(*points, normalizer).rank2_share.numpy(), 1, atol=1e-6)
+
     @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.floats(-2, 2), st.randoms())
     def test_order_scale_and_shift_do_not_matter_to_hartley(self, seed, num_points, log_scale, random):
         """One scale for both views, which the sum of their distances asks for; the share has no unit."""
