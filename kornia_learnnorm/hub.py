@@ -19,9 +19,8 @@ from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download  # 
 
 __all__ = ["HubModel"]
 
-LAYERS = {
-    layer.__name__: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedNormalizer)
-}  # what a repository may hold
+# What a repository may hold.
+LAYERS = {layer.__name__: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedNormalizer)}
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 

@@ -179,8 +179,7 @@ class LogEssentialLoss(nn.Module):
 
     The sign of a matrix has no meaning: the nearer of both counts.
 
-    The distance is about the angle between two poses, in radians: of the translations times the root of one half, and
-    of the rotations.
+    For small angles, in radians, the distance is that of the translations, or 0.7 to 1 times that of the rotations.
 
     Args:
         floor: distance :math:`f`, far below which nothing is gained.

@@ -131,16 +131,12 @@ def weights_format(name: str | Path) -> str | None:
 
 
 def weights_model(name: str | Path) -> str:
-    """Return the two-view model of a learned estimator's weights; that of fundamental matrices where none is named."""
-    path = weights_path(name)
-    if not path.is_file():
-        return "fundamental"
+    """Return the two-view model that weights name, "" where there is none; loading the file tells what is wrong."""
     try:
-        with safe_open(path, "pt") as file:
-            architecture = json.loads((file.metadata() or {}).get("architecture", "{}"))
-    except (SafetensorError, ValueError):
-        return "fundamental"
-    return str(architecture.get("model", "fundamental")) if isinstance(architecture, dict) else "fundamental"
+        with safe_open(weights_path(name), "pt") as file:
+            return str(json.loads(file.metadata()["architecture"])["model"])
+    except (OSError, SafetensorError, ValueError, LookupError, TypeError):
+        return ""
 
 
 def weights_digest(name: str | Path) -> str:

@@ -16,6 +16,8 @@ from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
+from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2")
@@ -203,3 +205,16 @@ def test_learned_estimators_by_name(benchmark, case, suffix):
     F_mat = sizes.find_method(name)(*points, torch.ones(2, 64).double())
     assert sizes.shown(name) == name
     assert kln.symmetric_epipolar_distance(*points, F_mat).median() < 0.5
+
+
+def test_poses_of_a_store(benchmark, tmp_path, capsys, monkeypatch):
+    poses, store = benchmark("poses"), tmp_path / "pairs.h5"
+    write_store(store, synthetic_store(2, points=80, scenes=["orbit"]))
+    names = ["RANSAC-calibrated", "learned:robust-pose-synthetic+scores"]
+    monkeypatch.setattr("sys.argv", ["poses", str(store), "--estimators", *names, "--csv", str(tmp_path / "poses.csv")])
+    poses.main()
+    rows = [line.split(",") for line in (tmp_path / "poses.csv").read_text().splitlines()]
+    assert rows[0] == ["store", *poses.HEADER]
+    assert [row[:2] for row in rows[1:]] == [["pairs", name] for name in names]
+    assert all(float(row[2]) > 50 for row in rows[1:])
+    assert "| RANSAC-calibrated" in capsys.readouterr().out

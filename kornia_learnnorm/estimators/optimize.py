@@ -16,7 +16,7 @@ from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss
 from kornia_learnnorm.geometry.checks import needs_gradient
 from kornia_learnnorm.models.contract import Residuals, State, TwoViewModel
 
-__all__ = ["Optimum", "RobustCost", "attach_gradient", "minimize", "refine_unrolled"]
+__all__ = ["UNROLLED_LOSS", "Optimum", "RobustCost", "attach_gradient", "minimize", "refine_unrolled"]
 
 FIRST_DAMPING = 1e-3  # of the diagonal of the normal matrix, added to it in the first step
 MAX_DAMPING = 1e8  # no step that is damped this much changes the cost by more than rounding

@@ -21,6 +21,7 @@ from kornia_learnnorm.estimators.match_features import (
     match_features,
     residual_features,
 )
+from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
@@ -90,21 +91,13 @@ class _Evidence(NamedTuple):
 
     def losses(self, E_mat: Tensor, pixels: float) -> Tensor:
         """Return Geman and McClure's loss (B, S, N) of a scale in pixels."""
-        relative = self.squares(E_mat)[0] * (self.unit[:, None] / pixels).square()
-        return relative / (1 + relative)
+        return UNROLLED_LOSS(self.squares(E_mat)[0] * (self.unit[:, None] / pixels).square())[0]
 
-    def in_front(self, axes: Tensor, weights: Tensor) -> Tensor:
-        """Return which matches are in front of both cameras, (B, N) bool, under the pose of most weight (B, N).
-
-        The essential matrix of axes (B, 2, 3, 3) has two rotations, and translations along the last axis of view 2.
-        """
-        U, V = axes.unbind(1)
-        last = (torch.linalg.det(U) * torch.linalg.det(V))[:, None, None] * V[..., 2:]
-        turned = U[..., :2] @ torch.stack([V[..., 1], -V[..., 0]], 1)
-        kept = U[..., 2:] @ last.mT
-        R = torch.stack([kept + turned, kept - turned], 1)
+    def in_front(self, state: Calibrated, weights: Tensor) -> Tensor:
+        """Return which matches are in front of both cameras, (B, N) bool, under the pose of most weight (B, N)."""
+        R, t = state.rotations(), state.axes[:, 0, :, 2:]
         between = R.mT.flatten(2) @ self.rows  # x2^T R x1, (B, 2, N)
-        along1, along2 = last.mT @ self.rays[:, :3], U[..., 2:].mT @ self.rays[:, 3:]  # (B, 1, N)
+        along1, along2 = (R[:, 0].mT @ t).mT @ self.rays[:, :3], t.mT @ self.rays[:, 3:]  # of either R, (B, 1, N)
         square1, square2 = torch.unflatten(self.rays.square(), 1, (2, 3)).sum(2)[:, :, None].unbind(1)
         depth1, depth2 = along2 * between - along1 * square2, along2 * square1 - along1 * between
         front = torch.cat([(depth1 > 0) & (depth2 > 0), (depth1 < 0) & (depth2 < 0)], 1)
@@ -163,7 +156,7 @@ def run_pose_stages(
                 axes, front = _most_consistent(evidence, weights, factor, states[-1:], drawn)
             share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
             axes = _reweight(evidence, axes, share, weights, LAST_SCALE * scale, refine_steps)
-        states.append(Calibrated(axes, _EQUAL.to(axes).expand(len(axes), 2, 2), model.C1, model.C2))
+        states.append(_state(axes, model))
         found.append(logits)
     return states, found
 
@@ -217,7 +210,7 @@ def _most_consistent(
     count = best.shape[1]
     repeated, present = evidence.repeat(count), present.repeat_interleave(count, 0)
     scale, axes = (LAST_PIXELS / repeated.unit).square(), _axes(best.flatten(0, 1))
-    front = repeated.in_front(axes, present)
+    front = repeated.in_front(_state(axes, repeated.model), present)
     axes = _descend(repeated, axes, present * front, lambda _: scale, LOCAL_STEPS)
     losses = torch.where(front, repeated.losses(_essential(axes)[:, None], LAST_PIXELS)[:, 0], 1.0)
     least = (losses * present).sum(1).view(-1, count).argmin(1)
@@ -284,7 +277,7 @@ def _descend(
     """
     for _ in range(steps):
         squares, factor = (value[:, 0] for value in evidence.squares(_essential(axes)[:, None]))
-        slope = (1 + squares / square_scale(squares)).square().reciprocal()
+        slope = UNROLLED_LOSS(squares / square_scale(squares))[1]
         axes = _gauss_newton(evidence.moments((weights * slope * factor)[:, None])[:, 0], axes)
     return axes
 
@@ -293,6 +286,11 @@ def _axes(E_mat: Tensor) -> Tensor:
     """Return the axes (B, 2, 3, 3) of the nearest essential matrices."""
     U, _, Vh = torch.linalg.svd(E_mat)
     return torch.stack([U, Vh.mT], 1)
+
+
+def _state(axes: Tensor, model: Essential) -> Calibrated:
+    """Return the states of axes (B, 2, 3, 3) of both views."""
+    return Calibrated(axes, _EQUAL.to(axes).expand(len(axes), 2, 2), model.C1, model.C2)
 
 
 def _essential(axes: Tensor) -> Tensor:

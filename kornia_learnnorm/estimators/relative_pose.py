@@ -125,7 +125,8 @@ class LearnedRelativePose(LearnedLayer):
     ) -> LearnedRelativePose:
         """Return an untrained estimator whose networks start from the first ones of one of fundamental matrices.
 
-        What only they read, directions and distances in pixels, has no effect yet.
+        What only they read, directions and distances in pixels, has no effect yet. Stages beyond those of ``layer`` are
+        new.
         """
         started = cls(layer.width, layer.depth, stages, refine_steps, samples)
         columns = torch.tensor([*range(POINT_FEATURES), *range(cls.features, cls.features + RESIDUAL_FEATURES)])

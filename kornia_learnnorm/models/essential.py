@@ -95,18 +95,21 @@ class Calibrated(NamedTuple):
         """Return the fundamental matrices, (B, 3, 3)."""
         return self.C2.mT @ self.essential() @ self.C1
 
-    def poses(self) -> tuple[Tensor, Tensor]:
-        """Return the four rotations (B, 4, 3, 3) and unit translations (B, 4, 3) of the essential matrices."""
+    def rotations(self) -> Tensor:
+        """Return the two rotations (B, 2, 3, 3) of each essential matrix; translations are along view 2's last axis.
+
+        Without a decomposition, whose derivatives two equal singular values make infinite.
+        """
         U, V = self.axes.unbind(1)
         turn = self.A.new_tensor([[0.0, 1.0], [-1.0, 0.0]]) @ self.A * 2**0.5
-        R = []
-        for inner in (turn, -turn):
-            handed = U[..., :2] @ inner @ V[..., :2].mT
-            last = U[..., :, 2:] @ V[..., :, 2:].mT
-            sign = torch.linalg.det(handed + last).sign().detach()
-            R.append(handed + sign[:, None, None] * last)
-        t = U[..., 2]
-        return torch.stack([R[0], R[0], R[1], R[1]], 1), torch.stack([t, -t, t, -t], 1)
+        turned, last = U[..., :2] @ turn @ V[..., :2].mT, U[..., 2:] @ V[..., 2:].mT
+        last = (torch.linalg.det(U) * torch.linalg.det(V)).sign().detach()[:, None, None] * last
+        return torch.stack([last + turned, last - turned], 1)
+
+    def poses(self) -> tuple[Tensor, Tensor]:
+        """Return the four rotations (B, 4, 3, 3) and unit translations (B, 4, 3) of the essential matrices."""
+        t = self.axes[:, 0, :, 2]
+        return self.rotations().repeat_interleave(2, 1), torch.stack([t, -t, t, -t], 1)
 
     def tangents(self) -> Tensor:
         """Return the derivatives (B, 9, 5) of the fundamental matrices' column-major entries by a step."""

@@ -182,11 +182,25 @@ def test_matches_of_networks():
     assert not second.any()
 
 
-def test_vmap_and_compile_agree():
+def test_vmap_compile_and_export_agree():
+    """The traced graph is whole; how fast its code is, is another question."""
     layer, values = pose_layer(), inputs("orbit", 2, 20)
     expected = layer(*values).detach()
     mapped = torch.func.vmap(lambda *rows: layer(*(row[None] for row in rows))[0])(*values)
     assert up_to_sign(mapped.detach(), expected) < 1e-6
+    for traced in (
+        torch.compile(layer, backend="eager", fullgraph=True),
+        torch.export.export(layer, tuple(values)).module(),
+    ):
+        assert up_to_sign(traced(*values).detach(), expected) < 1e-6
+
+
+def test_autocast_leaves_the_solver_in_float64():
+    layer, values = pose_layer().float(), inputs("orbit", 2, 40, noise=0.0)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = layer(*values)
+    assert found.dtype == torch.float64
+    assert up_to_sign(found.detach(), true_essential(scenes("orbit", 2, 40, noise=0.0))) < 1e-6
 
 
 def test_files(tmp_path):

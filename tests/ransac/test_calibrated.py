@@ -206,3 +206,17 @@ class TestInvariances:
         found = estimate(points, cameras)
         assert up_to_sign(found.E_mat[None], scaled.E_mat[None]) < 1e-2
         assert (found.inliers == scaled.inliers).float().mean() > 0.97
+
+
+@pytest.mark.parametrize(("distortion", "least", "most"), [(0.005, 0, 1), (0.1, 7, 8)])
+def test_leaves_the_cameras_where_much_of_the_noise_speaks_against_them(distortion, least, most):
+    """A distortion by half a percent is significant in three of the pairs, and explains little of the noise."""
+    left = 0
+    for seed in range(8):
+        points, cameras, _, _ = pair(num_points=800, noise=0.3, outliers=0.2, seed=seed)
+        offsets = [p - K[:2, 2] for p, K in zip(points, cameras, strict=True)]
+        squares = [offset.square().sum(-1, keepdim=True) for offset in offsets]
+        moved = [p + distortion * s / s.max() * o for p, s, o in zip(points, squares, offsets, strict=True)]
+        values = torch.linalg.svdvals(cameras[1].mT @ estimate(moved, cameras).F_mat @ cameras[0])
+        left += bool(values[1] < 0.9999 * values[0])
+    assert least <= left <= most
