@@ -65,7 +65,7 @@ def test_samples_lower_the_loss(tmp_path, precision):
         (layer_task, True, 20, 0.05),
         (layer_task, False, 50, 0.01),
         (sets_task, True, 60, 0.02),
-        (pose_task, True, 50, 0.03),
+        (pose_task, True, 120, 0.05),
     ],
 )
 def test_sets_lower_the_loss(make, labels, steps, least, tmp_path):
