@@ -105,10 +105,16 @@ class _Evidence(NamedTuple):
         return front.gather(1, best.expand(-1, 1, front.shape[-1]))[:, 0]
 
     def moments(self, weights: Tensor) -> Tensor:
-        """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9), of trace one."""
-        M = (self.rows[:, None] * weights[:, :, None]) @ self.rows.mT[:, None]
-        trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-        return M / (trace + (trace == 0))
+        """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9)."""
+        return (self.rows[:, None] * weights[:, :, None]) @ self.rows.mT[:, None]
+
+    def normal_moments(self, weights: Tensor) -> Tensor:
+        """Return the quadratic form (B, 9, 9) of E's entries that sums the lines' squared normals, weighted (B, N)."""
+        sums = torch.unflatten(self.products @ weights[..., None], 1, (2, 3, 3))[..., 0]
+        C1, C2 = self.model.C1, self.model.C2
+        first, second = (C @ S @ C.mT for C, S in zip((C1, C2), sums.unbind(1), strict=True))
+        flat1, flat2 = (C[..., :2] @ C[..., :2].mT for C in (C1, C2))
+        return _kron(first, flat2) + _kron(flat1, second)
 
 
 def run_pose_stages(
@@ -271,14 +277,24 @@ def _reweight(evidence: _Evidence, axes: Tensor, weights: Tensor, inliers: Tenso
 def _descend(
     evidence: _Evidence, axes: Tensor, weights: Tensor, square_scale: Callable[[Tensor], Tensor], steps: int
 ) -> Tensor:
-    r"""Return axes after Gauss-Newton steps, each on the moments :math:`e^\top M e` of new weights and factors.
+    r"""Return axes after Gauss-Newton steps, each on :math:`e^\top (M - X) e` of new weights.
 
+    With squared distances :math:`(e^\top a_i)^2 / e^\top B_i e` and factors held, the moments
+    :math:`M = \sum_i w_i a_i a_i^\top / e^\top B_i e` alone have another optimum:
+    :math:`X = \sum_i w_i (e^\top a_i)^2 B_i / (e^\top B_i e)^2` is what the factors add to the gradient.
     ``square_scale`` gives the squared scale of Geman and McClure's loss, (B, 1), from the squared distances.
+
+    Reference:
+        W. Chojnacki, M. Brooks, A. van den Hengel, D. Gawley, On the fitting of surfaces to data with covariances,
+        IEEE Transactions on Pattern Analysis and Machine Intelligence, 2000.
+
     """
     for _ in range(steps):
         squares, factor = (value[:, 0] for value in evidence.squares(_essential(axes)[:, None]))
         slope = UNROLLED_LOSS(squares / square_scale(squares))[1]
-        axes = _gauss_newton(evidence.moments((weights * slope * factor)[:, None])[:, 0], axes)
+        share = weights * slope * factor
+        M, X = evidence.moments(share[:, None])[:, 0], evidence.normal_moments(share * squares)
+        axes = _gauss_newton(M, X, axes)
     return axes
 
 
@@ -299,22 +315,30 @@ def _essential(axes: Tensor) -> Tensor:
     return E_mat
 
 
-def _gauss_newton(M: Tensor, axes: Tensor) -> Tensor:
-    """Return the axes after a step that lowers the algebraic cost of moments (B, 9, 9), or unchanged."""
+def _gauss_newton(M: Tensor, X: Tensor, axes: Tensor) -> Tensor:
+    """Return the axes after a step that lowers the cost of M - X (B, 9, 9), or unchanged."""
+    trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    M, X = (value / (trace + (trace == 0)) for value in (M, X))
     U, V = axes.unbind(1)
     local = (V[:, :, None, :, None] * U[:, None, :, None, :]).view(-1, 9, 9) @ _LOCAL.to(M)
-    G = local.mT @ M @ local
-    normal, gradient, cost = G[:, :5, :5], G[:, :5, 5], G[:, 5:, 5:]
+    tangents, e = local[..., :5], local[..., 5:]
+    normal, gradient = tangents.mT @ M @ tangents, tangents.mT @ (M - X) @ e
     damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1) + torch.finfo(M.dtype).tiny
     damped = normal + damping[:, None, None] * torch.eye(5, dtype=M.dtype, device=M.device)
-    step = RELAXATION * torch.linalg.solve_ex(damped, gradient)[0]
+    step = RELAXATION * torch.linalg.solve_ex(damped, gradient)[0][..., 0]
     S = torch.unflatten(step @ _SKEW.to(M), 1, (2, 3, 3))
     square = S @ S
     angle = square.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / -2
     moved = axes - axes @ ((S - square / 2) / (1 + angle / 4))  # Cayley's map of the negative step
-    e = _essential(moved).mT.flatten(1)[..., None]
+    new = _essential(moved).mT.flatten(1)[..., None]
     # A step at the optimum, whose derivative is the optimum's, may raise the cost by rounding.
-    return torch.where((e.mT @ M @ e <= cost + torch.finfo(M.dtype).eps)[..., None], moved, axes)
+    lower = new.mT @ (M - X) @ new <= e.mT @ (M - X) @ e + torch.finfo(M.dtype).eps
+    return torch.where(lower[..., None], moved, axes)
+
+
+def _kron(A: Tensor, B: Tensor) -> Tensor:
+    """Return the Kronecker products (B, 9, 9) of matrices (B, 3, 3)."""
+    return (A[:, :, None, :, None] * B[:, None, :, None, :]).flatten(3, 4).flatten(1, 2)
 
 
 def _skew(*vector: float) -> Tensor:

@@ -24,6 +24,11 @@ from scenes import (
 from torch.nn.functional import normalize
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.estimators import pose_stages
+from kornia_learnnorm.estimators.match_features import CommonFrame
+from kornia_learnnorm.estimators.optimize import RobustCost, minimize
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm.models.essential import Essential
 
 pytestmark = pytest.mark.numerical
 
@@ -76,6 +81,25 @@ def test_finds_the_truth_without_noise(kind, num_points):
     assert up_to_sign(essential_from_Rt(*_origin(found), found.R, found.t[..., None]) / 2**0.5, found.E_mat) < 1e-9
     x1, x2 = (torch.cat([p, torch.ones_like(p[..., :1])], -1) for p in (scene.points1, scene.points2))
     assert (x2 * (x1 @ found.F_mat.mT)).sum(-1)[right].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["handheld", "driving"])
+def test_steps_on_moments_end_at_the_optimum_of_the_distances(kind):
+    points1, points2, K1, K2 = inputs(kind, 5, 200)
+    points1, points2 = (
+        points + torch.randn(points.shape, generator=seeded(1)).to(points) for points in (points1, points2)
+    )
+    frame = CommonFrame.from_points(points1, points2, None)
+    x1, x2 = (torch.cat([x, torch.ones_like(x[..., :1])], -1).mT.contiguous() for x in (frame.x1, frame.x2))
+    model, scale = Essential.of_cameras(K1, K2, frame.T, frame.T), 2 * frame.T[:, 0, 0, None]
+    evidence = pose_stages._Evidence.from_frame(model, frame, x1, x2)
+    axes, weights = pose_stages._axes(true_essential(scenes(kind, 5, 200))), torch.ones_like(points1[..., 0])
+    found = pose_stages._essential(pose_stages._descend(evidence, axes, weights, lambda _: scale.square(), 60))
+    for i, best in enumerate(found):
+        own = Essential(model.C1[i : i + 1], model.C2[i : i + 1])
+        cost = RobustCost(own, x1[i : i + 1], x2[i : i + 1], weights[:1], GemanMcClure(float(scale[i])))
+        optimum = minimize(cost, own.calibrated(best[None]), 100, 1e-10)[1].state.essential()[0]
+        assert up_to_sign(best, optimum) < 1e-5
 
 
 def _origin(found):
