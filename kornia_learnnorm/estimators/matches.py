@@ -2,14 +2,15 @@ r"""Correspondences from the output of matching networks: matches by index, one 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor, nn
 from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
+
+from kornia_learnnorm.geometry.checks import check_tensor
 
 __all__ = ["Correspondences", "MatchLayer", "correspondences_from_matches", "refuse_jit"]
 
@@ -23,21 +24,24 @@ class Correspondences(NamedTuple):
     mask: Tensor  # false in padded rows, (B, N)
 
 
+Keypoints = Tensor | Mapping[str, Any]  # or the features of a detector
+Matches = Tensor | Sequence[Tensor] | Mapping[str, Any]  # or the output of LightGlue
+Scores = Tensor | Sequence[Tensor] | None
+
+
 def correspondences_from_matches(
-    keypoints1: Tensor,
-    keypoints2: Tensor,
-    matches: Tensor | Sequence[Tensor],
-    scores: Tensor | Sequence[Tensor] | None = None,
+    keypoints1: Keypoints, keypoints2: Keypoints, matches: Matches, scores: Scores = None
 ) -> Correspondences:
     """Return the matched keypoints of a batch, padded to one length of at least eight.
 
     Arguments and errors are those of :meth:`~kornia_learnnorm.EightPoint.from_matches`. Gradients reach keypoints and
     scores.
     """
-    for name, keypoints in (("keypoints1", keypoints1), ("keypoints2", keypoints2)):
-        if not isinstance(keypoints, Tensor):
-            raise TypeError(f"{name} must be a tensor, got {type(keypoints)}")
-        KORNIA_CHECK_SHAPE(keypoints, ["B", "M", "2"])
+    keypoints1, keypoints2 = _keypoints("keypoints1", keypoints1), _keypoints("keypoints2", keypoints2)
+    if isinstance(matches, Mapping):
+        if scores is not None:
+            raise ValueError("scores must be those of the mapping of matches, got others too")
+        matches, scores = _from_mapping(matches)
     if isinstance(matches, Tensor):
         matches, scores = _pairs_of_matches(keypoints1, matches, scores)
     if not len(matches) == len(keypoints1) == len(keypoints2):
@@ -76,23 +80,26 @@ class MatchLayer(nn.Module):
 
     def from_matches(
         self,
-        keypoints1: Tensor,
-        keypoints2: Tensor,
-        matches: Tensor | Sequence[Tensor],
-        scores: Tensor | Sequence[Tensor] | None = None,
+        keypoints1: Keypoints,
+        keypoints2: Keypoints,
+        matches: Matches,
+        scores: Scores = None,
         K1: Tensor | None = None,
         K2: Tensor | None = None,
     ) -> Any:
         """Return the estimate of the matches of a matching network, whose scores get gradients.
 
         Args:
-            keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`.
-            keypoints2: pixels in the second view with shape :math:`(B, M_2, 2)`.
+            keypoints1: pixels in the first view with shape :math:`(B, M_1, 2)`, or a mapping with ``"keypoints"``, as
+                LightGlue takes; without a batch too there, as its ``rbd`` leaves them.
+            keypoints2: pixels in the second view with shape :math:`(B, M_2, 2)`, or such a mapping.
             matches: a list of B tensors :math:`(S_i, 2)` of index pairs, as Kornia's LightGlue returns; or one tensor
+                :math:`(B, S, 2)` of pairs, negative for no match; or one tensor
                 :math:`(B, M_1)` with the index of the match of each keypoint of view 1, negative for no match, as
-                SuperGlue and Transformers (``matches[:, 0]``) return.
+                SuperGlue and Transformers (``matches[:, 0]``) return; or LightGlue's output, a mapping with
+                ``"matches"`` and ``"scores"`` or ``"matches0"`` and ``"matching_scores0"``, of a batch or of one pair.
             scores: optional, non-negative, of a learned layer from 0 to 1: a list of B tensors :math:`(S_i,)`, or one
-                tensor :math:`(B, M_1)`.
+                tensor :math:`(B, S)` or :math:`(B, M_1)`; those of a mapping come with it.
             K1: optional cameras of the first view, as for :meth:`estimate`.
             K2: optional cameras of the second view.
 
@@ -118,18 +125,43 @@ def refuse_jit() -> NoReturn:
     raise TypeError("this layer cannot be compiled by torch.jit, use torch.compile or torch.export")
 
 
-def _pairs_of_matches(
-    keypoints1: Tensor, matches: Tensor, scores: Tensor | Sequence[Tensor] | None
-) -> tuple[list[Tensor], list[Tensor] | None]:
-    """Return matches by keypoint, (B, M1), as pairs of indices."""
-    if matches.shape != keypoints1.shape[:2]:
-        raise ValueError(f"matches must have shape {[*keypoints1.shape[:2]]} or be a list, got {[*matches.shape]}")
-    if scores is not None and (not isinstance(scores, Tensor) or scores.shape != matches.shape):
-        raise ValueError(f"scores must have the shape of the matches, {[*matches.shape]}, got {_shape(scores)}")
+def _keypoints(name: str, keypoints: Keypoints) -> Tensor:
+    """Return the keypoints (B, M, 2) of a tensor, or of a mapping, which may lack the batch."""
+    values = _entry(keypoints, "keypoints") if isinstance(keypoints, Mapping) else keypoints
+    if isinstance(keypoints, Mapping) and isinstance(values, Tensor) and values.ndim == 2:
+        values = values[None]
+    check_tensor(name, values, ["B", "M", "2"])
+    return values
+
+
+def _from_mapping(found: Mapping[str, Any]) -> tuple[Tensor | Sequence[Tensor], Scores]:
+    """Return the matches and scores of LightGlue's output, with a batch."""
+    pairs = "matches" in found
+    matches = _entry(found, "matches" if pairs else "matches0")
+    scores = found.get("scores" if pairs else "matching_scores0")
+    if isinstance(matches, Tensor) and matches.ndim == 1 + pairs:  # of one pair
+        return matches[None], None if scores is None else scores[None]
+    return matches, scores
+
+
+def _entry(mapping: Mapping[str, Any], name: str) -> Any:
+    if name not in mapping:
+        raise ValueError(f"a mapping with {name!r} expected, got one with {', '.join(map(repr, mapping))}")
+    return mapping[name]
+
+
+def _pairs_of_matches(keypoints1: Tensor, matches: Tensor, scores: Scores) -> tuple[list[Tensor], list[Tensor] | None]:
+    """Return matches by keypoint, (B, M1), or padded pairs of indices, (B, S, 2), as lists of pairs."""
+    by_pair = matches.ndim == 3 and matches.shape[2] == 2
+    if not by_pair and matches.shape != keypoints1.shape[:2]:
+        expected = f"{[*keypoints1.shape[:2]]} or {[len(keypoints1), 'S', 2]}"
+        raise ValueError(f"matches must have shape {expected} or be a list, got {[*matches.shape]}")
+    if scores is not None and (not isinstance(scores, Tensor) or scores.shape != matches.shape[:2]):
+        raise ValueError(f"scores must have the shape of the matches, {[*matches.shape[:2]]}, got {_shape(scores)}")
     if matches.is_floating_point() or matches.dtype == torch.bool:
         raise TypeError(f"matches must be tensors of integers, got {matches.dtype}")
-    rows = [torch.nonzero(row >= 0)[:, 0] for row in matches]
-    pairs = [torch.stack([own, row[own]], -1) for own, row in zip(rows, matches, strict=True)]
+    rows = [torch.nonzero((row >= 0).all(-1) if by_pair else row >= 0)[:, 0] for row in matches]
+    pairs = [row[own] if by_pair else torch.stack([own, row[own]], -1) for own, row in zip(rows, matches, strict=True)]
     return pairs, None if scores is None else [row[own] for own, row in zip(rows, scores, strict=True)]
 
 

@@ -42,7 +42,8 @@ def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, p
     if not (value.dtype in (torch.float32, torch.float64) if precise else value.is_floating_point()):
         raise TypeError(f"{name} must be {kind}, got {value.dtype}")
     if shape is not None:
-        KORNIA_CHECK_SHAPE(value, [*shape], f"Argument: {name}")
+        hint = f"; for one pair write {name}[None]" if shape[0] == "B" and value.ndim == len(shape) - 1 else ""
+        KORNIA_CHECK_SHAPE(value, [*shape], f"Argument: {name}{hint}")
 
 
 def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None = None) -> None:

@@ -7,7 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
+from kornia.feature import LightGlue
 from scenes import uniform
+from torch.nn.utils.rnn import pad_sequence
 
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
 
@@ -39,6 +41,47 @@ def test_by_keypoint_is_the_same_as_pairs(index):
         strict=True,
     ):
         assert torch.equal(got, expected)
+
+
+def lightglue_output() -> tuple[list[dict], dict]:
+    """The features of two pairs and the output of a small LightGlue of random weights that matches every neighbour."""
+    torch.manual_seed(0)
+    every = {"depth_confidence": -1, "width_confidence": -1, "filter_threshold": 0.0, "flash": False}
+    network = LightGlue(None, input_dim=32, descriptor_dim=32, n_layers=1, num_heads=1, **every).eval()
+    size = torch.full((2, 2), 600.0)
+    sides = [
+        {"keypoints": k.float(), "descriptors": torch.randn(2, k.shape[1], 32), "image_size": size} for k in KEYPOINTS
+    ]
+    return sides, network(dict(zip(("image0", "image1"), sides, strict=True)))
+
+
+def test_every_form_of_lightglues_output_is_the_same():
+    sides, found = lightglue_output()
+    keypoints = [side["keypoints"] for side in sides]
+    expected = correspondences_from_matches(*keypoints, found["matches"], found["scores"])
+    assert expected.mask.any(1).all()
+    by_keypoint = {name: found[name] for name in ("matches0", "matching_scores0")}
+    padded = pad_sequence(found["matches"], batch_first=True, padding_value=-1), pad_sequence(found["scores"], True)
+    for form in ((*sides, found), (*sides, by_keypoint), (*keypoints, found), (*keypoints, *padded)):
+        for got, want in zip(correspondences_from_matches(*form), expected, strict=True):
+            torch.testing.assert_close(got, want)
+    for k in range(2):  # as the reference's rbd removes the batch
+        views = [{"keypoints": points[k]} for points in keypoints]
+        one = {name: found[name][k] for name in ("matches", "scores", "matches0", "matching_scores0")}
+        want = correspondences_from_matches(
+            *(points[k : k + 1] for points in keypoints), [one["matches"]], [one["scores"]]
+        )
+        for form in (one, {name: one[name] for name in by_keypoint}):
+            for got, expected_part in zip(correspondences_from_matches(*views, form), want, strict=True):
+                torch.testing.assert_close(got, expected_part)
+
+
+def test_lightglue_matcher_of_kornia():
+    scores, index = torch.rand(12, 1), torch.stack([torch.arange(12), torch.arange(12) + 10], -1)
+    points1, _, weights, mask = correspondences_from_matches(KEYPOINTS[0][:1], KEYPOINTS[1][:1], index[None], scores.T)
+    assert torch.equal(points1[0], KEYPOINTS[0][0, :12])
+    assert torch.equal(weights[0], scores[:, 0])
+    assert mask.all()
 
 
 @pytest.mark.parametrize("empty", [(), (0,), (1,), (0, 1)])
@@ -76,6 +119,10 @@ def test_wrong_matches_and_scores():
         (torch.zeros(2, 25, dtype=torch.int64), None, ValueError, r"\[2, 30\] .*, got \[2, 25\]"),
         (FIRST, [torch.rand(2)] * 2, ValueError, r"scores of pair 0 .* \[1\], got \[2\]"),
         (torch.zeros(2, 30).long(), torch.rand(2, 3), ValueError, r"\[2, 30\], got \[2, 3\]"),
+        (torch.zeros(2, 9, 3).long(), None, ValueError, r"\[2, 'S', 2\] .*, got \[2, 9, 3\]"),
+        (torch.zeros(2, 9, 2).long(), torch.rand(2, 8), ValueError, r"\[2, 9\], got \[2, 8\]"),
+        ({"scores": torch.rand(1)}, None, ValueError, "'matches0' expected, got one with 'scores'"),
+        ({"matches": FIRST}, FIRST, ValueError, "scores must be those of the mapping"),
         (FIRST, [torch.rand(1), None], TypeError, "scores must be floating-point"),
         (FIRST, [torch.rand(1)], ValueError, "scores .* got 1 for 2 pairs"),
         (FIRST, [torch.rand(1), -torch.rand(1)], ValueError, "scores of pair 1 must be finite and not negative"),
@@ -85,7 +132,9 @@ def test_wrong_matches_and_scores():
 
 
 def test_wrong_keypoints():
-    with pytest.raises(TypeError, match="keypoints1 must be a tensor"):
+    with pytest.raises(TypeError, match="keypoints1 must be a floating-point tensor"):
         correspondences_from_matches([[0.0, 0.0]], KEYPOINTS[1], FIRST)
-    with pytest.raises(ShapeError):
+    with pytest.raises(ValueError, match="'keypoints' expected, got one with 'lafs'"):
+        correspondences_from_matches({"lafs": KEYPOINTS[0]}, KEYPOINTS[1], FIRST)
+    with pytest.raises(ShapeError, match=r"(?s)\[30, 2\].*keypoints1\[None\]"):
         correspondences_from_matches(KEYPOINTS[0][0], KEYPOINTS[1][0], FIRST[:1])
