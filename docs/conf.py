@@ -121,6 +121,8 @@ def setup(app):
     app.connect("doctree-read", _plain_notebook)
     # The kernels of the pages inherit the style of figures, results_tables.py, and a path that has learnnorm.
     os.environ["MATPLOTLIBRC"] = str(app.confdir)
+    if (weights := Path(app.confdir).parent / ".weights").is_dir():  # made by make weights
+        os.environ.setdefault("TORCH_HOME", str(weights))
     os.environ["PYTHONPATH"] = os.pathsep.join([str(app.confdir), *filter(None, [os.environ.get("PYTHONPATH")])])
     os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     app.connect("autodoc-skip-member", _skip_tuple_fields)

@@ -12,6 +12,10 @@ import torch
 
 from kornia_learnnorm.cli.main import main
 
+ROOT = Path(__file__).parents[1]
+if (ROOT / ".weights").is_dir():  # made by make weights
+    os.environ.setdefault("TORCH_HOME", str(ROOT / ".weights"))
+
 hypothesis.settings.register_profile(
     "package",
     max_examples=25,
@@ -66,6 +70,18 @@ def real_data():
     if not folder:
         pytest.skip("LEARNNORM_DATA does not name a folder of real data")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def cached_weights():
+    """A function that skips a test unless torch.hub's cache has all of these files."""
+
+    def check(*files):
+        folder = Path(torch.hub.get_dir(), "checkpoints")
+        if missing := [file for file in files if not (folder / file).is_file()]:
+            pytest.skip(f"{', '.join(missing)} not in {folder}: make weights")
+
+    return check
 
 
 @pytest.fixture(scope="session")
