@@ -10,7 +10,7 @@ The inliers of a pair without ground truth are those of OpenCV's MAGSAC on all i
         [--methods NAME ...] [--json FILE] [--picture FILE]
 
 A method learned:WEIGHTS is a learned estimator by the name or file of its weights. With +bfloat16 after it, its
-networks compute in bfloat16. With +scores last, it also reads 1 minus the ratio of each match, as RANSAC+scores does.
+networks compute in bfloat16. With +scores last, it also reads the score of each match, as RANSAC+scores does.
 """
 
 import argparse
@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test, read_store
 from kornia_learnnorm.evaluation.robust.peers import find_peer
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write, short_name, write_text
@@ -154,19 +154,19 @@ def true_matrix(store: CorrespondenceStore, pair: int) -> Tensor | None:
 def draw_sets(store: CorrespondenceStore, protocol: str, size: int, number: int, seed: int) -> Tensor | None:
     """Return sets and the true inliers that measure them, (S, N + 64, 5); None where too few pairs have enough.
 
-    The last column is the score of a match, 1 minus the ratio.
+    The last column is the score of a match.
     """
     generator, pairs = np.random.default_rng(seed), []
     for i in range(len(store)):
-        points = np.hstack([store.points1[store.rows(i, None)], store.points2[store.rows(i, None)]]).astype(float)
+        rows = store.rows(i)
+        points = np.hstack([store.points1[rows], store.points2[rows]]).astype(float)
         F_mat = true_matrix(store, i)
         if F_mat is None:
             continue
         distance = kln.symmetric_epipolar_distance(*torch.from_numpy(points).split(2, -1), F_mat).numpy()
-        points = np.hstack([points, 1 - store.ratio[store.rows(i, None), None].astype(float)])
-        true = np.flatnonzero((distance < INLIER_THRESHOLD) & (store.ratio[store.rows(i, None)] < RATIO))
-        limit = PROTOCOLS[protocol]
-        passing = np.arange(len(points)) if limit is None else np.flatnonzero(store.ratio[store.rows(i, None)] < limit)
+        points = np.hstack([points, store.score[rows, None].astype(float)])
+        true = np.flatnonzero((distance < INLIER_THRESHOLD) & passes_ratio_test(store.ratio[rows], RATIO))
+        passing = np.flatnonzero(passes_ratio_test(store.ratio[rows], PROTOCOLS[protocol]))
         if len(true) >= MIN_TRUE and len(passing) >= size:
             pairs.append((points, passing, true))
     if not pairs:

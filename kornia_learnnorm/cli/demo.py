@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import webbrowser
 
+from kornia_learnnorm.data.matching.features import DETECTORS
+from kornia_learnnorm.data.matching.matchers import MATCHERS, check_methods
 from kornia_learnnorm.optional import import_extra
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
@@ -12,13 +14,16 @@ __all__ = ["EXAMPLES", "add_arguments", "run"]
 PORT = 5006
 EXAMPLES = """\
 learnnorm demo
-learnnorm demo --port 8000 --no-browser"""
+learnnorm demo --detector aliked --matcher lightglue --no-browser"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm demo`` to a parser."""
     parser.description = f"{parser.description};\nit is served to this computer alone, until Ctrl-C"
     parser.add_argument("--port", type=int, default=PORT, help="port of the page on 127.0.0.1 (default: %(default)s)")
+    for name, known, default in (("detector", DETECTORS, "sift"), ("matcher", MATCHERS, "nearest")):
+        text = f"{', '.join(known)} (default: %(default)s)"
+        parser.add_argument(f"--{name}", metavar="NAME", choices=known, default=default, help=text)
     parser.add_argument("--no-browser", action="store_true", help="print the address, but open no browser")
 
 
@@ -26,12 +31,13 @@ def run(args: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
     if not 1 <= args.port <= 65535:
         raise ValueError(f"--port: a number from 1 to 65535 expected, got {args.port}")
+    check_methods(args.detector, args.matcher)
     for module in ("bokeh", "cv2", "PIL"):
         import_extra(module, "demo", "the page")
     from kornia_learnnorm.demo.page import make_server
 
     try:
-        server = make_server(args.port)
+        server = make_server(args.port, args.detector, args.matcher)
     except OSError as error:
         raise OSError(f"--port {args.port}: cannot listen there: {error.strerror}; choose another port") from error
     address = f"http://127.0.0.1:{server.port}/"

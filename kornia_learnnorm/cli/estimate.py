@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name, known in (("detector", DETECTORS), ("matcher", MATCHERS)):
         text = f"{', '.join(known)} {default}"
         add(f"--{name}", metavar="NAME", choices=known, default=getattr(options, name), help=text)
-    add("--ratio", type=float, default=options.ratio, help=f"ratio test {default}")
+    add("--ratio", type=float, default=options.ratio, help=f"ratio test of nearest neighbours {default}")
     size = f"reduce images to this longer side {default}"
     add("--max-size", metavar="PX", type=int, default=options.max_size, help=size)
     mask = "one or two: features count where it is white"

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         match.add_argument(f"--{option}", metavar="NAME", choices=names, default=getattr(options, option), help=text)
     for option, text in (
         ("num_features", "of an image"),
-        ("max_matches", "per pair, of those that pass the ratio test and of those that fail; 0 keeps all"),
+        ("max_matches", "per pair, of those that fail the ratio test and of the others; 0 keeps all"),
         ("seed", "seed of the order of matches"),
     ):
         default, name = getattr(options, option), f"--{option.replace('_', '-')}"

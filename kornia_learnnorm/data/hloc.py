@@ -18,7 +18,7 @@ def read_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
 
     A group of the features is an image with ``keypoints`` (N, 2), pixels, and ``image_size``. A group of the matches is
     a pair, ``NAME0/NAME1`` with ``-`` for the slashes in names, with ``matches0`` (N,), an index or -1 for each
-    keypoint of image 0, and ``matching_scores0`` (N,). The ratio is 1 - score; K, R, t and F are NaN.
+    keypoint of image 0, and ``matching_scores0`` (N,). The ratio, K, R, t and F are NaN.
 
     FileNotFoundError if a file is missing; ValueError if it is not HDF5, holds no pair, or lacks data of a pair.
     """
@@ -49,7 +49,8 @@ def read_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
                 raise ValueError(f"{matches}, {key1}/{key2}: matches0 must be {expected}, got {target}")
             arrays["points1"].append(keypoints1[target >= 0])
             arrays["points2"].append(keypoints2[target[target >= 0]])
-            arrays["ratio"].append(1 - scores[target >= 0].astype(np.float64))
+            arrays["score"].append(scores[target >= 0].astype(np.float64))
+            arrays["ratio"].append(np.full(len(arrays["score"][-1]), np.nan))
             arrays["image_size"].append([[values(images[name], "image_size") for name in names[-1]]])
     if not names:
         raise ValueError(f"{matches} holds no pair of images, expected a group for each pair")

@@ -47,12 +47,13 @@ def import_pillow() -> Any:
     return import_extra("PIL.Image", "images", "reading images")
 
 
-def check_grey(image: NDArray[np.uint8]) -> None:
-    """Raise TypeError or ValueError unless an image is an array of grey values (H, W), uint8."""
+def check_grey(image: NDArray[np.uint8], colour: bool = False) -> None:
+    """Raise TypeError or ValueError unless an image is an array of grey values (H, W), or colours (H, W, 3), uint8."""
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         raise TypeError(f"an image must be an array of uint8, got {getattr(image, 'dtype', type(image))}")
-    if image.ndim != 2 or image.size == 0:
-        raise ValueError(f"an image must be grey with shape (H, W), got {image.shape}")
+    if image.size == 0 or not (image.ndim == 2 or (colour and image.ndim == 3 and image.shape[2] == 3)):
+        expected = "grey or RGB with shape (H, W) or (H, W, 3)" if colour else "grey with shape (H, W)"
+        raise ValueError(f"an image must be {expected}, got {image.shape}")
 
 
 def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint8]:

@@ -7,14 +7,16 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
 from kornia.geometry.epipolar import cross_product_matrix
+from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from kornia_learnnorm.data.augmentation import augment
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.sources import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
-from kornia_learnnorm.data.store import StoreReader
+from kornia_learnnorm.data.store import StoreReader, passes_ratio_test
 from kornia_learnnorm.data.synthetic.random_matches import SyntheticMatches, random_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
@@ -72,20 +74,22 @@ class _Pair(NamedTuple):
     """The matches of one image pair."""
 
     points: Tensor  # (M, 4), pixels in both views
-    ratio: Tensor  # (M,), Lowe's ratio
+    ratio: NDArray[np.float32]  # (M,), Lowe's ratio, or NaN
+    score: Tensor  # (M,), from 0 to 1
     distance: Tensor  # (M,), pixels from the true epipolar lines, NaN if unknown
     cameras: tuple[Tensor, Tensor, Tensor]  # K1, K2 and E, each (3, 3), NaN if unknown
 
     def passing(self, max_ratio: float | None) -> Tensor:
         """Return the indices of the matches that pass the ratio test."""
-        return torch.arange(len(self.ratio)) if max_ratio is None else (self.ratio < max_ratio).nonzero()[:, 0]
+        return torch.from_numpy(passes_ratio_test(self.ratio, max_ratio)).nonzero()[:, 0]
 
     @property
     def heldout(self) -> Tensor:
         """The indices of the matches that supervise."""
         if self.distance.isnan().any():
-            return torch.arange(len(self.ratio))
-        return ((self.distance < INLIER_THRESHOLD) & (self.ratio < RATIO)).nonzero()[:, 0]
+            return self.passing(None)
+        passing = self.passing(RATIO)
+        return passing[self.distance[passing] < INLIER_THRESHOLD]
 
     def draw(
         self, num_points: int, num_heldout: int, max_ratio: float | None, generator: Generator
@@ -98,7 +102,7 @@ class _Pair(NamedTuple):
         points, distance = self.points[rows], self.distance[rows]
         inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
         labelled = ~distance.isnan().any()
-        scores = 1 - self.ratio[rows]
+        scores = self.score[rows]
         return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], scores, inliers, labelled, *self.cameras
 
 
@@ -116,7 +120,7 @@ def _read_pairs(path: str, labels: bool) -> list[_Pair]:
         K1, K2, R, t = (torch.from_numpy(value) for value in (*store.K[i], store.R[i], store.t[i]))
         E_mat = cross_product_matrix(t[None])[0] @ R
         cameras = K1.float(), K2.float(), (E_mat / torch.linalg.matrix_norm(E_mat)).float()
-        pair = _Pair(points, torch.from_numpy(store.ratio[rows]), distance.float(), cameras)
+        pair = _Pair(points, store.ratio[rows], torch.from_numpy(store.score[rows]), distance.float(), cameras)
         if len(pair.heldout) >= MIN_HELDOUT:
             pairs.append(pair)
     return pairs

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test
 from kornia_learnnorm.estimators.linear import find_fundamental
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.normalizers.identity import Identity
@@ -26,7 +26,7 @@ class MatchSets(NamedTuple):
     heldout1: Tensor  # (B, M, 2), not in the set; true inliers where the ground truth is known; M may be 0
     heldout2: Tensor  # (B, M, 2)
     pair: Tensor  # (B,) int64, index of the image pair in its source
-    scores: Tensor | None = None  # (B, N), 1 minus Lowe's ratio
+    scores: Tensor | None = None  # (B, N), from 0 to 1, as 1 minus Lowe's ratio
     inliers: Tensor | None = None  # (B, N), one for inliers, zero for outliers, NaN where that is not known
     labelled: Tensor | None = None  # (B,) bool, whether the ground truth is known; None where it is known of no set
     K1: Tensor | None = None  # cameras, (B, 3, 3), NaN where unknown
@@ -77,8 +77,7 @@ def draw_samples(
         raise ValueError(f"a sample needs at least 8 correspondences, got size={size}")
     points = torch.cat([torch.from_numpy(store.points1), torch.from_numpy(store.points2)], -1)
     pair = torch.repeat_interleave(torch.arange(len(store)), torch.from_numpy(store.offsets).diff())
-    ratio = torch.from_numpy(store.ratio)
-    rows = torch.arange(len(points)) if max_ratio is None else torch.nonzero(ratio < max_ratio)[:, 0]
+    rows = torch.from_numpy(passes_ratio_test(store.ratio, max_ratio)).nonzero()[:, 0]
     rows = rows[torch.randperm(len(rows), generator=generator)]
     rows = rows[torch.argsort(pair[rows], stable=True)]
     count = torch.bincount(pair[rows], minlength=len(store))
@@ -87,7 +86,7 @@ def draw_samples(
     if len(rows) == 0:
         limit = "" if max_ratio is None else f" with ratio below {max_ratio}"
         raise ValueError(f"no pair of the store has {size} correspondences{limit}, which a sample needs")
-    sample_pair, passes = pair[rows[:, 0]], ratio < RATIO
+    sample_pair, passes = pair[rows[:, 0]], torch.from_numpy(passes_ratio_test(store.ratio, RATIO))
     passing = torch.bincount(pair[passes], minlength=len(store))[sample_pair]
     if num_heldout and require_heldout and int(passing.min()) <= size:
         raise ValueError(

@@ -1,7 +1,8 @@
 r"""Stores: correspondences of many image pairs in one HDF5 file of ragged arrays.
 
-Pair ``i`` owns the rows ``offsets[i]:offsets[i + 1]`` of ``points1``, ``points2`` and ``ratio``. Where a command or a
-configuration takes a store, ``file.h5@3:10`` means the pairs 3 to 9 of the file.
+Pair ``i`` owns the rows ``offsets[i]:offsets[i + 1]`` of ``points1``, ``points2``, ``ratio`` and ``score``. A file
+without scores, as of earlier versions, has 1 minus the ratio. Where a command or a configuration takes a store,
+``file.h5@3:10`` means the pairs 3 to 9 of the file.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     import h5py
 
 __all__ = ["FORMAT", "LAYOUT", "VERSION", "CorrespondenceStore", "StoreReader"]
-__all__ += ["open_hdf5", "own_dataset", "read_store"]
+__all__ += ["open_hdf5", "own_dataset", "passes_ratio_test", "read_store"]
 
 FORMAT = "correspondences"  # attribute of the file
 VERSION = 1  # attribute of the file
@@ -35,6 +36,7 @@ LAYOUT: dict[str, tuple[tuple[int, ...], str, str]] = {
     "points1": ((2,), "float32", "M"),
     "points2": ((2,), "float32", "M"),
     "ratio": ((), "float32", "M"),
+    "score": ((), "float32", "M"),
     "image_size": ((2, 2), "int32", "P"),
     "F": ((3, 3), "float64", "P"),
     "K": ((2, 3, 3), "float64", "P"),
@@ -49,7 +51,7 @@ class CorrespondenceStore:
 
     points1: NDArray[np.float32]  # pixels (x, y) in the first images, (M, 2)
     points2: NDArray[np.float32]  # pixels (x, y) in the second images, (M, 2)
-    ratio: NDArray[np.float32]  # nearest over second-nearest descriptor distance (Lowe's ratio), (M,)
+    ratio: NDArray[np.float32]  # nearest over second-nearest descriptor distance (Lowe's ratio), NaN without one, (M,)
     offsets: NDArray[np.int64]  # pair i owns rows offsets[i]:offsets[i + 1], (P + 1,)
     image_size: NDArray[np.int32]  # (width, height) of both images, (P, 2, 2)
     names: list[tuple[str, str]]  # file names of both images, P pairs
@@ -61,6 +63,13 @@ class CorrespondenceStore:
     pairs: str  # how the pairs were chosen
     detector: str  # detector and matcher
     provenance: dict[str, Any] = field(default_factory=dict)  # options, versions, skipped pairs; values of JSON's types
+    # from 0 to 1, (M,): 1 - ratio, and the matcher's score, to be given, of matches without a ratio
+    score: NDArray[np.float32] = field(default_factory=lambda: np.full(1, np.nan, np.float32))
+
+    def __post_init__(self) -> None:
+        """Compute the scores of matches with ratios."""
+        score = np.where(np.isnan(self.ratio), self.score, (1 - self.ratio).clip(0, 1))
+        object.__setattr__(self, "score", score)
 
     def __len__(self) -> int:
         """Return the number of image pairs."""
@@ -80,14 +89,19 @@ class CorrespondenceStore:
     def rows(self, pair: int, max_ratio: float | None = None) -> NDArray[np.int64]:
         """Return the rows (N,) of the correspondences of :meth:`matches`, in increasing order."""
         rows = np.arange(self.offsets[pair], self.offsets[pair + 1])
-        return rows if max_ratio is None else rows[self.ratio[rows] < max_ratio]
+        return rows[passes_ratio_test(self.ratio[rows], max_ratio)]
 
     def matches(
         self, pair: int, max_ratio: float | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return points1 (N, 2), points2 (N, 2) and ratio (N,) of a pair: those with a ratio below a limit, or all."""
+        """Return points1 (N, 2), points2 (N, 2) and ratio (N,) of a pair: those that pass the ratio test, or all."""
         rows = self.rows(pair, max_ratio)
         return self.points1[rows], self.points2[rows], self.ratio[rows]
+
+
+def passes_ratio_test(ratio: NDArray[np.float32], max_ratio: float | None) -> NDArray[np.bool_]:
+    """Return which matches (N,) have a ratio below a limit, None for no limit, or no ratio, NaN."""
+    return np.asarray(~(ratio >= (np.inf if max_ratio is None else max_ratio)))
 
 
 def _check_range(first: int, stop: int, number: int, path: str = "") -> None:
@@ -110,7 +124,7 @@ class StoreReader:
 
     The file is open only during a call, so that a reader can be pickled and sent to other processes. ``offsets``, (P +
     1,) int64, are those of the pairs of ``path``: pair ``i`` has ``offsets[i + 1] - offsets[i]`` correspondences.
-    Whether points and ratios are finite is checked by :meth:`read`.
+    The values of points and scores are checked by :meth:`read`.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -149,14 +163,16 @@ class StoreReader:
         with open_hdf5(self.path) as file:
             arrays: dict[str, Any] = {
                 name: np.concatenate([np.zeros((0, *tail), dtype), *(file[name][part] for part in rows[axis])])
-                for name, (tail, dtype, axis) in LAYOUT.items()
+                for name, (tail, dtype, axis) in _layout(file).items()
             }
             names = [(str(a), str(b)) for part in rows["P"] for a, b in file["names"].asstr()[part]]
             about: dict[str, Any] = {key: str(file.attrs.get(key, "")) for key in ("dataset", "pairs", "detector")}
             provenance = json.loads(file.attrs.get("provenance", "{}"))
-        for name in ("points1", "points2", "ratio"):
+        for name in ("points1", "points2", *(["ratio"] if "score" not in arrays else [])):
             if not np.isfinite(arrays[name]).all():
                 raise ValueError(f"{self.path}: {name} holds NaN or infinite numbers")
+        if "score" in arrays and not ((arrays["score"] >= 0) & (arrays["score"] <= 1)).all():
+            raise ValueError(f"{self.path}: score must be from 0 to 1, got other numbers")
         counts = np.diff(self.offsets)[list(pairs)]
         offsets = np.concatenate([[0], counts.cumsum()]).astype(np.int64)
         return CorrespondenceStore(offsets=offsets, names=names, **arrays, **about, provenance=provenance)
@@ -169,7 +185,7 @@ class StoreReader:
         with open_hdf5(self.path) as file:
             for first in range(0, len(self), COUNT_BLOCK):
                 offsets = self.offsets[first : first + COUNT_BLOCK + 1]
-                passes = file["ratio"][int(offsets[0]) : int(offsets[-1])] < max_ratio
+                passes = passes_ratio_test(file["ratio"][int(offsets[0]) : int(offsets[-1])], max_ratio)
                 total = np.concatenate([[0], passes.cumsum()])
                 counts[first : first + COUNT_BLOCK] = np.diff(total[offsets - offsets[0]])
         return counts
@@ -195,12 +211,17 @@ def own_dataset(group: h5py.Group, name: str) -> h5py.Dataset | None:
     return None if not hasattr(data, "shape") or data.external or data.is_virtual else data
 
 
+def _layout(file: h5py.File) -> dict[str, tuple[tuple[int, ...], str, str]]:
+    """Return the layout without the scores, where a file has none."""
+    return {name: entry for name, entry in LAYOUT.items() if name != "score" or name in file}
+
+
 def _read_offsets(path: Path, file: h5py.File) -> NDArray[np.int64]:
     """Return the offsets of a store, after checking its version and the shapes and types of its arrays."""
     if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
         got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')}"
         raise ValueError(f"{path} is not a store: expected format={FORMAT!r}, version={VERSION}, got {got}")
-    missing = [name for name in (*LAYOUT, "offsets", "names") if own_dataset(file, name) is None]
+    missing = [name for name in (*_layout(file), "offsets", "names") if own_dataset(file, name) is None]
     if missing:
         raise ValueError(f"{path} lacks the datasets {', '.join(missing)} (links to other files are not followed)")
     offsets = np.asarray(file["offsets"][:], np.int64)
@@ -208,7 +229,7 @@ def _read_offsets(path: Path, file: h5py.File) -> NDArray[np.int64]:
         expected = "start at 0 and not decrease, with one pair or more"
         raise ValueError(f"{path}: offsets must {expected}, got {offsets[:4]}...")
     rows = {"M": int(offsets[-1]), "P": len(offsets) - 1}
-    for name, (tail, dtype, axis) in {**LAYOUT, "names": ((2,), "O", "P")}.items():
+    for name, (tail, dtype, axis) in {**_layout(file), "names": ((2,), "O", "P")}.items():
         if file[name].shape != (rows[axis], *tail):
             raise ValueError(f"{path}: {name} must have shape {(rows[axis], *tail)}, got {file[name].shape}")
         if file[name].dtype.kind != np.dtype(dtype).kind:

@@ -98,7 +98,9 @@ def render_example() -> Example:
     return Example((first, second), torch.from_numpy(pair.points1), torch.from_numpy(pair.points2))
 
 
-def compare(image1: ImageFile, image2: ImageFile) -> dict[str, MethodResult]:
+def compare(
+    image1: ImageFile, image2: ImageFile, detector: str = "sift", matcher: str = "nearest"
+) -> dict[str, MethodResult]:
     """Return what every method, a key of ``METHODS``, makes of the matches of two images.
 
     Raises NoReliableMatrixError if neither RANSAC nor the learned layer finds a matrix.
@@ -108,7 +110,7 @@ def compare(image1: ImageFile, image2: ImageFile) -> dict[str, MethodResult]:
         for path, image in zip(paths, (image1, image2), strict=True):
             path.write_bytes(image.content)
         try:
-            matched = match_two_images(*paths)
+            matched = match_two_images(*paths, detector=detector, matcher=matcher)
         except NoReliableMatrixError as error:
             raise _without_names(error) from error
     matched = replace(matched, path1=Path(image1.name), path2=Path(image2.name))

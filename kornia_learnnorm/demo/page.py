@@ -55,12 +55,12 @@ WRAP: Any = {"flex-wrap": "wrap"}
 log = logging.getLogger(__name__)
 
 
-def make_server(port: int) -> Server:
+def make_server(port: int, detector: str = "sift", matcher: str = "nearest") -> Server:
     """Return a server of the page, which listens on 127.0.0.1 but does not answer yet; OSError for a taken port."""
     executor = ThreadPoolExecutor(max_workers=1)  # browser tabs wait for each other
 
     def open_page(document: Document) -> None:
-        page = Page(document, executor)
+        page = Page(document, executor, partial(compare, detector=detector, matcher=matcher))
         document.on_session_destroyed(lambda _context: page.close())
 
     origins = [f"{host}:{port}" for host in (ADDRESS, "localhost")]
@@ -74,10 +74,10 @@ def make_server(port: int) -> Server:
 
 
 class Page:
-    """The widgets of one browser tab and what they show; the executor runs what takes long."""
+    """The widgets of one browser tab and what they show; the executor runs what takes long, ``compare`` above all."""
 
-    def __init__(self, document: Document, executor: Executor) -> None:
-        self._document, self._executor = document, executor
+    def __init__(self, document: Document, executor: Executor, compare: Callable[..., dict[str, MethodResult]]) -> None:
+        self._document, self._executor, self._compare = document, executor, compare
         self._loop, self._closed = IOLoop.current(), False
         self._runs = {IMAGES[0]: 0, IMAGES[1]: 0, PAIR: 0}  # how often each was asked for; only the last run counts
         self._images: list[ImageFile | None] = [None, None]
@@ -151,7 +151,7 @@ class Page:
         if first is None or second is None:
             self._status.text = f"Choose {IMAGES[first is not None].lower()} too."
             return
-        self._submit(PAIR, "Matching ...", partial(compare, first, second), self._show_results)
+        self._submit(PAIR, "Matching ...", partial(self._compare, first, second), self._show_results)
 
     def _submit(self, subject: str, status: str, work: Callable[[], Any], show: Callable[[Any], None]) -> None:
         """Run work in the background, then show its result or, in one sentence, why there is none."""
@@ -169,7 +169,7 @@ class Page:
             return
         try:
             result = done.result()
-        except ValueError as error:
+        except (ValueError, OSError) as error:  # OSError: weights of a detector that cannot be loaded
             self._status.text = f"No result: {error}."
         except Exception:
             log.exception("the page could not show a result")

@@ -10,9 +10,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.images import Size, content_mask, image_size, import_cv2, read_image, resize_image, scaling
-from kornia_learnnorm.data.matching.features import DETECTORS, Features, check_mask, keep_features
-from kornia_learnnorm.data.matching.matchers import MATCHERS, check_methods, match_both_ways
+from kornia_learnnorm.data.images import (
+    Size,
+    check_grey,
+    content_mask,
+    image_size,
+    import_cv2,
+    read_colour,
+    read_image,
+    resize_image,
+    scaling,
+)
+from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Features, check_mask, keep_features
+from kornia_learnnorm.data.matching.matchers import check_methods, match_both_ways, match_features
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points
@@ -50,9 +60,9 @@ def estimate_pair(
 ) -> PairEstimate:
     """Return the fundamental matrix of two images with its matches, its predicted error and the reasons to doubt it.
 
-    Matches are nearest neighbours in both directions that pass the ratio test in both, one-to-one: of those that share
-    a point, the one of smallest ratio counts. :class:`~kornia_learnnorm.RANSAC`, or a learned layer, reads them with
-    their scores, 1 minus the larger ratio.
+    Matches are nearest neighbours in both directions that pass the ratio test in both, with 1 minus the larger ratio as
+    score, or LightGlue's with its scores. Of those that share a point, the one of highest score counts.
+    :class:`~kornia_learnnorm.RANSAC`, or a learned layer, reads the scores.
     Features on a constant black frame around an image are dropped. Where texture repeats, matches that do not move like
     those around them are left out. The predicted error is too small there.
 
@@ -60,7 +70,7 @@ def estimate_pair(
         image1: file of image 1, or its values: grey with shape (H, W) or RGB with shape (H, W, 3), uint8.
         image2: file of image 2, or its values.
         layer: estimates the matrix in the place of RANSAC.
-        ratio: largest ratio of the nearest to the second-nearest descriptor distance.
+        ratio: largest ratio of the nearest to the second-nearest descriptor distance, of the matcher ``nearest``.
         threshold: largest symmetric epipolar distance of an inlier, and RANSAC's threshold, pixels of the images as
             they are matched.
         seed: seed of RANSAC and of the parts of the matches that tell how stable the matrix is; equal images and seeds
@@ -71,7 +81,7 @@ def estimate_pair(
         mask2: the same of image 2.
         max_size: images with a longer side are matched reduced to it; points and F are those of the full images.
         detector: a key of ``kornia_learnnorm.data.matching.features.DETECTORS``.
-        matcher: a key of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
+        matcher: one of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
 
     Returns:
         the estimate; all its numbers are finite.
@@ -94,17 +104,17 @@ def estimate_pair(
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """The matches of two images that pass the ratio test from image 1 to image 2, to be estimated by any method."""
+    """The matches of two images, to be estimated by any method; nearest neighbours pass the ratio test from image 1."""
 
     points1: Tensor  # pixels of image 1 as it was matched, (N, 2), float64
     points2: Tensor  # pixels of image 2 as it was matched, (N, 2), float64
-    ratios: Tensor  # larger ratio of the two directions, (N,), float64
-    mutual: Tensor  # mask of the matches that pass the ratio test in both directions, (N,), bool
+    scores: Tensor  # 1 minus the larger ratio of the two directions, or LightGlue's score, (N,), float64
+    mutual: Tensor  # mask of the matches that pass the ratio test also from image 2 to image 1, (N,), bool
     size1: Size  # of image 1 as it was matched
     size2: Size  # of image 2 as it was matched
     full_size1: Size  # of image 1
     full_size2: Size  # of image 2
-    ratio: float  # largest ratio of the nearest to the second-nearest descriptor distance
+    ratio: float | None  # largest ratio of the nearest to the second-nearest descriptor distance
     path1: Path | None = None
     path2: Path | None = None
 
@@ -126,7 +136,7 @@ class MatchedPair:
             return estimate_matches(points1, points2, scores, *sizes, layer, threshold, seed, K1, K2)
 
         try:
-            first = solve(self.points1[self.mutual], self.points2[self.mutual], 1 - self.ratios[self.mutual])
+            first = solve(self.points1[self.mutual], self.points2[self.mutual], self.scores[self.mutual])
         except NoReliableMatrixError as error:
             raise _named(error, (self.path1, self.path2)) from error
         found = first
@@ -169,16 +179,15 @@ def match_two_images(
         if len(features.points) < 2:
             text = f"image {number} is blank, nearly so, or masked: {len(features.points)} features, expected 2 or more"
             raise _named(NoReliableMatrixError("blank", text), (path1, path2))
-    if matcher == "nearest":
-        matches, back = match_both_ways(features1, features2)
-    else:
-        matches = MATCHERS[matcher](features1, features2)
-        back = matches.ratio
+    about = features1.size, features2.size, full_size1, full_size2
+    if matcher != "nearest":
+        points1, points2, scores = (part.double() for part in match_features(features1, features2, detector, matcher))
+        return MatchedPair(points1, points2, scores, scores >= 0, *about, None, path1, path2)
+    matches, back = match_both_ways(features1, features2)
     larger = torch.maximum(matches.ratio, back)
     kept = matches.ratio.double() < ratio
     points1, points2, ratios = (value[kept].double() for value in (matches.points1, matches.points2, larger))
-    sizes = features1.size, features2.size, full_size1, full_size2
-    return MatchedPair(points1, points2, ratios, ratios < ratio, *sizes, float(ratio), path1, path2)
+    return MatchedPair(points1, points2, 1 - ratios, ratios < ratio, *about, float(ratio), path1, path2)
 
 
 def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> None:
@@ -190,6 +199,8 @@ def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> 
     if max_size < MIN_SIZE:
         raise ValueError(f"max_size must be at least {MIN_SIZE} pixels, got {max_size}")
     check_methods(detector, matcher)
+    if matcher != "nearest" and ratio != RATIO:
+        raise ValueError(f"ratio {ratio:g} is for matcher nearest alone: {matcher} has scores and no ratios")
 
 
 def _named(error: NoReliableMatrixError, paths: tuple[Path | None, Path | None]) -> NoReliableMatrixError:
@@ -200,26 +211,30 @@ def _named(error: NoReliableMatrixError, paths: tuple[Path | None, Path | None])
 
 def _features(image: Image, mask: Mask | None, max_size: int, detector: str) -> tuple[Features, Size]:
     """Return the features of an image at the size at which it is matched, and its full size."""
-    grey, size = _grey(image, max_size)
-    frame = content_mask(grey)
+    pixels, size = _pixels(image, max_size, detector in READS_COLOUR)
+    frame = content_mask(_grey(pixels))
     if mask is not None:
         mask = mask.cpu().numpy() if isinstance(mask, Tensor) else mask
         check_mask(mask, size)
-        small = import_cv2().resize(mask.astype(np.uint8), grey.shape[::-1], interpolation=0) > 0
+        small = import_cv2().resize(mask.astype(np.uint8), pixels.shape[1::-1], interpolation=0) > 0
         frame = small if frame is None else small & frame
-    features = DETECTORS[detector](grey, NUM_FEATURES)
+    features = DETECTORS[detector](pixels, NUM_FEATURES)
     return (features if frame is None else keep_features(features, frame)), size
 
 
-def _grey(image: Image, max_size: int) -> tuple[NDArray[np.uint8], Size]:
-    """Return the grey values of an image of at most a size, and its full size."""
+def _pixels(image: Image, max_size: int, colour: bool) -> tuple[NDArray[np.uint8], Size]:
+    """Return the grey values, or colours where there are some, of an image of at most a size, and its full size."""
     if isinstance(image, str | Path):
-        return read_image(image, max_size), image_size(image)
+        return (read_colour if colour else read_image)(image, max_size), image_size(image)
     values = image.cpu().numpy() if isinstance(image, Tensor) else image
     if not isinstance(values, np.ndarray) or values.dtype != np.uint8:
         raise TypeError(f"an image must be a path or an array of uint8, got {getattr(values, 'dtype', type(values))}")
-    if values.ndim == 3 and values.shape[2] == 3:
-        values = np.asarray(import_cv2().cvtColor(np.ascontiguousarray(values), import_cv2().COLOR_RGB2GRAY), np.uint8)
-    if values.ndim != 2 or values.size == 0:
-        raise ValueError(f"an image must have shape (H, W) or (H, W, 3), got {values.shape}")
-    return resize_image(np.ascontiguousarray(values), max_size), (values.shape[1], values.shape[0])
+    check_grey(values, colour=True)
+    values = np.ascontiguousarray(values if colour else _grey(values))
+    return resize_image(values, max_size), (values.shape[1], values.shape[0])
+
+
+def _grey(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if pixels.ndim == 2:
+        return pixels
+    return np.asarray(import_cv2().cvtColor(np.ascontiguousarray(pixels), import_cv2().COLOR_RGB2GRAY), np.uint8)

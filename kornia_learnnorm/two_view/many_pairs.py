@@ -155,7 +155,7 @@ def describe_failure(code: str, text: str, image1: Path, image2: Path, options: 
         "image2": describe(image2),
         "estimator": (RANSAC if options.weights is None else LearnedEightPoint).__name__,
         "seed": options.seed,
-        "ratio": options.ratio,
+        "ratio": options.ratio if options.matcher == "nearest" else None,
         "threshold_px": options.threshold,
         "versions": package_versions(),
     }

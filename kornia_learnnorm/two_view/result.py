@@ -35,7 +35,7 @@ class PairEstimate:
     estimator: str  # what made F_mat: "RANSAC" or "LearnedEightPoint"
     points1: Tensor  # pixels of the matches in image 1, (N, 2), float64
     points2: Tensor  # pixels of the matches in image 2, (N, 2), float64
-    scores: Tensor  # 1 minus the ratio of each match, (N,), float64
+    scores: Tensor  # of each match, 1 minus its ratio or the matcher's score, (N,), float64
     weights: Tensor  # probability of each match to be an inlier as the estimator sees it, (N,), float64
     inliers: Tensor  # mask of the matches with a distance to F_mat below the threshold, (N,), bool
     front: Tensor | None  # mask of the matches in front of both cameras, (N,), bool; None without cameras
@@ -43,7 +43,7 @@ class PairEstimate:
     warnings: tuple[PairWarning, ...]  # reasons to doubt F_mat; empty when all is well
     size1: tuple[int, int]  # width and height of image 1
     size2: tuple[int, int]  # width and height of image 2
-    ratio: float | None  # largest ratio of nearest to second-nearest descriptor distance; None where matches were given
+    ratio: float | None  # largest ratio of nearest to second-nearest descriptor distance; None where there is no limit
     threshold: float  # largest symmetric epipolar distance of an inlier, pixels; of the full images as the points are
     seed: int
     path1: Path | None = None

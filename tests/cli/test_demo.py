@@ -13,6 +13,10 @@ def test_a_port_out_of_range(refused, port):
     refused(["demo", f"--port={port}"], f"from 1 to 65535 expected, got {port}")
 
 
+def test_a_matcher_without_its_detector(refused):
+    refused(["demo", "--matcher", "lightglue"], "keynet, got sift")
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Tornado leaves its socket open
 def test_a_port_in_use(refused):
     pytest.importorskip("bokeh", reason="Bokeh is not installed")

@@ -39,7 +39,9 @@ def test_reference(paths, tmp_path):
     got = read_store(tmp_path / "stored.h5")
     np.testing.assert_array_equal(got.points1, [[1, 2], [5, 6]])
     np.testing.assert_array_equal(got.points2, [[9, 10], [7, 8]])
-    assert got.ratio.tolist() == [0.25, 0.5]
+    assert got.score.tolist() == [0.75, 0.5]
+    assert np.isnan(got.ratio).all()
+    assert len(got.rows(0, 0.8)) == 2  # no ratio test applies
     assert got.image_size.tolist() == [[[640, 480], [640, 480]]]
     assert got.names == [("seq/a.png", "b_1.png")]
     assert all(np.isnan(getattr(got, name)).all() for name in "FKRt")

@@ -1,10 +1,12 @@
 """Stores: what is written comes back, some pairs of it, and what a broken file says."""
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
 
-from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, read_store
+from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, StoreReader, read_store
 from kornia_learnnorm.data.writer import write_store
 
 
@@ -27,6 +29,25 @@ def test_round_trip(uneven, path):
         dtypes = {name: data.dtype for name, data in file.items()}
     assert all(getattr(got, name).dtype == getattr(uneven, name).dtype == dtypes[name] for name in ("offsets", *LAYOUT))
     assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
+
+
+def test_a_file_without_scores_has_one_minus_the_ratio(uneven, path):
+    with h5py.File(path, "r+") as file:
+        del file["score"]
+    same(read_store(path), uneven)
+    with h5py.File(path, "r+") as file:
+        file["ratio"][:3] = np.nan
+    with pytest.raises(ValueError, match="ratio holds NaN or infinite"):
+        read_store(path)
+
+
+def test_matches_without_a_ratio_pass_every_ratio_test(uneven, tmp_path):
+    ratio, score = np.full_like(uneven.ratio, np.nan), np.linspace(0, 1, 180, dtype=np.float32)
+    write_store(tmp_path / "scored.h5", replace(uneven, ratio=ratio, score=score))
+    store = read_store(tmp_path / "scored.h5")
+    np.testing.assert_array_equal(store.score, score)
+    assert store.rows(2, 0.8).tolist() == store.rows(2).tolist()
+    assert StoreReader(tmp_path / "scored.h5").passing(0.8).tolist() == np.diff(store.offsets).tolist()
 
 
 def test_missing_file(tmp_path):
@@ -53,7 +74,8 @@ def of_integers(file):
         ("offsets", np.array([0, 9, 3, 4, 5, 6, 180]), "offsets must start at 0 and not decrease"),
         ("offsets", np.array([0, 9, 10, 40, 50, 60, 2**62]), r"points1 must have shape \(4611686018427387904, 2\)"),
         ("points1", np.full((180, 2), np.nan), "points1 holds NaN or infinite"),
-        ("ratio", np.full(180, np.nan), "ratio holds NaN or infinite"),
+        ("score", np.full(180, np.nan), "score must be from 0 to 1"),
+        ("score", np.zeros(179), r"score must have shape \(180,\), got \(179,\)"),
         ("points1", np.zeros((180, 2), int), "points1 must be float32, got int64"),
         ("names", of_integers, "names must be strings"),
         ("version", 2, r"expected format='correspondences', version=1, got .*version=.*2"),

@@ -122,6 +122,18 @@ class TestEstimatePair:
         assert content["versions"]["torch"].partition("+")[0] == torch.__version__.partition("+")[0]
 
 
+def test_scores_of_lightglue_are_kept(planes, cached_weights):
+    cached_weights("xfeat.pt", "xfeat-lighterglue.pt")
+    pair = match_two_images(planes / "left.png", planes / "right.png", detector="xfeat", matcher="lightglue")
+    assert pair.ratio is None
+    assert pair.mutual.all()
+    assert 0.1 < pair.scores.min() < 0.3  # no limit of 0.8 applies
+    assert pair.scores.max() <= 1
+    found = pair.estimate()
+    assert found.as_dict()["ratio"] is None
+    assert {*found.scores.tolist()} <= {*pair.scores.tolist()}
+
+
 class TestErrors:
     @pytest.mark.parametrize(
         ("first", "second", "code", "message", "ratio"),
@@ -149,7 +161,8 @@ class TestErrors:
             ({"max_size": 99.5}, TypeError, "max_size must be a whole number, got 99.5"),
             ({"max_size": 10}, ValueError, "max_size must be at least 64"),
             ({"detector": "surf"}, ValueError, "detector must be one of sift, .*, got 'surf'"),
-            ({"matcher": "lightglue"}, ValueError, "matcher lightglue needs detector disk, got sift"),
+            ({"matcher": "lightglue"}, ValueError, "lightglue needs detector .*, keynet, got sift"),
+            ({"detector": "disk", "matcher": "lightglue", "ratio": 0.7}, ValueError, "0.7 is for matcher nearest"),
         ],
     )
     def test_options_are_checked_before_the_work(self, options, error, message, monkeypatch):

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.images import Size, import_cv2, read_image, scaling
+from kornia_learnnorm.data.images import Size, import_cv2, read_colour, read_image, scaling
 from kornia_learnnorm.data.motion import fundamental_from_motion
 
 __all__ = ["Frame", "FramePair", "read_frame", "resize_frames"]
@@ -83,14 +83,14 @@ def resize_frames(frames: Iterable[Frame], size: Size) -> list[Frame]:
     return [replace(frame, resized=size) for frame in frames]
 
 
-def read_frame(frame: Frame) -> NDArray[np.uint8]:
-    """Return the grey values (H, W) of a frame as it is matched: undistorted, of ``frame.matched_size``.
+def read_frame(frame: Frame, colour: bool = False) -> NDArray[np.uint8]:
+    """Return grey values (H, W) or colours (H, W, 3) of a frame as it is matched: undistorted, resized.
 
     Undistortion keeps the camera matrix; pixels without a source in the file become black.
     """
     cv2 = import_cv2()
-    image = read_image(frame.path)
-    if image.shape[::-1] != frame.size:
+    image = (read_colour if colour else read_image)(frame.path)
+    if image.shape[1::-1] != frame.size:
         got = f"{image.shape[1]} x {image.shape[0]}"
         raise ValueError(f"image {frame.path} has {got} pixels, its camera {frame.size[0]} x {frame.size[1]}")
     if any(frame.distortion):

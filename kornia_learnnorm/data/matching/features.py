@@ -5,20 +5,24 @@ The latter load their weights through :mod:`torch.hub`, from its cache or from t
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Callable
+from contextlib import redirect_stderr
 from functools import lru_cache
+from io import StringIO
 from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from kornia.feature import DISK, KeyNetAffNetHardNet
+from kornia.feature import ALIKED, DISK, KeyNetAffNetHardNet, XFeat, laf_from_center_scale_ori
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import check_grey, import_cv2
 
-__all__ = ["DETECTORS", "Features", "check_mask", "detect_disk", "detect_keynet", "detect_rootsift", "detect_sift"]
-__all__ += ["keep_features", "pretrained"]
+__all__ = ["DETECTORS", "READS_COLOUR", "Features", "check_mask", "detect_aliked", "detect_disk", "detect_keynet"]
+__all__ += ["detect_rootsift", "detect_sift", "detect_xfeat", "keep_features", "pretrained"]
 
 MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is of the mask's edge
 
@@ -29,20 +33,24 @@ class Features(NamedTuple):
     points: NDArray[np.float32]  # pixels (x, y), (N, 2)
     descriptors: NDArray[Any]  # one row a feature, (N, D), compared by their Euclidean distance
     size: tuple[int, int]  # (width, height) of the image, pixels
+    # Kornia's local affine frames, pixels, (N, 2, 3); None of a detector that finds points without scale and shape
+    lafs: NDArray[np.float32] | None = None
 
 
 def detect_sift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
     """Return the strongest SIFT features, with those that tie with the weakest; descriptors uint8, 128 columns.
 
     ``image`` has grey values :math:`(H, W)`, uint8; TypeError or ValueError for others, or if ``num_features`` is below
-    2. A pixel has several features where its keypoint has several orientations (D. Lowe, IJCV 2004).
+    2. A pixel has several features where its keypoint has several orientations (D. Lowe, IJCV 2004). The scale of a
+    frame is the standard deviation of the blur in which the keypoint was found.
     """
     _check(image, num_features)
     keypoints, descriptors = import_cv2().SIFT_create(num_features).detectAndCompute(image, None)
-    points = np.array([keypoint.pt for keypoint in keypoints], np.float32).reshape(-1, 2)
+    found = torch.tensor([(*keypoint.pt, keypoint.size / 2, -keypoint.angle) for keypoint in keypoints]).view(1, -1, 4)
+    lafs = laf_from_center_scale_ori(found[..., :2], found[..., 2, None, None], found[..., 3:])[0].numpy()
     # OpenCV's descriptors are whole numbers up to 255 in float32.
     rows = np.zeros((0, 128), np.uint8) if descriptors is None else descriptors.astype(np.uint8)
-    return Features(points, rows, (image.shape[1], image.shape[0]))
+    return Features(found[0, :, :2].numpy(), rows, (image.shape[1], image.shape[0]), lafs)
 
 
 def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
@@ -52,20 +60,36 @@ def detect_rootsift(image: NDArray[np.uint8], num_features: int = 4000) -> Featu
     return features._replace(descriptors=np.sqrt(rows / np.maximum(rows.sum(1, keepdims=True), 1.0)))
 
 
-def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Return the features of Kornia's DISK (M. Tyszkiewicz et al., NeurIPS 2020), 128 columns of float32.
+def detect_aliked(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+    """Return the features of Kornia's ALIKED, n16 (X. Zhao et al., IEEE TIM 2023), 128 columns of float32.
 
-    Arguments and errors are those of :func:`detect_sift`, and OSError if the weights cannot be loaded.
+    ``image`` has grey values :math:`(H, W)` or colours :math:`(H, W, 3)`, uint8. Errors are those of
+    :func:`detect_sift`, and OSError if the weights cannot be loaded.
     """
-    _check(image, num_features)
+    _check(image, num_features, colour=True)
+    with torch.inference_mode():
+        found = pretrained("ALIKED", ALIKED.from_pretrained, "aliked-n16", num_features)(_tensor(image))[0]
+    return _features(image, found.keypoints, found.descriptors)
+
+
+def detect_disk(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+    """Return the features of Kornia's DISK (M. Tyszkiewicz et al., NeurIPS 2020); as :func:`detect_aliked`."""
+    _check(image, num_features, colour=True)
     with torch.inference_mode():
         disk = pretrained("DISK", DISK.from_pretrained)
         found = disk(_tensor(image).expand(-1, 3, -1, -1), num_features, pad_if_not_divisible=True)[0]
-    return Features(found.keypoints.float().numpy(), found.descriptors.numpy(), (image.shape[1], image.shape[0]))
+    return _features(image, found.keypoints, found.descriptors)
+
+
+def detect_xfeat(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
+    """Return the features of Kornia's XFeat (G. Potje et al., CVPR 2024), 64 columns; as :func:`detect_aliked`."""
+    _check(image, num_features, colour=True)
+    found = pretrained("XFeat", XFeat.from_pretrained).detectAndCompute(_tensor(image), num_features)[0]
+    return _features(image, found["keypoints"], found["descriptors"])
 
 
 def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
-    """Return the features of Kornia's KeyNet, AffNet and HardNet; otherwise as :func:`detect_disk`.
+    """Return the features of Kornia's KeyNet, AffNet and HardNet of a grey image; otherwise as :func:`detect_aliked`.
 
     A. Barroso-Laguna et al., Key.Net, ICCV 2019; D. Mishkin et al., AffNet, ECCV 2018; A. Mishchuk et al., HardNet,
     NIPS 2017.
@@ -75,8 +99,8 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
         network = pretrained("KeyNet, AffNet and HardNet", KeyNetAffNetHardNet, num_features)
         frames, _, descriptors = network(_tensor(image))
     found = frames[0].flatten(1).any(1)  # Kornia pads with zeros
-    points, rows = frames[0, found, :, 2].float(), descriptors[0, found].float()
-    return Features(points.numpy(), rows.numpy(), (image.shape[1], image.shape[0]))
+    lafs = frames[0, found].float()
+    return _features(image, lafs[:, :, 2], descriptors[0, found].float())._replace(lafs=lafs.numpy())
 
 
 def keep_features(features: Features, mask: NDArray[np.bool_]) -> Features:
@@ -91,7 +115,8 @@ def keep_features(features: Features, mask: NDArray[np.bool_]) -> Features:
     inner = import_cv2().erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
     x, y = np.rint(features.points).astype(int).clip(0, (width - 1, height - 1)).T
     kept = inner[y, x]
-    return features._replace(points=features.points[kept], descriptors=features.descriptors[kept])
+    lafs = None if features.lafs is None else features.lafs[kept]
+    return features._replace(points=features.points[kept], descriptors=features.descriptors[kept], lafs=lafs)
 
 
 def check_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> None:
@@ -106,27 +131,48 @@ def check_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> None:
 DETECTORS: dict[str, Callable[[NDArray[np.uint8], int], Features]] = {
     "sift": detect_sift,
     "rootsift": detect_rootsift,
+    "aliked": detect_aliked,
     "disk": detect_disk,
+    "xfeat": detect_xfeat,
     "keynet": detect_keynet,
 }
+READS_COLOUR = ("aliked", "disk", "xfeat")  # names of those that take colours
+
+
+class _ErrorsOnly(StringIO):
+    """Standard error without the lines of downloads that begin: Kornia prints one for each address and attempt."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stream = sys.stderr
+
+    def write(self, text: str) -> int:
+        return len(text) if text.startswith("Downloading:") else self.stream.write(text)
 
 
 @lru_cache(maxsize=2)  # a detector and a matcher
 def pretrained(name: str, load: Callable[..., Any], *args: Any) -> Any:
     """Return the network of Kornia that ``load(*args)`` makes; OSError if its weights cannot be loaded."""
     try:
-        return load(*args)
+        with warnings.catch_warnings(), redirect_stderr(_ErrorsOnly()):
+            warnings.simplefilter("ignore", UserWarning)  # one for each attempt to download
+            return load(*args)
     except (OSError, RuntimeError, EOFError, UnpicklingError) as error:  # the last two: a truncated file in the cache
+        get = "run the command once with access to the internet, or save the file of the address as the path"
         folder = f"{torch.hub.get_dir()}/checkpoints"
-        raise OSError(f"the weights of {name} are not in {folder} and could not be loaded: {error}") from error
+        raise OSError(f"the weights of {name} are not in {folder} and could not be loaded: {error} ({get})") from error
+
+
+def _features(image: NDArray[np.uint8], points: torch.Tensor, descriptors: torch.Tensor) -> Features:
+    return Features(points.float().numpy(), descriptors.numpy(), (image.shape[1], image.shape[0]))
 
 
 def _tensor(image: NDArray[np.uint8]) -> torch.Tensor:
-    """Return grey values in [0, 1], (1, 1, H, W)."""
-    return torch.from_numpy(image)[None, None].float() / 255.0
+    """Return grey values or colours in [0, 1], (1, C, H, W)."""
+    return torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None].float() / 255.0
 
 
-def _check(image: NDArray[np.uint8], num_features: int) -> None:
-    check_grey(image)
+def _check(image: NDArray[np.uint8], num_features: int, colour: bool = False) -> None:
+    check_grey(image, colour)
     if num_features < 2:
         raise ValueError(f"num_features must be at least 2, got {num_features}")

@@ -21,10 +21,10 @@ import numpy as np
 
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair, read_frame
 from kornia_learnnorm.data.images import import_cv2
-from kornia_learnnorm.data.matching.features import DETECTORS, Features
-from kornia_learnnorm.data.matching.matchers import MATCHERS, check_methods, one_to_one
+from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Features
+from kornia_learnnorm.data.matching.matchers import check_methods, match_features, one_to_one
 from kornia_learnnorm.data.matching.workers import Workers, open_workers, restart_crashed
-from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test
 from kornia_learnnorm.data.writer import StoreWriter, check_target
 from kornia_learnnorm.files import exclusive
 from kornia_learnnorm.optional import import_extra
@@ -44,8 +44,8 @@ class MatchOptions:
 
     detector: str = "sift"  # a key of features.DETECTORS
     num_features: int = 4000  # kept of an image, the strongest ones
-    matcher: str = "nearest"  # a key of matchers.MATCHERS
-    # Matches kept of a pair, drawn at random: so many that pass Lowe's ratio test, so many that fail it; None for all.
+    matcher: str = "nearest"  # one of matchers.MATCHERS
+    # Matches kept of a pair, drawn at random: so many that fail Lowe's ratio test, so many others; None for all.
     max_matches: int | None = MAX_FILTERED
     seed: int = 0  # of this draw and of the order of a pair's matches
 
@@ -63,12 +63,13 @@ def match_frames(
     pair: FramePair, features1: Features, features2: Features, options: MatchOptions, place: int = 0
 ) -> CorrespondenceStore:
     """Return a store of one pair: its matches, one-to-one and in an order of the seed and of ``place``, its index."""
-    matches = MATCHERS[options.matcher](features1, features2)
-    kept = one_to_one(*matches)
-    points1, points2, ratio = (part[kept].numpy() for part in matches)
+    matches = match_features(features1, features2, options.detector, options.matcher)
+    arrays = matches.points1, matches.points2, matches.ratio, matches.score
+    kept = one_to_one(matches.points1, matches.points2, -matches.score)
+    points1, points2, ratio, score = (part[kept].numpy() for part in arrays)
     order = np.random.default_rng([options.seed, place]).permutation(len(ratio))
     if options.max_matches is not None:
-        passes = ratio[order] < RATIO
+        passes = passes_ratio_test(ratio[order], RATIO)
         rank = np.where(passes, passes.cumsum(), (~passes).cumsum())  # from 1, within its class
         order = order[rank <= options.max_matches]
     R, t = pair.motion
@@ -76,6 +77,7 @@ def match_frames(
         points1=points1[order],
         points2=points2[order],
         ratio=ratio[order],
+        score=score[order],
         offsets=np.array([0, len(order)]),
         image_size=np.array([[features1.size, features2.size]], np.int32),
         names=[(pair.frame1.name, pair.frame2.name)],
@@ -188,7 +190,7 @@ def _detect(frame: Frame, options: MatchOptions) -> Features | str:
     """Return the features of a frame, or the reason why it cannot be read."""
     import_cv2().setNumThreads(1)
     try:
-        image = read_frame(frame)
+        image = read_frame(frame, options.detector in READS_COLOUR)
     except (OSError, ValueError) as error:
         return str(error)
     return DETECTORS[options.detector](image, options.num_features)
@@ -236,7 +238,7 @@ class FeatureCache:
         self.held[frame.name] = features if isinstance(features, str) else ""
         if not isinstance(features, str):
             try:
-                np.savez(self._path(frame), **features._asdict())
+                np.savez(self._path(frame), **{k: v for k, v in features._asdict().items() if v is not None})
             except OSError as error:  # NumPy's message does not name the file
                 target = f"the features of {frame.name} to {self.folder}"
                 raise OSError(f"cannot write {target}, is the disk full? {error}") from error
@@ -246,7 +248,7 @@ class FeatureCache:
         if reason := self.held[frame.name]:
             return reason
         with np.load(self._path(frame)) as data:
-            return Features(data["points"], data["descriptors"], tuple(data["size"].tolist()))
+            return Features(data["points"], data["descriptors"], tuple(data["size"].tolist()), data.get("lafs"))
 
     def release(self, pair: FramePair) -> None:
         """Mark a pair as done and delete features that no other pair needs."""

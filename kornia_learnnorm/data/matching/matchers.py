@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.feature import LightGlue
+from kornia.feature import LightGlue, get_laf_orientation, get_laf_scale
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,8 +15,18 @@ from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.features import DETECTORS, Features, detect_sift, pretrained
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 
-__all__ = ["MATCHERS", "Matches", "check_methods", "match_both_ways", "match_images", "match_lightglue"]
-__all__ += ["match_nearest", "one_to_one"]
+__all__ = ["MATCHERS", "Matches", "ScoredMatches", "check_methods", "match_both_ways", "match_features"]
+__all__ += ["match_images", "match_lightglue", "match_nearest", "one_to_one"]
+
+MATCHERS = ("nearest", "lightglue")  # names on the command line
+# What Kornia calls the features of a detector for which it has weights of LightGlue.
+LIGHTGLUE = {
+    "rootsift": "sift",
+    "aliked": "aliked",
+    "disk": "disk",
+    "xfeat": "xfeat",  # LighterGlue, a smaller network
+    "keynet": "keynet_affnet_hardnet",
+}
 
 
 class Matches(NamedTuple):
@@ -28,6 +37,24 @@ class Matches(NamedTuple):
     # Distance of the nearest over that of the second-nearest descriptor, in [0, 1], (N,), float32. A small ratio is a
     # distinctive match (D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004, section 7.1).
     ratio: Tensor
+
+    @property
+    def score(self) -> Tensor:
+        """Return 1 minus the ratio, (N,)."""
+        return 1 - self.ratio
+
+
+class ScoredMatches(NamedTuple):
+    """Correspondences of two images by a matcher that gives scores and no ratios, one row per match."""
+
+    points1: Tensor  # pixels (x, y) in image 1, (N, 2), float32
+    points2: Tensor  # pixels of their matches in image 2, (N, 2), float32
+    score: Tensor  # the matcher's confidence, from 0 to 1, (N,), float32
+
+    @property
+    def ratio(self) -> Tensor:
+        """Return NaN, (N,): there are no ratios, and no ratio test applies."""
+        return torch.full_like(self.score, torch.nan)
 
 
 def match_nearest(features1: Features, features2: Features) -> Matches:
@@ -63,27 +90,32 @@ def _nearest(features1: Features, features2: Features) -> tuple[NDArray[np.int64
     return index2, torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
 
 
-def match_lightglue(features1: Features, features2: Features) -> Matches:
-    """Match DISK features with Kornia's LightGlue (P. Lindenberger et al., ICCV 2023); ``ratio`` is 1 - score.
+def match_lightglue(features1: Features, features2: Features, detector: str = "disk") -> ScoredMatches:
+    """Match the features of a detector with Kornia's LightGlue for it (P. Lindenberger et al., ICCV 2023).
 
-    So the limit of 0.8 keeps scores above 0.2. An image of fewer than two features, or descriptors other than 128
-    columns of float32, are a ValueError; weights that cannot be loaded an OSError.
+    A score is LightGlue's probability of the match, above 0.1. An image of fewer than two features, a detector without
+    weights, or descriptors of another one are a ValueError; weights that cannot be loaded an OSError.
     """
     _check(features1, features2)
+    check_methods(detector, "lightglue")
+    columns = LightGlue.features[LIGHTGLUE[detector]]["input_dim"]
     for features in (features1, features2):
-        if features.descriptors.dtype != np.float32 or features.descriptors.shape[1] != 128:
+        if features.descriptors.dtype != np.float32 or features.descriptors.shape[1] != columns:
             got = f"{features.descriptors.dtype} with {features.descriptors.shape[1]} columns"
-            raise ValueError(f"LightGlue needs the descriptors of DISK, float32 with 128 columns, got {got}")
+            raise ValueError(f"LightGlue of {detector} needs descriptors of float32 with {columns} columns, got {got}")
     with torch.inference_mode():
-        network = pretrained("LightGlue for DISK", _lightglue)
+        network = pretrained(f"LightGlue for {detector}", LightGlue, LIGHTGLUE[detector])
         found = network({"image0": _lightglue_input(features1), "image1": _lightglue_input(features2)})
     index1, index2 = found["matches"][0].numpy().T
     points1, points2 = torch.from_numpy(features1.points[index1]), torch.from_numpy(features2.points[index2])
-    return Matches(points1, points2, (1.0 - found["scores"][0]).clamp(0.0, 1.0).float().clone())
+    return ScoredMatches(points1, points2, found["scores"][0].clamp(0.0, 1.0).float().clone())
 
 
-# names on the command line
-MATCHERS: dict[str, Callable[[Features, Features], Matches]] = {"nearest": match_nearest, "lightglue": match_lightglue}
+def match_features(features1: Features, features2: Features, detector: str, matcher: str) -> Matches | ScoredMatches:
+    """Return the matches of a detector's features by a matcher's name, :func:`match_nearest` or LightGlue."""
+    return (
+        match_nearest(features1, features2) if matcher == "nearest" else match_lightglue(features1, features2, detector)
+    )
 
 
 def check_methods(detector: str, matcher: str) -> None:
@@ -91,8 +123,8 @@ def check_methods(detector: str, matcher: str) -> None:
     for name, given, known in (("detector", detector, DETECTORS), ("matcher", matcher, MATCHERS)):
         if given not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {given!r}")
-    if matcher == "lightglue" and detector != "disk":
-        raise ValueError(f"matcher lightglue needs detector disk, got {detector}")
+    if matcher == "lightglue" and detector not in LIGHTGLUE:
+        raise ValueError(f"matcher lightglue needs detector {', '.join(LIGHTGLUE)}, got {detector}")
 
 
 def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_features: int = 4000) -> Matches:
@@ -132,12 +164,14 @@ def _check(features1: Features, features2: Features) -> None:
 
 
 def _lightglue_input(features: Features) -> dict[str, Tensor]:
-    return {
+    side = {
         "keypoints": torch.from_numpy(features.points)[None],
         "descriptors": torch.from_numpy(features.descriptors)[None],
         "image_size": torch.tensor([features.size], dtype=torch.float32),
     }
-
-
-def _lightglue() -> Any:
-    return LightGlue("disk").eval()
+    if features.lafs is not None:
+        lafs = torch.from_numpy(features.lafs)[None]
+        # SIFT's weights expect COLMAP's orientations, clockwise from x to y.
+        side |= {"lafs": lafs, "scales": get_laf_scale(lafs).flatten(1)}
+        side["oris"] = -torch.deg2rad(get_laf_orientation(lafs).flatten(1))
+    return side

@@ -50,7 +50,7 @@ class EvaluatedPair(NamedTuple):
     R: Tensor  # true rotation, (3, 3)
     t: Tensor  # true translation, (3,)
     size: NDArray[np.int32]  # (width, height) of both images, (2, 2)
-    scores: Tensor  # of the correspondences, 1 minus Lowe's ratio, (N,)
+    scores: Tensor  # of the correspondences, those of the store, (N,)
 
 
 class Estimate(NamedTuple):

@@ -146,7 +146,7 @@ def shuffled_pair(store: CorrespondenceStore, pair: int, protocol: str, seed: in
     rows = np.random.default_rng([seed, pair, order]).permutation(rows)
     points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
     F_mat, K, R, t = (torch.from_numpy(part[pair]) for part in (store.F, store.K, store.R, store.t))
-    scores = (1 - torch.from_numpy(store.ratio[rows])).double().clamp(0, 1)
+    scores = torch.from_numpy(store.score[rows]).double()
     return EvaluatedPair(points1, points2, F_mat, K, R, t, store.image_size[pair], scores)
 
 

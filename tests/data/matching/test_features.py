@@ -8,12 +8,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.feature import DISK, LightGlue
+from kornia.feature import DISK, LightGlue, LightGlueMatcher, scale_laf
 from make_sequences import texture
 
 from kornia_learnnorm.data.matching import features as module
 from kornia_learnnorm.data.matching import matchers as matching
 from kornia_learnnorm.data.matching.features import (
+    DETECTORS,
     Features,
     detect_disk,
     detect_keynet,
@@ -22,6 +23,9 @@ from kornia_learnnorm.data.matching.features import (
     keep_features,
     pretrained,
 )
+from kornia_learnnorm.data.matching.matchers import MATCHERS, match_features
+from kornia_learnnorm.data.synthetic.render import render_pair
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
@@ -90,17 +94,83 @@ def test_keynet_of_random_weights(monkeypatch):
 
 
 def test_lightglue_of_random_weights(monkeypatch):
-    monkeypatch.setattr(matching, "_lightglue", LightGlue(None, input_dim=128).eval().__call__)
-    monkeypatch.setattr(matching, "pretrained", lambda name, network: network)
+    network = LightGlue(None, input_dim=128, filter_threshold=0.0).eval()
+    monkeypatch.setattr(matching, "pretrained", lambda *_: network)
     rng = np.random.default_rng(0)
     points, rows = rng.uniform(0, 90, (2, 30, 2)), rng.normal(size=(2, 30, 128))
     sides = [Features(*map(np.float32, side), (100, 90)) for side in zip(points, rows, strict=True)]
     matches = matching.match_lightglue(*sides)
-    assert matches.points1.shape == matches.points2.shape == (len(matches.ratio), 2)
+    assert matches.points1.shape == matches.points2.shape == (len(matches.score), 2)
+    assert len(matches.score) > 0
     assert all(part.dtype == torch.float32 for part in matches)
-    assert ((matches.ratio >= 0) & (matches.ratio <= 1)).all()
-    with pytest.raises(ValueError, match=r"the descriptors of DISK, .* got float32 with 64 columns"):
+    assert ((matches.score >= 0) & (matches.score <= 1)).all()
+    assert matches.ratio.isnan().all()
+    with pytest.raises(ValueError, match=r"LightGlue of disk needs .* 128 columns, got float32 with 64 columns"):
         matching.match_lightglue(*(side._replace(descriptors=side.descriptors[:, :64]) for side in sides))
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "used"), [("sift", 6.0, ("scales", "oris")), ("keynet_affnet_hardnet", 1.0, ("lafs",))]
+)
+def test_lightglue_gets_the_frames_that_kornia_gives_it(monkeypatch, name, scale, used):
+    """Kornia's LightGlueMatcher makes the same input of local affine frames, SIFT's of six standard deviations."""
+    given = {}
+
+    class Spy(torch.nn.Module):
+        def __init__(self, *_, **__):
+            super().__init__()
+
+        def forward(self, data):
+            given.update(data)
+            return {"matches0": torch.full((1, 2), -1), "matching_scores0": torch.zeros(1, 2)}
+
+    monkeypatch.setattr("kornia.feature.integrated.LightGlue", Spy)
+    found = [detect_rootsift(texture(seed, 200), 50) for seed in range(2)]
+    rows, lafs = ([torch.from_numpy(getattr(side, part)) for side in found] for part in ("descriptors", "lafs"))
+    frames = [scale_laf(side[None], scale) for side in lafs]
+    LightGlueMatcher(name)(*rows, *frames, *(side.size[::-1] for side in found))
+    for number, side in enumerate(found):
+        ours, expected = matching._lightglue_input(side), given[f"image{number}"]
+        for part in ("keypoints", "descriptors", "image_size", *used):
+            torch.testing.assert_close(ours[part], expected[part].to(ours[part].dtype), rtol=1e-5, atol=1e-4)
+
+
+KEYNET_FILES = ["keynet_pytorch.pth", "AffNet.pth", "OriNet.pth", "checkpoint_liberty_with_aug.pth"]
+
+
+@pytest.mark.parametrize(
+    ("detector", "files", "lightglue", "share", "distance"),
+    [
+        ("aliked", ["aliked-n16.pth"], "aliked_lightglue_v0-1_arxiv-pth", 0.9, 0.4),
+        ("disk", ["depth-save.pth"], "disk_lightglue_v0-1_arxiv-pth", 0.85, 1.0),
+        ("xfeat", ["xfeat.pt"], "xfeat-lighterglue.pt", 0.6, 1.5),
+        ("rootsift", [], "sift_lightglue_v0-1_arxiv-pth", 0.8, 0.3),
+        ("keynet", KEYNET_FILES, "keynet_affnet_hardnet_lightglue.pth", 0.6, 1.5),
+    ],
+)
+def test_matches_of_trained_networks_are_true(cached_weights, detector, files, lightglue, share, distance):
+    """On a rendered pair: share of matches within 2 px of their epipolar lines, median distance."""
+    cached_weights(*files, lightglue)
+    pair = render_pair(seed=0, width=240, height=180)
+    sides = [DETECTORS[detector](image, 300) for image in (pair.image1, pair.image2)]
+    for matcher in MATCHERS:
+        matches = match_features(*sides, detector, matcher)
+        kept = matches.score > 0.2
+        points = matches.points1[kept][None].double(), matches.points2[kept][None].double()
+        found = symmetric_epipolar_distance(*points, torch.from_numpy(pair.F_mat)[None])[0]
+        assert len(found) > 50
+        assert (found < 2).double().mean() > share
+        assert found.median() < distance
+
+
+@pytest.mark.parametrize(("detector", "file"), [("aliked", "aliked-n16.pth"), ("xfeat", "xfeat.pt")])
+def test_grey_values_are_colours_of_three_equal_channels(cached_weights, detector, file):
+    cached_weights(file)
+    grey = texture(0, 120, 100)
+    one, three = DETECTORS[detector](grey, 50), DETECTORS[detector](np.stack([grey] * 3, -1), 50)
+    assert np.allclose(one.points, three.points, atol=1e-3)
+    with pytest.raises(ValueError, match=r"grey or RGB with shape .*, got \(120, 100, 4\)"):
+        DETECTORS[detector](np.zeros((120, 100, 4), np.uint8), 50)
 
 
 @pytest.mark.parametrize(
@@ -111,6 +181,17 @@ def test_weights_that_cannot_be_loaded(monkeypatch, detect, error):
         monkeypatch.setattr(f"kornia.feature.{place}.load_state_dict_from_url", Mock(side_effect=error))
     with pytest.raises(OSError, match=r"the weights of .*checkpoints and could not be loaded: .*(no network|Ran out)"):
         detect(texture(), 10)
+
+
+def test_weights_without_a_network_are_one_line(monkeypatch, tmp_path, refused, planes):
+    """Kornia warns of every attempt and prints every address; the command names the file and its address once."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr("kornia.core.download.urlopen", Mock(side_effect=urllib.error.URLError("no network")))
+    monkeypatch.setattr("kornia.core.download.time.sleep", lambda _: None)
+    images = planes / "left.png", planes / "right.png"
+    refused(["estimate", *images, "--detector", "xfeat"], "the weights of XFeat are not in")
+    refused(["estimate", *images, "--detector", "xfeat"], f"{tmp_path}/hub/checkpoints/xfeat.pt")
+    refused(["estimate", *images, "--detector", "aliked"], "/aliked-n16.pth")
 
 
 class TestKeepFeatures:

@@ -59,6 +59,16 @@ def expected(images, tmp_path_factory):
     return path
 
 
+def test_scores_of_lightglue_reach_the_store(images, tmp_path, cached_weights):
+    cached_weights("xfeat.pt", "xfeat-lighterglue.pt")
+    options = MatchOptions("xfeat", 200, "lightglue", max_matches=30)
+    collect_matches(pairs_of(images)[:2], tmp_path / "s.h5", options)
+    store = read_store(tmp_path / "s.h5")
+    assert np.isnan(store.ratio).all()
+    assert 0.1 < store.score.min() < store.score.max() <= 1
+    assert np.diff(store.offsets).tolist() == [30, 30]  # no ratio test divides them
+
+
 def test_each_frame_is_detected_once_and_its_features_go(images, tmp_path, monkeypatch):
     detect, waiting = match_store.DETECTORS["sift"], []
 
