@@ -26,7 +26,7 @@ learnnorm estimate left.png right.png --K 700,700,320,240 --out pair.png
 learnnorm estimate --pairs pairs.txt --out results --estimator learned
 """
 MAX_FAILURES = 5  # failed pairs that are named
-UNRELIABLE = 3  # exit code where there is no matrix, or reasons to doubt it
+NO_MATRIX, DOUBTFUL = 3, 4  # exit codes where there is no matrix, or reasons to doubt it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,12 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options = PairOptions()
     parser.usage = "%(prog)s IMG1 IMG2 [options]\n       %(prog)s --pairs LIST --out FOLDER [options]"
     parser.description = (
-        f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix or a doubtful one"
+        f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 a matrix with warnings"
     )
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
     picture = "picture of matches and epipolar lines; with --pairs, a folder"
     parser.add_argument("--out", metavar="PATH", type=Path, help=picture)
-    parser.add_argument("--json", metavar="FILE", help="write everything to this file; -: standard output")
+    parser.add_argument("--json", metavar="FILE", help="write the result to this file; -: standard output")
+    parser.add_argument("--matches", action="store_true", help="with the matches in the JSON")
+    parser.add_argument("--strict", action="store_true", help="exit with 3 where there are warnings")
     add = parser.add_argument_group("estimation").add_argument
     names, default = ("ransac", "learned"), "(default: %(default)s)"
     add("--estimator", metavar="NAME", choices=names, default=names[0], help=f"{', '.join(names)} {default}")
@@ -74,13 +76,16 @@ def _seed(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Print the fundamental matrix; write the picture and the JSON file if asked to, both or neither."""
     _check_options(args)
+    doubtful = NO_MATRIX if args.strict else DOUBTFUL
     weights = (args.weights or "robust-synthetic") if args.estimator == "learned" else None
-    names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher")
+    names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher", "matches")
     options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
     if args.pairs is not None:
         found = estimate_pairs(read_pair_list(args.pairs), args.out, options, args.jobs, args.dask)
         _print_pairs(found, args.out)
-        return UNRELIABLE if any(line["warnings"] for line in found) else 0
+        if any(line["F"] is None for line in found):
+            return NO_MATRIX
+        return doubtful if any(line["warnings"] for line in found) else 0
     (image1, image2), json_path = args.images, _json_path(args)
     try:
         estimate = _estimate(args, options)
@@ -92,14 +97,14 @@ def run(args: argparse.Namespace) -> int:
         elif args.json == "-":
             print(failure, end="")
         print(f"no reliable matrix ({error.code}): {error}", file=sys.stderr)
-        return UNRELIABLE
+        return NO_MATRIX
     if args.json == "-":
-        print(_to_json(estimate.as_dict()), end="")
+        print(_to_json(estimate.as_dict(args.matches)), end="")
         for warning in estimate.warnings:
             print(f"warning ({warning.code}): {warning.text}", file=sys.stderr)
     else:
         print("\n".join([estimate.summary(), *(f"wrote    {path}" for path in (args.out, json_path) if path)]))
-    return UNRELIABLE if estimate.warnings else 0
+    return doubtful if estimate.warnings else 0
 
 
 def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
@@ -118,7 +123,7 @@ def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
             first, second = (read_colour(image, options.max_size) for image in args.images)
             draw_pair(first, second, estimate, picture)
         if report:
-            write_text(report, _to_json(estimate.as_dict()))
+            write_text(report, _to_json(estimate.as_dict(args.matches)))
     return estimate
 
 

@@ -45,6 +45,7 @@ class PairOptions:
     max_size: int = MAX_SIZE
     detector: str = "sift"
     matcher: str = "nearest"
+    matches: bool = False  # results hold the matches
 
     def __post_init__(self) -> None:
         """Raise a clear error for options that are out of range or do not go together."""
@@ -53,7 +54,7 @@ class PairOptions:
 
     def arguments(self, image1: Path, image2: Path) -> dict[str, Any]:
         """Return the keyword arguments of ``estimate_pair`` for two image files."""
-        options = {name: value for name, value in vars(self).items() if name not in ("weights", "K")}
+        options = {name: value for name, value in vars(self).items() if name not in ("weights", "K", "matches")}
         texts = self.K * 2 if len(self.K) == 1 else self.K
         cameras = [read_camera(text, image) for text, image in zip(texts, (image1, image2), strict=False)]
         return {**options, "layer": _layer(self.weights), **dict(zip(("K1", "K2"), cameras, strict=False))}
@@ -164,7 +165,7 @@ def describe_failure(code: str, text: str, image1: Path, image2: Path, options: 
 def _estimate(image1: Path, image2: Path, options: PairOptions) -> Line:
     import_cv2().setNumThreads(1)
     try:
-        return estimate_pair(image1, image2, **options.arguments(image1, image2)).as_dict()
+        return estimate_pair(image1, image2, **options.arguments(image1, image2)).as_dict(options.matches)
     except (ValueError, OSError) as error:
         code = error.code if isinstance(error, NoReliableMatrixError) else UNREADABLE
         return describe_failure(code, str(error), image1, image2, options)

@@ -65,8 +65,8 @@ class PairEstimate:
         inlying = self.points1[self.inliers], self.points2[self.inliers]
         return median(symmetric_epipolar_distance(*inlying, self.F_mat)).item()
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return all of it as what JSON can hold."""
+    def as_dict(self, matches: bool = True) -> dict[str, Any]:
+        """Return all of it, or all but what each match has, as what JSON can hold."""
 
         def view(path: Path | None, size: tuple[int, int]) -> dict[str, Any]:
             return {"file": None if path is None else str(path), "width": size[0], "height": size[1]}
@@ -87,10 +87,11 @@ class PairEstimate:
             "threshold_px": self.threshold,
             "num_matches": self.num_matches,
             "num_inliers": self.num_inliers,
-            **{name: getattr(self, name) for name in ("points1", "points2", "scores", "weights", "inliers")},
-            "in_front": self.front,
             "versions": package_versions(),
         }
+        if matches:
+            content |= {name: getattr(self, name) for name in ("points1", "points2", "scores", "weights", "inliers")}
+            content["in_front"] = self.front
         return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in content.items()}
 
     def summary(self) -> str:

@@ -57,8 +57,10 @@ class TestOnePair:
         assert all(text in printed for text in ("by       LearnedEightPoint", "(ratio test 0.7)", "< 2 px"))
 
     def test_exit_codes(self, command, planes, capsys):
-        """3 with a warning, and where there is no matrix; no picture is written in the latter case."""
-        assert command("--json", "F.json", images=("left", "plane")) == 3
+        """4 with a warning, 3 where there is no matrix; no picture is written in the latter case."""
+        assert command("--strict", images=("left", "plane")) == 3
+        assert command("--json", "F.json", images=("left", "plane")) == 4
+        assert "points1" not in json.loads(Path("F.json").read_text())
         assert "\nwarning  planar: one homography explains" in capsys.readouterr().out
         assert "planar" in [warning["code"] for warning in json.loads(Path("F.json").read_text())["warnings"]]
         assert command("--json", "F.json", "--out", "pair.png", images=("left", "left")) == 3
@@ -76,7 +78,7 @@ class TestOnePair:
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
         mask[:, WIDTH // 2 :] = 0
         cv2.imwrite("mask.png", mask)
-        command("--mask", "mask.png", "--json", "-", "--K", "300,300,160,120")
+        command("--mask", "mask.png", "--json", "-", "--matches", "--K", "300,300,160,120")
         content = json.loads(capsys.readouterr().out)
         assert np.array(content["R"]).shape == (3, 3)
         assert np.array(content["points1"])[:, 0].max() < WIDTH // 2
