@@ -17,22 +17,25 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
-from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedEstimate
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
 from kornia_learnnorm.estimators.linear import EightPoint
-from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES
+from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.normalizers.learned_normalizer import FORMAT as NORMALIZER_FORMAT
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
-from kornia_learnnorm.pretrained import shipped_weights, weights_format
+from kornia_learnnorm.pretrained import shipped_weights, weights_format, weights_model
 
 __all__ = ["export_layer", "export_networks", "load_layer"]
 
 MIN_DYNAMIC_POINTS = 9  # eight correspondences have a solver of their own
 EXAMPLE_BATCH = 2  # sets of the example that is traced; a dynamic size must not be one there
 DTYPES = {"mask": torch.bool}  # of inputs that are not float32
+ESTIMATORS = {layer.model_name: layer for layer in (LearnedEightPoint, LearnedRelativePose)}
+OUTPUTS = ("F_mat", "determined", "weights")  # fields of an estimate, where it has them
+POSE_OUTPUTS = ("E_mat", "R", "t", "determined", "weights")
 
 
-def load_layer(name: str | Path) -> EightPoint | LearnedEightPoint:
+def load_layer(name: str | Path) -> EightPoint | LearnedLayer:
     """Load trained weights as a layer: an estimator's as they are, a normaliser's inside :class:`EightPoint`.
 
     Args:
@@ -57,11 +60,11 @@ def load_layer(name: str | Path) -> EightPoint | LearnedEightPoint:
         )
     if file_format == NORMALIZER_FORMAT:
         return EightPoint(LearnedNormalizer.from_pretrained(name)).eval()
-    return LearnedEightPoint.from_pretrained(name)
+    return ESTIMATORS.get(weights_model(name), LearnedEightPoint).from_pretrained(name)
 
 
 def export_layer(
-    layer: EightPoint | LearnedEightPoint,
+    layer: EightPoint | LearnedLayer,
     inputs: Collection[str] = (),
     num_points: int | None = None,
     gradients: bool = False,
@@ -70,13 +73,15 @@ def export_layer(
 
     The program takes ``points1`` and ``points2`` with shape :math:`(B, N, 2)`, float32, and by name the tensors of
     ``inputs``. It returns a tuple of the matrices ``F_mat`` (B, 3, 3), ``determined`` (B,) and, of a
-    :class:`~kornia_learnnorm.LearnedEightPoint`, ``weights`` (B, N), as the layer's ``estimate``. The batch size
-    :math:`B` is any from one on. Values are not checked: points must be finite but where masked, weights not negative.
+    :class:`~kornia_learnnorm.LearnedEightPoint`, ``weights`` (B, N), as the layer's ``estimate``. That of a
+    :class:`~kornia_learnnorm.LearnedRelativePose` takes the cameras ``K1`` and ``K2`` (B, 3, 3) after the points, and
+    returns ``E_mat``, ``R`` and ``t`` in the place of ``F_mat``. The batch size :math:`B` is any from one on. Values
+    are not checked: points must be finite but where masked, weights not negative.
 
     Args:
         layer: the layer; the program runs on its device.
-        inputs: further inputs: ``"weights"``, ``"mask"`` and, for a :class:`~kornia_learnnorm.LearnedEightPoint`,
-            ``"scores"``. They are then no longer optional.
+        inputs: further inputs: ``"weights"``, ``"mask"`` and, for learned layers, ``"scores"``. They are then no longer
+            optional.
         num_points: number of correspondences :math:`N`, at least eight; without it, any number from nine on, up to the
             normaliser's ``max_points`` where there is one. With a mask, sets of eight and less fit in nine rows.
         gradients: keep what derivatives need, as for training the network before the layer. Without, the outputs
@@ -86,7 +91,7 @@ def export_layer(
         the program.
 
     Raises:
-        TypeError: if ``layer`` is neither layer.
+        TypeError: if ``layer`` is none of these layers.
         ValueError: if the layer has no such input, or ``num_points`` is less than eight.
 
     Example:
@@ -96,9 +101,9 @@ def export_layer(
         torch.Size([3, 3, 3])
 
     """
-    if not isinstance(layer, EightPoint | LearnedEightPoint):
-        raise TypeError(f"layer must be an EightPoint or a LearnedEightPoint, got {type(layer)}")
-    offered = list(inspect.signature(layer.forward).parameters)[2:]
+    if not isinstance(layer, EightPoint | LearnedEightPoint | LearnedRelativePose):
+        raise TypeError(f"layer must be an EightPoint or a learned layer, got {type(layer)}")
+    offered = [name for name in list(inspect.signature(layer.forward).parameters)[2:] if name not in ("K1", "K2")]
     if wrong := [name for name in inputs if name not in offered]:
         raise ValueError(f"further inputs of {type(layer).__name__} are {', '.join(offered)}, got {', '.join(wrong)}")
     if num_points is not None and num_points < 8:
@@ -109,18 +114,23 @@ def export_layer(
         shape[1] = Dim("N", min=MIN_DYNAMIC_POINTS, max=most)
     size = (EXAMPLE_BATCH, num_points or MIN_DYNAMIC_POINTS + 1)
     device = next(layer.parameters(), torch.empty(0)).device
-    points = torch.zeros(*size, 2, device=device), torch.zeros(*size, 2, device=device)
+    points = {name: torch.zeros(*size, 2, device=device) for name in ("points1", "points2")}
     given = {name: torch.ones(size, device=device, dtype=DTYPES.get(name)) for name in inputs}
-    shapes = dict.fromkeys(["points1", "points2", *given], shape)
+    shapes = dict.fromkeys([*points, *given], shape)
+    exported: nn.Module = _Exported(layer, gradients)
+    if isinstance(layer, LearnedRelativePose):
+        points |= {name: torch.eye(3, device=device).repeat(EXAMPLE_BATCH, 1, 1) for name in ("K1", "K2")}
+        shapes |= {name: {0: shape[0]} for name in ("K1", "K2")}
+        exported = _ExportedPose(layer, gradients)
     with torch.set_grad_enabled(gradients):
-        return torch.export.export(_Exported(layer, gradients), points, given, dynamic_shapes=shapes, strict=False)
+        return torch.export.export(exported, tuple(points.values()), given, dynamic_shapes=shapes, strict=False)
 
 
-def export_networks(layer: EightPoint | LearnedEightPoint) -> dict[str, Any]:
+def export_networks(layer: EightPoint | LearnedLayer) -> dict[str, Any]:
     """Return the networks of a layer as ONNX programs, without the steps around them.
 
-    The networks of a :class:`~kornia_learnnorm.LearnedEightPoint` map ``features`` (B, N, C) and ``absent`` (B, N) to
-    ``logits`` (B, N) and ``params`` (B, 10); the features are those of
+    The networks of learned layers map ``features`` (B, N, C) and ``absent`` (B, N) to ``logits`` (B, N) and ``params``
+    (B, P); the features of a :class:`~kornia_learnnorm.LearnedEightPoint` are those of
     :mod:`kornia_learnnorm.estimators.match_features`. The network of a learned normaliser maps ``points1`` and
     ``points2`` (B, N, 2) in the base's coordinates, and ``null_matrix`` (B, 3, 3) where it needs one, to ``params1``
     and ``params2`` (B, P).
@@ -138,10 +148,10 @@ def export_networks(layer: EightPoint | LearnedEightPoint) -> dict[str, Any]:
     """
     import_extra("onnx", "onnx", "ONNX export")
     import_extra("onnxscript", "onnx", "ONNX export")
-    if isinstance(layer, LearnedEightPoint):
+    if isinstance(layer, LearnedLayer):
         programs = {}
         for stage, part in enumerate(layer.networks):
-            features = torch.zeros(EXAMPLE_BATCH, 10, POINT_FEATURES + (RESIDUAL_FEATURES if stage else 0))
+            features = torch.zeros(EXAMPLE_BATCH, 10, layer.features + (layer.residual_features if stage else 0))
             example = {"features": features, "absent": torch.zeros(EXAMPLE_BATCH, 10, dtype=torch.bool)}
             programs[f"stage{stage + 1}"] = _to_onnx(part, example, ["logits", "params"])
         return programs
@@ -157,7 +167,9 @@ def export_networks(layer: EightPoint | LearnedEightPoint) -> dict[str, Any]:
 class _Exported(nn.Module):
     """A layer with a plain tuple as output: a named tuple needs its class where the program is loaded."""
 
-    def __init__(self, layer: EightPoint | LearnedEightPoint, gradients: bool) -> None:
+    outputs = OUTPUTS
+
+    def __init__(self, layer: EightPoint | LearnedLayer, gradients: bool) -> None:
         super().__init__()
         self.layer, self.gradients = layer, gradients
 
@@ -169,12 +181,34 @@ class _Exported(nn.Module):
         mask: Tensor | None = None,
         scores: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """Return the matrices, which sets determine them, and the weights of the correspondences."""
+        """Return the outputs of the points and optional inputs."""
         given = {} if scores is None else {"scores": scores}
-        found = self.layer.estimate(points1, points2, weights=weights, mask=mask, **given)
-        outputs = [found.F_mat, found.determined, *([found.weights] if isinstance(found, LearnedEstimate) else [])]
+        return self.select(self.layer.estimate(points1, points2, weights=weights, mask=mask, **given))
+
+    def select(self, found: Any) -> tuple[Tensor, ...]:
+        """Return the outputs that an estimate has."""
+        outputs = [getattr(found, name) for name in self.outputs if hasattr(found, name)]
         # Steps that need a gradient have been left out of the graph: what is left would give a wrong one.
         return tuple(outputs) if self.gradients else tuple(value.detach() for value in outputs)
+
+
+class _ExportedPose(_Exported):
+    """The same of a layer that needs cameras."""
+
+    outputs = POSE_OUTPUTS
+
+    def forward(  # type: ignore[override]
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        K1: Tensor,
+        K2: Tensor,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        scores: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """Return the outputs of the points, cameras and optional inputs."""
+        return self.select(self.layer.estimate(points1, points2, K1, K2, weights=weights, mask=mask, scores=scores))
 
 
 def _to_onnx(network: nn.Module, example: dict[str, Tensor], outputs: list[str]) -> Any:

@@ -8,9 +8,16 @@ import sys
 
 import pytest
 import torch
-from scenes import correspondences, shaken, shaken_estimator, signless, up_to_sign
+from scenes import correspondences, scenes, shaken, shaken_estimator, signless, up_to_sign
 
-from kornia_learnnorm import CrossViewNetwork, EightPoint, LearnedEightPoint, LearnedNormalizer, Whitening
+from kornia_learnnorm import (
+    CrossViewNetwork,
+    EightPoint,
+    LearnedEightPoint,
+    LearnedNormalizer,
+    LearnedRelativePose,
+    Whitening,
+)
 from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 from kornia_learnnorm.pretrained import shipped_weights
 
@@ -43,6 +50,11 @@ def sets(batch_size: int, num_points: int, device="cpu") -> list[torch.Tensor]:
     return [points.float().to(device) for points in correspondences("handheld", batch_size, num_points)]
 
 
+def calibrated_sets(batch_size: int, num_points: int) -> list[torch.Tensor]:
+    scene = scenes("handheld", batch_size, num_points)
+    return [value.float() for value in (scene.points1, scene.points2, scene.K1, scene.K2)]
+
+
 def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
     """Points, and a mask and scores by name; the first set has eight correspondences, the last one all rows."""
     numbers = torch.linspace(8, num_points, batch_size).long()
@@ -54,6 +66,8 @@ def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], d
 def estimates(layer, *points, **given) -> tuple[torch.Tensor, ...]:
     """What a program of the layer returns."""
     found = layer.estimate(*points, **given)
+    if isinstance(layer, LearnedRelativePose):
+        return found.E_mat, found.R, found.t, found.determined, found.weights
     return (found.F_mat, found.determined, *([found.weights] if isinstance(layer, LearnedEightPoint) else []))
 
 
@@ -95,6 +109,14 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path):
     assert not any(value.requires_grad for value in run(points[0].requires_grad_(), points[1], **given))
 
 
+def test_relative_pose():
+    torch.manual_seed(0)
+    layer = LearnedRelativePose(width=8, depth=1, refine_steps=2, samples=4)
+    program = export_layer(layer, ["scores"]).module()
+    for size in SIZES:
+        check(program, layer, *calibrated_sets(*size), scores=torch.rand(size))
+
+
 def test_gradients_of_sets():
     layer = EightPoint(Whitening())
     check_gradients_of_program(export_layer(layer, gradients=True).module(), layer, *sets(3, 20))
@@ -120,7 +142,8 @@ def test_shipped_weights(name):
     most = 12 if name.startswith("crossview") else 300
     program = export_layer(layer).module()
     for batch_size, num_points in SIZES:
-        check(program, layer, *sets(batch_size, min(num_points, most)))
+        draw = calibrated_sets if isinstance(layer, LearnedRelativePose) else sets
+        check(program, layer, *draw(batch_size, min(num_points, most)))
     if isinstance(layer, EightPoint):
         check(export_layer(layer, num_points=8).module(), layer, *sets(5, 8))
 
@@ -193,6 +216,7 @@ def test_wrong_arguments():
 
 def test_load_layer():
     assert isinstance(load_layer("robust-tiny"), LearnedEightPoint)
+    assert isinstance(load_layer("robust-pose"), LearnedRelativePose)
     assert load_layer("crossview").normalizer.max_points == 12
     with pytest.raises(FileNotFoundError, match=r"'rubust'.* crossview.* robust"):
         load_layer("rubust")

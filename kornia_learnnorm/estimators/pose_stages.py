@@ -220,7 +220,7 @@ def _most_consistent(
     axes = _descend(repeated, axes, present * front, lambda _: scale, LOCAL_STEPS)
     losses = torch.where(front, repeated.losses(_essential(axes)[:, None], LAST_PIXELS)[:, 0], 1.0)
     least = (losses * present).sum(1).view(-1, count).argmin(1)
-    chosen = least + count * torch.arange(len(least), device=least.device)
+    chosen = least + count * torch.arange(least.shape[0], device=least.device)
     return axes[chosen], front[chosen]
 
 
@@ -230,7 +230,7 @@ def _span_moments(evidence: _Evidence, weights: Tensor) -> tuple[Tensor, Tensor]
     basis = torch.unflatten(basis, -1, (3, 3)).mT
     E_mat, real = essential_in_span(basis)
     nearest = nearest_essential(basis[:, 3])[:, None]
-    E_mat, real = torch.cat([E_mat, nearest], 1), torch.cat([real, real.new_ones(len(real), 1)], 1)
+    E_mat, real = torch.cat([E_mat, nearest], 1), torch.cat([real, torch.ones_like(real[:, :1])], 1)
     number = 11 * weights.shape[1]
     return E_mat.view(-1, number, 3, 3), real.view(-1, number)
 
@@ -306,7 +306,7 @@ def _axes(E_mat: Tensor) -> Tensor:
 
 def _state(axes: Tensor, model: Essential) -> Calibrated:
     """Return the states of axes (B, 2, 3, 3) of both views."""
-    return Calibrated(axes, _EQUAL.to(axes).expand(len(axes), 2, 2), model.C1, model.C2)
+    return Calibrated(axes, _EQUAL.to(axes).expand(axes.shape[0], 2, 2), model.C1, model.C2)
 
 
 def _essential(axes: Tensor) -> Tensor:

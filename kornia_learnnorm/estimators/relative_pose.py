@@ -228,7 +228,7 @@ class LearnedRelativePose(LearnedLayer):
         problem = prepare_problem(self.model, points1, points2, weights, mask)
         check_cameras(K1, K2, points1.shape[0])
         scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
-        K1, K2 = (K.to(problem.x1).expand(len(points1), 3, 3) for K in (K1, K2))
+        K1, K2 = (K.to(problem.x1).expand(points1.shape[0], 3, 3) for K in (K1, K2))
         determined, gap = _determined(problem)
         # No derivative meets an undetermined set: generic points take its place, and their result is dropped.
         rows = determined[:, None]
@@ -241,7 +241,7 @@ class LearnedRelativePose(LearnedLayer):
         options = self.refine_steps, self.samples, self.detach_stages
         states, logits = run_pose_stages(self.networks, solved, C1, C2, scores, *options)
         sideways = Essential(eye[None], eye[None]).calibrated(
-            p1.new_tensor(self.model.preferred).view(1, 3, 3).expand(len(p1), -1, -1)
+            p1.new_tensor(self.model.preferred).view(1, 3, 3).expand(p1.shape[0], -1, -1)
         )
         states = [
             state._replace(

@@ -51,7 +51,7 @@ def essential_in_span(basis: Tensor) -> tuple[Tensor, Tensor]:
     rows = torch.cat([cubic, determinant], -1).flatten(1, 3).mT @ _TABLE.to(basis)  # (B, 10, 20)
     reduced = -torch.linalg.solve_ex(rows[..., :10], rows[..., 10:])[0]
     reduced = torch.where(reduced.isfinite().flatten(1).all(1)[:, None, None], reduced, 0.0)
-    known = torch.eye(10, dtype=basis.dtype, device=basis.device).expand(len(basis), -1, -1)
+    known = torch.eye(10, dtype=basis.dtype, device=basis.device).expand(basis.shape[0], -1, -1)
     action = torch.cat([reduced, known], 1)[:, _TIMES_X]
     values, vectors = torch.linalg.eig(action)
     solutions = vectors.mT[..., _SOLUTION]
