@@ -11,6 +11,7 @@ Example:
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.linear import EightPoint, find_fundamental
+from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
@@ -50,6 +51,7 @@ __all__ = [
     "LearnedRelativePose",
     "LogEpipolarLoss",
     "LogEssentialLoss",
+    "MatchRefiner",
     "NoReliableMatrixError",
     "PaperNetwork",
     "PerView",

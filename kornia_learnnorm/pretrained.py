@@ -39,6 +39,7 @@ WEIGHTS = Path(__file__).parent / "weights"
 CLASSES = {  # of the modules that files hold, by the format
     "kornia_learnnorm.normalizer.v1": "LearnedNormalizer",
     "kornia_learnnorm.eight_point.v1": "LearnedEightPoint",
+    "kornia_learnnorm.match_refiner.v1": "MatchRefiner",
 }
 MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that a file may name
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["config_names", "find_config", "with_config_paths"]
+__all__ = ["config_names", "find_config", "names_task", "with_config_paths"]
 
 OPTIONS = ("-c", "--config")
+TASK = re.compile(r"^model:[\s{]*class_path:", re.MULTILINE)
 PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
 FOLDER = PACKAGED if PACKAGED.is_dir() else Path(__file__).parents[1] / "configs"  # of the repository
 
@@ -40,3 +42,9 @@ def with_config_paths(args: Sequence[str]) -> list[str]:
         elif option == "--config" and equals:
             replaced[i] = f"--config={find_config(value)}"
     return replaced
+
+
+def names_task(args: Sequence[str]) -> bool:
+    """Return whether a configuration of :func:`with_config_paths` names the class of its task."""
+    paths = [Path(arg.removeprefix("--config=")) for arg in args]
+    return any(TASK.search(path.read_text(encoding="utf-8", errors="replace")) for path in paths if path.is_file())

@@ -27,7 +27,7 @@ from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.normalizers.whitening import Whitening
 from lightning_modules.schedule import one_cycle
 
-__all__ = ["EstimatorTask", "SetLoss"]
+__all__ = ["EstimatorTask", "SetLoss", "adamw", "cameras_of"]
 
 EARLY_STAGE = 0.3  # weight of the losses of all stages but the last
 RESIDUAL_FLOOR = 1e-3  # pixels, added to the residuals under the logarithm of the validation
@@ -35,7 +35,8 @@ BASELINES = {"hartley": EightPoint(Hartley()), "whitening": EightPoint(Whitening
 SIZES = {32: "32", 256: "256", 10**9: "1000"}  # largest number of matches in a set, and the name of its median
 
 
-def _adamw(params: Iterable[nn.Parameter]) -> Optimizer:
+def adamw(params: Iterable[nn.Parameter]) -> Optimizer:
+    """Return AdamW with a learning rate of 2e-3."""
     return torch.optim.AdamW(params, lr=2e-3)
 
 
@@ -116,7 +117,7 @@ class EstimatorTask(pl.LightningModule):
         self,
         estimator: nn.Module,
         loss: nn.Module | None = None,
-        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = _adamw,
+        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = adamw,
         lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
         warm_up: float = 0.05,
         sample_gradient: float | None = 1.0,
@@ -132,7 +133,7 @@ class EstimatorTask(pl.LightningModule):
         self.warm_up, self.sample_gradient = warm_up, sample_gradient
         metrics: dict[str, Metric] = {"left_out": SumMetric(), "log_sed": MeanMetric()}
         metrics |= {f"better_than_{name}": MeanMetric() for name in BASELINES}
-        metrics |= {f"median_{name}": Median() for name in SIZES.values()}
+        metrics |= {f"median_{name}": Median() for name in (*SIZES.values(), "found", "moved")}
         self.metrics = nn.ModuleDict({name: metric.set_dtype(torch.float64) for name, metric in metrics.items()})
         self._sets = 0  # of all processes since the last step
 
@@ -201,7 +202,7 @@ class EstimatorTask(pl.LightningModule):
         try:
             if not isinstance(layer, LearnedRelativePose):
                 return [*layer.estimate(*points, scores=batch.scores).stages]
-            K1, K2 = _cameras(batch)
+            K1, K2 = cameras_of(batch)
             stages = layer.estimate(*points, K1, K2, scores=batch.scores).stages
             inverse1, inverse2 = (torch.linalg.inv_ex(K)[0] for K in (K1, K2))
             return [(inverse2.mT @ stage.E_mat @ inverse1, stage.logits) for stage in stages]
@@ -212,7 +213,7 @@ class EstimatorTask(pl.LightningModule):
         """Return the matrices of the estimator, without scores."""
         points = batch.points1.double(), batch.points2.double()  # in float32, F itself loses digits of the residual
         if isinstance(self.estimator, LearnedRelativePose):
-            return self.estimator.estimate(*points, *_cameras(batch)).F_mat
+            return self.estimator.estimate(*points, *cameras_of(batch)).F_mat
         F_mat: Tensor = self.estimator(*points)
         return F_mat
 
@@ -278,7 +279,8 @@ class EstimatorTask(pl.LightningModule):
         return found
 
 
-def _cameras(batch: MatchSets) -> tuple[Tensor, Tensor]:
+def cameras_of(batch: MatchSets) -> tuple[Tensor, Tensor]:
+    """Return the cameras of sets, (B, 3, 3) x 2."""
     if batch.K1 is None or batch.K2 is None:
         raise ValueError("LearnedRelativePose needs sets with cameras, got none")
     return batch.K1.double(), batch.K2.double()

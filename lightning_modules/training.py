@@ -24,7 +24,7 @@ from torch import Tensor
 from kornia_learnnorm.files import exclusive
 from kornia_learnnorm.optional import working_folder_importable
 from lightning_modules.callbacks import Checkpoints, ExpectedTime, ExportWeights, WritePredictions
-from lightning_modules.config_files import config_names, with_config_paths
+from lightning_modules.config_files import config_names, names_task, with_config_paths
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import EstimatorTask
 
@@ -181,6 +181,7 @@ def run(args: list[str]) -> dict[str, float]:
             cli = TrainingCLI(
                 command,
                 model_class=EstimatorTask,
+                subclass_mode_model=names_task(options),
                 datamodule_class=CorrespondenceDataModule,
                 args=[command, *options],
                 auto_configure_optimizers=False,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from kornia_learnnorm.data.augmentation import augment
+from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.sources import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
 from kornia_learnnorm.data.store import StoreReader, passes_ratio_test
@@ -78,6 +79,8 @@ class _Pair(NamedTuple):
     score: Tensor  # (M,), from 0 to 1
     distance: Tensor  # (M,), pixels from the true epipolar lines, NaN if unknown
     cameras: tuple[Tensor, Tensor, Tensor]  # K1, K2 and E, each (3, 3), NaN if unknown
+    names: tuple[str, str]  # of the images
+    sizes: tuple[Size, Size]  # of the images
 
     def passing(self, max_ratio: float | None) -> Tensor:
         """Return the indices of the matches that pass the ratio test."""
@@ -120,7 +123,9 @@ def _read_pairs(path: str, labels: bool) -> list[_Pair]:
         K1, K2, R, t = (torch.from_numpy(value) for value in (*store.K[i], store.R[i], store.t[i]))
         E_mat = cross_product_matrix(t[None])[0] @ R
         cameras = K1.float(), K2.float(), (E_mat / torch.linalg.matrix_norm(E_mat)).float()
-        pair = _Pair(points, store.ratio[rows], torch.from_numpy(store.score[rows]), distance.float(), cameras)
+        width1, height1, width2, height2 = store.image_size[i].ravel().tolist()
+        about = distance.float(), cameras, store.names[i], ((width1, height1), (width2, height2))
+        pair = _Pair(points, store.ratio[rows], torch.from_numpy(store.score[rows]), *about)
         if len(pair.heldout) >= MIN_HELDOUT:
             pairs.append(pair)
     return pairs

@@ -32,6 +32,8 @@ class MatchSets(NamedTuple):
     K1: Tensor | None = None  # cameras, (B, 3, 3), NaN where unknown
     K2: Tensor | None = None
     E_mat: Tensor | None = None  # true essential matrices of unit Frobenius norm, (B, 3, 3), NaN where unknown
+    image1: Tensor | None = None  # grey values, (B, 1, H, W), uint8
+    image2: Tensor | None = None
 
     def select(self, rows: Tensor) -> MatchSets:
         """Return the sets of the given rows (indices or mask)."""

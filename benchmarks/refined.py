@@ -1,0 +1,129 @@
+"""Compare matches as they were found, moved by a MatchRefiner and tracked by Lucas and Kanade, on pairs with images.
+
+Table: median symmetric epipolar distance of the matches within 4 px of the true lines as they were found, px, mean over
+pairs; AUC of the pose error up to 5 degrees, %, by estimator; median time of moving the matches, ms, of one thread.
+Lucas-Kanade is OpenCV's, with a window of 15 px, started at the match; where it fails the found match stays.
+
+    python benchmarks/refined.py STORE.h5 [STORE.h5 ...] --images FOLDER [FOLDER ...] [--pairs 25] [--filtered]
+        [--weights refiner] [--estimators NAME ...] [--csv FILE]
+
+An estimator is one of learnnorm robust; what is not installed is left out. --csv adds the rows to those of other stores
+in the file.
+"""
+
+import argparse
+import csv
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from poses import THRESHOLD, find_installed
+from torch import Tensor
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.data.image_sets import find_images
+from kornia_learnnorm.data.images import read_image
+from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.evaluation.robust.robust_estimators import EvaluatedPair, run_estimator
+from kornia_learnnorm.evaluation.robust.robust_run import even_pairs, measure, shuffled_pair
+from kornia_learnnorm.evaluation.tables import format_table, names_of
+from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.metrics.poses import pose_auc
+
+ESTIMATORS = ("RANSAC", "poselib", "RANSAC-calibrated", "poselib-calibrated", "learned:robust-pose-synthetic+scores")
+TRUE_MATCH = 4.0  # pixels from the true lines
+WINDOW = 15  # pixels, of Lucas-Kanade
+
+Mover = Callable[[list[np.ndarray], EvaluatedPair], tuple[Tensor, Tensor]]  # of two grey images and their matches
+
+
+def track(images: list[np.ndarray], pair: EvaluatedPair) -> tuple[Tensor, Tensor]:
+    """Return the matches with second points by Lucas and Kanade."""
+    first, second = (points.float().numpy()[:, None] for points in (pair.points1, pair.points2))
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(
+        *images, first, second.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, flags=flags
+    )
+    return pair.points1, torch.from_numpy(np.where(status[..., None] > 0, tracked, second)[:, 0]).double()
+
+
+def mover(refiner: kln.MatchRefiner) -> Mover:
+    """Return the refiner as a function of grey images and a pair."""
+
+    @torch.no_grad()
+    def move(images: list[np.ndarray], pair: EvaluatedPair) -> tuple[Tensor, Tensor]:
+        views = (torch.from_numpy(image)[None, None] / 255 for image in images)
+        moved = refiner(*views, pair.points1[None], pair.points2[None])
+        return moved.points1[0], moved.points2[0]
+
+    return move
+
+
+def measure_store(path: str, folders: list[str], number: int, protocol: str, movers: dict, estimators: dict) -> list:
+    """Return the rows of a store's table."""
+    store, find = read_store(path), find_images(folders)
+    pixels: dict[str, list[float]] = {name: [] for name in movers}
+    seconds: dict[str, list[float]] = {name: [] for name in movers}
+    errors: dict[tuple[str, str], list[float]] = {(name, other): [] for name in movers for other in estimators}
+    for index in even_pairs(len(store), number):
+        found = shuffled_pair(store, index, protocol, seed=0)
+        sizes = [(int(width), int(height)) for width, height in found.size]
+        files = [find(name, size) for name, size in zip(store.names[index], sizes, strict=True)]
+        if None in files:
+            raise FileNotFoundError(f"{path}: no images of {store.names[index]} in {', '.join(folders)}")
+        images = [read_image(file, max(size)) for file, size in zip(files, sizes, strict=True)]
+        near = kln.symmetric_epipolar_distance(found.points1, found.points2, found.F_mat) < TRUE_MATCH
+        for name, move in movers.items():
+            start = time.perf_counter()
+            points1, points2 = move(images, found)
+            seconds[name].append(time.perf_counter() - start)
+            pair = found._replace(points1=points1, points2=points2)
+            distance = kln.symmetric_epipolar_distance(points1, points2, found.F_mat)[near]
+            pixels[name].append(distance.median().item() if len(distance) else math.nan)
+            for other, estimator in estimators.items():
+                F_mat = run_estimator(estimator, pair, 0, THRESHOLD).F_mat
+                results = measure(pair, F_mat, THRESHOLD)
+                errors[name, other].append(max(results["rotation_error"], results["translation_error"]))
+    rows = []
+    for name in movers:
+        aucs = [f"{100 * pose_auc(torch.tensor(errors[name, other]).double(), [5])[0]:.1f}" for other in estimators]
+        ms = 1000 * np.median(seconds[name])
+        rows.append([name, f"{np.nanmean(pixels[name]):.3f}", *aucs, f"{ms:.1f}"])
+    return rows
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("stores", nargs="+")
+    parser.add_argument("--images", nargs="+", required=True, help="folders below which the images lie")
+    parser.add_argument("--pairs", type=int, default=25, help="of each store, evenly spaced; 0: all")
+    parser.add_argument("--filtered", action="store_true", help="matches that pass the ratio test, as for SIFT")
+    parser.add_argument("--weights", default="refiner", help="of a MatchRefiner, by name or a file")
+    parser.add_argument("--estimators", nargs="*", default=[*ESTIMATORS])
+    parser.add_argument("--csv", help="add the rows to this file")
+    args = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    refiner = kln.MatchRefiner.from_pretrained(args.weights)
+    movers = {"found": lambda _, pair: (pair.points1, pair.points2), "moved": mover(refiner), "Lucas-Kanade": track}
+    estimators, protocol = find_installed(args.estimators), "filtered" if args.filtered else "unfiltered"
+    header, rows = ["matches", "px", *estimators, "ms"], []
+    for path, name in names_of(args.stores).items():
+        found = measure_store(path, args.images, args.pairs, protocol, movers, estimators)
+        print(f"{name}\n\n{format_table(header, found)}\n", flush=True)
+        rows += [[name, *row] for row in found]
+    if args.csv:
+        kept = []
+        if Path(args.csv).exists():
+            with Path(args.csv).open(newline="", encoding="utf-8") as file:
+                kept = [row for row in [*csv.reader(file)][1:] if row[0] not in {row[0] for row in rows}]
+        with atomic_write(args.csv) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([["store", *header], *kept, *rows])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""The training task of a refiner of matches: image pairs and their matches in, no labels needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.match_refiner import MatchRefiner, RefinedMatches
+from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from lightning_modules.task import EstimatorTask, adamw, cameras_of
+
+__all__ = ["HeldOutLoss", "RefinerTask"]
+
+TRUE_MATCH = 4.0  # pixels, the largest distance of the found matches that the validation's medians are of
+
+
+class HeldOutLoss(nn.Module):
+    r"""Distances of one half of the moved matches under the matrix of the other half, and the reverse.
+
+    The matrix comes from a learned layer, which is not trained and sends gradients to the points of its half. The loss
+    is the mean of :math:`\log(d + f)` with the symmetric epipolar distance :math:`d`, at most ``ceiling``. The
+    predicted noise :math:`\sigma` is trained by the likelihood of :math:`d / 2` under Laplace's distribution.
+
+    Args:
+        estimator: :class:`~kornia_learnnorm.LearnedEightPoint`, ``robust-synthetic`` when not given, or
+            :class:`~kornia_learnnorm.LearnedRelativePose`, which needs stores with cameras.
+        teacher: take the matrices of the matches as they were found, without gradient, for comparisons.
+        floor: distance :math:`f` in pixels, far below which nothing is gained.
+        ceiling: larger distances, pixels, count as this and send no gradient.
+        scale_weight: weight of the likelihood.
+
+    Raises:
+        TypeError: if the estimator is none of both.
+        ValueError: if ``floor`` or ``ceiling`` is not positive.
+
+    """
+
+    def __init__(
+        self,
+        estimator: nn.Module | None = None,
+        teacher: bool = False,
+        floor: float = 0.05,
+        ceiling: float = 6.0,
+        scale_weight: float = 0.2,
+    ) -> None:
+        super().__init__()
+        estimator = LearnedEightPoint.from_pretrained() if estimator is None else estimator
+        if not isinstance(estimator, LearnedLayer):
+            raise TypeError(f"expected a learned layer, got {type(estimator).__name__}")
+        if not min(floor, ceiling) > 0:
+            raise ValueError(f"floor and ceiling must be positive, got {floor} and {ceiling}")
+        self.estimator = estimator.requires_grad_(False)
+        self.teacher, self.floor, self.ceiling, self.scale_weight = teacher, floor, ceiling, scale_weight
+
+    def forward(self, sets: MatchSets, moved: RefinedMatches) -> Tensor:
+        """Return the loss of each set, (B,), of the moved matches (B, 2 N), in the order of :func:`all_matches`."""
+        matrices = None
+        if self.teacher:
+            with torch.no_grad():
+                matrices = self.matrices(sets, *all_matches(sets))
+        distance = self.distances(sets, moved.points1, moved.points2, matrices).clamp(max=self.ceiling)
+        likelihood = moved.scale.log() + 2**0.5 * 0.5 * distance.detach() / moved.scale
+        return ((distance + self.floor).log() + self.scale_weight * likelihood).mean(-1)
+
+    def distances(self, sets: MatchSets, points1: Tensor, points2: Tensor, F_mat: Tensor | None = None) -> Tensor:
+        """Return the distances (B, 2 N) of both halves of matches, each under the matrix of the other half."""
+        F_mat = self.matrices(sets, points1, points2) if F_mat is None else F_mat
+        distance = symmetric_epipolar_distance(_halves(points1), _halves(points2), F_mat.roll(len(points1), 0))
+        return torch.cat([*distance.chunk(2)], 1)
+
+    def matrices(self, sets: MatchSets, points1: Tensor, points2: Tensor) -> Tensor:
+        """Return the fundamental matrices (2 B, 3, 3) of the first halves of matches (B, 2 N), then of the second."""
+        calibrated = isinstance(self.estimator, LearnedRelativePose)
+        cameras = [K.repeat(2, 1, 1) for K in cameras_of(sets)] if calibrated else []
+        F_mat: Tensor = self.estimator.estimate(_halves(points1), _halves(points2), *cameras).F_mat
+        return F_mat
+
+
+def _halves(points: Tensor) -> Tensor:
+    """Return the first halves of points (B, 2 N, 2), then the second ones, (2 B, N, 2) float64."""
+    return torch.cat([*points.double().chunk(2, 1)])
+
+
+def all_matches(sets: MatchSets) -> tuple[Tensor, Tensor]:
+    """Return the points (B, 2 N, 2) of both views, first those of the sets, then the held-out ones."""
+    return torch.cat([sets.points1, sets.heldout1], 1), torch.cat([sets.points2, sets.heldout2], 1)
+
+
+class RefinerTask(EstimatorTask):
+    """Train a :class:`~kornia_learnnorm.MatchRefiner` by the agreement of the matches that it moves, without labels.
+
+    The data are sets with images, of :class:`~kornia_learnnorm.data.image_sets.ImageSets`. Validation logs the median
+    distance of matches under the matrix of other matches of their pair, as they were found and moved.
+
+    Args:
+        refiner: the refiner to train.
+        loss: the loss, :class:`HeldOutLoss` when not given.
+        optimizer: builds the optimiser from the parameters; AdamW with a learning rate of 2e-3 when not given.
+        lr_scheduler: see :class:`~lightning_modules.task.EstimatorTask`.
+        warm_up: share of the cycle in which the learning rate rises.
+    """
+
+    loss: HeldOutLoss
+
+    def __init__(
+        self,
+        refiner: MatchRefiner,
+        loss: HeldOutLoss | None = None,
+        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = adamw,
+        lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        warm_up: float = 0.05,
+    ) -> None:
+        loss = loss or HeldOutLoss()
+        super().__init__(loss.estimator, loss, optimizer, lr_scheduler, warm_up)
+        self.refiner = refiner.train()
+
+    @property
+    def trained(self) -> Any:
+        """The refiner, whose weights ``from_pretrained`` reads."""
+        return self.refiner
+
+    def compute_loss(self, batch: MatchSets) -> Tensor:
+        """Return the mean loss of a batch."""
+        loss: Tensor = self.loss(batch, self._move(batch)).mean()
+        return loss
+
+    def validation_step(self, batch: MatchSets, batch_idx: int) -> None:
+        """Log the medians of a batch, in the test too; Lightning gathers them over batches and processes."""
+        found, moved = all_matches(batch), self._move(batch)
+        before = self.loss.distances(batch, *found)
+        after = self.loss.distances(batch, moved.points1, moved.points2)
+        for name, distance in (("found", before), ("moved", after)):
+            self._log(f"median_{name}", distance[before < TRUE_MATCH])
+
+    test_step = validation_step
+
+    def predict_step(self, batch: MatchSets, batch_idx: int) -> dict[str, Tensor]:
+        """Return the moved matches of a batch and the predicted noise."""
+        return {**self._move(batch)._asdict(), "pair": batch.pair}
+
+    def _move(self, batch: MatchSets) -> RefinedMatches:
+        if batch.image1 is None or batch.image2 is None:
+            raise ValueError("a refiner needs sets with images, of ImageSets, got none")
+        moved: RefinedMatches = self.refiner(batch.image1 / 255, batch.image2 / 255, *all_matches(batch))
+        return moved

@@ -1,0 +1,192 @@
+"""Refiners of matches: sets with images from stores, the loss, and a training on rendered pairs by the command line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+from scenes import seeded
+
+import kornia_learnnorm as kln
+from kornia_learnnorm.cli.main import main
+from kornia_learnnorm.data.image_sets import ImageSets, find_images
+from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
+from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.data.synthetic.render import render_pair
+from kornia_learnnorm.data.writer import write_store
+from lightning_modules.refiner_task import HeldOutLoss, RefinerTask, all_matches
+
+pytestmark = pytest.mark.usefixtures("program")
+WIDTH, HEIGHT = 200, 150
+NOISE = 0.7  # pixels, standard deviation of each coordinate of the second points
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Images of two rendered pairs, and a store of their exact matches with noise, the second pair of other names."""
+    pytest.importorskip("cv2")
+    folder, rng, points, names, pairs = tmp_path_factory.mktemp("rendered"), np.random.default_rng(0), [], [], []
+    for seed in range(2):
+        pair = render_pair(seed, WIDTH, HEIGHT)
+        for view in (1, 2):
+            (folder / f"images/place{seed}").mkdir(parents=True, exist_ok=True)
+            Image.fromarray(getattr(pair, f"image{view}")).save(folder / f"images/place{seed}/s{seed}v{view}.png")
+        rows = rng.permutation(len(pair.points1))[:200]
+        noise = rng.normal(0, NOISE, (len(rows), 2))
+        points.append([pair.points1[rows], pair.points2[rows] + noise])
+        names.append([f"place{seed}/s{seed}v1.png", "elsewhere/s1v2.extra.jpg" if seed else "place0/s0v2.png"])
+        pairs.append(pair)
+    points1, points2 = (np.concatenate([views[k] for views in points]).astype(np.float32) for k in range(2))
+    store = CorrespondenceStore(
+        points1=points1,
+        points2=points2,
+        ratio=np.full(len(points1), 0.5, np.float32),
+        offsets=np.cumsum([0, *(len(views[0]) for views in points)]),
+        image_size=np.full((2, 2, 2), (WIDTH, HEIGHT), np.int32),
+        names=[(a, b) for a, b in names],
+        F=np.stack([pair.F_mat for pair in pairs]),
+        K=np.stack([np.stack([pair.K] * 2) for pair in pairs]),
+        R=np.stack([pair.R for pair in pairs]),
+        t=np.stack([pair.t for pair in pairs]),
+        dataset="rendered",
+        pairs="both",
+        detector="exact, with noise",
+    )
+    write_store(folder / "matches.h5", store)
+    return folder
+
+
+def source(folder, part="", **options):
+    return ImageSets([f"{folder}/matches.h5{part}"], [f"{folder}/images"], **options)
+
+
+def true_distance(sets, points1, points2):
+    F_mat = torch.linalg.inv(sets.K2).mT @ sets.E_mat @ torch.linalg.inv(sets.K1)
+    return kln.symmetric_epipolar_distance(points1.double(), points2.double(), F_mat.double())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_images_matches_and_cameras_are_mapped_alike(folder, seed):
+    sets = source(folder, jitter=0.0).draw(3, 40, seeded(seed))
+    assert sets.points1.shape == sets.heldout2.shape == (3, 40, 2)
+    assert sets.image1.dtype == torch.uint8
+    assert true_distance(sets, *all_matches(sets)).median() < 4 * NOISE
+    views = zip((sets.image1, sets.image2), (sets.points1, sets.points2), strict=True)
+    patches = [
+        kln.MatchRefiner(5)._normalized_patches(v / 255, p, torch.eye(2).expand(3, 40, 2, 2))[0] for v, p in views
+    ]
+    correlation = (patches[0] * patches[1]).mean((-1, -2))
+    assert correlation.median() > 0.3
+    rows = torch.cat([sets.points1, sets.heldout1], 1)[0]
+    assert len(torch.unique(rows, dim=0)) == len(rows)  # the halves share no match
+
+
+def test_draws(folder):
+    given = source(folder, symmetries=False)
+    first, second, other = (given.draw(2, 30, seeded(seed)) for seed in (0, 0, 1))
+    assert all(a is b or torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert not torch.equal(first.points1, other.points1)
+    assert first.image1.shape == (2, 1, HEIGHT, WIDTH)
+    assert given.draw(1, 10_000, seeded()).points1.shape == (1, 100, 2)
+
+
+def test_images_of_stores(folder, tmp_path):
+    find = find_images([f"{folder}/images"])
+    assert find("place0/s0v1.png", (WIDTH, HEIGHT)) == folder / "images/place0/s0v1.png"
+    assert find("x/s0v1._c.jpg", (WIDTH // 2, HEIGHT // 2)) == folder / "images/place0/s0v1.png"
+    assert find("x/s0v1.png", (HEIGHT, WIDTH)) is None
+    assert find("none.png", (WIDTH, HEIGHT)) is None
+    assert source(folder).left_out == 0
+    assert ImageSets([f"{folder}/matches.h5"], [f"{folder}/images/place1"]).left_out == 1
+    with pytest.raises(ValueError, match="none of 2 pairs"):
+        ImageSets([f"{folder}/matches.h5"], [str(tmp_path)])
+    with pytest.raises(FileNotFoundError, match="no folder of images at"):
+        ImageSets([f"{folder}/matches.h5"], [f"{folder}/none"])
+    with pytest.raises(ValueError, match="jitter must be"):
+        source(folder, jitter=-1.0)
+
+
+def test_the_loss_is_that_of_the_other_half(folder):
+    """Against a computation half by half; with a teacher, the matrices are those of the found matches."""
+    sets = source(folder).draw(2, 32, seeded())
+    points = all_matches(sets)
+    moved = kln.MatchRefiner()(sets.image1 / 255, sets.image2 / 255, *points)
+    layer = kln.LearnedEightPoint.from_pretrained("robust-tiny")
+    for teacher in (False, True):
+        loss = HeldOutLoss(layer, teacher, scale_weight=0.5)(sets, moved)
+        expected = torch.zeros(2).double()
+        halves = [[p[:, :32].double() for p in points], [p[:, 32:].double() for p in points]]
+        for fit, test in (halves, halves[::-1]):
+            distance = kln.symmetric_epipolar_distance(*test, layer(*fit)).clamp(max=6)
+            expected += ((distance + 0.05).log() + 0.5 * 2**0.5 * distance / 2).mean(-1) / 2  # the scale is one
+        torch.testing.assert_close(loss.double(), expected, atol=1e-5, rtol=0)
+    with pytest.raises(TypeError, match="expected a learned layer, got EightPoint"):
+        HeldOutLoss(kln.EightPoint())
+    with pytest.raises(ValueError, match="floor and ceiling"):
+        HeldOutLoss(layer, floor=0.0)
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_gradients_pass_the_layer_and_leave_it(folder, calibrated):
+    name, kind = (
+        ("robust-pose-synthetic", kln.LearnedRelativePose) if calibrated else ("robust-tiny", kln.LearnedEightPoint)
+    )
+    task = RefinerTask(kln.MatchRefiner(), HeldOutLoss(kind.from_pretrained(name)))
+    task.compute_loss(source(folder).draw(2, 16, seeded())).backward()
+    assert all(p.grad is None for p in task.loss.estimator.parameters())
+    assert task.refiner.shift.weight.grad.any()
+    assert task.refiner.gates.weight.grad.isfinite().all()
+    sets = RandomSets([SyntheticSets()], sizes=(16, 16)).draw(0, 0)
+    with pytest.raises(ValueError, match="needs sets with images"):
+        task.compute_loss(sets)
+
+
+def test_a_training_moves_matches_nearer_to_the_truth(folder, tmp_path, capsys):
+    """By the command line, with checkpoints, weights, validation and predictions."""
+    images = {"paths": [f"{folder}/matches.h5"], "images": [f"{folder}/images"]}
+    data = {
+        "class_path": "kornia_learnnorm.data.random_sets.RandomSets",
+        "init_args": {
+            "sources": [{"class_path": "kornia_learnnorm.data.image_sets.ImageSets", "init_args": images}],
+            **{"sizes": [64, 64], "correspondences": 128, "augmented": 0.0, "batches": 30},
+        },
+    }
+    loss = {
+        "class_path": "lightning_modules.refiner_task.HeldOutLoss",
+        "init_args": {
+            "estimator": {
+                "class_path": "kornia_learnnorm.LearnedEightPoint.from_pretrained",
+                "init_args": {"name": "robust-tiny"},
+            }
+        },
+    }
+    config = {
+        "seed_everything": 0,
+        "trainer": {
+            "max_steps": 20,
+            "default_root_dir": str(tmp_path / "run"),
+            "enable_progress_bar": False,
+            "gradient_clip_val": 1.0,
+            "limit_val_batches": 2,
+        },
+        "model": {
+            "class_path": "lightning_modules.refiner_task.RefinerTask",
+            "init_args": {"refiner": {"class_path": "kornia_learnnorm.MatchRefiner"}, "loss": loss},
+        },
+        "data": {"batch_size": None, "train": data, "val": data, "test": data},
+    }
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(config))
+    options = ["--config", str(tmp_path / "own.yaml")]
+    assert main(["fit", *options]) == 0
+    refiner = kln.MatchRefiner.from_pretrained(tmp_path / "run/weights.safetensors")
+    assert refiner.trained_on == ("matches",)
+    sets = source(folder, jitter=0.0).draw(4, 90, seeded(5))
+    with torch.no_grad():
+        moved = refiner(sets.image1 / 255, sets.image2 / 255, *all_matches(sets))
+    before, after = (true_distance(sets, *points).median() for points in (all_matches(sets), moved[:2]))
+    assert after < 0.85 * before
+    assert moved.scale.min() > 0
+    assert main(["validate", *options, f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"]) == 0
+    assert "val/median_moved" in capsys.readouterr().out
