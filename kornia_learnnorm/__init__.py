@@ -10,12 +10,17 @@ Example:
 """
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.estimators.linear import EightPoint, find_fundamental
+from kornia_learnnorm.estimators.linear import EightPoint, find_fundamental, find_homography
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
-from kornia_learnnorm.geometry.distances import algebraic_distance, sampson_distance, symmetric_epipolar_distance
+from kornia_learnnorm.geometry.distances import (
+    algebraic_distance,
+    sampson_distance,
+    symmetric_epipolar_distance,
+    transfer_distance,
+)
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.rank2 import optimal_rank2
 from kornia_learnnorm.losses import BoundedEpipolarLoss, EpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
@@ -62,10 +67,12 @@ __all__ = [
     "estimate_matches",
     "estimate_pair",
     "find_fundamental",
+    "find_homography",
     "optimal_rank2",
     "refine_essential",
     "refine_fundamental",
     "relative_pose",
     "sampson_distance",
     "symmetric_epipolar_distance",
+    "transfer_distance",
 ]

@@ -20,6 +20,25 @@ DTYPES = [torch.float32, torch.float64]
 WALL_SHIFT = np.array([4.0, 3.0])  # of the wall of `repeated_wall`, pixels
 
 
+def plane(batch_size: int = 3, number: int = 40, noise: float = 0.0, outliers: float = 0.0):
+    """Points of a plane in two views, and its homographies of unit norm with a positive first entry."""
+    H = torch.eye(3, dtype=torch.float64) + 0.1 * uniform(batch_size, 3, 3, low=-1, seed=1)
+    H[:, :2, 2], H[:, 2, :2] = 30 * H[:, :2, 2], 1e-4 * H[:, 2, :2]
+    points1 = uniform(batch_size, number, 2, high=600)
+    moved = torch.cat([points1, torch.ones_like(points1[..., :1])], -1) @ H.mT
+    points2 = moved[..., :2] / moved[..., 2:] + noise * uniform(batch_size, number, 2, low=-1, seed=2)
+    wrong = int(outliers * number)
+    points2[:, :wrong] = uniform(batch_size, wrong, 2, high=600, seed=3)
+    return points1, points2, H / torch.linalg.matrix_norm(H, keepdim=True)
+
+
+def corner_error(M, H) -> float:
+    """Largest distance of the corners of an image of 600 x 600 pixels, mapped by two batches of homographies."""
+    corners = torch.tensor([[0.0, 0, 1], [600, 0, 1], [600, 600, 1], [0, 600, 1]], dtype=torch.float64).mT
+    a, b = (X.detach() @ corners for X in (M, H))
+    return float((a[..., :2, :] / a[..., 2:, :] - b[..., :2, :] / b[..., 2:, :]).norm(dim=-2).max())
+
+
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
@@ -191,15 +210,16 @@ def up_to_sign(F, G) -> float:
     return float(np.minimum(np.abs(F - G).max((-2, -1)), np.abs(F + G).max((-2, -1))).max(initial=0))
 
 
-def in_hartley(F, points1, points2) -> np.ndarray:
-    """F of pixels in Hartley's coordinates, where all nine entries count."""
-    inverse1, inverse2 = np.linalg.inv(numpy_hartley(points1)), np.linalg.inv(numpy_hartley(points2))
-    return unit(inverse2.swapaxes(-1, -2) @ np.asarray(F, dtype=np.float64) @ inverse1)
+def in_hartley(F, points1, points2, homography: bool = False) -> np.ndarray:
+    """F, or H, of pixels in Hartley's coordinates, where all nine entries count."""
+    T1, T2 = numpy_hartley(points1), numpy_hartley(points2)
+    left = T2 if homography else np.linalg.inv(T2).swapaxes(-1, -2)
+    return unit(left @ np.asarray(F, dtype=np.float64) @ np.linalg.inv(T1))
 
 
-def hartley_difference(F, G, points1, points2) -> float:
+def hartley_difference(F, G, points1, points2, homography: bool = False) -> float:
     """Largest difference of two batches of matrices of pixels in Hartley's coordinates."""
-    return up_to_sign(in_hartley(F, points1, points2), in_hartley(G, points1, points2))
+    return up_to_sign(in_hartley(F, points1, points2, homography), in_hartley(G, points1, points2, homography))
 
 
 def signless(F: Tensor) -> Tensor:
@@ -207,7 +227,7 @@ def signless(F: Tensor) -> Tensor:
     return (F.flatten(-2) @ uniform(9, 4, low=-1, seed=9).to(F)).square()
 
 
-def _wrong_correspondences() -> list[tuple]:
+def _wrong_correspondences(least: int) -> list[tuple]:
     """Points, weights, and the error that every function of correspondences raises for them."""
     points, ones = uniform(2, 8, 2), torch.ones(2, 8)
     wrong = [
@@ -231,9 +251,9 @@ def _wrong_correspondences() -> list[tuple]:
     for shape in ([8], [2, 9], [2, 8, 1]):
         message = rf"weights must have shape \[2, 8\], got \{shape}"
         wrong.append((points, points, torch.ones(shape), ValueError, message))
-    for number in (0, 1, 7):
+    for number in (0, 1, least - 1):
         few = points[:, :number]
-        wrong.append((few, few, None, ValueError, f"at least 8 correspondences are needed, got {number}"))
+        wrong.append((few, few, None, ValueError, f"at least {least} correspondences are needed, got {number}"))
     for value in (torch.nan, torch.inf, -torch.inf):
         for k, (name, count) in enumerate([("points1", 2), ("points2", 2), ("weights", 1)]):
             values = [points.clone(), points.clone(), ones.clone()]
@@ -272,9 +292,9 @@ def derivative(function):
     return gradient
 
 
-def check_refuses(call) -> None:
+def check_refuses(call, least: int = 8) -> None:
     """Check that a function of correspondences and weights raises the right error for every kind of wrong ones."""
-    for points1, points2, weights, error, message in _wrong_correspondences():
+    for points1, points2, weights, error, message in _wrong_correspondences(least):
         with pytest.raises(error, match=message):
             call(points1, points2, weights)
 

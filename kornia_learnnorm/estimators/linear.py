@@ -21,6 +21,7 @@ from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determi
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer, normalizing_transforms
 
@@ -30,6 +31,7 @@ __all__ = [
     "TwoViewEstimate",
     "essential_matrix",
     "find_fundamental",
+    "find_homography",
     "prepare_problem",
     "solve_linear",
     "solve_undetermined",
@@ -130,6 +132,56 @@ class LinearLayer(MatchLayer):
 
     def _solve_undetermined(self, problem: LinearProblem) -> tuple[Tensor]:
         return (solve_undetermined(problem, getattr(self.normalizer, "base", None)),)
+
+
+def find_homography(
+    points1: Tensor,
+    points2: Tensor,
+    weights: Tensor | None = None,
+    mask: Tensor | None = None,
+    normalizer: Normalizer | None = None,
+) -> Tensor:
+    r"""Compute the homography from four or more correspondences of a plane, or of a camera that only turns.
+
+    The DLT in normalised coordinates, :math:`H = T_2^{-1} \hat H T_1`. Four points determine :math:`H` exactly,
+    whatever the weights and the normaliser. Do not use it on matches with outliers: it is least squares.
+
+    Args:
+        points1: pixels in the first image with shape :math:`(B, N, 2)`, :math:`N \ge 4`, float32 or float64.
+        points2: pixels in the second image with shape :math:`(B, N, 2)`.
+        weights: optional non-negative weights :math:`(B, N)` of the squared algebraic residuals; zero means absent.
+        mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows may
+            hold any value, NaN too.
+        normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views;
+            :class:`~kornia_learnnorm.Hartley` when not given. :class:`~kornia_learnnorm.ReweightedWhitening` and the
+            shipped weights of :class:`~kornia_learnnorm.LearnedNormalizer` are made for fundamental matrices.
+
+    Returns:
+        matrices with shape :math:`(B, 3, 3)` in the dtype of the points that map homogeneous pixels of image 1 to image
+        2, :math:`x_2 \sim H x_1`, of unit Frobenius norm with the sign of
+        :func:`~kornia_learnnorm.geometry.matrices.unit_matrix`; ``H / H[:, 2:, 2:]`` has OpenCV's scale. Where the
+        correspondences do not determine an invertible :math:`H` (fewer than four, coincident or collinear points, four
+        of which three are on a line) it is the identity and carries no gradient.
+
+    Raises:
+        TypeError: if the points are not floating-point tensors of one dtype, the mask is not boolean, or the normaliser
+            cannot be called.
+        ShapeError: if a shape is wrong.
+        ValueError: if there are fewer than four rows, shapes do not pair up, an unmasked value is not finite, or a
+            weight is negative.
+
+    Reference:
+        R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, algorithm 4.2.
+
+    Example:
+        >>> points1 = torch.tensor([[[0.0, 0.0], [9.0, 0.0], [9.0, 9.0], [0.0, 9.0]]])
+        >>> H_mat = find_homography(points1, 2 * points1 + 3)
+        >>> (H_mat / H_mat[:, 2:, 2:])[0].diagonal().round(decimals=3)
+        tensor([2., 2., 1.])
+
+    """
+    H_mat: Tensor = LinearLayer(Homography(), normalizer)(points1, points2, weights, mask)
+    return H_mat
 
 
 class TwoViewEstimate(NamedTuple):

@@ -17,6 +17,7 @@ from kornia.geometry.epipolar import (
     right_to_left_epipolar_distance,
     sampson_epipolar_distance,
 )
+from kornia.geometry.homography import symmetric_transfer_error
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_tensor, safe_divisor, weighted_mean
@@ -29,17 +30,18 @@ __all__ = [
     "sampson_scale",
     "symmetric_epipolar_distance",
     "symmetric_scale",
+    "transfer_distance",
 ]
 
 EPIPOLE_TOLERANCE = 1e-12  # length of an epipolar line's normal over that of its summands; rounding leaves less
 
 
-def _check(points1: Tensor, points2: Tensor, F_mat: Tensor) -> None:
+def _check(points1: Tensor, points2: Tensor, M: Tensor, name: str = "F_mat") -> None:
     check_tensor("points1", points1, ["*", "N", "2"])
     check_tensor("points2", points2, ["*", "N", "2"])
-    check_tensor("F_mat", F_mat, ["*", "3", "3"])
-    if not points1.dtype == points2.dtype == F_mat.dtype:
-        raise TypeError(f"one dtype is needed, got {points1.dtype}, {points2.dtype} and {F_mat.dtype}")
+    check_tensor(name, M, ["*", "3", "3"])
+    if not points1.dtype == points2.dtype == M.dtype:
+        raise TypeError(f"one dtype is needed, got {points1.dtype}, {points2.dtype} and {M.dtype}")
     if points1.shape[-2] != points2.shape[-2]:
         raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
 
@@ -128,6 +130,37 @@ def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tenso
     x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
     with _without_autocast(points1):
         return torch.einsum("...ni,...ij,...nj->...n", x2, F_mat, x1).abs()
+
+
+def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor:
+    r"""Return the root of the sum of both squared transfer errors, of :math:`H x_1` and of :math:`H^{-1} x_2`.
+
+    Args:
+        points1: pixels in the first image with shape :math:`(B, N, 2)`.
+        points2: pixels in the second image with shape :math:`(B, N, 2)`.
+        H_mat: homographies with shape :math:`(B, 3, 3)`, any scale.
+
+    Returns:
+        distances in pixels with shape :math:`(B, N)`; the largest number of the dtype under a singular matrix.
+
+    Raises:
+        TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
+        ShapeError: if a shape is wrong.
+        ValueError: if the points do not pair up.
+
+    Reference:
+        R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, Eq. 4.7.
+
+    Example:
+        >>> H_mat = torch.diag(torch.tensor([2.0, 2.0, 1.0]))[None]
+        >>> transfer_distance(torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[4.0, 0.0]]]), H_mat)
+        tensor([[2.2361]])
+
+    """
+    _check(points1, points2, H_mat, "H_mat")
+    with _without_autocast(points1):
+        distance: Tensor = symmetric_transfer_error(points1, points2, H_mat, squared=False)
+    return distance
 
 
 def line_norms(

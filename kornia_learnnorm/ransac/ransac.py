@@ -12,13 +12,14 @@ import torch
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.linear import solve_linear
-from kornia_learnnorm.geometry.checks import check_cameras, solve_dtype
+from kornia_learnnorm.geometry.checks import check_cameras, check_choice, solve_dtype
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.normalizers.hartley import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
@@ -90,7 +91,9 @@ class RANSAC(nn.Module):
             :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`. It is called with the weights, and with cameras
             also with ``size=5``.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
-        model: what the matrix is, in place of a fundamental matrix of that ``distance`` and ``rank2``.
+        model: ``"fundamental"``, ``"homography"``, or a model of one's own in place of one of that ``distance`` and
+            ``rank2``. A homography has minimal samples of four, no cameras and no ``rank2``; its symmetric distance is
+            the root of the sum of both squared transfer errors.
 
     Raises:
         TypeError: if ``normalizer``, ``distance`` or ``sampler`` cannot be called, or an argument that must be a number
@@ -126,7 +129,7 @@ class RANSAC(nn.Module):
         refine: bool = True,
         sampler: Callable[..., Sampler] = ProsacSampler,
         seed: int | None = None,
-        model: TwoViewModel | None = None,
+        model: Literal["fundamental", "homography"] | TwoViewModel = "fundamental",
     ) -> None:
         super().__init__()
         check_numbers(inl_th, max_samples, max_seconds, confidence, seed)
@@ -136,7 +139,10 @@ class RANSAC(nn.Module):
             raise TypeError(f"sampler must be a function or a class, got {sampler!r}")
         if rank2 is None:
             rank2 = "optimal" if normalizer is None else "projection"
-        self.model = Fundamental(rank2, distance) if model is None else model
+        if isinstance(model, str):
+            check_choice("model", model, ("fundamental", "homography"))
+            model = Homography(distance) if model == "homography" else Fundamental(rank2, distance)
+        self.model = model
         self.normalizer = Hartley() if normalizer is None and rank2 == "projection" else normalizer
         self.rank2: Literal["projection", "optimal"] = rank2
         self.inl_th, self.max_samples, self.max_seconds, self.confidence = inl_th, max_samples, max_seconds, confidence
@@ -197,6 +203,10 @@ class RANSAC(nn.Module):
 
         """
         check_cameras(K1, K2)
+        if K1 is not None and not isinstance(self.model, Fundamental):
+            raise ValueError(
+                f"K1 and K2 make a fundamental matrix an essential one, got a {self.model.name}: leave them out"
+            )
         cameras = None if K1 is None or K2 is None else (K1, K2)
         size = self.model.sample_size if cameras is None else Essential.sample_size
         check_matches(points1, points2, weights, size)

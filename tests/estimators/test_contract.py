@@ -26,7 +26,7 @@ from scenes import (
 )
 
 import kornia_learnnorm as kln
-from kornia_learnnorm import EightPoint, find_fundamental, optimal_rank2, refine_fundamental
+from kornia_learnnorm import EightPoint, find_fundamental, find_homography, optimal_rank2, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import squared_loss
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental
@@ -62,7 +62,8 @@ LINEAR = {
 }
 ALL = LINEAR | {"refined": refined, "refined, symmetric": partial(refined, distance="symmetric")}
 ALL |= {f"refined, {name}": partial(refined, loss=loss) for name, loss in LOSSES.items()}
-CONTRACT = ["projection", "optimal", "corrected", "refined", "refined, symmetric"]
+ALL |= {"homography": find_homography}
+CONTRACT = ["projection", "optimal", "corrected", "refined", "refined, symmetric", "homography"]
 
 
 @pairwise(name=CONTRACT, batch_size=[0, 1, 5], num_points=[8, 9, 50, 500], weighted=[False, True], dtype=DTYPES)
@@ -111,7 +112,8 @@ def test_swapped_views_give_the_transpose(name, scene, bound):
 
 
 @pytest.mark.parametrize(
-    ("name", "bound"), [("projection", 1e-12), ("optimal", 1e-10), ("corrected", 1e-10), ("refined", 1e-7)]
+    ("name", "bound"),
+    [("projection", 1e-12), ("optimal", 1e-10), ("corrected", 1e-10), ("refined", 1e-7), ("homography", 1e-12)],
 )
 def test_batch_is_many_single_calls(name, bound):
     points = correspondences("random", 6, 12)
@@ -126,13 +128,15 @@ def test_batch_is_many_single_calls(name, bound):
         ("optimal", [*SCENES], 1e-6),
         ("corrected", [*SCENES], 1e-6),
         ("refined", ["handheld", "orbit"], 1e-6),
+        ("homography", ["handheld", "orbit"], 1e-7),
     ],
 )
 @given(seed=st.integers(0, 2**31), num_points=st.sampled_from([8, 9, 17]), random=st.randoms(), data=st.data())
 def test_order_does_not_matter(name, scenes, bound, seed, num_points, random, data):
     points = correspondences(data.draw(st.sampled_from(scenes)), 4, num_points, seed)
     order = random.sample(range(num_points), num_points)
-    assert hartley_difference(ALL[name](*(p[:, order] for p in points)), ALL[name](*points), *points) < bound
+    shuffled, expected = ALL[name](*(p[:, order] for p in points)), ALL[name](*points)
+    assert hartley_difference(shuffled, expected, *points, name == "homography") < bound
 
 
 @pytest.mark.parametrize("name", [name for name in CONTRACT if name != "projection"])
@@ -140,8 +144,9 @@ def test_order_does_not_matter(name, scenes, bound, seed, num_points, random, da
 @given(log_scale=st.floats(-3, 3), num_points=st.sampled_from([8, 15]))
 def test_moves_with_the_scale_of_the_pixels(name, log_scale, num_points):
     points, scale = correspondences("orbit", 4, num_points), 10**log_scale
-    S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
-    assert hartley_difference(S @ ALL[name](*(scale * p for p in points)) @ S, ALL[name](*points), *points) < 1e-7
+    S, homography = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64)), name == "homography"
+    back = (S.inverse() if homography else S) @ ALL[name](*(scale * p for p in points)) @ S
+    assert hartley_difference(back, ALL[name](*points), *points, homography) < 1e-7
 
 
 @pytest.mark.parametrize("factor", [-7.0, 1e-3, 1e6])
@@ -154,22 +159,24 @@ def test_scale_of_the_start_does_not_matter(factor):
 
 
 @pytest.mark.parametrize("num_points", [8, 20])
-@pytest.mark.parametrize("name", [*LINEAR, *(f"refined, {loss}" for loss in LOSSES)])
+@pytest.mark.parametrize("name", [*LINEAR, *(f"refined, {loss}" for loss in LOSSES), "homography"])
 def test_zero_weight_means_absent(name, num_points):
     points, weights = correspondences("orbit", 5, num_points), uniform(5, num_points, low=0.5)
     junk = [uniform(5, 4, 2, low=-5000, high=5000, seed=seed) for seed in (3, 4)]
     every = [torch.cat(pair, 1) for pair in zip((*points, weights), (*junk, torch.zeros(5, 4)), strict=True)]
-    assert hartley_difference(ALL[name](*every), ALL[name](*points, weights), *points) < 1e-7
+    assert hartley_difference(ALL[name](*every), ALL[name](*points, weights), *points, name == "homography") < 1e-7
 
 
-@pytest.mark.parametrize(("name", "bound"), [("projection", 1e-8), ("optimal", 1e-9), ("corrected", 1e-9)])
+@pytest.mark.parametrize(
+    ("name", "bound"), [("projection", 1e-8), ("optimal", 1e-9), ("corrected", 1e-9), ("homography", 1e-9)]
+)
 @given(seed=st.integers(0, 2**31), counts=st.lists(st.integers(0, 3), min_size=12, max_size=12))
 def test_whole_weights_are_repetitions(name, bound, seed, counts):
     counts = torch.tensor([2, 1, 3, 1, 1, 1, 1, 1, 1, *counts])  # at least nine are present
     points = correspondences("handheld", 3, 21, seed)
     repeated = [p.repeat_interleave(counts, 1) for p in points]
     found, expected = ALL[name](*points, counts.double().expand(3, -1)), ALL[name](*repeated)
-    assert hartley_difference(found, expected, *repeated) < bound
+    assert hartley_difference(found, expected, *repeated, name == "homography") < bound
 
 
 def degenerate(kind: str) -> list[torch.Tensor]:
@@ -230,6 +237,10 @@ EYE = torch.eye(3).expand(2, 3, 3)
 )
 def test_wrong_correspondences(estimate):
     check_refuses(estimate)
+
+
+def test_wrong_correspondences_of_a_homography():
+    check_refuses(find_homography, least=4)
 
 
 @pytest.mark.parametrize(("F_mat", "error", "message"), WRONG_MATRICES)

@@ -76,7 +76,7 @@ def check(solve, parameters, points1, points2, weights=None):
     assert torch.isfinite(F_mat).all()
     norms = np.linalg.norm(F_mat.detach().double().numpy(), axis=(1, 2))
     np.testing.assert_allclose(norms, 1, rtol=1e-6)
-    assert (np.linalg.svd(F_mat.detach().double().numpy())[1][:, 2] < 1e-6).all()
+    assert solve is kln.find_homography or (np.linalg.svd(F_mat.detach().double().numpy())[1][:, 2] < 1e-6).all()
     direction = torch.randn(F_mat.shape, generator=torch.Generator().manual_seed(1)).to(F_mat)
     loss = kln.EpipolarLoss()(values[0], values[1], F_mat)
     assert torch.isfinite(loss)
@@ -86,18 +86,19 @@ def check(solve, parameters, points1, points2, weights=None):
 
 
 def check_function(name, points1, points2, weights=None):
-    normalizer = NORMALIZERS[name]()
-    check(partial(kln.find_fundamental, normalizer=normalizer), normalizer.parameters(), points1, points2, weights)
+    normalizer = None if name == "homography" else NORMALIZERS[name]()
+    solve = kln.find_homography if normalizer is None else partial(kln.find_fundamental, normalizer=normalizer)
+    check(solve, [] if normalizer is None else normalizer.parameters(), points1, points2, weights)
 
 
-@pairwise(name=NORMALIZERS, sample=SAMPLES, num_points=[8, 12], dtype=DTYPES)
+@pairwise(name=[*NORMALIZERS, "homography"], sample=SAMPLES, num_points=[8, 12], dtype=DTYPES)
 def test_degenerate_and_extreme_samples(name, sample, num_points, dtype):
     points1, points2 = (points.to(dtype) for points in SAMPLES[sample](num_points))
     check_function(name, points1, points2)
 
 
 @pairwise(
-    name=["hartley", "whitening", "reweighted", "learned"],
+    name=["hartley", "whitening", "reweighted", "learned", "homography"],
     sample=["plain", "all points equal", "collinear", "one view collinear", "four places"],
     weights=WEIGHTS,
     num_points=[8, 12],
@@ -119,7 +120,7 @@ def test_many_correspondences(name, dtype):
     check_function(name, base(5000, 0, 2).to(dtype), base(5000, 1, 2).to(dtype))
 
 
-@pytest.mark.parametrize("name", NORMALIZERS)
+@pytest.mark.parametrize("name", [*NORMALIZERS, "homography"])
 @settings(max_examples=15)
 @given(st.sampled_from([8, 9]), st.lists(st.integers(-2, 2), min_size=36, max_size=36))
 @example(9, [int(n) - 1 for n in "112111211111120112112111121221111122"])

@@ -8,10 +8,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from scenes import SCENES, correspondences, epipolar_distances, homogeneous, numpy_sampson, scenes, uniform
+from scenes import SCENES, correspondences, epipolar_distances, homogeneous, numpy_sampson, plane, scenes, uniform
 from torch.autograd import gradcheck
 
-from kornia_learnnorm import algebraic_distance, find_fundamental, sampson_distance, symmetric_epipolar_distance
+from kornia_learnnorm import (
+    algebraic_distance,
+    find_fundamental,
+    sampson_distance,
+    symmetric_epipolar_distance,
+    transfer_distance,
+)
 from kornia_learnnorm.geometry.distances import line_norms, sampson_scale, symmetric_scale
 
 ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x2^T F x1 = y1 - y2
@@ -159,3 +165,32 @@ class TestLineNorms:
         for norms in line_norms(x, x, ORIGIN):  # lines (0, 0), (4, -3): mean 2.5
             np.testing.assert_allclose(norms[0].numpy(), [0.0025, 5.0025], rtol=1e-5)
         assert all((norms > 0).all() for norms in line_norms(x[..., :1], x[..., :1], ORIGIN))
+
+
+class TestTransferDistance:
+    def test_agrees_with_numpy(self):
+        points1, points2, H = plane(noise=2.0)
+        there, back = (
+            homogeneous(p.numpy()) @ M.numpy().swapaxes(1, 2) for p, M in ((points1, H), (points2, H.inverse()))
+        )
+        errors = [x[..., :2] / x[..., 2:] - p.numpy() for x, p in ((there, points2), (back, points1))]
+        expected = np.sqrt((np.concatenate(errors, -1) ** 2).sum(-1))
+        np.testing.assert_allclose(transfer_distance(points1, points2, -3 * H), expected, rtol=1e-9)
+        assert transfer_distance(points1.float(), points2.float(), H.float()).dtype == torch.float32
+
+    def test_gradcheck(self):
+        values = [
+            value.requires_grad_() for value in (uniform(2, 5, 2), uniform(2, 5, 2, seed=1), 1 + uniform(2, 3, 3))
+        ]
+        assert gradcheck(lambda p, q, H: transfer_distance(p, q, H + 2 * torch.eye(3)), values)
+
+    def test_exceptions(self):
+        for H_mat, error, message in [
+            (None, TypeError, "H_mat must be .* got <class 'NoneType'>"),
+            (MATRICES[:, 0], ShapeError, r"\[2, 3\]"),
+            (MATRICES.float(), TypeError, "one dtype"),
+        ]:
+            with pytest.raises(error, match=message):
+                transfer_distance(POINTS, POINTS, H_mat)
+        with pytest.raises(ValueError, match="pair up"):
+            transfer_distance(POINTS, POINTS[:, :1], MATRICES)
