@@ -33,6 +33,7 @@ MIN_FALSE_SHARE = 0.15  # of the false matches off the plane; as many fit the tr
 MAX_FALSE_SHARE = 0.3  # of the false matches off the plane; more fit only a matrix that they decided
 MAX_SHARE_LEFT = 0.8  # of the false matches per coherent one that fit the first matrix, for another to replace it
 MIN_COHERENT_SHARE = 2 / 3  # of the coherent matches off the plane; with fewer, they belong to two matrices
+MIN_AGREEING_SHARE = 0.8  # of the inliers of either matrix off the plane that fit the other one, for them to be alike
 
 
 def mutual_share(points1: Tensor, points2: Tensor, mutual: Tensor, F_mat: Tensor, threshold: float) -> float:
@@ -55,7 +56,7 @@ def resolve_ambiguity(
     """Return the estimate of the coherent matches where false ones decided the first, with a warning where in doubt.
 
     It replaces the first one if fewer false matches, which are not nearest neighbours in both directions, fit its
-    matrix for each coherent one that does. On rendered walls of repeated windows the predicted error of the answers
+    matrix for each coherent one that does. There is no doubt where both matrices say the same. On rendered walls of repeated windows the predicted error of the answers
     without a warning is too small: 0.2 to 0.7 times the true one (10 % and 90 % quantiles).
     ``again`` maps a mask of the first one's matches to their estimate, or raises NoReliableMatrixError.
     """
@@ -78,12 +79,25 @@ def resolve_ambiguity(
             left, gained = fitting(second.F_mat)
             if left * true < MAX_SHARE_LEFT * false * gained:
                 best, false, true = second, left, gained
+            if _agree(first, second, plane):
+                return best
     off = "of the matches off the main plane that"
     if false > MAX_FALSE_SHARE:
         return _with_doubt(best, f"{false:.0%} {off} are nearest in one direction only fit")
     if true < MIN_COHERENT_SHARE:
         return _with_doubt(best, f"only {true:.0%} {off} move like their neighbours fit")
     return best
+
+
+def _agree(first: PairEstimate, second: PairEstimate, H: Tensor) -> bool:
+    """Return whether most inliers of either matrix off the plane of a homography, if there are any, fit the other."""
+    for own, other in ((first, second), (second, first)):
+        points1, points2 = own.points1[own.inliers], own.points2[own.inliers]
+        off = parallax(points1, points2, H) > PARALLAX * own.threshold
+        distance = symmetric_epipolar_distance(points1[off], points2[off], other.F_mat)
+        if not float((distance < PARALLAX * own.threshold).double().mean()) >= MIN_AGREEING_SHARE:
+            return False
+    return True
 
 
 def _with_doubt(estimate: PairEstimate, reason: str) -> PairEstimate:

@@ -149,6 +149,11 @@ class TestResolveAmbiguity:
         assert [warning.code for warning in found.warnings] == ["ambiguous"]
         assert (found.F_mat is first.F_mat) != replaced
 
+    def test_no_doubt_where_the_coherent_matches_say_the_same(self, first, again):
+        """Although all of the others fit too: the board alone, of which there are two draws."""
+        board = resolve_ambiguity(first, *one_way(), again)
+        assert resolve_ambiguity(board, *one_way(kind=1), lambda _: board).warnings == ()
+
 
 def test_rendered_windows():
     """More matches fit a wrong matrix, of another pose, than the true one."""
