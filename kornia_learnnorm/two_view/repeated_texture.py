@@ -56,8 +56,9 @@ def resolve_ambiguity(
     """Return the estimate of the coherent matches where false ones decided the first, with a warning where in doubt.
 
     It replaces the first one if fewer false matches, which are not nearest neighbours in both directions, fit its
-    matrix for each coherent one that does. There is no doubt where both matrices say the same. On rendered walls of repeated windows the predicted error of the answers
-    without a warning is too small: 0.2 to 0.7 times the true one (10 % and 90 % quantiles).
+    matrix for each coherent one that does. There is no doubt where both matrices say the same. On rendered walls of
+    repeated windows the predicted error of the answers without a warning is too small: 0.2 to 0.7 times the true one
+    (10 % and 90 % quantiles).
     ``again`` maps a mask of the first one's matches to their estimate, or raises NoReliableMatrixError.
     """
     inlying = first.points1[first.inliers], first.points2[first.inliers]
