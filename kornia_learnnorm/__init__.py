@@ -10,6 +10,7 @@ Example:
 """
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_homography import LearnedHomography
 from kornia_learnnorm.estimators.linear import EightPoint, find_fundamental, find_homography
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
@@ -52,6 +53,7 @@ __all__ = [
     "Identity",
     "InlierLoss",
     "LearnedEightPoint",
+    "LearnedHomography",
     "LearnedNormalizer",
     "LearnedRelativePose",
     "LogEpipolarLoss",

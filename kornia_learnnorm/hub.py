@@ -9,6 +9,7 @@ from typing import Any
 from torch import nn
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.learned_homography import LearnedHomography
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
@@ -20,7 +21,9 @@ from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download  # 
 __all__ = ["HubModel"]
 
 # What a repository may hold.
-LAYERS = {layer.__name__: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedNormalizer)}
+LAYERS = {
+    layer.__name__: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedHomography, LearnedNormalizer)
+}
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 
@@ -58,7 +61,8 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
 
     Raises:
         TypeError: if the layer is none of :class:`~kornia_learnnorm.LearnedEightPoint`,
-            :class:`~kornia_learnnorm.LearnedRelativePose` and :class:`~kornia_learnnorm.LearnedNormalizer`.
+            :class:`~kornia_learnnorm.LearnedRelativePose`, :class:`~kornia_learnnorm.LearnedHomography` and
+            :class:`~kornia_learnnorm.LearnedNormalizer`.
 
     Example:
         >>> import tempfile

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.learned_homography import LearnedHomography
 from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.normalizers.learned_normalizer import FORMAT as NORMALIZER_FORMAT
@@ -30,8 +31,8 @@ __all__ = ["export_layer", "export_networks", "load_layer"]
 MIN_DYNAMIC_POINTS = 9  # eight correspondences have a solver of their own
 EXAMPLE_BATCH = 2  # sets of the example that is traced; a dynamic size must not be one there
 DTYPES = {"mask": torch.bool}  # of inputs that are not float32
-ESTIMATORS = {layer.model_name: layer for layer in (LearnedEightPoint, LearnedRelativePose)}
-OUTPUTS = ("F_mat", "determined", "weights")  # fields of an estimate, where it has them
+ESTIMATORS = {layer.model_name: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedHomography)}
+OUTPUTS = ("F_mat", "H_mat", "determined", "weights")  # fields of an estimate, where it has them
 POSE_OUTPUTS = ("E_mat", "R", "t", "determined", "weights")
 
 
@@ -75,8 +76,9 @@ def export_layer(
     ``inputs``. It returns a tuple of the matrices ``F_mat`` (B, 3, 3), ``determined`` (B,) and, of a
     :class:`~kornia_learnnorm.LearnedEightPoint`, ``weights`` (B, N), as the layer's ``estimate``. That of a
     :class:`~kornia_learnnorm.LearnedRelativePose` takes the cameras ``K1`` and ``K2`` (B, 3, 3) after the points, and
-    returns ``E_mat``, ``R`` and ``t`` in the place of ``F_mat``. The batch size :math:`B` is any from one on. Values
-    are not checked: points must be finite but where masked, weights not negative.
+    returns ``E_mat``, ``R`` and ``t`` in the place of ``F_mat``; that of a :class:`~kornia_learnnorm.LearnedHomography`
+    returns ``H_mat``. The batch size :math:`B` is any from one on. Values are not checked: points must be finite but
+    where masked, weights not negative.
 
     Args:
         layer: the layer; the program runs on its device.
@@ -101,7 +103,7 @@ def export_layer(
         torch.Size([3, 3, 3])
 
     """
-    if not isinstance(layer, EightPoint | LearnedEightPoint | LearnedRelativePose):
+    if not isinstance(layer, EightPoint | LearnedEightPoint | LearnedRelativePose | LearnedHomography):
         raise TypeError(f"layer must be an EightPoint or a learned layer, got {type(layer)}")
     offered = [name for name in list(inspect.signature(layer.forward).parameters)[2:] if name not in ("K1", "K2")]
     if wrong := [name for name in inputs if name not in offered]:
@@ -167,7 +169,8 @@ def export_networks(layer: EightPoint | LearnedLayer) -> dict[str, Any]:
 class _Exported(nn.Module):
     """A layer with a plain tuple as output: a named tuple needs its class where the program is loaded."""
 
-    outputs = OUTPUTS
+    outputs: tuple[str, ...] = OUTPUTS
+    layer: Any  # an EightPoint or a learned layer, whose `estimate` takes the inputs
 
     def __init__(self, layer: EightPoint | LearnedLayer, gradients: bool) -> None:
         super().__init__()

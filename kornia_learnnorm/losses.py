@@ -17,6 +17,7 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
 __all__ = ["BoundedEpipolarLoss", "EpipolarLoss", "InlierLoss", "LogEpipolarLoss", "LogEssentialLoss"]
 
+Residual = Callable[[Tensor, Tensor, Tensor], Tensor]  # distances (B, N) of points (B, N, 2) x 2 under (B, 3, 3)
 MAX_DISTANCE = 1e4  # pixels; larger distances count as this and send no gradient
 
 
@@ -53,7 +54,7 @@ class EpipolarLoss(nn.Module):
 
     def __init__(
         self,
-        residual: Callable[[Tensor, Tensor, Tensor], Tensor] = symmetric_epipolar_distance,
+        residual: Residual = symmetric_epipolar_distance,
         log: bool = True,
         heldout_weight: float = 0.0,
         floor: float = 1e-3,
@@ -123,6 +124,7 @@ class BoundedEpipolarLoss(nn.Module):
 
     Args:
         scale: distance :math:`s` in pixels at which a match costs one half.
+        residual: another distance, such as :func:`~kornia_learnnorm.transfer_distance` of homographies.
 
     Raises:
         ValueError: if ``scale`` is not positive.
@@ -134,15 +136,15 @@ class BoundedEpipolarLoss(nn.Module):
 
     """
 
-    def __init__(self, scale: float = 2.0) -> None:
+    def __init__(self, scale: float = 2.0, residual: Residual = symmetric_epipolar_distance) -> None:
         super().__init__()
         if not scale > 0:
             raise ValueError(f"scale must be positive, got {scale}")
-        self.scale = scale
+        self.scale, self.residual = scale, residual
 
     def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         """Return the loss of each set, (B,), of matches (B, M, 2) x 2 under matrices (B, 3, 3)."""
-        squared = symmetric_epipolar_distance(points1, points2, F_mat).clamp(max=MAX_DISTANCE).square()
+        squared = self.residual(points1, points2, F_mat).clamp(max=MAX_DISTANCE).square()
         return (squared / (squared + self.scale**2)).mean(-1)
 
 
@@ -151,6 +153,7 @@ class LogEpipolarLoss(nn.Module):
 
     Args:
         floor: distance :math:`f` in pixels, far below which nothing is gained.
+        residual: another distance, such as :func:`~kornia_learnnorm.transfer_distance` of homographies.
 
     Raises:
         ValueError: if ``floor`` is not positive.
@@ -162,15 +165,15 @@ class LogEpipolarLoss(nn.Module):
 
     """
 
-    def __init__(self, floor: float = 0.1) -> None:
+    def __init__(self, floor: float = 0.1, residual: Residual = symmetric_epipolar_distance) -> None:
         super().__init__()
         if not floor > 0:
             raise ValueError(f"floor must be positive, got {floor}")
-        self.floor = floor
+        self.floor, self.residual = floor, residual
 
     def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         """Return the loss of each set, (B,), of correspondences (B, M, 2) x 2 under matrices (B, 3, 3)."""
-        distance = symmetric_epipolar_distance(points1, points2, F_mat).clamp(max=MAX_DISTANCE)
+        distance = self.residual(points1, points2, F_mat).clamp(max=MAX_DISTANCE)
         return (distance + self.floor).log().mean(-1)
 
 

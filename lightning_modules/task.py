@@ -251,7 +251,7 @@ class EstimatorTask(pl.LightningModule):
         F_mat = self._estimate(batch)
         if isinstance(self.loss, SetLoss):
             size = next(name for largest, name in SIZES.items() if batch.points1.shape[1] <= largest)
-            error = symmetric_epipolar_distance(batch.heldout1.double(), batch.heldout2.double(), F_mat)
+            error = self.loss.labelled.residual(batch.heldout1.double(), batch.heldout2.double(), F_mat)
             self._log(f"median_{size}", error.median(-1).values)
         else:
             residual = symmetric_epipolar_distance(*points, F_mat).mean(-1)

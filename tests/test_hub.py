@@ -12,6 +12,7 @@ import kornia_learnnorm as kln
 
 hub = pytest.importorskip("kornia_learnnorm.hub")
 LAYERS = [(kln.LearnedEightPoint, "robust-tiny"), (kln.LearnedRelativePose, "robust-pose-synthetic")]
+LAYERS += [(kln.LearnedHomography, "robust-homography")]
 LAYERS += [(kln.LearnedNormalizer, "crossview-synthetic")]
 COMMIT = "0" * 40
 
@@ -96,5 +97,7 @@ def test_weights_of_another_class_or_none_are_refused(folder):
 
 
 def test_other_modules_are_refused():
-    with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedRelativePose, LearnedNormalizer, got EightPoint"):
+    with pytest.raises(
+        TypeError, match=r"LearnedEightPoint, LearnedRelativePose, LearnedHomography, LearnedNormalizer, got EightPoint"
+    ):
         hub.HubModel(kln.EightPoint())

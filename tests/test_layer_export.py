@@ -8,12 +8,13 @@ import sys
 
 import pytest
 import torch
-from scenes import correspondences, scenes, shaken, shaken_estimator, signless, up_to_sign
+from scenes import correspondences, plane, scenes, shaken, shaken_estimator, signless, up_to_sign
 
 from kornia_learnnorm import (
     CrossViewNetwork,
     EightPoint,
     LearnedEightPoint,
+    LearnedHomography,
     LearnedNormalizer,
     LearnedRelativePose,
     Whitening,
@@ -68,7 +69,7 @@ def estimates(layer, *points, **given) -> tuple[torch.Tensor, ...]:
     found = layer.estimate(*points, **given)
     if isinstance(layer, LearnedRelativePose):
         return found.E_mat, found.R, found.t, found.determined, found.weights
-    return (found.F_mat, found.determined, *([found.weights] if isinstance(layer, LearnedEightPoint) else []))
+    return (found[0], found.determined, *([] if isinstance(layer, EightPoint) else [found.weights]))
 
 
 def check(program, layer, *points, **given) -> None:
@@ -115,6 +116,15 @@ def test_relative_pose():
     program = export_layer(layer, ["scores"]).module()
     for size in SIZES:
         check(program, layer, *calibrated_sets(*size), scores=torch.rand(size))
+
+
+def test_homography():
+    torch.manual_seed(0)
+    layer = LearnedHomography(width=8, depth=1)
+    program = export_layer(layer, ["scores"]).module()
+    for batch_size, num_points in SIZES:
+        points = [p.float() for p in plane(batch_size, num_points, noise=1.0)[:2]]
+        check(program, layer, *points, scores=torch.rand(batch_size, num_points))
 
 
 def test_gradients_of_sets():
@@ -217,6 +227,7 @@ def test_wrong_arguments():
 def test_load_layer():
     assert isinstance(load_layer("robust-tiny"), LearnedEightPoint)
     assert isinstance(load_layer("robust-pose"), LearnedRelativePose)
+    assert isinstance(load_layer("robust-homography"), LearnedHomography)
     assert load_layer("crossview").normalizer.max_points == 12
     with pytest.raises(FileNotFoundError, match=r"'rubust'.* crossview.* robust"):
         load_layer("rubust")

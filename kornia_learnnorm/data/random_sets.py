@@ -198,8 +198,8 @@ class RandomSets:
         shares = [1.0] * len(sources) if shares is None else list(shares)
         if len(shares) != len(sources) or min(shares) < 0 or not sum(shares) > 0:
             raise ValueError(f"shares must be one non-negative number for each of {len(sources)} sources, got {shares}")
-        if not 5 <= sizes[0] <= sizes[1]:
-            raise ValueError(f"sizes must be a range of at least 5 matches, 8 without cameras, got {sizes}")
+        if not 4 <= sizes[0] <= sizes[1]:
+            raise ValueError(f"sizes must be a range of at least 4 matches, the fewest of a homography, got {sizes}")
         if batches < 1:
             raise ValueError(f"batches must be at least 1, got {batches}")
         self.sources, self.shares = list(sources), shares

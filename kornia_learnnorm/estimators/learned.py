@@ -114,6 +114,16 @@ class LearnedLayer(MatchLayer):
         layer: Self = load_module(name, FORMAT, build)  # type: ignore[assignment]
         return layer
 
+    def start_from(self, layer: LearnedEightPoint) -> Self:
+        """Load the first networks of an estimator of fundamental matrices; what only the own ones read is zero."""
+        columns = torch.tensor([*range(POINT_FEATURES), *range(self.features, self.features + RESIDUAL_FEATURES)])
+        for own, other in zip(self.networks, layer.networks, strict=False):
+            state = {k: v for k, v in other.state_dict().items() if not k.startswith("head.2.")}
+            new, old = own.state_dict(), state.pop("stem.weight")
+            new["stem.weight"] = torch.zeros_like(new["stem.weight"]).index_copy(1, columns[: old.shape[1]], old)
+            own.load_state_dict(new | state)
+        return self
+
     def _estimate(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, mask: Tensor | None, scores: Tensor | None
     ) -> tuple[LinearProblem, tuple[StageEstimate, ...], Tensor]:
@@ -122,9 +132,7 @@ class LearnedLayer(MatchLayer):
         scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
 
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
-            given = scores if scores is None or rows is None else scores[rows]
-            options = self.learn_transforms, self.refine_steps, self.detach_stages
-            return run_stages(self.model, self.networks, problem, given, *options)
+            return self._run(problem, scores if scores is None or rows is None else scores[rows])
 
         def solve_rest(problem: LinearProblem) -> tuple[Tensor, ...]:
             number = self.stages if self.detach_stages else self.stages + 1
@@ -137,6 +145,11 @@ class LearnedLayer(MatchLayer):
         if problem.weights is not None:
             probability = torch.where(problem.weights > 0, probability, 0.0)
         return problem, stages, probability
+
+    def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return matrices (B, S, 3, 3) and logits (B, S, N) of stages and final estimate, of determined sets."""
+        options = self.learn_transforms, self.refine_steps, self.detach_stages
+        return run_stages(self.model, self.networks, problem, scores, *options)
 
 
 class LearnedEstimate(NamedTuple):

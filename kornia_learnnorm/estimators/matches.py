@@ -104,7 +104,7 @@ class MatchLayer(nn.Module):
             K2: optional cameras of the second view.
 
         Returns:
-            the estimate; pairs with fewer than eight matches are not determined.
+            the estimate; pairs with fewer matches than the matrix needs (fundamental: eight) are not determined.
 
         Raises:
             TypeError: if keypoints, matches or scores are no tensors, matches no integers or scores not floating-point.
@@ -113,7 +113,8 @@ class MatchLayer(nn.Module):
 
         """
         points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
-        return self.estimate(points1, points2, mask=mask, K1=K1, K2=K2, **{self.scores_are: weights})
+        cameras = {name: K for name, K in (("K1", K1), ("K2", K2)) if K is not None}  # homographies have none
+        return self.estimate(points1, points2, mask=mask, **cameras, **{self.scores_are: weights})
 
     def __prepare_scriptable__(self) -> NoReturn:
         """Raise a TypeError: ``torch.jit`` is not supported."""

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer, check_scores
 from kornia_learnnorm.estimators.linear import prepare_problem
-from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES
 from kornia_learnnorm.estimators.pose_stages import (
     POSE_OUTPUTS,
     POSE_POINT_FEATURES,
@@ -128,14 +127,7 @@ class LearnedRelativePose(LearnedLayer):
         What only they read, directions and distances in pixels, has no effect yet. Stages beyond those of ``layer`` are
         new.
         """
-        started = cls(layer.width, layer.depth, stages, refine_steps, samples)
-        columns = torch.tensor([*range(POINT_FEATURES), *range(cls.features, cls.features + RESIDUAL_FEATURES)])
-        for own, other in zip(started.networks, layer.networks, strict=False):
-            state = {k: v for k, v in other.state_dict().items() if not k.startswith("head.2.")}
-            new, old = own.state_dict(), state.pop("stem.weight")
-            new["stem.weight"] = torch.zeros_like(new["stem.weight"]).index_copy(1, columns[: old.shape[1]], old)
-            own.load_state_dict(new | state)
-        return started
+        return cls(layer.width, layer.depth, stages, refine_steps, samples).start_from(layer)
 
     def extra_repr(self) -> str:
         """Return the parameters."""

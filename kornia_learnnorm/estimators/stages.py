@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
@@ -15,7 +17,7 @@ from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform
 from kornia_learnnorm.models.contract import TwoViewModel
 
-__all__ = ["TRANSFORM_PARAMS", "run_stages"]
+__all__ = ["TRANSFORM_PARAMS", "Refinement", "run_stages"]
 
 EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
 MAX_MINIMAL_DISTANCE = 0.01  # of the frame's unit; quadratic mean that the best fit of `min_points` inliers leaves
@@ -32,6 +34,7 @@ def run_stages(
     learn_transforms: bool,
     refine_steps: int,
     detach_stages: bool,
+    refinement: Callable[..., Refinement] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return matrices (B, S, 3, 3) and logits (B, S, N) of the stages, for sets that determine their matrix.
 
@@ -43,7 +46,7 @@ def run_stages(
     features, factor = match_features(frame, scores, present), None
     found: list[tuple[Tensor, Tensor]] = []
     with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
-        refine = _Refinement(model, problem, frame)
+        refine = (refinement or Refinement)(model, problem, frame)
     dtype = next(networks.parameters()).dtype
     for network in networks:
         seen = features
@@ -58,7 +61,7 @@ def run_stages(
         weights = weights if problem.weights is None else weights * problem.weights
         found.append((_solve_weighted(model, frame, weights, present, params if learn_transforms else None), logits))
     if not detach_stages:
-        found.append(refine(*found[-1], refine_steps))
+        found.append(refine(*found[-1], refine_steps, last=True))
     matrices, all_logits = zip(*found, strict=True)
     T = frame.T[:, None]
     return unit_matrix(model.carry(torch.stack(matrices, 1), T, T)), torch.stack(all_logits, 1)
@@ -79,7 +82,7 @@ def _solve_weighted(
     return solve_in_coordinates(weighted, T1, T2)
 
 
-class _Refinement:
+class Refinement:
     """Robust refinement of a stage's matrices in the frame; sets of as few as possible matches are solved once."""
 
     def __init__(self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame) -> None:
@@ -93,16 +96,20 @@ class _Refinement:
         if problem.weights is not None:
             self.is_minimal = ((problem.weights > 0).sum(1) <= model.min_points)[:, None, None]
 
-    def __call__(self, M: Tensor, logits: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    def __call__(self, M: Tensor, logits: Tensor, steps: int, last: bool = False) -> tuple[Tensor, Tensor]:
         """Return a stage's matrices after so many steps, and its logits."""
         if self.minimal is not None and self.x1.shape[-1] == self.model.min_points:
             # The stage has no effect; through the zero, its network, scores and weights still get a gradient of zero.
             return self.minimal + 0.0 * M, logits
-        weights = logits.sigmoid() if self.weights is None else logits.sigmoid() * self.weights
-        refined = refine_unrolled(self.model, self.x1, self.x2, M, weights, steps)
+        refined = self.optimize(M, logits.sigmoid(), steps, last)
         if self.minimal is not None and self.is_minimal is not None:
             refined = torch.where(self.is_minimal, self.minimal, refined)
         return refined, logits
+
+    def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
+        """Return the matrices after so many steps, with the probabilities of inliers; ``last`` in the last stage."""
+        weights = probability if self.weights is None else probability * self.weights
+        return refine_unrolled(self.model, self.x1, self.x2, M, weights, steps)
 
 
 def _solve_minimal(model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, x1: Tensor, x2: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from train_processes import make_trainer, normaliser_task
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
 from kornia_learnnorm.data.sources import SyntheticSamples, block_generator
+from kornia_learnnorm.data.synthetic.random_matches import random_matches, random_planes
 from lightning_modules.callbacks import ExportWeights, WritePredictions
 from lightning_modules.datamodule import EVALUATION_SEED, CorrespondenceDataModule
 from lightning_modules.task import EstimatorTask, SetLoss
@@ -29,6 +30,13 @@ def pose_task():
     return EstimatorTask(layer, SetLoss(pose_weight=0.5), lambda params: torch.optim.AdamW(params, lr=1e-2))
 
 
+def homography_task():
+    torch.manual_seed(0)
+    loss = SetLoss(labelled=kln.LogEpipolarLoss(residual=kln.transfer_distance))
+    layer = kln.LearnedHomography(width=16, depth=1, stages=2)
+    return EstimatorTask(layer, loss, lambda params: torch.optim.AdamW(params, lr=1e-2))
+
+
 def sets_task():
     """A normaliser that is trained on sets of matches."""
     torch.manual_seed(0)
@@ -37,8 +45,8 @@ def sets_task():
     return EstimatorTask(layer, optimizer=lambda params: torch.optim.AdamW(params, lr=1e-2))
 
 
-def make_sets(labels=True, **arguments):
-    source = SyntheticSets(32, labels=labels)
+def make_sets(labels=True, matches=random_matches, **arguments):
+    source = SyntheticSets(32, matches, labels)
     sets = RandomSets([source], **{"sizes": (16, 64), "correspondences": 512, "batches": 20, **arguments})
     return CorrespondenceDataModule(sets, sets, batch_size=None)
 
@@ -66,11 +74,13 @@ def test_samples_lower_the_loss(tmp_path, precision):
         (layer_task, False, 50, 0.01),
         (sets_task, True, 60, 0.02),
         (pose_task, True, 120, 0.05),
+        (homography_task, True, 60, 0.05),
     ],
 )
 def test_sets_lower_the_loss(make, labels, steps, least, tmp_path):
-    task, data = make(), make_sets(labels)
-    batch = SyntheticSets(32, labels=labels).draw(64, 32, block_generator(9))
+    matches = random_planes if make is homography_task else random_matches
+    task, data = make(), make_sets(labels, matches)
+    batch = SyntheticSets(32, matches, labels).draw(64, 32, block_generator(9))
     before = task.compute_loss(batch).item()
     options = {"enable_checkpointing": False, "gradient_clip_val": 1.0, "limit_val_batches": 4}
     trainer = make_trainer(tmp_path, max_steps=steps, **options)

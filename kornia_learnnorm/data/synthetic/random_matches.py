@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_points_to_homogeneous
 from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
@@ -19,11 +21,13 @@ from kornia_learnnorm.data.synthetic.scenes import (
     random_views,
     two_views,
 )
-from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, transfer_distance
 
-__all__ = ["SyntheticMatches", "random_matches", "wide_baseline"]
+__all__ = ["SyntheticMatches", "random_matches", "random_planes", "wide_baseline"]
 
 ORBIT_CANDIDATES = 6  # motions per scene
+PLANE_CANDIDATES = 6  # planes and motions per scene
+MIN_DEPTH = 0.15  # of a point of a plane, over its depth in the other view
 KINDS = 5  # of scenes
 
 
@@ -71,8 +75,70 @@ def random_matches(
     scene = _distort(scene, generator)
     points1, exact1 = torch.split(scene.points1, [num_points, num_exact], 1)
     points2, exact2 = torch.split(scene.points2, [num_points, num_exact], 1)
-    shown = scene.inliers[:, :num_points]
+    distance = partial(symmetric_epipolar_distance, F_mat=scene.F_mat)
+    matches = _corrupt(points1, points2, scene.inliers[:, :num_points], scene.image_size, distance, coarse, generator)
+    E_mat = scene.K2.mT @ scene.F_mat @ scene.K1
+    E_mat = E_mat / torch.linalg.matrix_norm(E_mat, keepdim=True)
+    return SyntheticMatches(*matches, exact1, exact2, scene.K1, scene.K2, E_mat)
 
+
+def random_planes(
+    batch_size: int, num_points: int, num_exact: int, generator: Generator, coarse: float = 0.0
+) -> SyntheticMatches:
+    """Draw matches of planes, and in a quarter of the scenes of a camera that only turns.
+
+    The plane is slanted by up to about 60 degrees. The camera turns by 0.005-0.7 rad, also about its axis, and moves by
+    0.01-1 times the distance of the plane. The second image shows an eighth of the first or more. Noise, outliers and
+    scores are those of :func:`random_matches`. Half of the exact correspondences are in the part that both images show,
+    the others anywhere in the first image. Essential matrices, of which a plane has two, are NaN.
+    """
+    size, K = draws.random_cameras(batch_size, generator)
+    shape = (batch_size, PLANE_CANDIDATES)
+    shared = num_exact // 2
+    total = num_points + shared
+    points1 = draws.spread_points(size, 8 * total, generator, clustered=0.3)
+    anywhere = draws.spread_points(size, num_exact - shared, generator)
+    angle = draws.log_uniform(shape, 0.005, 0.7, generator)
+    direction, axes = (draws.normal((*shape, 3), generator) for _ in range(2))
+    turning = draws.uniform((batch_size, 1), 0.0, 1.0, generator) < 0.25
+    baseline = torch.where(turning, 0.0, draws.log_uniform(shape, 0.01, 1.0, generator))
+    R, t = draws.motions(axes, angle, direction, baseline)
+    slope = 0.6 * draws.normal((*shape, 2), generator)
+    normal = normalize(torch.cat([slope, torch.ones_like(slope[..., :1])], -1), dim=-1)
+    K_inverse = torch.linalg.inv(K)
+    H = K[:, None] @ (R + t[..., None] * normal[..., None, :]) @ K_inverse[:, None]
+
+    rays = convert_points_to_homogeneous(torch.cat([points1, anywhere], 1))
+    x2 = H @ rays.mT[:, None]  # (B, C, 3, M)
+    in_front = (x2[:, :, 2] > MIN_DEPTH) & ((normal @ K_inverse) @ rays.mT > MIN_DEPTH)
+    pixels = x2[:, :, :2] / x2[:, :, 2:].clamp(min=MIN_DEPTH)
+    inside = in_front & ((pixels >= 0) & (pixels < size[:, None, :, None])).all(2)
+    number = points1.shape[1]
+    shown = inside[..., :number]
+    count = shown.sum(-1).clamp(max=total) * in_front[..., number:].all(-1)
+    row, chosen = torch.arange(batch_size, device=size.device), count.argmax(1)
+    H, shown, pixels = H[row, chosen], shown[row, chosen], pixels[row, chosen].mT
+    order = shown.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :total]
+    pick = order[..., None].expand(-1, -1, 2)
+    points1, shared1 = torch.split(points1.gather(1, pick), [num_points, shared], 1)
+    points2, shared2 = torch.split(pixels.gather(1, pick), [num_points, shared], 1)
+    distance, shown = partial(transfer_distance, H_mat=H), shown.gather(1, order)[:, :num_points]
+    matches = _corrupt(points1, points2, shown, size, distance, coarse, generator)
+    exact1, exact2 = torch.cat([shared1, anywhere], 1), torch.cat([shared2, pixels[:, number:]], 1)
+    return SyntheticMatches(*matches, exact1, exact2, K, K.clone(), torch.full_like(K, torch.nan))
+
+
+def _corrupt(
+    points1: Tensor,
+    points2: Tensor,
+    shown: Tensor,
+    size: Tensor,
+    distance: Callable[[Tensor, Tensor], Tensor],
+    coarse: float,
+    generator: Generator,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return exact correspondences with noise and outliers, their scores, and which are inliers."""
+    batch_size, num_points = points1.shape[:2]
     scale = draws.log_uniform((batch_size, 1, 1), 0.05, 1.0, generator)
     heavy = draws.uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
     quality = draws.normal((batch_size, num_points, 1), generator)
@@ -93,17 +159,14 @@ def random_matches(
     share = draws.uniform((batch_size, 1), 0.0, 1.0, generator)
     dirty = torch.where(learned, 0.1 + 0.6 * share, 0.2 + 0.7 * share)
     share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, dirty))
-    outliers = _choose_outliers(points1, share, generator)
-    wrong = _wrong_partners(points2, scene.image_size, common, generator)
+    outliers = _choose_outliers(points1, share, generator) | ~shown
+    wrong = _wrong_partners(points2, size, common, generator)
     points2 = torch.where(outliers[..., None], wrong, points2)
-    distance = symmetric_epipolar_distance(points1, points2, scene.F_mat)
-    inliers = shown & (distance < 3 * scale[..., 0] + 0.5)
+    inliers = shown & (distance(points1, points2) < 3 * scale[..., 0] + 0.5)
     scores = _scores(inliers, clean, generator)
     if coarse:
         scores = torch.where(learned, _learned_scores(inliers, quality[..., 0], clean, generator), scores)
-    E_mat = scene.K2.mT @ scene.F_mat @ scene.K1
-    E_mat = E_mat / torch.linalg.matrix_norm(E_mat, keepdim=True)
-    return SyntheticMatches(points1, points2, scores, inliers, exact1, exact2, scene.K1, scene.K2, E_mat)
+    return points1, points2, scores, inliers
 
 
 def wide_baseline(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:

@@ -1,4 +1,4 @@
-"""The learned relative pose: truth, invariances, small and degenerate sets, gradients, files, errors."""
+"""The learned relative pose and homography: truth, invariances, small and degenerate sets, gradients, files, errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from pairwise import pairwise
 from scenes import (
     DTYPES,
     check_gradients,
+    check_refuses,
+    corner_error,
     correspondences,
+    plane,
     scenes,
     seeded,
     signless,
@@ -33,15 +36,23 @@ from kornia_learnnorm.models.essential import Essential
 pytestmark = pytest.mark.numerical
 
 
-def pose_layer(**options) -> kln.LearnedRelativePose:
+def roughened(layer):
     """A layer whose weights differ from one another, as after training."""
-    torch.manual_seed(0)
-    layer = kln.LearnedRelativePose(**{"width": 16, "depth": 2, "stages": 2, "samples": 8} | options).double().eval()
-    generator = seeded(1)
+    layer, generator = layer.double().eval(), seeded(1)
     with torch.no_grad():
         for parameter in layer.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype))
     return layer
+
+
+def pose_layer(**options) -> kln.LearnedRelativePose:
+    torch.manual_seed(0)
+    return roughened(kln.LearnedRelativePose(**{"width": 16, "depth": 2, "stages": 2, "samples": 8} | options))
+
+
+def homography_layer(**options) -> kln.LearnedHomography:
+    torch.manual_seed(0)
+    return roughened(kln.LearnedHomography(**{"width": 16, "depth": 2, "stages": 2} | options))
 
 
 def inputs(name="orbit", *args, **options):
@@ -50,20 +61,52 @@ def inputs(name="orbit", *args, **options):
     return [scene.points1, scene.points2, scene.K1, scene.K2]
 
 
-@pairwise(batch_size=[0, 1, 3], num_points=[5, 6, 8, 60], kind=["plain", "weights", "mask", "scores"], dtype=DTYPES)
-def test_smoke(batch_size, num_points, kind, dtype):
-    values = [value.to(dtype) for value in inputs("orbit", max(batch_size, 1), num_points)]
+def planar(batch_size, num_points):
+    """Points of planes with some noise."""
+    return [*plane(batch_size, num_points, noise=0.2)[:2]]
+
+
+LAYERS = {"pose": pose_layer, "homography": homography_layer}
+INPUTS = {"pose": inputs, "homography": lambda name, *args, **options: planar(*args, **options)}
+SHAPES = {
+    "pose": {"E_mat": (3, 3), "F_mat": (3, 3), "R": (3, 3), "t": (3,)},
+    "homography": {"H_mat": (3, 3), "gap": ()},
+}
+both = pytest.mark.parametrize("kind", LAYERS)
+
+
+@pairwise(
+    kind=LAYERS,
+    batch_size=[0, 1, 3],
+    num_points=[5, 6, 8, 60],
+    more=["plain", "weights", "mask", "scores"],
+    dtype=DTYPES,
+)
+def test_smoke(kind, batch_size, num_points, more, dtype):
+    values = [value.to(dtype) for value in INPUTS[kind]("orbit", max(batch_size, 1), num_points)]
     values = [value[:batch_size] for value in values]
     rows = uniform(batch_size, num_points)
-    given = {"plain": {}, "mask": {"mask": rows > 0.1}}.get(kind, {kind: rows})
-    found = pose_layer().estimate(*values, **given)
-    shapes = {"E_mat": (3, 3), "F_mat": (3, 3), "R": (3, 3), "t": (3,), "weights": (num_points,)}
-    for name, shape in shapes.items():
+    given = {"plain": {}, "mask": {"mask": rows > 0.1}}.get(more, {more: rows})
+    found = LAYERS[kind]().estimate(*values, **given)
+    for name, shape in (SHAPES[kind] | {"weights": (num_points,)}).items():
         value = getattr(found, name)
-        assert (value.shape, value.dtype) == ((batch_size, *shape), dtype)
+        assert (value.shape, value.dtype) == ((batch_size, *shape), torch.float64 if name == "gap" else dtype)
         assert value.isfinite().all()
     assert len(found.stages) == 2
-    assert torch.equal(pose_layer()(*values, **given), found.E_mat)
+    assert torch.equal(LAYERS[kind]()(*values, **given), found[0])
+
+
+@pytest.mark.parametrize("num_points", [4, 5, 50, 400])
+def test_finds_the_homography_without_noise(num_points):
+    points1, points2, H = plane(8, num_points)
+    layer = homography_layer(refine_steps=10)
+    for weights in (None, uniform(8, num_points, low=0.1)):
+        found = layer.estimate(points1, points2, weights=weights)
+        assert found.determined.all()
+        assert corner_error(found.H_mat, H) < 1e-4
+    padded = [torch.cat([p, 600 - p[:, :3]], 1) for p in (points1, points2)]
+    mask = torch.arange(num_points + 3).expand(8, -1) < num_points
+    assert corner_error(layer(*padded, mask=mask), H) < 1e-4
 
 
 @pytest.mark.parametrize("num_points", [6, 8, 50, 400])
@@ -142,12 +185,27 @@ def test_invariances(num_points, seed, shift):
     assert up_to_sign(moved, found.E_mat) < 1e-5
 
 
-def test_masked_rows_do_not_count():
-    layer, (points1, points2, K1, K2) = pose_layer(), inputs("orbit", 3, 20)
+@settings(max_examples=5)
+@given(num_points=st.sampled_from([4, 5, 30]), seed=st.integers(0, 2**20), shift=st.floats(-1e3, 1e3))
+@torch.no_grad()
+def test_invariances_of_a_homography(num_points, seed, shift):
+    """Moved pixels move the matrix along: it has no cameras."""
+    layer, (points1, points2) = homography_layer(), planar(4, num_points)
+    found, order = layer.estimate(points1, points2), torch.randperm(num_points, generator=seeded(seed))
+    assert up_to_sign(layer(points1[:, order], points2[:, order]), found.H_mat) < 1e-6
+    assert up_to_sign(layer.model.swap(layer(points2, points1)), found.H_mat) < 1e-6
+    T = torch.tensor([[0.5, 0, shift], [0, 0.5, shift], [0, 0, 1]], dtype=torch.float64)
+    moved = layer(points1 / 2 + shift, points2 / 2 + shift)
+    assert up_to_sign(layer.model.carry(moved, T, T), found.H_mat) < 1e-5
+
+
+@both
+def test_masked_rows_do_not_count(kind):
+    layer, (points1, points2, *cameras) = LAYERS[kind](), INPUTS[kind]("orbit", 3, 20)
     mask = torch.arange(20).expand(3, 20) < 12
     hidden = [torch.where(mask[..., None], p, torch.nan).requires_grad_() for p in (points1, points2)]
-    found = layer(*hidden, K1, K2, mask=mask)
-    assert up_to_sign(found.detach(), layer(points1[:, :12], points2[:, :12], K1, K2).detach()) < 1e-6
+    found = layer(*hidden, *cameras, mask=mask)
+    assert up_to_sign(found.detach(), layer(points1[:, :12], points2[:, :12], *cameras).detach()) < 1e-6
     signless(found).sum().backward()
     for points in hidden:
         assert points.grad[~mask].eq(0).all()
@@ -162,53 +220,62 @@ DEGENERATE = {
     "zero": lambda p: (0 * p, 0 * p),
     "unrelated": lambda p: (p, p.flip(1)),
 }
+DETERMINED = {"pose": ["no motion", "unrelated"], "homography": ["four places", "no motion", "unrelated"]}
 
 
+@both
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_finite_on_degenerate_sets(name):
-    _, _, K1, K2 = inputs("orbit", 3, 12)
+def test_finite_on_degenerate_sets(kind, name):
     points = [p.clone().requires_grad_() for p in DEGENERATE[name](uniform(3, 12, 2, high=600))]
-    layer = pose_layer()
-    found = layer.estimate(*points, K1, K2)
-    assert found.determined.any() == (name in ("no motion", "unrelated"))
-    loss = signless(found.E_mat).sum() + found.R.sum() + found.weights.sum()
+    layer = LAYERS[kind]()
+    found = layer.estimate(*points, *INPUTS[kind]("orbit", 3, 12)[2:])
+    assert found.determined.any() == (name in DETERMINED[kind])
+    matrices = [getattr(found, key) for key in SHAPES[kind]]
+    loss = signless(found[0]).sum() + sum(value.sum() for value in matrices[1:]) + found.weights.sum()
     gradients = torch.autograd.grad(loss, [*points, *layer.parameters()], allow_unused=True)
-    for value in (found.E_mat, found.R, found.t, *(g for g in gradients if g is not None)):
+    for value in (*matrices, *(g for g in gradients if g is not None)):
         assert value.isfinite().all()
 
 
-def test_gradients():
+@both
+def test_gradients(kind):
     """With many steps derivatives are those of the optimum."""
-    layer = pose_layer(stages=1, refine_steps=60, samples=0)
-    points1, points2, K1, K2 = inputs("orbit", 1, 12, noise=0.3)
+    layer = LAYERS[kind](stages=1, refine_steps=60, **({"samples": 0} if kind == "pose" else {}))
+    points1, points2, *cameras = INPUTS[kind]("orbit", 1, 12)
 
     def numbers(points1, points2, scores):
-        return signless(layer(points1, points2, K1[0], K2[0], scores=scores))
+        return signless(layer(points1, points2, *(K[0] for K in cameras), scores=scores))
 
-    check_gradients(numbers, points1, points2, uniform(1, 12), atol=1e-4, rtol=1e-2)
+    # Numbers of a homography of pixels are tiny in its last row.
+    points, eps = (points1, points2), 1e-6 if cameras else 1e-4
+    check_gradients(numbers, *points, uniform(1, 12), eps=eps, atol=1e-4 if cameras else 1e-6, rtol=1e-2)
 
 
-def test_every_parameter_gets_a_gradient():
-    layer = pose_layer()
-    found = layer.estimate(*inputs("orbit", 3, 20))
-    (signless(found.E_mat).sum() + sum(signless(stage.E_mat).sum() for stage in found.stages)).backward()
+@both
+def test_every_parameter_gets_a_gradient(kind):
+    layer = LAYERS[kind]()
+    found = layer.estimate(*INPUTS[kind]("orbit", 3, 20))
+    (signless(found[0]).sum() + sum(signless(stage[0]).sum() for stage in found.stages)).backward()
     assert all(parameter.grad is not None and parameter.grad.isfinite().all() for parameter in layer.parameters())
 
 
-def test_matches_of_networks():
-    points1, points2, K1, K2 = inputs("orbit", 2, 30)
-    matches = [torch.arange(20)[:, None].expand(20, 2), torch.arange(4)[:, None].expand(4, 2)]
+@both
+def test_matches_of_networks(kind):
+    points1, points2, *cameras = INPUTS[kind]("orbit", 2, 30)
+    few = 4 if kind == "pose" else 3
+    matches = [torch.arange(20)[:, None].expand(20, 2), torch.arange(few)[:, None].expand(few, 2)]
     scores = [torch.rand(len(pairs), dtype=torch.float64, requires_grad=True) for pairs in matches]
-    found = pose_layer().from_matches(points1, points2, matches, scores, K1, K2)
+    found = LAYERS[kind]().from_matches(points1, points2, matches, scores, *cameras)
     assert found.determined.tolist() == [True, False]
-    first, second = torch.autograd.grad(signless(found.E_mat).sum(), scores)
+    first, second = torch.autograd.grad(signless(found[0]).sum(), scores)
     assert first.any()
     assert not second.any()
 
 
-def test_vmap_compile_and_export_agree():
+@both
+def test_vmap_compile_and_export_agree(kind):
     """The traced graph is whole; how fast its code is, is another question."""
-    layer, values = pose_layer(), inputs("orbit", 2, 20)
+    layer, values = LAYERS[kind](), INPUTS[kind]("orbit", 2, 20)
     expected = layer(*values).detach()
     mapped = torch.func.vmap(lambda *rows: layer(*(row[None] for row in rows))[0])(*values)
     assert up_to_sign(mapped.detach(), expected) < 1e-6
@@ -221,32 +288,37 @@ def test_vmap_compile_and_export_agree():
 
 def test_autocast_leaves_the_solver_in_float64():
     layer, values = pose_layer().float(), inputs("orbit", 2, 40, noise=0.0)
+    points1, points2, H = plane(2, 40)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = layer(*values)
-    assert found.dtype == torch.float64
+        found, homography = layer(*values), homography_layer(refine_steps=10).float()(points1, points2)
+    assert found.dtype == homography.dtype == torch.float64
     assert up_to_sign(found.detach(), true_essential(scenes("orbit", 2, 40, noise=0.0))) < 1e-6
+    assert corner_error(homography, H) < 1e-4
 
 
-def test_files(tmp_path):
-    layer = pose_layer()
+@both
+def test_files(kind, tmp_path):
+    layer, own = LAYERS[kind](), {"pose": "essential", "homography": "homography"}[kind]
     layer.trained_on = ("one",)
-    layer.save_pretrained(tmp_path / "pose.safetensors")
-    loaded = kln.LearnedRelativePose.from_pretrained(tmp_path / "pose.safetensors")
-    assert (loaded.trained_on, loaded.samples, loaded.training) == (("one",), 8, False)
-    values = inputs("orbit", 2, 20)
+    layer.save_pretrained(tmp_path / "own.safetensors")
+    loaded = type(layer).from_pretrained(tmp_path / "own.safetensors")
+    assert (loaded.trained_on, loaded.extra_repr(), loaded.training) == (("one",), layer.extra_repr(), False)
+    values = INPUTS[kind]("orbit", 2, 20)
     assert torch.equal(loaded(*values), layer(*values))
     assert torch.equal(pickle.loads(pickle.dumps(loaded))(*values), layer(*values))
-    with pytest.raises(ValueError, match=r"model 'essential', expected 'fundamental'"):
-        kln.LearnedEightPoint.from_pretrained(tmp_path / "pose.safetensors")
+    with pytest.raises(ValueError, match=rf"model '{own}', expected 'fundamental'"):
+        kln.LearnedEightPoint.from_pretrained(tmp_path / "own.safetensors")
 
 
-def test_starts_from_an_eight_point_estimator():
+@both
+def test_starts_from_an_eight_point_estimator(kind):
     eight = kln.LearnedEightPoint.from_pretrained("robust-tiny")
-    layer = kln.LearnedRelativePose.from_eight_point(eight).eval()
-    points1, points2, K1, K2 = inputs("orbit", 2, 60)
+    layer = type(LAYERS[kind]()).from_eight_point(eight).eval()
+    points1, points2, *cameras = INPUTS[kind]("orbit", 2, 60)
     scores = uniform(2, 60)
     first = eight.estimate(points1, points2, scores=scores).stages[0].logits
-    assert torch.allclose(layer.estimate(points1, points2, K1, K2, scores=scores).stages[0].logits, first, atol=1e-5)
+    found = layer.estimate(points1, points2, *cameras, scores=scores).stages[0].logits
+    assert torch.allclose(found, first, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -266,6 +338,15 @@ def test_wrong_input(change, error, message):
     given = dict(zip(("points1", "points2"), (p.float() for p in correspondences("orbit", 2, 8)), strict=True))
     with pytest.raises(error, match=message):
         pose_layer()(**given | {"K1": torch.eye(3), "K2": torch.eye(3)} | change)
+
+
+def test_wrong_input_of_a_homography():
+    check_refuses(homography_layer(), least=4)
+    points = torch.rand(2, 8, 2)
+    with pytest.raises(ValueError, match=r"scores .* got 2 to 2"):
+        homography_layer()(points, points, scores=torch.full((2, 8), 2.0))
+    with pytest.raises(ValueError, match="refine_steps must be"):
+        kln.LearnedHomography(refine_steps=-1)
 
 
 def test_wrong_options():

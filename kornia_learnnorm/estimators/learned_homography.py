@@ -1,0 +1,154 @@
+r"""The learned homography: a matrix between two views of a plane, or of a camera that only turns, from matches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.estimators.homography_stages import HomographyRefinement
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.match_features import CommonFrame
+from kornia_learnnorm.estimators.stages import run_stages
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.models.homography import Homography
+
+__all__ = ["HomographyEstimate", "HomographyStage", "LearnedHomography"]
+
+
+class HomographyStage(NamedTuple):
+    """What one stage gives."""
+
+    H_mat: Tensor  # homographies of unit Frobenius norm, (B, 3, 3)
+    logits: Tensor  # of the probabilities that the correspondences are inliers, (B, N)
+
+
+class HomographyEstimate(NamedTuple):
+    """Homographies of a batch of image pairs, and what the layer makes of their correspondences."""
+
+    H_mat: Tensor  # of unit Frobenius norm, map homogeneous pixels of image 1 to image 2, (B, 3, 3)
+    determined: Tensor  # whether the correspondences determine an invertible matrix, (B,) bool
+    gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
+    # Probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that do not
+    # determine their matrix.
+    weights: Tensor
+    stages: tuple[HomographyStage, ...]  # what each stage gives, before its refinement, the last one last
+
+
+class LearnedHomography(LearnedLayer):
+    r"""Estimate the homography of a plane, or of a camera that only turns, from matches with outliers in one pass.
+
+    The sibling of :class:`~kornia_learnnorm.LearnedEightPoint` for homographies, differentiable too. Each stage's
+    network predicts a logit for every correspondence and two transforms, the weighted DLT follows in their
+    coordinates, and reweighted least squares of the Sampson distances refine its matrix. In the last stage a
+    correspondence counts with the tenth root of its probability: full probabilities leave out true matches that the
+    matrix needs where noise is coarse.
+
+    Four correspondences determine their matrix exactly, whatever the weights; the networks get a gradient of zero. The
+    order of the correspondences has no effect. Swapping the views gives :math:`H^{-1}` up to scale. Moving both images
+    by one translation and scaling them by one factor moves :math:`H` along.
+
+    Do not use it on scenes with relief: it returns the homography that most matches agree on, without a warning.
+
+    Args:
+        width: channels of the networks.
+        depth: blocks of each stage's network.
+        stages: number of stages.
+        refine_steps: reweightings in the last stage, and at most three in the others. Derivatives are those of the
+            steps: more steps bring them closer to those of the optimum.
+
+    Attributes:
+        detach_stages: send no gradient from a stage into the one before and don't refine the last, as when the layer
+            itself is trained; a loss of every stage takes its place.
+        trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
+
+    Raises:
+        ValueError: if a number is not whole or too small.
+
+    Example:
+        >>> layer = LearnedHomography(width=16, depth=2)
+        >>> layer(torch.rand(2, 100, 2), torch.rand(2, 100, 2)).shape
+        torch.Size([2, 3, 3])
+
+    """
+
+    model_name = Homography.name
+    architecture = ("width", "depth", "stages", "refine_steps")
+
+    def __init__(self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 3) -> None:
+        super().__init__(Homography(), width, depth, stages, True, refine_steps)
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path = "robust-homography") -> LearnedHomography:
+        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
+
+        Args:
+            name: ``"robust-homography"``, or the path of a ``.safetensors`` file.
+
+        Returns:
+            the estimator, in evaluation mode.
+
+        Raises:
+            FileNotFoundError: if there are no such weights; the message lists those that ship.
+            ValueError: if the file is not an estimator of this package or its tensors do not fit.
+
+        """
+        return super().from_pretrained(name)  # configurations need the name of the class, not Self
+
+    @classmethod
+    def from_eight_point(cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 3) -> LearnedHomography:
+        """Return an untrained estimator whose networks start from the first ones of one of fundamental matrices.
+
+        Stages beyond those of ``layer`` are new.
+        """
+        return cls(layer.width, layer.depth, stages, refine_steps).start_from(layer)
+
+    def estimate(
+        self,
+        points1: Tensor,
+        points2: Tensor,
+        *,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        scores: Tensor | None = None,
+    ) -> HomographyEstimate:
+        r"""Return the homographies, the weights of the correspondences and what each stage gives.
+
+        Args:
+            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 4`, float32 or float64.
+            points2: pixels in the second view with shape :math:`(B, N, 2)`.
+            weights: optional non-negative weights with shape :math:`(B, N)`, which multiply the predicted ones.
+            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows
+                may hold any value, NaN too, and get a gradient of zero; without a mask NaN is an error.
+            scores: optional scores of the matches with shape :math:`(B, N)`, from 0 to 1: a matcher's confidence, or 1
+                minus Lowe's ratio, which the networks read.
+
+        Returns:
+            the matrices, weights and stages, in the dtype of the points. Sets that do not determine an invertible
+            matrix, such as fewer than four different correspondences or four of which three are on a line, get the
+            identity, without gradient.
+
+        Raises:
+            TypeError: if the points are not floating-point tensors of one dtype, weights or scores not floating-point,
+                or the mask not boolean.
+            ShapeError: if a shape is wrong.
+            ValueError: if there are fewer than four rows, shapes do not pair up, an unmasked value is not finite, a
+                weight is negative, or a score is outside of 0 to 1.
+
+        """
+        problem, found, probability = self._estimate(points1, points2, weights, mask, scores)
+        stages = tuple(HomographyStage(*stage) for stage in found)
+        number = self.stages
+        return HomographyEstimate(stages[-1].H_mat, problem.determined, problem.gap, probability, stages[:number])
+
+    def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Run the stages from the view whose points spread less to the other: errors are not the same both ways."""
+        swapped = CommonFrame.from_points(problem.points1, problem.points2, problem.present).swapped[:, None, None]
+        points1, points2 = problem.points1, problem.points2
+        points1, points2 = torch.where(swapped, points2, points1), torch.where(swapped, points1, points2)
+        ordered = LinearProblem.from_points(points1, points2, problem.weights, self.model)
+        options = self.learn_transforms, self.refine_steps, self.detach_stages, HomographyRefinement
+        M, logits = run_stages(self.model, self.networks, ordered, scores, *options)
+        return torch.where(swapped[..., None], self.model.swap(M), M), logits
