@@ -186,6 +186,15 @@ def poses_table(column: str, matcher: str) -> Markdown:
     return Markdown(format_table([column, *(store.removesuffix(f"_{matcher}") for store in stores)], cells))
 
 
+def planes_table(column: str, outliers: str) -> Markdown:
+    """Return a number of planes.csv by estimator and number of matches, at one share of outliers."""
+    header, *rows = read_rows("planes")
+    found = {(row[2], row[1]): row[header.index(column)] for row in rows if row[0] == outliers}
+    names, sizes = (dict.fromkeys(key[k] for key in found) for k in (0, 1))
+    cells = [[name, *(found[name, size] for size in sizes)] for name in names]
+    return Markdown(format_table([f"{column}, {outliers} outliers", *(f"N = {size}" for size in sizes)], cells))
+
+
 def scores_table(title: str) -> Markdown:
     """Return the median errors of one store and protocol where the estimators get Lowe's ratio as scores."""
     names = ["RANSAC", *(name for name in ESTIMATORS if name.startswith("learned"))]

@@ -218,3 +218,17 @@ def test_poses_of_a_store(benchmark, tmp_path, capsys, monkeypatch):
     assert [row[:2] for row in rows[1:]] == [["pairs", name] for name in names]
     assert all(float(row[2]) > 50 for row in rows[1:])
     assert "| RANSAC-calibrated" in capsys.readouterr().out
+
+
+def test_planes(benchmark, tmp_path, capsys, monkeypatch):
+    planes, file = benchmark("planes"), tmp_path / "planes.csv"
+    options = ["--sizes", "64", "--outliers", "0.2", "--sets", "3", "--csv", str(file)]
+    monkeypatch.setattr("sys.argv", ["planes", *options])
+    planes.main()
+    rows = [line.split(",") for line in file.read_text().splitlines()]
+    assert rows[0] == ["outliers", "N", *planes.HEADER]
+    errors = {row[2]: float(row[3]) for row in rows[1:]}
+    assert max(errors[name] for name in ("RANSAC", "opencv-usac-magsac", "learned:robust-homography")) < 20
+    assert errors["kornia-dlt"] > 20
+    assert "20% outliers" in capsys.readouterr().out
+    assert planes.corner_error(None, torch.eye(3).double(), torch.zeros(4, 2).double()) == planes.MAX_ERROR
