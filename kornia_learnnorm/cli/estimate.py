@@ -27,6 +27,7 @@ learnnorm estimate --pairs pairs.txt --out results --estimator learned
 """
 MAX_FAILURES = 5  # failed pairs that are named
 NO_MATRIX, DOUBTFUL = 3, 4  # exit codes where there is no matrix, or reasons to doubt it
+HINT = "more accurate, but slower: --detector aliked --matcher lightglue, whose weights are downloaded once (50 MB)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
     if args.pairs is not None:
         found = estimate_pairs(read_pair_list(args.pairs), args.out, options, args.jobs, args.dask)
         _print_pairs(found, args.out)
+        _print_hint(args)
         if any(line["F"] is None for line in found):
             return NO_MATRIX
         return doubtful if any(line["warnings"] for line in found) else 0
@@ -104,6 +106,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"warning ({warning.code}): {warning.text}", file=sys.stderr)
     else:
         print("\n".join([estimate.summary(), *(f"wrote    {path}" for path in (args.out, json_path) if path)]))
+        _print_hint(args)
     return doubtful if estimate.warnings else 0
 
 
@@ -125,6 +128,12 @@ def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
         if report:
             write_text(report, _to_json(estimate.as_dict(args.matches)))
     return estimate
+
+
+def _print_hint(args: argparse.Namespace) -> None:
+    """Print, to standard error, what is more accurate than the default."""
+    if args.detector == PairOptions.detector:
+        print(f"matched SIFT features; {HINT}", file=sys.stderr)
 
 
 def _print_pairs(found: list[dict[str, Any]], folder: Path) -> None:

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames.add_argument("--split", metavar="NAME", help="kitti, cambridge: train, test; tum: train, val")
     frames.add_argument("--camera", help="kitti: image_0 to image_3 (default: image_0)")
     frames.add_argument("--model", metavar="FOLDER", type=Path, help="colmap: cameras, images, points; ROOT has images")
-    text = "tum: seconds between an image and its pose, at most (default: 0.02)"
+    text = "tum: seconds from image to pose (default: 0.02)"
     frames.add_argument("--max-difference", metavar="S", type=float, help=text)
     frames.add_argument("--resize", metavar=("WIDTH", "HEIGHT"), nargs=2, type=int, help="resize images and cameras")
     pairs = parser.add_argument_group("pairs").add_mutually_exclusive_group()
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         match.add_argument(f"--{option}", metavar="NAME", choices=names, default=getattr(options, option), help=text)
     for option, text in (
         ("num_features", "of an image"),
-        ("max_matches", "per pair, of those that fail the ratio test and of the others; 0 keeps all"),
+        ("max_matches", "per pair, of those that fail the ratio test and of others; 0 keeps all"),
         ("seed", "seed of the order of matches"),
     ):
         default, name = getattr(options, option), f"--{option.replace('_', '-')}"
