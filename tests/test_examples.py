@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from kornia.feature import DISK, LightGlue
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.data.synthetic import orbit
+from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -45,24 +46,53 @@ def test_kornia_ransac_example(example, synthetic):
     assert all(f1 > 50 and error < 3 for f1, error in results.values())
 
 
-def test_lightglue_learns_through_the_layer_and_the_learned_one_needs_no_scores(example, synthetic):
-    before, after = example("match_and_estimate").main(["--steps", "25"])
-    assert after < 0.9 * before
-    before, _ = example("match_and_estimate").main(["--layer", "learned", "--steps", "1"])
-    assert before < 1
-
-
-def test_images_are_matched_with_gradients(example, tmp_path):
-    cv2 = pytest.importorskip("cv2")
-    module = example("match_and_estimate")
+def test_weights_of_matches_learn_which_are_coarse_without_labels(example, monkeypatch):
+    """Half of the matches have noise of 2 px and descriptors of their own."""
+    module = example("finetune_lightglue")
+    monkeypatch.setattr(module, "HALF", 64)
+    generator = torch.Generator().manual_seed(0)
+    scene = orbit(3, 160, generator, noise=0.1)
+    coarse = torch.rand(3, 160, generator=generator) < 0.5
+    points = torch.cat([scene.points1, scene.points2], -1).double()
+    points += 2 * coarse[..., None] * torch.randn(3, 160, 4, generator=generator)
+    descriptors = torch.where(coarse, 1.0, -1.0)[:, None, :, None].expand(3, 2, 160, 96)
+    pairs = [module.Pair(*fields) for fields in zip(points, torch.full((3, 160), 0.5), descriptors, strict=True)]
     torch.manual_seed(0)
-    images = tmp_path / "image1.png", tmp_path / "image2.png"
-    for path in images:
-        cv2.imwrite(str(path), torch.randint(256, (64, 80), dtype=torch.uint8).numpy())
-    lightglue = LightGlue(None, input_dim=128, n_layers=1, flash=False, **module.EVERY_MATCH)
-    distance, norm = module.match_images(DISK().eval(), lightglue, kln.EightPoint(), images)
-    assert distance > 0
-    assert norm > 0
+    layer, weigh = kln.LearnedEightPoint.from_pretrained(), module.MatchWeights()
+    assert torch.equal(weigh(pairs[0]), torch.ones(160, dtype=torch.float64))
+    before = module.held_out_loss(layer, weigh, pairs)
+    module.train(layer, weigh, pairs, steps=12, batch=1)
+    assert module.held_out_loss(layer, weigh, pairs) < before - 0.02
+    weights = weigh(pairs[0])
+    assert weights[coarse[0]].mean() < 0.9 < 1.1 < weights[~coarse[0]].mean()
+
+
+def test_scores_of_lightglue_get_gradients(example, cached_weights):
+    cached_weights("xfeat.pt", "xfeat-lighterglue.pt")
+    module = example("finetune_lightglue")
+    layer, lightglue = module.pretrained()
+    room = render_pair(0, width=480, height=360)
+    sides = module.features([room.image1, room.image2])
+    found = lightglue(sides)
+    F_mat = layer.from_matches(sides["image0"], sides["image1"], found).F_mat
+    exact = [torch.from_numpy(points)[None].float() for points in (room.points1, room.points2)]
+    kln.symmetric_epipolar_distance(*exact, F_mat).median().backward()
+    assert all(p.grad.norm() > 0 for p in lightglue.log_assignment[-1].parameters())
+
+    pair, generator = module.match(lightglue, sides), torch.Generator().manual_seed(0)
+    weights = torch.ones(len(pair.points), dtype=torch.float64, requires_grad=True)
+    module.halves_loss(layer, lambda _: weights, [pair] * 16, generator).backward()
+    distance = kln.symmetric_epipolar_distance(
+        *(x[None] for x in pair.points.split(2, 1)), torch.from_numpy(room.F_mat)[None]
+    )[0]
+    assert weights.grad[distance < 1].sum() < 0 < weights.grad[distance > 1].sum()
+
+
+def test_folders_of_images_are_trained_on(example, cached_weights, tmp_path):
+    cached_weights("xfeat.pt", "xfeat-lighterglue.pt")
+    write_pair(tmp_path, render_pair(0, width=240, height=180))
+    before, after = example("finetune_lightglue").main([str(tmp_path), "--steps", "0"])
+    assert before == after
 
 
 def test_one_line_changes_nothing_but_the_solver(example):

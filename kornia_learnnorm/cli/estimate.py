@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 a matrix with warnings"
     )
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
-    picture = "picture of matches and epipolar lines; with --pairs, a folder"
+    picture = "picture of the matches; with --pairs, a folder"
     parser.add_argument("--out", metavar="PATH", type=Path, help=picture)
     parser.add_argument("--json", metavar="FILE", help="write the result to this file; -: standard output")
     parser.add_argument("--matches", action="store_true", help="with the matches in the JSON")
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     names, default = ("ransac", "learned"), "(default: %(default)s)"
     add("--estimator", metavar="NAME", choices=names, default=names[0], help=f"{', '.join(names)} {default}")
     add("--weights", metavar="NAME_OR_PATH", help="of the learned one (default: robust-synthetic)")
-    distance = f"largest symmetric epipolar distance of an inlier in the images as matched {default}"
+    distance = f"largest epipolar distance of inliers {default}"
     add("--threshold", metavar="PX", type=float, default=options.threshold, help=distance)
     add("--seed", metavar="N", type=_seed, default=options.seed, help=default)
     camera = "one or two of fx,fy,cx,cy, a file of 4 or 9 numbers, KITTI's calib.txt, exif; adds E, R, t"
