@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options = PairOptions()
     parser.usage = "%(prog)s IMG1 IMG2 [options]\n       %(prog)s --pairs LIST --out FOLDER [options]"
     parser.description = (
-        f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 a matrix with warnings"
+        f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 with warnings"
     )
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
     picture = "picture of the matches; with --pairs, a folder"
