@@ -176,9 +176,9 @@ def sizes_table(
     return Markdown(format_table([corner, *(f"N = {size}" for size in sizes)], sizes_rows(title, methods, sizes)))
 
 
-def poses_table(column: str, matcher: str) -> Markdown:
-    """Return a number of poses.csv by estimator and store, of the stores that a matcher's name ends."""
-    header, *rows = read_rows("poses")
+def poses_table(column: str, matcher: str, name: str = "poses") -> Markdown:
+    """Return a column of poses.csv or refined.csv by row and store, of the stores that a matcher's name ends."""
+    header, *rows = read_rows(name)
     stores = dict.fromkeys(row[0] for row in rows if row[0].endswith(matcher))
     found = {(row[0], row[1]): row[header.index(column)] for row in rows}
     names = dict.fromkeys(row[1] for row in rows)

@@ -12,6 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from make_sequences import texture
+from PIL import Image
 from torch import Tensor
 
 import kornia_learnnorm as kln
@@ -232,3 +234,27 @@ def test_planes(benchmark, tmp_path, capsys, monkeypatch):
     assert errors["kornia-dlt"] > 20
     assert "20% outliers" in capsys.readouterr().out
     assert planes.corner_error(None, torch.eye(3).double(), torch.zeros(4, 2).double()) == planes.MAX_ERROR
+
+
+def test_refined_matches_beside_found_and_tracked_ones(benchmark, tmp_path):
+    refined = benchmark("refined")
+    store = synthetic_store(1, points=60, seed=0)
+    write_store(tmp_path / "store.h5", store)
+    image, untrained = texture(0, 640, 480), tmp_path / "untrained.safetensors"
+    for name, (width, height) in zip(np.ravel(store.names), store.image_size.reshape(-1, 2), strict=True):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.resize(image, (height, width))).save(tmp_path / name, format="png")
+    kln.MatchRefiner().save_pretrained(untrained)
+    options = ["--images", str(tmp_path), "--weights", str(untrained), "--pairs", "1"]
+    options += ["--estimators", "ground-truth"]
+    for _ in range(2):  # rows of a store are replaced
+        refined.main([str(tmp_path / "store.h5"), *options, "--csv", str(tmp_path / "refined.csv")])
+    header, *rows = (line.split(",") for line in (tmp_path / "refined.csv").read_text().splitlines())
+    assert header == ["store", "matches", "px", "fit", "ground-truth", "ms"]
+    assert [row[:2] for row in rows] == [["store", name] for name in ("found", "moved", "Lucas-Kanade")]
+    assert rows[0][2:5] == rows[1][2:5]  # untrained, it moves nothing
+    shift = np.roll(image, 1, axis=1)
+    points = torch.tensor([[200.0, 150], [300, 250]]).double()
+    pair = SimpleNamespace(points1=points, points2=points)
+    tracked = refined.track([image, shift], pair)[1] - points
+    torch.testing.assert_close(tracked, torch.tensor([[1.0, 0], [1, 0]]).double(), atol=0.02, rtol=0)

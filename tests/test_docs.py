@@ -156,6 +156,7 @@ def test_the_model_zoo_lists_every_shipped_file_with_its_size():
         module = kln.LearnedEightPoint if path.stem.startswith("robust") else kln.LearnedNormalizer
         module = kln.LearnedRelativePose if path.stem.startswith("robust-pose") else module
         module = kln.LearnedHomography if path.stem == "robust-homography" else module
+        module = kln.MatchRefiner if path.stem == "refiner" else module
         size = sum(p.numel() for p in module.from_pretrained(path.stem).parameters())
         row = rf"\[`{path.stem}`\].*\| `{module.__name__}` \| {size:,} \| (.*) \| (.*) \|"
         data, licence = re.search(row, TEXTS["README.md"]).groups()

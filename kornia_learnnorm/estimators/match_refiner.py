@@ -13,7 +13,7 @@ from torch.nn.functional import grid_sample, pad
 from kornia_learnnorm.geometry.checks import check_correspondences, check_mask, check_tensor, read_condition
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
-__all__ = ["MatchRefiner", "RefinedMatches"]
+__all__ = ["MatchRefiner", "RefinedMatches", "local_frames"]
 
 FORMAT = "kornia_learnnorm.match_refiner.v1"
 WINDOWS = (1.0, 1.7, 3.0)  # pixels, standard deviations of the windows of Lucas-Kanade before training
@@ -111,7 +111,7 @@ class MatchRefiner(nn.Module):
     ) -> RefinedMatches:
         r"""Return the moved matches and the predicted standard deviation of each.
 
-        Gradients reach points and images. A match's weight in a layer is ``scale**-2``.
+        Gradients reach points and images. ``1 / scale`` is a weight for layers.
 
         Args:
             image1: first views with shape :math:`(B, C, H, W)`, grey or colour, values from 0 to 1.
@@ -162,8 +162,8 @@ class MatchRefiner(nn.Module):
         y, x = torch.meshgrid(offsets, offsets, indexing="ij")
         # Points and both columns of their frames times constants: one product is faster than broadcasting.
         constants = torch.stack([torch.ones_like(x), x, y]).view(3, -1, 1, 1) * unit.diag()
-        terms = torch.cat([points[..., None, :] + margin + 0.5, frame.mT], -2).view(-1, 6)
-        grid = terms @ constants.transpose(1, 2).reshape(6, -1) - 1
+        terms = torch.cat([points[..., None, :] + margin + 0.5 - 1 / unit, frame.mT], -2).view(-1, 6)
+        grid = terms @ constants.transpose(1, 2).reshape(6, -1)
         grid = grid.view(len(points), points.shape[1] * size, size, 2)
         patches = grid_sample(image, grid, align_corners=False).view(-1, size * size)
         if patches.numel():
@@ -171,7 +171,7 @@ class MatchRefiner(nn.Module):
             if read_condition(~((low >= 0) & (high <= 1 + RANGE_ROUNDING))):
                 raise ValueError(f"images must have values from 0 to 1, got {low.item():g} to {high.item():g}")
         patches = patches - patches.mean(-1, keepdim=True)
-        variance = patches.square().mean(-1, keepdim=True) + VARIANCE_FLOOR
+        variance = (patches * patches).mean(-1, keepdim=True) + VARIANCE_FLOOR
         return (patches * variance.rsqrt()).view(-1, size, size), variance
 
     def _displacements(self, first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
