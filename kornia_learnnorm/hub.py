@@ -10,6 +10,7 @@ from torch import nn
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
 from kornia_learnnorm.estimators.learned_homography import LearnedHomography
+from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
@@ -21,9 +22,8 @@ from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download  # 
 __all__ = ["HubModel"]
 
 # What a repository may hold.
-LAYERS = {
-    layer.__name__: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedHomography, LearnedNormalizer)
-}
+CLASSES = LearnedEightPoint, LearnedRelativePose, LearnedHomography, LearnedNormalizer, MatchRefiner
+LAYERS = {layer.__name__: layer for layer in CLASSES}
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 
@@ -61,8 +61,8 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
 
     Raises:
         TypeError: if the layer is none of :class:`~kornia_learnnorm.LearnedEightPoint`,
-            :class:`~kornia_learnnorm.LearnedRelativePose`, :class:`~kornia_learnnorm.LearnedHomography` and
-            :class:`~kornia_learnnorm.LearnedNormalizer`.
+            :class:`~kornia_learnnorm.LearnedRelativePose`, :class:`~kornia_learnnorm.LearnedHomography`,
+            :class:`~kornia_learnnorm.LearnedNormalizer` and :class:`~kornia_learnnorm.MatchRefiner`.
 
     Example:
         >>> import tempfile
@@ -75,7 +75,7 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
 
     """
 
-    def __init__(self, layer: LearnedLayer | LearnedNormalizer) -> None:
+    def __init__(self, layer: LearnedLayer | LearnedNormalizer | MatchRefiner) -> None:
         super().__init__()
         if type(layer) not in LAYERS.values():
             raise TypeError(f"the layer must be one of {', '.join(LAYERS)}, got {type(layer).__name__}")

@@ -13,7 +13,7 @@ import kornia_learnnorm as kln
 hub = pytest.importorskip("kornia_learnnorm.hub")
 LAYERS = [(kln.LearnedEightPoint, "robust-tiny"), (kln.LearnedRelativePose, "robust-pose-synthetic")]
 LAYERS += [(kln.LearnedHomography, "robust-homography")]
-LAYERS += [(kln.LearnedNormalizer, "crossview-synthetic")]
+LAYERS += [(kln.LearnedNormalizer, "crossview-synthetic"), (kln.MatchRefiner, "refiner")]
 COMMIT = "0" * 40
 
 
@@ -32,6 +32,7 @@ def test_a_layer_returns_from_a_folder(layer_class, name, tmp_path):
     loaded = hub.HubModel.from_pretrained(tmp_path)
     values = [torch.rand(2, 9, 2) * 600, torch.rand(2, 9, 2) * 600]
     values += [torch.eye(3)] * 2 if layer_class is kln.LearnedRelativePose else []
+    values = [*torch.rand(2, 2, 1, 40, 60), *values] if layer_class is kln.MatchRefiner else values
     assert type(loaded.layer) is layer_class
     assert not loaded.training
     assert loaded.layer.trained_on == layer.trained_on
@@ -97,7 +98,5 @@ def test_weights_of_another_class_or_none_are_refused(folder):
 
 
 def test_other_modules_are_refused():
-    with pytest.raises(
-        TypeError, match=r"LearnedEightPoint, LearnedRelativePose, LearnedHomography, LearnedNormalizer, got EightPoint"
-    ):
+    with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedRelativePose, .*, MatchRefiner, got EightPoint"):
         hub.HubModel(kln.EightPoint())
