@@ -30,7 +30,7 @@ __all__ = ["POSE_OUTPUTS", "POSE_POINT_FEATURES", "POSE_RESIDUAL_FEATURES", "run
 
 POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
-EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of the last stage's candidates
+EARLY_STEPS, LOCAL_STEPS = 2, 6  # reweightings in all stages but the last, and of the last stage's candidates
 # Scales of the robust loss in geometric means of the distances, times the network's factor.
 EARLY_SCALE, LAST_SCALE = 3.0, 0.7
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
