@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import Tensor
@@ -14,6 +15,7 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
+from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.parallax import distances_from_plane, find_homography
@@ -38,6 +40,7 @@ def estimate_matches(
     seed: int = 0,
     K1: Points | None = None,
     K2: Points | None = None,
+    sampler: Callable[..., Sampler] = ProsacSampler,
 ) -> PairEstimate:
     """Return the fundamental matrix of matches with its predicted error and the reasons to doubt it.
 
@@ -57,6 +60,9 @@ def estimate_matches(
         seed: seed of RANSAC and of the parts of the matches.
         K1: camera of image 1, (3, 3), in pixels.
         K2: camera of image 2; both or none.
+        sampler: how the scores steer RANSAC, see :class:`~kornia_learnnorm.RANSAC`. A matcher's confidences, such as
+            LightGlue's, want :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`: samples of the highest alone
+            are worse.
 
     Returns:
         the estimate; its matches are the given ones but for those left out, those that share a point with one of a
@@ -74,7 +80,7 @@ def estimate_matches(
     cameras = read_cameras(K1, K2)
     points1, points2, scores = _usable_matches(*read_matches(points1, points2, scores), threshold)
     size1, size2 = read_size("size1", size1, points1), read_size("size2", size2, points2)
-    solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras)
+    solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras, sampler)
     found = solver.search(size2)
     F_mat, inliers = found.F_mat, solver.inliers(found.F_mat)
     cameras = cameras or (nominal_camera(size1), nominal_camera(size2))

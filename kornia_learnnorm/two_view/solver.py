@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
+from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.parallax import find_homography, fit_plane_and_parallax, parallax, parallax_evidence
@@ -66,6 +68,7 @@ class TwoViewSolver:
     seed: int
     layer: LearnedEightPoint | None = None  # estimates in the place of RANSAC
     cameras: Cameras | None = None
+    sampler: Callable[..., Sampler] = ProsacSampler  # of RANSAC, by the scores
 
     @property
     def estimator(self) -> str:
@@ -137,7 +140,7 @@ class TwoViewSolver:
         return float(self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1).score.sum())
 
     def _ransac(self) -> RansacResult:
-        ransac = RANSAC(inl_th=self.threshold, seed=self.seed)
+        ransac = RANSAC(inl_th=self.threshold, seed=self.seed, sampler=self.sampler)
         return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *(self.cameras or ()))
 
     def _solve_parts(self, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
