@@ -273,17 +273,15 @@ def test_matches_of_networks(kind):
 
 
 @both
-def test_vmap_compile_and_export_agree(kind):
-    """The traced graph is whole; how fast its code is, is another question."""
-    layer, values = LAYERS[kind](), INPUTS[kind]("orbit", 2, 20)
+def test_vmap_and_compile_agree(kind, monkeypatch):
+    """The traced graph is whole; how fast its code is, is another question. Export has a test of its own."""
+    monkeypatch.setattr(pose_stages, "LOCAL_STEPS", 1)
+    layer, values = LAYERS[kind](refine_steps=2), INPUTS[kind]("orbit", 2, 20)
     expected = layer(*values).detach()
     mapped = torch.func.vmap(lambda *rows: layer(*(row[None] for row in rows))[0])(*values)
     assert up_to_sign(mapped.detach(), expected) < 1e-6
-    for traced in (
-        torch.compile(layer, backend="eager", fullgraph=True),
-        torch.export.export(layer, tuple(values)).module(),
-    ):
-        assert up_to_sign(traced(*values).detach(), expected) < 1e-6
+    traced = torch.compile(layer, backend="eager", fullgraph=True)
+    assert up_to_sign(traced(*values).detach(), expected) < 1e-6
 
 
 def test_autocast_leaves_the_solver_in_float64():
