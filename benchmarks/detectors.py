@@ -9,15 +9,14 @@ The folder, such as $LEARNNORM_DATA/images/photographs, has a file cameras.json:
 """
 
 import argparse
-import csv
 import json
 import math
 from pathlib import Path
 
 import torch
+from results_file import write_csv
 
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.metrics.poses import pose_auc, pose_error
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
@@ -69,8 +68,7 @@ def main() -> None:
         print(*rows[-1], flush=True)
     print(format_table(HEADER, rows))
     if args.csv:
-        with atomic_write(args.csv) as beside, beside.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([HEADER, *rows])
+        write_csv(args.csv, [HEADER, *rows])
 
 
 if __name__ == "__main__":

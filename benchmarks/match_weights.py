@@ -11,7 +11,6 @@ camera_to_world.
 """
 
 import argparse
-import csv
 import json
 import sys
 from pathlib import Path
@@ -22,12 +21,12 @@ from torch import nn
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.images import read_colour
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_auc, pose_error
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import finetune_lightglue as example
+from results_file import write_csv
 
 HEADER = ["matches", "log px, held out", "layer AUC 5", "10", "20", "RANSAC AUC 5", "10", "20"]
 SEEDS = 3
@@ -92,8 +91,7 @@ def main() -> None:
     rows.append(row("scores and trained weights"))
     print(format_table(HEADER, rows))
     if args.csv:
-        with atomic_write(args.csv) as beside, beside.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([HEADER, *rows])
+        write_csv(args.csv, [HEADER, *rows])
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ What is not installed is left out.
 """
 
 import argparse
-import csv
 import importlib
 import time
 from collections.abc import Callable
@@ -20,13 +19,13 @@ import cv2
 import torch
 from kornia.geometry import ransac as kornia_ransac
 from kornia.geometry.homography import find_homography_dlt, find_homography_dlt_iterated
+from results_file import write_csv
 from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic.draws import normal, uniform
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.metrics.poses import pose_auc
 
 THRESHOLD = 2.0  # pixels
@@ -146,8 +145,7 @@ def main() -> None:
             print(f"N = {size}, {outliers:.0%} outliers\n\n{format_table(HEADER, found)}\n", flush=True)
             rows += [[f"{outliers:.0%}", str(size), *row] for row in found]
     if args.csv:
-        with atomic_write(args.csv) as beside, beside.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([["outliers", "N", *HEADER], *rows])
+        write_csv(args.csv, [["outliers", "N", *HEADER], *rows])
 
 
 if __name__ == "__main__":

@@ -10,16 +10,15 @@ An estimator is one of learnnorm robust; what is not installed is left out.
 """
 
 import argparse
-import csv
 import math
 
 import torch
+from results_file import write_csv
 
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.evaluation.robust.robust_estimators import find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import even_pairs, measure, shuffled_pair
 from kornia_learnnorm.evaluation.tables import format_table, names_of
-from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.metrics.poses import pose_auc
 
 ESTIMATORS = (
@@ -81,8 +80,7 @@ def main() -> None:
         print(f"{name}\n\n{format_table(HEADER, found)}\n", flush=True)
         rows += [[name, *row] for row in found]
     if args.csv:
-        with atomic_write(args.csv) as beside, beside.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([["store", *HEADER], *rows])
+        write_csv(args.csv, [["store", *HEADER], *rows])
 
 
 if __name__ == "__main__":

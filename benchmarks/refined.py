@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import torch
 from poses import THRESHOLD, find_installed
+from results_file import write_csv
 from torch import Tensor
 
 import kornia_learnnorm as kln
@@ -33,7 +34,6 @@ from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.evaluation.robust.robust_estimators import EvaluatedPair, find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import even_pairs, measure, shuffled_pair
 from kornia_learnnorm.evaluation.tables import format_table, names_of
-from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.metrics.poses import pose_auc
 
 ESTIMATORS = ("RANSAC", "poselib", "RANSAC-calibrated", "poselib-calibrated", "learned:robust-pose-synthetic+scores")
@@ -128,8 +128,7 @@ def main(arguments: list[str] | None = None) -> None:
         if Path(args.csv).exists():
             with Path(args.csv).open(newline="", encoding="utf-8") as file:
                 kept = [row for row in [*csv.reader(file)][1:] if row[0] not in {row[0] for row in rows}]
-        with atomic_write(args.csv) as beside, beside.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([["store", *header], *kept, *rows])
+        write_csv(args.csv, [["store", *header], *kept, *rows])
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def export_layer(
         torch.Size([3, 3, 3])
 
     """
-    if not isinstance(layer, EightPoint | LearnedEightPoint | LearnedRelativePose | LearnedHomography):
+    if not isinstance(layer, EightPoint | LearnedLayer):
         raise TypeError(f"layer must be an EightPoint or a learned layer, got {type(layer)}")
     offered = [name for name in list(inspect.signature(layer.forward).parameters)[2:] if name not in ("K1", "K2")]
     if wrong := [name for name in inputs if name not in offered]:

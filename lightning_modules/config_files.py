@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
+
+import yaml
 
 __all__ = ["config_names", "find_config", "names_task", "with_config_paths"]
 
 OPTIONS = ("-c", "--config")
-TASK = re.compile(r"^model:[\s{]*class_path:", re.MULTILINE)
 PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
 FOLDER = PACKAGED if PACKAGED.is_dir() else Path(__file__).parents[1] / "configs"  # of the repository
 
@@ -46,5 +47,13 @@ def with_config_paths(args: Sequence[str]) -> list[str]:
 
 def names_task(args: Sequence[str]) -> bool:
     """Return whether a configuration of :func:`with_config_paths` names the class of its task."""
-    paths = [Path(arg.removeprefix("--config=")) for arg in args]
-    return any(TASK.search(path.read_text(encoding="utf-8", errors="replace")) for path in paths if path.is_file())
+    paths = [after for before, after in pairwise(args) if before in OPTIONS]
+    paths += [arg.removeprefix("--config=") for arg in args if arg.startswith("--config=")]
+    for path in paths:
+        try:
+            model = yaml.safe_load(Path(path).read_text(encoding="utf-8"))["model"]
+        except (UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError):  # an error of jsonargparse, or no model
+            continue
+        if isinstance(model, dict) and "class_path" in model:
+            return True
+    return False

@@ -15,7 +15,7 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner, RefinedMatches
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from lightning_modules.task import EstimatorTask, adamw, cameras_of
+from lightning_modules.task import EstimatorTask, Median, adamw, cameras_of
 
 __all__ = ["HeldOutLoss", "RefinerTask", "all_matches"]
 
@@ -121,6 +121,8 @@ class RefinerTask(EstimatorTask):
         loss = loss or HeldOutLoss()
         super().__init__(loss.estimator, loss, optimizer, lr_scheduler, warm_up)
         self.refiner = refiner.train()
+        for name in ("found", "moved"):
+            self.metrics[f"median_{name}"] = Median().set_dtype(torch.float64)
 
     @property
     def trained(self) -> Any:

@@ -27,7 +27,7 @@ from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.normalizers.whitening import Whitening
 from lightning_modules.schedule import one_cycle
 
-__all__ = ["EstimatorTask", "SetLoss", "adamw", "cameras_of"]
+__all__ = ["EstimatorTask", "Median", "SetLoss", "adamw", "cameras_of"]
 
 EARLY_STAGE = 0.3  # weight of the losses of all stages but the last
 RESIDUAL_FLOOR = 1e-3  # pixels, added to the residuals under the logarithm of the validation
@@ -133,7 +133,7 @@ class EstimatorTask(pl.LightningModule):
         self.warm_up, self.sample_gradient = warm_up, sample_gradient
         metrics: dict[str, Metric] = {"left_out": SumMetric(), "log_sed": MeanMetric()}
         metrics |= {f"better_than_{name}": MeanMetric() for name in BASELINES}
-        metrics |= {f"median_{name}": Median() for name in (*SIZES.values(), "found", "moved")}
+        metrics |= {f"median_{name}": Median() for name in SIZES.values()}
         self.metrics = nn.ModuleDict({name: metric.set_dtype(torch.float64) for name, metric in metrics.items()})
         self._sets = 0  # of all processes since the last step
 

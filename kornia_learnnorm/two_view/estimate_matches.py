@@ -18,7 +18,7 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
-from kornia_learnnorm.two_view.parallax import distances_from_plane, find_homography
+from kornia_learnnorm.two_view.parallax import distances_from_plane, find_main_plane
 from kornia_learnnorm.two_view.predicted_error import nominal_camera, predict_error
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, TwoViewSolver
@@ -146,7 +146,7 @@ def _all_warnings(
     points1, points2, threshold = solver.points1, solver.points2, solver.threshold
     distance = solver.distance(F_mat)
     near = distance < threshold
-    H = None if solver.cameras else find_homography(points1[near], points2[near], threshold)
+    H = None if solver.cameras else find_main_plane(points1[near], points2[near], threshold)
     off_plane = None if H is None else distances_from_plane(points1, points2, H, size1, size2, threshold)
     warnings = find_warnings(points1, points2, distance, off_plane, threshold, size2, angle)
     if solver.cameras is None or pose.R is not None:

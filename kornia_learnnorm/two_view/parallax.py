@@ -27,7 +27,7 @@ from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 
-__all__ = ["distances_from_plane", "find_homography", "fit_plane_and_parallax", "parallax", "parallax_evidence"]
+__all__ = ["distances_from_plane", "find_main_plane", "fit_plane_and_parallax", "parallax", "parallax_evidence"]
 
 OFF_PLANE = 2.0  # thresholds; a match that the homography misses by more lies off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
@@ -38,7 +38,7 @@ TOLERANCE = 1e-6  # cosine of offsets and derivatives at which Levenberg-Marquar
 AT_INFINITY = 1e6  # halves of the diagonal; offset of a point that the homography moves to infinity
 
 
-def find_homography(points1: Tensor, points2: Tensor, threshold: float) -> Tensor | None:
+def find_main_plane(points1: Tensor, points2: Tensor, threshold: float) -> Tensor | None:
     """Return the homography that explains most matches within a threshold, by OpenCV's MAGSAC, or None."""
     cv2 = import_cv2()
     try:

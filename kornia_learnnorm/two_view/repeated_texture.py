@@ -17,7 +17,7 @@ from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.two_view.parallax import find_homography, parallax
+from kornia_learnnorm.two_view.parallax import find_main_plane, parallax
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.warnings import MIN_INLIERS, PairWarning
 
@@ -44,7 +44,7 @@ def mutual_share(points1: Tensor, points2: Tensor, mutual: Tensor, F_mat: Tensor
     since they determine the epipole; the share is 1 where they are fewer than 16.
     """
     fits = symmetric_epipolar_distance(points1, points2, F_mat) < threshold
-    H = find_homography(points1[fits], points2[fits], threshold) if int(fits.sum()) >= 8 else None
+    H = find_main_plane(points1[fits], points2[fits], threshold) if int(fits.sum()) >= 8 else None
     if H is not None:
         fits &= parallax(points1, points2, H) > PARALLAX * threshold
     return float(mutual[fits].double().mean()) if int(fits.sum()) >= MIN_INLIERS else 1.0
@@ -62,11 +62,11 @@ def resolve_ambiguity(
     ``again`` maps a mask of the first one's matches to their estimate, or raises NoReliableMatrixError.
     """
     inlying = first.points1[first.inliers], first.points2[first.inliers]
-    H, coherent = find_homography(*inlying, first.threshold), torch.zeros_like(first.inliers)
+    H, coherent = find_main_plane(*inlying, first.threshold), torch.zeros_like(first.inliers)
     if H is not None:
         coherent = coherent_matches(first.points1, first.points2, H, first.threshold)
     matches = first.points1[coherent], first.points2[coherent]
-    plane = find_homography(*matches, first.threshold)
+    plane = find_main_plane(*matches, first.threshold)
     if plane is None:
         return _with_doubt(first, "few matches move like their neighbours")
 

@@ -22,7 +22,7 @@ from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view.inputs import Cameras
-from kornia_learnnorm.two_view.parallax import find_homography, fit_plane_and_parallax, parallax, parallax_evidence
+from kornia_learnnorm.two_view.parallax import find_main_plane, fit_plane_and_parallax, parallax, parallax_evidence
 from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 from kornia_learnnorm.two_view.warnings import (
@@ -191,7 +191,7 @@ class TwoViewSolver:
         inliers = self.inliers(F_mat)
         if int(inliers.sum()) < 8:
             return F_mat
-        H = find_homography(self.points1[inliers], self.points2[inliers], self.threshold)
+        H = find_main_plane(self.points1[inliers], self.points2[inliers], self.threshold)
         if H is None:
             return F_mat
         off_plane = parallax(self.points1, self.points2, H)

@@ -14,7 +14,7 @@ from scenes import epipolar_distances
 import kornia_learnnorm as kln
 from kornia_learnnorm.two_view.parallax import (
     distances_from_plane,
-    find_homography,
+    find_main_plane,
     fit_plane_and_parallax,
     parallax,
     parallax_evidence,
@@ -80,7 +80,7 @@ class TestEvidence:
 def test_homography():
     pytest.importorskip("cv2", reason="OpenCV is not installed")
     points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (40, 2)))
-    found = find_homography(points, points + 7.0, 1.0)
+    found = find_main_plane(points, points + 7.0, 1.0)
     assert np.allclose(found / found[2, 2], [[1, 0, 7], [0, 1, 7], [0, 0, 1]], atol=1e-6)
 
 
