@@ -97,14 +97,12 @@ def run(args: argparse.Namespace) -> int:
             return 0
         if not args.out:
             raise ValueError("--out is empty: expected a folder")
-        no_example = record_run(args.out, stores, methods, options, command=args.command_line)
+        record_run(args.out, stores, methods, options, command=args.command_line)
         recorded = read_run(args.out)
         _print_tables(args, recorded, tables)
     further = [name for name in recorded.about["methods"] if name not in short_names(methods).values()]
     if further:
         print(f"{args.out} also holds, from before: {', '.join(further)}", file=sys.stderr)
-    if no_example:
-        print(f"without a drawn pair and the errors by the number of matches: {no_example}", file=sys.stderr)
     done = f"\nwrote {args.out}; learnnorm report {args.out} makes tables and figures of it"
     print(done, file=sys.stderr if args.json == "-" else sys.stdout)
     return 0

@@ -19,7 +19,6 @@ from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.diagnostics import diagnose
 from kornia_learnnorm.evaluation.report.accuracy import report_tables
-from kornia_learnnorm.evaluation.runs import example
 from kornia_learnnorm.evaluation.runs.prediction_run import read_run
 from kornia_learnnorm.evaluation.tables import tables_as_json
 from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
@@ -80,8 +79,7 @@ def tables_of_report(folder, capsys, *words):
     return {table["title"]: {row["method"]: row for row in table["rows"] if "method" in row} for table in tables}
 
 
-def test_the_commands_agree_with_a_computation_by_hand(folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(example, "TRIALS", 5)
+def test_the_commands_agree_with_a_computation_by_hand(folder, tmp_path, capsys):
     shared = [str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--weights"]
     shared += [str(folder / "tilted/weights.safetensors")]
     samples, drawn = samples_of(folder, "known.h5")
@@ -108,8 +106,7 @@ def test_the_commands_agree_with_a_computation_by_hand(folder, tmp_path, capsys,
     assert rows["Hartley"][0] == rows["Hartley"][-1] == rows["whitening"][1] == "-"
 
 
-def test_diagnostics(folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(example, "TRIALS", 5)
+def test_diagnostics(folder, tmp_path, capsys):
     words = [str(folder / "known.h5"), "--methods", "Hartley", "whitening", "--size", "20"]
     rows = tables_of_report(tmp_path / "run", capsys, *words)["Fit and accuracy: known, filtered"]
     samples, _ = samples_of(folder, "known.h5", size=20)

@@ -12,7 +12,6 @@ from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import robust_estimators
 from kornia_learnnorm.evaluation.robust.robust_run import shuffled_pair
-from kornia_learnnorm.evaluation.runs import example
 
 METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
 ESTIMATORS = ["opencv-usac", "RANSAC", "RANSAC:whitening", "ground-truth"]
@@ -35,9 +34,7 @@ def command(store):
 def run(command, tmp_path_factory):
     """A run, not to be changed."""
     folder = tmp_path_factory.mktemp("runs") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(example, "TRIALS", 20)
-        assert main([*command, str(folder)]) == 0
+    assert main([*command, str(folder)]) == 0
     return folder
 
 
@@ -83,11 +80,6 @@ def robust_copied(robust_run, tmp_path):
 @pytest.fixture
 def robust_again(robust_copied, robust_command):
     return [*robust_command, str(robust_copied)]
-
-
-@pytest.fixture
-def few_trials(monkeypatch):
-    monkeypatch.setattr(example, "TRIALS", 20)
 
 
 @pytest.fixture

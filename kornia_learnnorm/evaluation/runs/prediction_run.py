@@ -20,9 +20,8 @@ from kornia_learnnorm.data.sets import MatchSets, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.runs import results_store
-from kornia_learnnorm.evaluation.runs.example import EXAMPLE, SWEEP, random_pair, sweep
 from kornia_learnnorm.evaluation.runs.predict import AGREEMENT, ERRORS, SampleOptions, predict
-from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, file_name, read_arrays
+from kornia_learnnorm.evaluation.runs.results_store import About, Job, Stores, file_name, read_arrays
 from kornia_learnnorm.protocol import PROTOCOLS
 
 SAMPLES = ("pair", "plain_residual")  # arrays in the file of samples
@@ -51,13 +50,11 @@ class Run:
 
     about: About  # what the run was computed from, its section of run.json
     cells: list[RunCell]
-    sizes: dict[str, Arrays]  # errors by the number of correspondences, by method
-    example: Arrays  # the image pair of these errors, from random_pair; empty where there is none yet
     missing: list[str] = field(default_factory=list)  # what has not been computed yet
 
 
 def temporary_run(stores: Mapping[str, str], methods: Sequence[str], options: SampleOptions | None = None) -> Run:
-    """Return a run that is not kept, without shares of inliers and errors by the number of correspondences."""
+    """Return a run that is not kept, without shares of inliers."""
     with TemporaryDirectory(prefix="learnnorm-") as folder:
         record_run(folder, stores, methods, options, complete=False)
         return read_run(folder, complete=False)
@@ -70,12 +67,12 @@ def record_run(
     options: SampleOptions | None = None,
     complete: bool = True,
     command: str = "",
-) -> str:
-    """Compute what a run does not have yet; return why there is no example of a pair, empty where there is one.
+) -> None:
+    """Compute what a run does not have yet.
 
     ``stores`` are paths by the names that tables give them, ``methods`` names for ``find_method``. A run that
-    is ``complete`` has all that a report shows: also the shares of inliers, F1 and, for one pair, the errors by the
-    number of correspondences. ``command`` is the command line that asks for it, for the report.
+    is ``complete`` has all that a report shows: also the shares of inliers and F1. ``command`` is the command line that
+    asks for it, for the report.
 
     A ValueError tells that the folder holds a run of other options, a store or a method is wrong, a file is damaged,
     or, at the end, that a method has failed; an OSError that a file is missing or cannot be written, or that another
@@ -92,14 +89,11 @@ def record_run(
     }
     with results_store.run_folder(folder):
         before = results_store.begin_section(folder, "evaluate", read, about, command=command)
-        no_example = _record_example(folder, read, options.seed) if complete else ""
         jobs = _jobs(folder, read, found, options, complete)
-        swept = sum(map(_is_swept, found)) if complete and not no_example else 0
-        total = len(read) * len(PROTOCOLS) * len(found) + swept
+        total = len(read) * len(PROTOCOLS) * len(found)
         failed = results_store.record(folder, "evaluate", jobs, total, before.get("methods", ()))
     if failed:
         raise ValueError(failed + (f". All others are in {folder}" if complete else ""))
-    return no_example
 
 
 def _jobs(
@@ -114,22 +108,12 @@ def _jobs(
             for label, method in methods.items():
                 compute = partial(predict, method, samples, store, max_ratio, complete)
                 yield Job(label, _path(folder, name, protocol, label), compute, keys, len(samples.pair))
-    if complete and (folder / "example.npz").is_file():
-        example = read_arrays(folder / "example.npz", EXAMPLE)
-        for label in filter(_is_swept, methods):
-            compute = partial(sweep, methods[label], example, options.seed)
-            yield Job(label, _path(folder, "sizes", label), compute, SWEEP)
 
 
 def _path(folder: Path, *names: str) -> Path:
     """Return a file of a run."""
     *parents, last = map(file_name, names)
     return folder.joinpath(*parents, f"{last}.npz")
-
-
-def _is_swept(method: str) -> bool:
-    """Return whether a run keeps a method's errors by the number of correspondences: searching takes too long."""
-    return not method.startswith("searched")
 
 
 def _samples(
@@ -149,17 +133,6 @@ def _samples(
     return drawn.select(torch.from_numpy(found["plain_residual"] < limit))
 
 
-def _record_example(folder: Path, stores: Stores, seed: int) -> str:
-    """Write the example of a pair, or return why there is none."""
-    path = folder / "example.npz"
-    if not path.is_file():
-        try:
-            results_store.write_arrays(path, random_pair(stores, seed))
-        except ValueError as error:
-            return str(error)
-    return ""
-
-
 def read_run(folder: str | Path, complete: bool = True) -> Run:
     """Read what there is of a run; raise FileNotFoundError for a folder without one, ValueError if it is damaged."""
     folder = Path(folder)
@@ -174,14 +147,7 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
                 cells.append(_read_cell(folder, about, store, protocol, complete))
                 absent = [name for name in about["methods"] if name not in cells[-1].predictions]
             missing += [f"{name} on {store}, {protocol}" for name in absent]
-    if not (folder / "example.npz").is_file():
-        known = any(bool(p["truth"].isfinite().any()) for cell in cells for p in cell.predictions.values())
-        return Run(about, cells, {}, {}, [*missing, *["the example of a pair"] * known])
-    example = read_arrays(folder / "example.npz", EXAMPLE)
-    swept = {name: _path(folder, "sizes", name) for name in about["methods"] if _is_swept(name)}
-    missing += [f"{name} by the number of correspondences" for name, path in swept.items() if not path.is_file()]
-    sizes = {name: read_arrays(path, SWEEP) for name, path in swept.items() if path.is_file()}
-    return Run(about, cells, sizes, example, missing)
+    return Run(about, cells, missing)
 
 
 def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, complete: bool) -> RunCell:

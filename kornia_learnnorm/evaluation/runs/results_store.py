@@ -34,7 +34,7 @@ OPTIONS = {
     "robust": ("pairs", "seeds", "slow_seeds", "seed", "threads"),
 }
 # Where the files of methods are.
-PLACES = {"evaluate": ("*/filtered", "*/unfiltered", "sizes"), "robust": ("robust/*/*/*",)}
+PLACES = {"evaluate": ("*/filtered", "*/unfiltered"), "robust": ("robust/*/*/*",)}
 
 MAX_NAME = 80  # letters of a name in that of a file
 RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{device}{i}" for device in ("COM", "LPT") for i in range(10))}  # Windows

@@ -109,7 +109,7 @@ def test_the_rate_of_known_distributions():
     trained_on = {"Hartley": [], "crossview": ["kitti_06@0:3"]}
     about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(own, ""), "trained_on": trained_on}
     about["stores"] = {"kitti_06": "KITTI odometry 06, 200 pairs, 20000 matches"}
-    (table,) = rate_tables(Run(about, [cell], {}, {}))
+    (table,) = rate_tables(Run(about, [cell]))
     name, rate, trained_on = table.rows[0]
     (low, high), rate = rate.interval, rate.value
     assert (name, trained_on) == ("crossview", "kitti_06@0:3")

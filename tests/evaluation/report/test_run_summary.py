@@ -27,7 +27,7 @@ def errors(scale, key="truth"):
 
 
 def summary_of(predictions, pair=PAIR):
-    (text,) = run_summary(Run({}, [RunCell("a", "filtered", pair, SAMPLES, predictions)], {}, {}))
+    (text,) = run_summary(Run({}, [RunCell("a", "filtered", pair, SAMPLES, predictions)], []))
     return text
 
 
@@ -55,7 +55,7 @@ def test_hartley_may_win():
 def test_weights_of_ones_own_are_named_where_another_method_wins():
     predictions = {"Hartley": errors(1.0), "best": errors(0.5), "own": errors(0.8), "crossview": errors(0.9)}
     about = {"trained_on": {"Hartley": [], "best": [], "own": ["a@0:9"], "crossview": ["kitti_00"]}}
-    (text,) = run_summary(Run(about, [RunCell("a", "filtered", PAIR, SAMPLES, predictions)], {}, {}))
+    (text,) = run_summary(Run(about, [RunCell("a", "filtered", PAIR, SAMPLES, predictions)], []))
     assert text.endswith("`own` has 5.200 px.")
 
 

@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ def test_a_temporary_run_of_methods_in_another_order_has_the_same_numbers(run, s
     assert found.about | {"commands": read_run(run).about["commands"]} == read_run(run).about
 
 
-def test_another_run_computes_nothing_and_adds_what_is_new(copied, command, monkeypatch, few_trials):
+def test_another_run_computes_nothing_and_adds_what_is_new(copied, command, monkeypatch):
     files = {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")}
     with monkeypatch.context() as patch:
         patch.setattr(prediction_run, "predict", pytest.fail)
@@ -68,7 +69,7 @@ def test_another_run_computes_nothing_and_adds_what_is_new(copied, command, monk
     assert {path: path.stat().st_mtime_ns for path in copied.rglob("*.npz")} == files
     assert main([*command[:3], "reweighted", "--out", str(copied)]) == 0
     assert [*read_run(copied).about["methods"]] == [*command[3:-1], "reweighted"]
-    assert len([*copied.rglob("*.npz")]) == len(files) + 3
+    assert len([*copied.rglob("*.npz")]) == len(files) + 2
 
 
 @pytest.mark.parametrize(
@@ -104,9 +105,9 @@ def test_damaged_or_of_another_version(copied, reading, refused, name, text, mes
         refused(again, message)
 
 
-@pytest.mark.parametrize("name", ["scenes/filtered/crossview", "sizes/none", "example"])
+@pytest.mark.parametrize("name", ["crossview", "samples"])
 def test_damaged_arrays(copied, reading, refused, name):
-    path = copied / f"{name}.npz"
+    path = copied / f"scenes/filtered/{name}.npz"
     path.write_bytes(path.read_bytes()[:200])
     for again in reading:
         refused(again, f"{path.name} is damaged, remove it")
@@ -125,15 +126,13 @@ def test_other_samples(copied, reading, refused):
     refused(reading[1], "samples.npz is of other samples, remove it")
 
 
-def test_a_store_that_joins_later_changes_no_number(copied, command, tmp_path, few_trials):
+def test_a_store_that_joins_later_changes_no_number(copied, command, tmp_path):
     write_store(tmp_path / "other.h5", synthetic_store(pairs=2, points=330, seed=2))
     before = read_run(copied)
-    (copied / "sizes/Hartley.npz").unlink()
     assert main([command[0], str(tmp_path / "other.h5"), *command[2:], str(copied)]) == 0
     after = read_run(copied)
     assert [*after.about["stores"]] == ["scenes", "other"]
-    assert str(after.example["store"]) == "scenes"
-    np.testing.assert_array_equal(after.sizes["Hartley"]["own"], before.sizes["Hartley"]["own"])
+    assert_same(before, replace(after, cells=after.cells[:2]))
 
 
 class TestOwnCode:
@@ -142,7 +141,7 @@ class TestOwnCode:
     GOOD = "from kornia_learnnorm import Whitening as Mine\n"
 
     @pytest.fixture(autouse=True)
-    def here(self, tmp_path, monkeypatch, few_trials):
+    def here(self, tmp_path, monkeypatch):
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
         monkeypatch.chdir(tmp_path)
 
@@ -192,13 +191,13 @@ class TestOwnCode:
 
     def test_edited_code_is_refused(self, store, capsys):
         assert self.evaluate(store, self.GOOD) == 0
-        assert len([*Path("run").rglob("own_normaliser_Mine-*.npz")]) == 3
+        assert len([*Path("run").rglob("own_normaliser_Mine-*.npz")]) == 2
         assert self.evaluate(store, self.GOOD) == 0
         assert self.evaluate(store, self.GOOD + "# edited") == 2
         assert "is a run of other options, remove it or write elsewhere: own_normaliser:Mine" in capsys.readouterr().err
 
 
-def test_pairs_with_few_matches_have_no_example_and_nothing_held_out(tmp_path, capsys):
+def test_pairs_with_few_matches_have_nothing_held_out(tmp_path):
     """Of nine matches eight are a sample, and the last of those left over may be held out; of eight none."""
     few = synthetic_store(pairs=2, points=60, seed=1, outliers=0.0)
     few.ratio[:] = 0.9
@@ -206,8 +205,6 @@ def test_pairs_with_few_matches_have_no_example_and_nothing_held_out(tmp_path, c
     write_store(tmp_path / "few.h5", few)
     command = ["evaluate", str(tmp_path / "few.h5"), "--out", str(tmp_path / "run"), "--methods", "Hartley"]
     assert main([*command, "--max-residual", "inf"]) == 0
-    printed = capsys.readouterr()
-    assert "without a drawn pair and the errors by the number of matches: no pair of few has 256 matches" in printed.err
     filtered, unfiltered = read_run(tmp_path / "run").cells
     assert filtered.predictions["Hartley"]["heldout"].isnan().tolist() == [True, False]
     assert torch.equal(unfiltered.predictions["Hartley"]["heldout"].isnan(), unfiltered.pair != 1)
