@@ -34,7 +34,13 @@ class TestSetMaximum:
     def test_gradient(self, features, absent):
         assert torch.autograd.gradcheck(lambda h: set_maximum(h, absent, 1), features.requires_grad_())
 
-    @pytest.mark.long
+    def test_gradient_goes_to_one_of_equal_points(self):
+        """That of `amax` would go to all of them, and is NaN where Inductor rounds the maximum alone."""
+        features = torch.ones(2, 4, 3, requires_grad=True)
+        (gradient,) = torch.autograd.grad(set_maximum(features, None, 1).sum(), features)
+        assert (gradient.sort(1, descending=True).values == torch.tensor([1.0, 0, 0, 0])[:, None]).all()
+
+    @pytest.mark.slow
     @pytest.mark.filterwarnings("ignore")  # Inductor's own
     def test_gradient_of_compiled_bfloat16(self, features):
         features = features.bfloat16().requires_grad_()
