@@ -111,12 +111,8 @@ def load_module(name: str | Path, file_format: str, build: Callable[[Path, str],
 
 def shipped_weights(file_format: str | None = None) -> list[str]:
     """Return the names of the weights that ship with the package, of one format or of all."""
-    names = []
-    for path in WEIGHTS.glob("*.safetensors"):
-        with safe_open(path, "pt") as file:
-            if file_format is None or file.metadata()["format"] == file_format:
-                names.append(path.stem)
-    return sorted(names)
+    paths = WEIGHTS.glob("*.safetensors")
+    return sorted(path.stem for path in paths if file_format in (None, _metadata(path)["format"]))
 
 
 def weights_format(name: str | Path) -> str | None:
@@ -125,8 +121,7 @@ def weights_format(name: str | Path) -> str | None:
     if not path.is_file():
         return "" if Path(name).is_file() else None
     try:
-        with safe_open(path, "pt") as file:
-            return str((file.metadata() or {}).get("format", ""))
+        return _metadata(path).get("format", "")
     except SafetensorError:
         return ""
 
@@ -134,8 +129,7 @@ def weights_format(name: str | Path) -> str | None:
 def weights_model(name: str | Path) -> str:
     """Return the two-view model that weights name, "" where there is none; loading the file tells what is wrong."""
     try:
-        with safe_open(weights_path(name), "pt") as file:
-            return str(json.loads(file.metadata()["architecture"])["model"])
+        return str(json.loads(_metadata(weights_path(name))["architecture"])["model"])
     except (OSError, SafetensorError, ValueError, LookupError, TypeError):
         return ""
 
@@ -148,6 +142,11 @@ def weights_digest(name: str | Path) -> str:
 def weights_path(name: str | Path) -> Path:
     """Return the file of shipped weights, or the path that ends in ``.safetensors`` as it is."""
     return Path(name) if Path(name).suffix == ".safetensors" else WEIGHTS / f"{name}.safetensors"
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    with safe_open(path, "pt") as file:
+        return file.metadata() or {}
 
 
 def check_architecture(*parts: Mapping[str, Any]) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.kitti import read_calibration
+from kornia_learnnorm.data.datasets.textfiles import camera_matrix
 from kornia_learnnorm.data.images import focal_length_35mm, image_size
 
 __all__ = ["exif_camera", "read_camera"]
@@ -44,8 +45,7 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
     except ValueError as error:
         raise ValueError(f"camera {text}: {expected}: {error}") from error
     if numbers.size == 4:
-        fx, fy, cx, cy = numbers
-        numbers = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])
+        numbers = camera_matrix(*numbers)
     if numbers.size != 9:
         raise ValueError(f"camera {text}: {expected}, got {numbers.size} numbers")
     K: NDArray[np.float64] = numbers.reshape(3, 3)
@@ -67,4 +67,4 @@ def exif_camera(path: str | Path) -> NDArray[np.float64]:
     if not 0 < focal < math.inf:
         raise ValueError(f"camera exif: {path} has no focal length on 35 mm film; give --K fx,fy,cx,cy")
     pixels = focal * math.hypot(*size) / FILM_DIAGONAL
-    return np.array([[pixels, 0, (size[0] - 1) / 2], [0, pixels, (size[1] - 1) / 2], [0, 0, 1]])
+    return camera_matrix(pixels, pixels, (size[0] - 1) / 2, (size[1] - 1) / 2)

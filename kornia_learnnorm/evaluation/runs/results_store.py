@@ -153,8 +153,6 @@ def _read(folder: Path) -> dict[str, Any]:
     """Return the sections; none where there is no run."""
     path = folder / "run.json"
     advice = "another version of the package made it, remove it or give another folder to --out"
-    if (folder / "robust.json").is_file():
-        raise ValueError(f"{folder} is a run of format 1 with a robust.json, expected {FORMAT}: {advice}")
     if not path.is_file():
         return {}
     try:
