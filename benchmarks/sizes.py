@@ -3,11 +3,11 @@
 A set is N random matches of one image pair, filtered by the ratio test or not. Its error is the median symmetric
 epipolar distance of 64 ground-truth inliers of the pair, most of which are not in the set. The tables have the medians
 over the sets, in pixels, and the time per set of batches of 32 sets, in milliseconds; estimators of other packages and
-RANSAC take one set at a time. Prints progress to stderr; writes the numbers and the picture where asked to.
+RANSAC take one set at a time. Prints progress to stderr; writes the numbers where asked to.
 The inliers of a pair without ground truth are those of OpenCV's MAGSAC on all its matches that pass the ratio test.
 
     python benchmarks/sizes.py STORE.h5 [STORE.h5 ...] [--sizes 8 16 32 64 128 512] [--sets 128] [--seed 0]
-        [--methods NAME ...] [--json FILE] [--picture FILE]
+        [--methods NAME ...] [--json FILE]
 
 A method learned:WEIGHTS is a learned estimator by the name or file of its weights. With +bfloat16 after it, its
 networks compute in bfloat16. With +scores last, it also reads the score of each match, as RANSAC+scores does.
@@ -30,7 +30,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test, read_store
 from kornia_learnnorm.evaluation.robust.peers import find_peer
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import atomic_write, short_name, write_text
+from kornia_learnnorm.files import short_name, write_text
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, PROTOCOLS, RATIO
 
 BATCH = 32  # sets solved at once, as in training
@@ -124,17 +124,6 @@ METHODS: dict[str, Callable[[], Solver]] = {
 }
 SHIPPED = ["learned:robust", "learned:robust-synthetic"]
 ROBUST = ("opencv-usac-magsac", "poselib", "kornia", "RANSAC", "RANSAC+scores")  # need more than eight matches
-DRAWN = {  # in the picture: name, colour and line
-    "Hartley": ("Hartley's eight-point", "#7b858f", "-"),
-    "Hartley+optimal": ("optimal correction", "#7b858f", "--"),
-    "Hartley+LM": ("robust LM", "#7b858f", ":"),
-    "opencv-usac-magsac": ("OpenCV USAC-MAGSAC", "#9a63d6", "-"),
-    "poselib": ("PoseLib", "#2a9d62", "-"),
-    "kornia": ("Kornia RANSAC", "#2a9d62", "--"),
-    "RANSAC": ("RANSAC", "#d9622b", "-"),
-    "learned:robust": ("LearnedEightPoint, robust", "#2f7fd6", "--"),
-    "learned:robust-synthetic": ("LearnedEightPoint, default", "#2f7fd6", "-"),
-}
 
 
 def shown(name: str) -> str:
@@ -201,46 +190,8 @@ def table(results: dict[str, dict[str, list[float]]], sizes: list[int], column: 
     return format_table([title, *(f"N = {size}" for size in sizes)], rows)
 
 
-def draw_light_and_dark(everything: dict[str, dict], path: Path) -> None:
-    """Draw the errors to a file, and for dark pages to one whose name ends in -dark."""
-    from matplotlib import style
-
-    for name, target in {"default": path, "dark_background": path.with_stem(f"{path.stem}-dark")}.items():
-        with style.context(name):
-            draw(everything, target)
-
-
-def draw(everything: dict[str, dict], path: Path) -> None:
-    """Draw the error against the number of matches, a panel for each store and protocol, to be read at 400 pixels."""
-    from matplotlib.figure import Figure
-
-    columns = min(2, len(everything))
-    rows = -(-len(everything) // columns)
-    figure = Figure(figsize=(6.4, 1.4 + 2.5 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for axis, (title, results) in zip(axes.flat, everything.items(), strict=False):
-        for name, (label, colour, line) in DRAWN.items():
-            if name in results:
-                errors = {int(size): found[0] for size, found in results[name].items()}
-                width = 2.4 if name.startswith(LEARNED) else 1.2
-                axis.plot(errors.keys(), errors.values(), line, marker=".", color=colour, label=label, linewidth=width)
-        axis.set(title=title, xscale="log", yscale="log", ylim=(0.1, 200))
-        sizes = sorted({int(size) for found in results.values() for size in found})
-        axis.set_xticks(sizes, [str(size) for size in sizes])
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.minorticks_off()
-        axis.grid(alpha=0.3)
-    for axis in axes[-1]:
-        axis.set_xlabel("matches in the set", fontsize=11)
-    figure.supylabel("median error of true inliers, px", fontsize=11)
-    handles = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, fontsize=11)
-    with atomic_write(path) as beside:
-        figure.savefig(beside, dpi=200, format=path.suffix[1:])
-
-
 def main() -> None:
-    """Measure, print the tables, write the numbers and the picture."""
+    """Measure, print the tables, write the numbers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("stores", nargs="+", help="stores of correspondences with ground truth")
     parser.add_argument("--sizes", type=int, nargs="+", default=[8, 16, 32, 64, 128, 512], help="matches in a set")
@@ -254,13 +205,11 @@ def main() -> None:
     )
     parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     parser.add_argument("--json", help="write the numbers to this file")
-    parser.add_argument("--picture", help="draw the errors to this file, and for dark pages to NAME-dark")
     args = parser.parse_args()
     if unknown := [name for name in args.methods if name not in METHODS and not name.startswith(LEARNED)]:
         parser.error(f"--methods {' '.join(unknown)}: expected some of {', '.join(METHODS)} or learned:WEIGHTS")
-    for path in filter(None, (args.json, args.picture)):
-        if not Path(path).parent.is_dir():
-            parser.error(f"cannot write {path}: the folder {Path(path).parent} does not exist")
+    if args.json and not Path(args.json).parent.is_dir():
+        parser.error(f"cannot write {args.json}: the folder {Path(args.json).parent} does not exist")
     everything: dict[str, dict] = {}
     missing: dict[str, ImportError] = {}
     for path in args.stores:
@@ -286,8 +235,6 @@ def main() -> None:
         print(f"without {name}: {error}", file=sys.stderr)
     if args.json:
         write_text(args.json, json.dumps(everything, indent=1))
-    if args.picture:
-        draw_light_and_dark(everything, Path(args.picture))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """Tables and plots of the numbers in docs/results, for the directive ``results`` of the pages (results_directive.py).
 
 A page shows the file ``results/NAME.csv`` by ``table("NAME")``. ``results/commands.toml`` has the command that printed
-each file. sizes.json is what benchmarks/sizes.py writes with --json.
+each file. sizes.json is what benchmarks/sizes.py writes with --json. The README's table and picture are made by
+
+    python docs/results_tables.py docs/images/sizes.svg
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import sys
 from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
@@ -30,7 +33,9 @@ INK = "#010203"  # text and axes; the page's own text colour takes its place, li
 BLUE, ORANGE, GREEN, PURPLE, GREY = "#2f7fd6", "#d9622b", "#2a9d62", "#9a63d6", "#7b858f"  # readable on both
 DRAWN_IN_INK = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color", "grid.color")
 PLAIN = {**dict.fromkeys(DRAWN_IN_INK, INK), "figure.facecolor": "none", "axes.facecolor": "none"}
-MIN_WIDTH = 34  # rem; a plot scrolls within its box on pages that are narrower
+GREY_INK = "#747b84"  # of pictures in files, which is readable on light and dark pages
+FIT_WIDTH = 6  # inches; a wider plot scrolls within its box on narrow pages, others shrink
+REM = 6  # of the page for an inch of a plot
 
 SIZES = (8, 16, 32, 64, 128, 512)
 ESTIMATORS = {  # as benchmarks/sizes.py names them, and how they are drawn
@@ -63,6 +68,23 @@ TIMED = {  # as benchmarks/sizes.py names them, and how they are drawn
     "learned:robust-synthetic": (BLUE, "s"),
     "learned:robust-tiny": (BLUE, "D"),
     "learned:robust-tiny+bfloat16": (BLUE, "v"),
+}
+COMPARED = {  # in the picture of the landing page and the README, each divided by PoseLib's: name, colour and line
+    "opencv-usac-magsac": ("OpenCV MAGSAC", PURPLE, "-"),
+    "poselib": ("PoseLib", GREEN, "-"),
+    "kornia": ("Kornia RANSAC", GREEN, "--"),
+    "RANSAC": ("RANSAC", ORANGE, "-"),
+    "learned:robust-synthetic": ("LearnedEightPoint", BLUE, "-"),
+}
+VIEWS = {"kitti_06": "Street from a car (KITTI 06)", "tum_fr3_office": "Office, camera in hand (TUM)"}
+POSE_STORES = {"photographs": "photographs", "kitti_06": "KITTI 06", "tum_fr3_office": "TUM"}
+POSE_ROWS = {  # of poses.csv, and how the landing page and the README call them
+    "opencv-usac-magsac": "OpenCV USAC-MAGSAC",
+    "poselib": "PoseLib",
+    "RANSAC": "`RANSAC`",
+    "learned:robust-synthetic+scores": "`LearnedEightPoint`",
+    "poselib-calibrated": "PoseLib, cameras known",
+    "learned:robust-pose-synthetic+scores": "`LearnedRelativePose`, cameras known",
 }
 EIGHTS, SOLVERS, ROBUST = "sets of eight", "larger sets: solvers", "larger sets: robust estimators"
 LAYERS = {  # as benchmarks/speed.py names them, and the parts in which they take turns with Kornia's solver
@@ -176,6 +198,15 @@ def sizes_table(
     return Markdown(format_table([corner, *(f"N = {size}" for size in sizes)], sizes_rows(title, methods, sizes)))
 
 
+def poses_summary() -> Markdown:
+    """Return the pose errors of the landing page and the README: rows of poses.csv, in words."""
+    found = {(row[0], row[1]): row[2] for row in read_rows("poses")[1:]}
+    stores = [f"{store}_{detector}_lightglue" for store in POSE_STORES for detector in ("xfeat", "aliked")]
+    header = [f"{words}, {detector}" for words in POSE_STORES.values() for detector in ("XFeat", "ALIKED")]
+    rows = [[words, *(found[store, name] for store in stores)] for name, words in POSE_ROWS.items()]
+    return Markdown(format_table(["AUC of the pose error up to 5 degrees, %", *header], rows))
+
+
 def poses_table(column: str, matcher: str, name: str = "poses") -> Markdown:
     """Return a column of poses.csv or refined.csv by row and store, of the stores that a matcher's name ends."""
     header, *rows = read_rows(name)
@@ -213,21 +244,50 @@ def sizes_ratios(method: str, reference: str) -> Markdown:
 
 
 def show(figure: Figure, alt: str) -> HTML:
-    """Return a figure as SVG in the text colour of the page, which scrolls within its box where the page is narrow."""
-    text = StringIO()
+    """Return a figure as SVG in the text colour of the page; on narrow pages it shrinks, or scrolls if it is wide."""
+    width, text = figure.get_figwidth(), StringIO()
     with plt.rc_context({"svg.hashsalt": alt}):
         figure.savefig(text, format="svg", metadata={"Date": None})
     plt.close(figure)
     svg = text.getvalue().replace(INK, "currentColor")
-    style = f'style="width: 100%; min-width: {MIN_WIDTH}rem; height: auto"'
+    least = f"min-width: {REM * width * 0.75:.0f}rem; " if width > FIT_WIDTH else ""
+    style = f'style="width: 100%; {least}max-width: {REM * width:.0f}rem; height: auto"'
     svg = svg[svg.index("<svg") :].replace("<svg", f"<svg {style}", 1)
     return HTML(f'<div role="img" aria-label="{alt}" style="overflow-x: auto">{svg}</div>')
+
+
+def draw_relative(ink: str) -> Figure:
+    """Draw the median errors on unfiltered matches divided by PoseLib's, a panel for each store."""
+    with plt.rc_context({**PLAIN, **dict.fromkeys(DRAWN_IN_INK, ink)}):
+        figure, axes = plt.subplots(2, 1, figsize=(4.4, 5.4), layout="constrained", sharex=True)
+        sizes = SIZES[1:]
+        for ax, (store, words) in zip(axes, VIEWS.items(), strict=True):
+            found = read_sizes()[f"{store}, unfiltered"]
+            for name, (label, colour, line) in COMPARED.items():
+                ratios = [found[name][str(size)][0] / found["poselib"][str(size)][0] for size in sizes]
+                width = 2.8 if name.startswith("learned") else 1.6
+                ax.plot(sizes, ratios, line, marker="o", markersize=4, color=colour, label=label, linewidth=width)
+            ax.set(xscale="log", ylim=(0, 2))
+            ax.set_title(words, fontsize=11)
+            ax.set_xticks(sizes, map(str, sizes))
+            ax.tick_params(labelsize=10)
+            ax.minorticks_off()
+            ax.grid(visible=True)
+        axes[-1].set_xlabel("matches, with outliers", fontsize=10)
+        figure.supylabel("median error, divided by PoseLib's", fontsize=10)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=10)
+        return figure
+
+
+def relative_plot() -> HTML:
+    """Return the picture of the landing page."""
+    return show(draw_relative(INK), "Median error divided by PoseLib's, by the number of matches, on KITTI and TUM")
 
 
 def sizes_plot(protocols: Sequence[str] = ("unfiltered", "filtered")) -> HTML:
     """Draw the median error against the number of matches, a row for each protocol and a panel for each store."""
     with plt.rc_context(PLAIN):
-        options = {"figsize": (8, 1.2 + 2.7 * len(protocols)), "layout": "constrained", "squeeze": False}
+        options = {"figsize": (6, 1.4 + 2.2 * len(protocols)), "layout": "constrained", "squeeze": False}
         figure, axes = plt.subplots(len(protocols), len(STORES), sharex=True, sharey="row", **options)
         titles = [f"{store}, {protocol}" for protocol in protocols for store in STORES]
         for title, ax in zip(titles, axes.flat, strict=True):
@@ -244,7 +304,7 @@ def sizes_plot(protocols: Sequence[str] = ("unfiltered", "filtered")) -> HTML:
         for ax in axes[-1]:
             ax.set_xlabel("matches in the set")
         figure.supylabel("median error of true inliers, px", fontsize=9)
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         return show(figure, f"Median error against the number of matches, on KITTI and TUM, {' and '.join(protocols)}")
 
 
@@ -252,7 +312,7 @@ def time_plot(name: str) -> HTML:
     """Draw the median error against the time of a set of unfiltered matches, a row for each size of sets."""
     with plt.rc_context(PLAIN):
         found = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
-        figure, axes = plt.subplots(2, 2, figsize=(8, 6.6), layout="constrained", sharex=True)
+        figure, axes = plt.subplots(2, 2, figsize=(6, 6.4), layout="constrained", sharex=True)
         cells = [(size, store) for size in ("128", "512") for store in STORES]
         for (size, store), ax in zip(cells, axes.flat, strict=True):
             for method, (colour, mark) in TIMED.items():
@@ -265,7 +325,7 @@ def time_plot(name: str) -> HTML:
         for ax in axes[-1]:
             ax.set_xlabel("ms per set")
         figure.supylabel("median error of true inliers, px", fontsize=9)
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         return show(figure, "Median error against time, on KITTI and TUM, unfiltered, sets of 128 and of 512 matches")
 
 
@@ -296,7 +356,7 @@ def dot_plot(panels: dict[str, tuple[str, dict[str, int]]], alt: str, log: bool 
     }
     first = next(iter(tables.values()))[0]
     with plt.rc_context(PLAIN):
-        size = (8, 1.1 + 0.21 * len(first))
+        size = (2 + 2 * len(tables), 1.1 + 0.21 * len(first))
         figure, axes = plt.subplots(1, len(tables), figsize=size, layout="constrained", sharey=True, squeeze=False)
         for ax, (title, (rows, columns)) in zip(axes[0], tables.items(), strict=True):
             for index, (label, column) in enumerate(columns.items()):
@@ -322,3 +382,10 @@ def rates_plot(name: str, stores: dict[str, int]) -> HTML:
     files["truth: better than Hartley %"] = "truth"
     alt = "Better rates of all rows with 95 % intervals, but for none and Hartley; the tables below have the numbers"
     return dot_plot({title: (f"{name}-{file}", stores) for title, file in files.items()}, alt)
+
+
+if __name__ == "__main__":
+    plt.style.use(Path(__file__).parent / "matplotlibrc")
+    with plt.rc_context({"svg.hashsalt": "sizes"}):
+        draw_relative(GREY_INK).savefig(sys.argv[1], metadata={"Date": None}, transparent=True)
+    print(poses_summary().data)
