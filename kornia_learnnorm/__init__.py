@@ -1,4 +1,4 @@
-r"""Learned normalisation for the normalised eight-point algorithm, composed with Kornia.
+r"""F, E and H from matches with outliers in one differentiable pass, composed with Kornia.
 
 Example:
     >>> import torch, kornia_learnnorm as kln

@@ -43,6 +43,7 @@ def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, p
         raise TypeError(f"{name} must be {kind}, got {value.dtype}")
     if shape is not None:
         hint = f"; for one pair write {name}[None]" if shape[0] == "B" and value.ndim == len(shape) - 1 else ""
+        hint = f"; this takes one pair, {name}[0]" if shape[0] == "N" and value.ndim == len(shape) + 1 else hint
         KORNIA_CHECK_SHAPE(value, [*shape], f"Argument: {name}{hint}")
 
 

@@ -8,7 +8,13 @@ import torch
 from kornia.core.exceptions import ShapeError
 from scenes import uniform
 
-from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, solve_dtype, weighted_mean
+from kornia_learnnorm.geometry.checks import (
+    check_cameras,
+    check_correspondences,
+    check_tensor,
+    solve_dtype,
+    weighted_mean,
+)
 
 K = torch.tensor([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
 
@@ -48,6 +54,19 @@ class TestCameras:
     @pytest.mark.long
     def test_values_are_not_read_when_compiled(self):
         assert torch.compile(focal_length, backend="eager", fullgraph=True)(K.T) == 700.0
+
+
+@pytest.mark.parametrize(
+    ("points", "shape", "hint"),
+    [
+        (torch.rand(9, 2), ["B", "N", "2"], r"for one pair write points1\[None\]"),
+        (torch.rand(1, 9, 2), ["N", "2"], r"this takes one pair, points1\[0\]"),
+        (torch.rand(9), ["B", "N", "2"], r"points1$"),
+    ],
+)
+def test_a_wrong_shape_names_what_to_write(points, shape, hint):
+    with pytest.raises(ShapeError, match=hint):
+        check_tensor("points1", points, shape)
 
 
 class TestCorrespondences:
