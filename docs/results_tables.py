@@ -77,14 +77,14 @@ COMPARED = {  # in the picture of the landing page and the README, each divided 
     "learned:robust-synthetic": ("LearnedEightPoint", BLUE, "-"),
 }
 VIEWS = {"kitti_06": "Street from a car (KITTI 06)", "tum_fr3_office": "Office, camera in hand (TUM)"}
-POSE_STORES = {"photographs": "photographs", "kitti_06": "KITTI 06", "tum_fr3_office": "TUM"}
+POSE_STORES = {"photographs": "photos", "tum_fr3_office": "TUM"}
 POSE_ROWS = {  # of poses.csv, and how the landing page and the README call them
-    "opencv-usac-magsac": "OpenCV USAC-MAGSAC",
+    "opencv-usac-magsac": "OpenCV MAGSAC",
     "poselib": "PoseLib",
     "RANSAC": "`RANSAC`",
     "learned:robust-synthetic+scores": "`LearnedEightPoint`",
-    "poselib-calibrated": "PoseLib, cameras known",
-    "learned:robust-pose-synthetic+scores": "`LearnedRelativePose`, cameras known",
+    "poselib-calibrated": "PoseLib with cameras",
+    "learned:robust-pose-synthetic+scores": "`LearnedRelativePose`",
 }
 EIGHTS, SOLVERS, ROBUST = "sets of eight", "larger sets: solvers", "larger sets: robust estimators"
 LAYERS = {  # as benchmarks/speed.py names them, and the parts in which they take turns with Kornia's solver
@@ -204,7 +204,7 @@ def poses_summary() -> Markdown:
     stores = [f"{store}_{detector}_lightglue" for store in POSE_STORES for detector in ("xfeat", "aliked")]
     header = [f"{words}, {detector}" for words in POSE_STORES.values() for detector in ("XFeat", "ALIKED")]
     rows = [[words, *(found[store, name] for store in stores)] for name, words in POSE_ROWS.items()]
-    return Markdown(format_table(["AUC of the pose error up to 5 degrees, %", *header], rows))
+    return Markdown(format_table(["", *header], rows))
 
 
 def poses_table(column: str, matcher: str, name: str = "poses") -> Markdown:
