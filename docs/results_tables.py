@@ -77,7 +77,8 @@ COMPARED = {  # in the picture of the landing page and the README, each divided 
     "learned:robust-synthetic": ("LearnedEightPoint", BLUE, "-"),
 }
 VIEWS = {"kitti_06": "Street from a car (KITTI 06)", "tum_fr3_office": "Office, camera in hand (TUM)"}
-POSE_STORES = {"photographs": "photos", "tum_fr3_office": "TUM"}
+POSE_STORES = {"photographs": "photos", "kitti_06": "KITTI 06", "tum_fr3_office": "TUM"}
+DETECTORS = {"xfeat": "XFeat", "aliked": "ALIKED"}
 POSE_ROWS = {  # of poses.csv, and how the landing page and the README call them
     "opencv-usac-magsac": "OpenCV MAGSAC",
     "poselib": "PoseLib",
@@ -201,10 +202,14 @@ def sizes_table(
 def poses_summary() -> Markdown:
     """Return the pose errors of the landing page and the README: rows of poses.csv, in words."""
     found = {(row[0], row[1]): row[2] for row in read_rows("poses")[1:]}
-    stores = [f"{store}_{detector}_lightglue" for store in POSE_STORES for detector in ("xfeat", "aliked")]
-    header = [f"{words}, {detector}" for words in POSE_STORES.values() for detector in ("XFeat", "ALIKED")]
+    stores = [f"{store}_{detector}_lightglue" for store in ("photographs", "tum_fr3_office") for detector in DETECTORS]
     rows = [[words, *(found[store, name] for store in stores)] for name, words in POSE_ROWS.items()]
-    return Markdown(format_table(["", *header], rows))
+    return Markdown(format_table(["", *map(_store_words, stores)], rows))
+
+
+def _store_words(store: str) -> str:
+    name, detector, _ = store.rsplit("_", 2)
+    return f"{POSE_STORES[name]}, {DETECTORS[detector]}"
 
 
 def poses_table(column: str, matcher: str, name: str = "poses") -> Markdown:
@@ -214,7 +219,7 @@ def poses_table(column: str, matcher: str, name: str = "poses") -> Markdown:
     found = {(row[0], row[1]): row[header.index(column)] for row in rows}
     names = dict.fromkeys(row[1] for row in rows)
     cells = [[name, *(found[store, name] for store in stores)] for name in names]
-    return Markdown(format_table([column, *(store.removesuffix(f"_{matcher}") for store in stores)], cells))
+    return Markdown(format_table([column, *map(_store_words, stores)], cells))
 
 
 def planes_table(column: str, outliers: str) -> Markdown:
