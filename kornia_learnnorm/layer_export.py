@@ -119,13 +119,12 @@ def export_layer(
     points = {name: torch.zeros(*size, 2, device=device) for name in ("points1", "points2")}
     given = {name: torch.ones(size, device=device, dtype=DTYPES.get(name)) for name in inputs}
     shapes = dict.fromkeys([*points, *given], shape)
-    exported: nn.Module = _Exported(layer, gradients)
     if isinstance(layer, LearnedRelativePose):
         points |= {name: torch.eye(3, device=device).repeat(EXAMPLE_BATCH, 1, 1) for name in ("K1", "K2")}
         shapes |= {name: {0: shape[0]} for name in ("K1", "K2")}
-        exported = _ExportedPose(layer, gradients)
+    program, arguments = _Exported(layer, gradients), tuple(points.values())
     with torch.set_grad_enabled(gradients):
-        return torch.export.export(exported, tuple(points.values()), given, dynamic_shapes=shapes, strict=False)
+        return torch.export.export(program, arguments, given, dynamic_shapes=shapes, strict=False)
 
 
 def export_networks(layer: EightPoint | LearnedLayer) -> dict[str, Any]:
@@ -169,7 +168,6 @@ def export_networks(layer: EightPoint | LearnedLayer) -> dict[str, Any]:
 class _Exported(nn.Module):
     """A layer with a plain tuple as output: a named tuple needs its class where the program is loaded."""
 
-    outputs: tuple[str, ...] = OUTPUTS
     layer: Any  # an EightPoint or a learned layer, whose `estimate` takes the inputs
 
     def __init__(self, layer: EightPoint | LearnedLayer, gradients: bool) -> None:
@@ -180,38 +178,19 @@ class _Exported(nn.Module):
         self,
         points1: Tensor,
         points2: Tensor,
+        K1: Tensor | None = None,
+        K2: Tensor | None = None,
         weights: Tensor | None = None,
         mask: Tensor | None = None,
         scores: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """Return the outputs of the points and optional inputs."""
-        given = {} if scores is None else {"scores": scores}
-        return self.select(self.layer.estimate(points1, points2, weights=weights, mask=mask, **given))
-
-    def select(self, found: Any) -> tuple[Tensor, ...]:
-        """Return the outputs that an estimate has."""
-        outputs = [getattr(found, name) for name in self.outputs if hasattr(found, name)]
+        """Return the outputs of the points and of the inputs that are given."""
+        inputs = {"K1": K1, "K2": K2, "weights": weights, "mask": mask, "scores": scores}
+        found = self.layer.estimate(points1, points2, **{k: value for k, value in inputs.items() if value is not None})
+        names = POSE_OUTPUTS if isinstance(self.layer, LearnedRelativePose) else OUTPUTS
+        outputs = [getattr(found, name) for name in names if hasattr(found, name)]
         # Steps that need a gradient have been left out of the graph: what is left would give a wrong one.
         return tuple(outputs) if self.gradients else tuple(value.detach() for value in outputs)
-
-
-class _ExportedPose(_Exported):
-    """The same of a layer that needs cameras."""
-
-    outputs = POSE_OUTPUTS
-
-    def forward(  # type: ignore[override]
-        self,
-        points1: Tensor,
-        points2: Tensor,
-        K1: Tensor,
-        K2: Tensor,
-        weights: Tensor | None = None,
-        mask: Tensor | None = None,
-        scores: Tensor | None = None,
-    ) -> tuple[Tensor, ...]:
-        """Return the outputs of the points, cameras and optional inputs."""
-        return self.select(self.layer.estimate(points1, points2, K1, K2, weights=weights, mask=mask, scores=scores))
 
 
 def _to_onnx(network: nn.Module, example: dict[str, Tensor], outputs: list[str]) -> Any:

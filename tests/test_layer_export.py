@@ -112,7 +112,8 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path):
 
 
 def test_relative_pose(monkeypatch):
-    monkeypatch.setattr(pose_stages, "LOCAL_STEPS", 1)
+    for name in ("EARLY_STEPS", "LOCAL_STEPS"):
+        monkeypatch.setattr(pose_stages, name, 1)
     torch.manual_seed(0)
     layer = LearnedRelativePose(width=8, depth=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()
@@ -122,7 +123,7 @@ def test_relative_pose(monkeypatch):
 
 def test_homography():
     torch.manual_seed(0)
-    layer = LearnedHomography(width=8, depth=1, refine_steps=2)
+    layer = LearnedHomography(width=8, depth=1, refine_steps=1)
     program = export_layer(layer, ["scores"]).module()
     for batch_size, num_points in SIZES:
         points = [p.float() for p in plane(batch_size, num_points, noise=1.0)[:2]]
