@@ -28,7 +28,7 @@ def synthetic(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "steps", "points", "gain"), [("predict_weights", 64, 128, 0.3), ("guided_sampling", 32, 128, 0.5)]
+    ("name", "steps", "points", "gain"), [("predict_weights", 64, 128, 0.3), ("guided_sampling", 20, 128, 0.5)]
 )
 def test_learns_from_synthetic_pairs(name, steps, points, gain, example, synthetic):
     before, after = example(name).main(["--steps", str(steps), "--points", str(points)])

@@ -273,6 +273,7 @@ def test_matches_of_networks(kind):
 
 
 @both
+@pytest.mark.long
 def test_vmap_and_compile_agree(kind, monkeypatch):
     """The traced graph is whole; how fast its code is, is another question. Export has a test of its own."""
     monkeypatch.setattr(pose_stages, "LOCAL_STEPS", 1)
