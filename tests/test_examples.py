@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import orbit
+from kornia_learnnorm.data.synthetic.random_matches import random_matches
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -100,3 +103,59 @@ def test_one_line_changes_nothing_but_the_solver(example):
     kornia, same, whitening, learned = errors.values()
     assert same == pytest.approx(kornia, rel=1e-3)
     assert learned < whitening < kornia
+
+
+@pytest.fixture
+def gluefactory(monkeypatch):
+    """What the example needs of glue-factory: a base class that merges and keeps the options, and poses."""
+
+    class BaseEstimator:
+        def __init__(self, conf):
+            options = SimpleNamespace(**{**self.default_conf["options"], **conf.pop("options", {})})
+            self.conf = SimpleNamespace(**{**self.default_conf, **conf, "options": options})
+            self._init(self.conf)
+
+        def __call__(self, data):
+            return self._forward(data)
+
+    class Pose:
+        def __init__(self, R, t):
+            self.R, self.t = R, t
+
+        @classmethod
+        def from_Rt(cls, R, t):  # noqa: N802
+            return cls(R, t)
+
+        @classmethod
+        def from_4x4mat(cls, T):
+            return cls(T[:3, :3], T[:3, 3])
+
+        def to(self, other):
+            return Pose(self.R.to(other), self.t.to(other))
+
+    for name in ("gluefactory", "gluefactory.geometry", "gluefactory.robust_estimators"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    monkeypatch.setitem(sys.modules, "gluefactory.geometry.wrappers", SimpleNamespace(Pose=Pose))
+    base = SimpleNamespace(BaseEstimator=BaseEstimator)
+    monkeypatch.setitem(sys.modules, "gluefactory.robust_estimators.base_estimator", base)
+
+
+@pytest.mark.parametrize("weights", [None, "robust-pose"])
+def test_estimator_of_gluefactory(example, gluefactory, weights):
+    module = example("gluefactory_estimator")
+    (estimator,) = (c for c in vars(module).values() if isinstance(c, type) and c.__module__ == module.__name__)
+    drawn = random_matches(1, 300, 20, torch.Generator().manual_seed(3))
+    cameras = [SimpleNamespace(calibration_matrix=lambda K=K: K[0].float()) for K in (drawn.K1, drawn.K2)]
+    values = drawn.points1[0].float(), drawn.points2[0].float(), *cameras
+    data = dict(zip(estimator.required_data_keys, values, strict=True))
+    found = estimator({"name": "learnnorm", "ransac_th": 1.5, "options": {"weights": weights}})(data)
+    assert found["success"]
+    R, t = found["M_0to1"].R, found["M_0to1"].t
+    E_mat = torch.linalg.cross(t[:, None], R, dim=0).double()
+    cosine = (E_mat / E_mat.norm() * drawn.E_mat[0]).sum().abs()
+    assert (R.dtype, cosine) == (torch.float32, pytest.approx(1, abs=1e-3))
+    assert (found["inliers"] == (drawn.inliers[0] > 0)).double().mean() > 0.85
+
+    few = estimator({})({**data, "m_kpts0": data["m_kpts0"][:5], "m_kpts1": data["m_kpts1"][:5]})
+    assert (few["success"], few["inliers"].tolist()) == (False, [False] * 5)
+    assert torch.equal(few["M_0to1"].R, torch.eye(3))

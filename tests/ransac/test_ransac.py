@@ -11,13 +11,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
+from kornia.feature import LightGlueMatcher, laf_from_center_scale_ori
 from kornia.geometry import ransac as kornia_ransac
 from kornia.geometry.linalg import transform_points
 from scenes import epipolar_distances, scenes, shaken, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
+from kornia_learnnorm.data.matching.features import detect_aliked
 from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.metrics.inliers import f1_score
 from kornia_learnnorm.ransac.samplers import WeightedSampler
 
@@ -137,6 +140,36 @@ class TestAccuracy:
             scores.append([f1_score(*points, F_mat, truth, 1.0).item() for F_mat in F_mats])
         ours, theirs = np.nanmean(scores, 0)
         assert ours > theirs - 0.01
+
+
+class TestInPlaceOfKornia:
+    """The same call of ``kornia.geometry.RANSAC`` and of this class, on what matchers of Kornia give."""
+
+    @staticmethod
+    def check(points1, points2, exact, weights=None):
+        for ransac in (kornia_ransac.RANSAC("fundamental", inl_th=1.0, seed=0), RANSAC(inl_th=1.0, seed=0)):
+            F_mat, inliers = ransac(points1, points2, weights)
+            assert (F_mat.shape, F_mat.dtype) == ((3, 3), points1.dtype)
+            assert (inliers.shape, inliers.dtype) == (points1.shape[:1], torch.bool)
+            assert kln.symmetric_epipolar_distance(*exact, F_mat.double()).median() < 1
+
+    def test_lightglue_matcher(self, cached_weights):
+        cached_weights("aliked-n16.pth", "aliked_lightglue_v0-1_arxiv-pth")
+        pytest.importorskip("cv2")
+        room = render_pair(0, width=320, height=240)
+        sides = [detect_aliked(image, 500) for image in (room.image1, room.image2)]
+        points, rows = ([torch.from_numpy(getattr(side, part)) for side in sides] for part in ("points", "descriptors"))
+        lafs = [laf_from_center_scale_ori(side[None]) for side in points]
+        with torch.inference_mode():
+            score, index = LightGlueMatcher("aliked")(*rows, *lafs, (240, 320), (240, 320))
+        matches = (side[column] for side, column in zip(points, index.mT, strict=True))
+        exact = torch.from_numpy(room.points1), torch.from_numpy(room.points2)
+        self.check(*matches, exact, score[:, 0])
+
+    @pytest.mark.parametrize("num_points", [5000, 12000])
+    def test_dense_matches(self, num_points):
+        points1, points2, _, _ = pair(num_points=num_points, noise=0.5, outliers=0.3)
+        self.check(points1.float(), points2.float(), pair(num_points=num_points, noise=0.0, outliers=0.0)[:2])
 
 
 class TestSeeds:
