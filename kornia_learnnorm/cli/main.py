@@ -55,6 +55,7 @@ TOOLS = {
     "robust": ("kornia_learnnorm.cli.robust", "robust estimators on stores"),
     "report": ("kornia_learnnorm.cli.report", "tables and figures of what evaluate --out and robust wrote"),
     "match": ("kornia_learnnorm.cli.match", "a store of correspondences from folders of images"),
+    "export-colmap": ("kornia_learnnorm.cli.export_colmap", "a COLMAP database from a folder of images"),
     "synthesize": ("kornia_learnnorm.cli.synthesize", "a synthetic store and a rendered image pair"),
     "export": ("kornia_learnnorm.cli.export", "a layer as a program that runs without this package"),
     "config": ("kornia_learnnorm.cli.config", "print a configuration for training"),

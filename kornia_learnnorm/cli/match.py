@@ -19,7 +19,7 @@ from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.data.writer import check_target
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
+__all__ = ["EXAMPLES", "add_arguments", "add_matching_arguments", "print_skipped", "run"]
 
 EXAMPLES = """\
 learnnorm match folder PHOTOS --out photos.h5
@@ -32,7 +32,6 @@ READER_OPTIONS = ("sequences", "split", "camera", "max_difference", "model")  # 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm match`` to a parser."""
-    options = MatchOptions()
     parser.add_argument("reader", metavar="DATASET", choices=[*DATASETS], help=f"one of {', '.join(DATASETS)}")
     parser.add_argument("root", metavar="ROOT", type=Path, help="its folder")
     parser.add_argument("--out", metavar="STORE.h5", type=Path, required=True, help="the store to write")
@@ -48,20 +47,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pairs.add_argument("--gap", type=int, default=1, help="frames apart (default: %(default)s)")
     pairs.add_argument("--pairs", metavar="FILE", type=Path, help="two names a line, as hloc lists them")
     pairs.add_argument("--min-points", metavar="N", type=int, help="colmap: pairs that share at least N points")
+    pairs.add_argument("--exhaustive", dest="gap", action="store_const", const=None, help="all pairs of frames")
     match = parser.add_argument_group("matching")
-    for option, names in (("detector", DETECTORS), ("matcher", MATCHERS)):
-        text = f"{', '.join(names)} (default: %(default)s)"
-        match.add_argument(f"--{option}", metavar="NAME", choices=names, default=getattr(options, option), help=text)
+    add_matching_arguments(match)
     for option, text in (
-        ("num_features", "of an image"),
         ("max_matches", "per pair, of those that fail the ratio test and of others; 0 keeps all"),
         ("seed", "seed of the order of matches"),
     ):
-        default, name = getattr(options, option), f"--{option.replace('_', '-')}"
-        match.add_argument(name, metavar="N", type=int, default=default, help=f"{text} (default: %(default)s)")
+        _add_number(match, option, text)
+
+
+def add_matching_arguments(match: argparse._ArgumentGroup) -> None:
+    """Add the arguments that say which features are matched, how, and where it is computed."""
+    for option, names in (("detector", DETECTORS), ("matcher", MATCHERS)):
+        text, default = f"{', '.join(names)} (default: %(default)s)", getattr(MatchOptions, option)
+        match.add_argument(f"--{option}", metavar="NAME", choices=names, default=default, help=text)
+    _add_number(match, "num_features", "of an image")
     where = match.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=int, default=-1, help="processes here; -1 for all cores (default: %(default)s)")
     where.add_argument("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
+
+
+def _add_number(match: argparse._ArgumentGroup, option: str, text: str) -> None:
+    default, name = getattr(MatchOptions, option), f"--{option.replace('_', '-')}"
+    match.add_argument(name, metavar="N", type=int, default=default, help=f"{text} (default: %(default)s)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -86,10 +95,7 @@ def run(args: argparse.Namespace) -> int:
     about = {"dataset": f"{DATASETS[args.reader][0]} {', '.join(names)}{resized}", "pairs": pairing}
     wrote = "" if args.out.exists() else "wrote "
     skipped = collect_matches(pairs, args.out, options, about, args.jobs, args.dask)
-    for pair, reason in list(skipped.items())[:MAX_LISTED]:
-        print(f"skipped {pair}: {reason}", file=sys.stderr)
-    if len(skipped) > MAX_LISTED:
-        print(f"skipped {len(skipped)} pairs in all; the store lists them", file=sys.stderr)
+    print_skipped(skipped)
     store = read_store(args.out)
     known = int(np.isfinite(store.F).all((1, 2)).sum())
     print(f"{wrote}{args.out}: {len(store)} pairs, {known} with ground truth, {store.offsets[-1]} matches")
@@ -97,6 +103,14 @@ def run(args: argparse.Namespace) -> int:
     if 1 < len(parts) <= MAX_LISTED:
         print("sequences: " + ", ".join(f"{name or '.'} @{first}:{stop}" for name, first, stop in parts))
     return 0
+
+
+def print_skipped(skipped: dict[str, str]) -> None:
+    """Print, to standard error, which pairs could not be matched and why."""
+    for pair, reason in list(skipped.items())[:MAX_LISTED]:
+        print(f"skipped {pair}: {reason}", file=sys.stderr)
+    if len(skipped) > MAX_LISTED:
+        print(f"skipped {len(skipped)} pairs in all; the store lists them", file=sys.stderr)
 
 
 def _sequences(store: CorrespondenceStore) -> list[tuple[str, int, int]]:

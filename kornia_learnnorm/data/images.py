@@ -6,7 +6,7 @@ Pillow, of the extra ``images``, is imported on use. The centre of the top left 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from kornia_learnnorm.optional import import_extra
 
 __all__ = ["Size", "check_grey", "content_mask", "focal_length_35mm", "image_size", "import_cv2", "read_colour"]
 __all__ += ["read_image", "read_mask", "reduced_size", "resize_image", "scale_points", "scaling"]
+__all__ += ["stored_pixels"]
 
 Size = tuple[int, int]  # width and height, pixels
 
@@ -30,6 +31,7 @@ REDUCING_GAP = 2.0  # the last step of reducing, which is filtered, is by this f
 # EXIF 2.32, sections 4.6.3 to 4.6.5
 ORIENTATION, EXIF_IFD, FOCAL_LENGTH_35MM = 0x0112, 0x8769, 0xA405  # tags
 QUARTER_TURNS = (5, 6, 7, 8)  # orientations that swap width and height
+MIRRORED_X, MIRRORED_Y = (2, 3, 7, 8), (3, 4, 6, 7)  # orientations of files whose x or y run the other way
 # Names in PIL.Image.Transpose of the turns that undo the orientations from 2 on.
 TURNS = ("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90")
 MAX_BLACK = 2  # largest grey value of a black frame
@@ -127,6 +129,26 @@ def _orientation(image: Any) -> int:
     if "exif" not in image.info:  # getexif() would decode a whole PNG
         return 1
     return int(image.getexif().get(ORIENTATION) or 1)
+
+
+def stored_pixels(
+    path: Path, points: NDArray[Any], size: Sequence[int], turned: bool = True
+) -> tuple[NDArray[np.float64], Size]:
+    """Return pixels (N, 2) and the (width, height) of an image that EXIF turns in the file as it is stored.
+
+    They are returned as they are, in float64, if they are not ``turned``.
+    """
+    turn = 1
+    if turned:
+        with open_image(path) as image:
+            turn = _orientation(image)
+    x, y = np.asarray(points, np.float64).T
+    width, height = map(int, size)
+    if turn in QUARTER_TURNS:
+        x, y, width, height = y, x, height, width
+    x = width - 1 - x if turn in MIRRORED_X else x
+    y = height - 1 - y if turn in MIRRORED_Y else y
+    return np.stack([x, y], -1), (width, height)
 
 
 def focal_length_35mm(path: Path) -> float:

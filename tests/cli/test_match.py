@@ -37,6 +37,7 @@ def run(*args) -> int:
         ("kitti", ["--split", "test", "--gap", "2", "--camera", "image_1"], 2, 2),
         ("tum", ["--split", "val", "--max-difference", "0.001"], 3, 0),  # no pose is so near
         ("cambridge", ["--split", "train"], 3, 3),
+        ("folder", ["--exhaustive"], 21, 0),
     ],
 )
 def test_readers(written, tmp_path, capsys, reader, args, pairs, known):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import groupby
+from itertools import combinations, groupby, starmap
 from pathlib import Path
 
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs
@@ -15,12 +15,15 @@ __all__ = ["choose_pairs", "listed_pairs", "pair_frames"]
 
 def choose_pairs(
     frames: Sequence[Frame],
-    gap: int = 1,
+    gap: int | None = 1,
     listed: Path | None = None,
     model: Path | None = None,
     min_points: int | None = None,
 ) -> tuple[list[FramePair], str]:
-    """Return pairs of frames and, in words, how they were chosen: listed, by common points, or ``gap`` apart."""
+    """Return pairs of frames and, in words, how they were chosen: listed, by common points, or ``gap`` apart.
+
+    Without a ``gap``, None, they are all pairs.
+    """
     found: Iterable[FramePair]
     if listed is not None:
         found, text = listed_pairs(frames, listed), f"listed in {listed.name}"
@@ -28,6 +31,8 @@ def choose_pairs(
         if model is None:
             raise ValueError(f"min_points {min_points} needs a COLMAP model, got none")
         found, text = covisible_pairs(model, frames, min_points), f"sharing at least {min_points} points"
+    elif gap is None:
+        found, text = starmap(FramePair, combinations(frames, 2)), "all pairs"
     else:
         found, text = pair_frames(frames, gap), "consecutive frames" if gap == 1 else f"frames {gap} apart"
     pairs = list(found)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from make_sequences import names
 
 from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.datasets.pairing import listed_pairs, pair_frames
+from kornia_learnnorm.data.datasets.pairing import choose_pairs, listed_pairs, pair_frames
 
 
 def numbered(*sequences: str) -> list[Frame]:
@@ -22,6 +22,11 @@ class TestPairFrames:
     def test_wrong_gap(self):
         with pytest.raises(ValueError, match="at least 1, got 0"):
             list(pair_frames(numbered("x"), 0))
+
+    def test_all_pairs(self):
+        pairs, text = choose_pairs(numbered("x", "y"), gap=None)
+        assert text == "all pairs"
+        assert len({frozenset(both) for both in names(pairs)}) == len(pairs) == 8 * 7 / 2
 
 
 class TestListedPairs:

@@ -1,0 +1,81 @@
+"""Write a COLMAP database from a folder of images or their matches: ``learnnorm export-colmap``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from kornia_learnnorm.cli.match import add_matching_arguments, print_skipped
+from kornia_learnnorm.data.cameras import read_camera
+from kornia_learnnorm.data.datasets.pairing import choose_pairs
+from kornia_learnnorm.data.datasets.reading import read_dataset
+from kornia_learnnorm.data.hloc import read_hloc
+from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
+from kornia_learnnorm.data.matching.workers import check_jobs
+from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.protocol import INLIER_THRESHOLD
+from kornia_learnnorm.two_view.colmap_database import check_database, export_colmap
+
+__all__ = ["EXAMPLES", "add_arguments", "run"]
+
+EXAMPLES = """\
+learnnorm export-colmap PHOTOS --out photos.db --single-camera
+learnnorm export-colmap PHOTOS --out photos.db --matches photos.h5"""
+NEXT = """\
+to reconstruct: mkdir sparse && python -c "import pycolmap; pycolmap.incremental_mapping('{}', '{}', 'sparse')\""""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``learnnorm export-colmap`` to a parser."""
+    parser.add_argument("root", metavar="ROOT", type=Path, help="folder of the images; its subfolders count")
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="the database to write")
+    pairs = parser.add_argument_group("pairs (default: all)").add_mutually_exclusive_group()
+    pairs.add_argument("--gap", metavar="N", type=int, help="only images N apart, by name")
+    pairs.add_argument("--pairs", metavar="FILE", type=Path, help="two names a line, as hloc lists them")
+    text = "a store of learnnorm match, or hloc's features and matches, in place of matching"
+    pairs.add_argument("--matches", metavar="STORE", type=Path, nargs="+", default=[], help=text)
+    add = parser.add_argument_group("cameras").add_argument
+    add("--K", metavar="CAMERA", help="of all images: fx,fy,cx,cy or a file (default: EXIF)")
+    add("--single-camera", action="store_true", help="all images share one camera")
+    add = parser.add_argument_group("estimation").add_argument
+    add("--weights", metavar="NAME_OR_PATH", help="a learned layer in the place of RANSAC")
+    text = "largest distance of inliers (default: %(default)s)"
+    add("--threshold", metavar="PX", type=float, default=INLIER_THRESHOLD, help=text)
+    add("--seed", metavar="N", type=int, default=0, help="of RANSAC (default: %(default)s)")
+    add_matching_arguments(parser.add_argument_group("matching"))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Match the images where no matches are given, into a store beside the database, and write the database."""
+    check_database(args.out)
+    check_jobs(args.jobs)
+    K = None if args.K is None else read_camera(args.K)
+    layer = None if args.weights is None else LearnedEightPoint.from_pretrained(args.weights)
+    options = {"layer": layer, "threshold": args.threshold, "seed": args.seed, "jobs": args.jobs}
+    store = _matches(args)
+    turned = len(args.matches) != 2
+    counts = export_colmap(store, args.root, args.out, K, args.single_camera, turned=turned, **options)
+    print(
+        f"wrote {args.out}: {counts.images} images; {counts.verified} of {counts.pairs} pairs verified, "
+        f"{counts.inliers} of {counts.matches} matches are their inliers"
+    )
+    print(NEXT.format(args.out, args.root), file=sys.stderr)
+    return 0
+
+
+def _matches(args: argparse.Namespace) -> CorrespondenceStore:
+    if len(args.matches) > 2:
+        raise ValueError(f"--matches: a store, or hloc's features and matches expected, got {len(args.matches)} files")
+    if args.matches:
+        return read_store(*args.matches) if len(args.matches) == 1 else read_hloc(*args.matches)
+    frames = read_dataset("folder", args.root)
+    pairs, pairing = choose_pairs(frames, args.gap, args.pairs)
+    print(f"{len(frames)} images; {len(pairs)} pairs ({pairing})", file=sys.stderr)
+    store = args.out.with_suffix(".h5")
+    options = MatchOptions(args.detector, args.num_features, args.matcher, max_matches=None)
+    print_skipped(
+        collect_matches(pairs, store, options, {"dataset": str(args.root), "pairs": pairing}, args.jobs, args.dask)
+    )
+    return read_store(store)

@@ -1,0 +1,240 @@
+"""Matches and their two-view geometries as a database that COLMAP reconstructs. pycolmap is imported on use.
+
+Pixels are COLMAP's in all private functions: they begin at the corner of the first pixel, not at its centre.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kornia_learnnorm.data.images import Size, stored_pixels
+from kornia_learnnorm.data.matching.workers import open_workers
+from kornia_learnnorm.data.store import CorrespondenceStore
+from kornia_learnnorm.data.writer import check_target
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.optional import import_extra
+from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
+from kornia_learnnorm.two_view.estimate_matches import estimate_matches
+from kornia_learnnorm.two_view.inputs import check_settings, read_cameras
+from kornia_learnnorm.two_view.parallax import find_main_plane
+from kornia_learnnorm.two_view.result import NoReliableMatrixError
+
+__all__ = ["DatabaseCounts", "check_database", "export_colmap"]
+
+CORNER = 0.5  # pixels from the corner of the first pixel to its centre
+MIN_INLIERS = 15  # of a verified pair, COLMAP's own number
+Array = NDArray[np.float64]
+
+
+class DatabaseCounts(NamedTuple):
+    """What a database holds."""
+
+    images: int
+    pairs: int
+    matches: int
+    verified: int  # pairs with a two-view geometry
+    inliers: int  # of the verified pairs
+
+
+class _Pair(NamedTuple):
+    names: tuple[str, str]
+    sizes: tuple[Size, Size]  # (width, height)
+    points1: Array  # (N, 2)
+    points2: Array
+    scores: Array  # (N,)
+    scored: bool  # by a matcher, not by the ratio test
+
+
+class _Geometry(NamedTuple):
+    config: str  # a name of pycolmap.TwoViewGeometryConfiguration
+    matrices: dict[str, Array]  # F, E, H, (3, 3), where there are some
+    pose: tuple[Array, Array] | None  # R (3, 3) and t (3,)
+    points1: Array  # of the inliers, (N, 2)
+    points2: Array
+
+
+def export_colmap(
+    store: CorrespondenceStore,
+    images: str | Path,
+    path: str | Path,
+    K: Array | None = None,
+    single_camera: bool = False,
+    layer: LearnedEightPoint | None = None,
+    threshold: float = INLIER_THRESHOLD,
+    seed: int = 0,
+    ratio: float = RATIO,
+    turned: bool = True,
+    jobs: int = -1,
+) -> DatabaseCounts:
+    """Write the matches of a store and their two-view geometries as a COLMAP database, and return what it holds.
+
+    :func:`~kornia_learnnorm.estimate_matches` estimates each pair: a fundamental matrix, the homography of its main
+    plane, and with ``K`` an essential matrix and a pose. A pair with fewer than 15 inliers, or no more than random
+    matches have, gets no geometry. Keypoints are the matched points. ``pycolmap.incremental_mapping`` and
+    ``colmap mapper`` reconstruct from the database.
+
+    Args:
+        store: matches of images at full size; of two pairs of the same images, the first counts.
+        images: folder that the names in the store start from.
+        path: the database to write; there must be none yet.
+        K: camera (3, 3) of all images, pixels, without distortion. When not given, COLMAP derives cameras from EXIF, or
+            from 1.2 times the longer side.
+        single_camera: whether all images share one camera; with ``K`` they do.
+        layer: estimates the matrices in the place of RANSAC.
+        threshold: largest symmetric epipolar distance of an inlier, pixels.
+        seed: seed of RANSAC.
+        ratio: largest ratio of the nearest to the second-nearest descriptor distance, of matches that have one.
+        turned: whether the points are those of images turned by EXIF, as a store has them, or of the files as they are,
+            as hloc and COLMAP read them.
+        jobs: number of processes, -1 for one a core.
+
+    Raises:
+        FileNotFoundError: if an image is missing.
+        FileExistsError: if there is a file at ``path``.
+        TypeError: if an argument is of a wrong type.
+        ValueError: if an argument is out of range, or COLMAP cannot read an image or finds another size than the store.
+        ImportError: if pycolmap is not installed.
+
+    """
+    pycolmap = import_extra("pycolmap", "colmap", "writing a COLMAP database")
+    tqdm = import_extra("tqdm", "images", "estimating many pairs").tqdm
+    images, path = Path(images), Path(path)
+    check_database(path)
+    check_settings(threshold, seed, layer)
+    read_cameras(K, K)
+    names = sorted({name for both in store.names for name in both})
+    if missing := [name for name in names if not (images / name).is_file()]:
+        raise FileNotFoundError(f"{len(missing)} of {len(names)} images are not in {images}, the first is {missing[0]}")
+    camera = None if K is None else K + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]])
+    pairs = _read_pairs(store, images, ratio, turned)
+    with atomic_write(path) as temporary:
+        ids = _write_images(pycolmap, temporary, images, pairs, camera, single_camera)
+        arguments = ((pair, layer, threshold, seed, camera) for pair in pairs)
+        with open_workers(jobs) as workers, workers.results(_estimate, arguments) as results:
+            found = [*tqdm(results, "estimating", len(pairs), unit="pair", file=sys.stderr)]
+        _write_pairs(pycolmap, temporary, ids, pairs, found)
+    inliers = [len(geometry.points1) for geometry in found if geometry is not None]
+    matches = sum(len(pair.scores) for pair in pairs)
+    return DatabaseCounts(len(ids), len(pairs), matches, len(inliers), sum(inliers))
+
+
+def check_database(path: Path) -> None:
+    """Raise a clear error unless a COLMAP database can be written to a path."""
+    import_extra("pycolmap", "colmap", "writing a COLMAP database")
+    if path.exists():
+        raise FileExistsError(f"{path} exists already: remove it, or write elsewhere")
+    check_target(path)
+
+
+def _read_pairs(store: CorrespondenceStore, images: Path, ratio: float, turned: bool) -> list[_Pair]:
+    """Return the pairs of a store, each two images once, in pixels of the files as they are."""
+    pairs: dict[frozenset[str], _Pair] = {}
+    for place, names in enumerate(store.names):
+        rows = store.rows(place, ratio)
+        (points1, size1), (points2, size2) = [
+            stored_pixels(images / name, points[rows], size, turned)
+            for name, points, size in zip(names, (store.points1, store.points2), store.image_size[place], strict=True)
+        ]
+        scored = bool(np.isnan(store.ratio[rows]).all())
+        scores = store.score[rows].astype(np.float64)
+        pair = _Pair(names, (size1, size2), points1 + CORNER, points2 + CORNER, scores, scored)
+        pairs.setdefault(frozenset(names), pair)
+    return [*pairs.values()]
+
+
+def _estimate(
+    pair: _Pair, layer: LearnedEightPoint | None, threshold: float, seed: int, camera: Array | None
+) -> _Geometry | None:
+    """Return the geometry of a pair, or None where too few matches agree."""
+    matches = pair.points1, pair.points2, pair.scores
+    sampler = WeightedSampler if pair.scored else ProsacSampler
+    try:
+        found = estimate_matches(*matches, *pair.sizes, layer, threshold, seed, camera, camera, sampler)
+    except NoReliableMatrixError:
+        return None
+    codes = {warning.code for warning in found.warnings}
+    inliers = found.points1[found.inliers], found.points2[found.inliers]
+    if found.num_inliers < MIN_INLIERS or "chance" in codes:
+        return None
+    H_mat = find_main_plane(*inliers, threshold)
+    matrices = {"F": found.F_mat, "E": found.E_mat, "H": H_mat}
+    config = "PLANAR_OR_PANORAMIC" if "planar" in codes else "UNCALIBRATED" if camera is None else "CALIBRATED"
+    return _Geometry(
+        config,
+        {name: matrix.numpy() for name, matrix in matrices.items() if matrix is not None},
+        None if found.R is None or found.t is None else (found.R.numpy(), found.t.numpy()),
+        *(points.numpy() for points in inliers),
+    )
+
+
+def _write_images(
+    pycolmap: Any, database: Path, images: Path, pairs: Sequence[_Pair], camera: Array | None, single_camera: bool
+) -> dict[str, int]:
+    """Write images and cameras to a database and return the number of each image."""
+    sizes = {name: size for pair in pairs for name, size in zip(pair.names, pair.sizes, strict=True)}
+    options = pycolmap.ImageReaderOptions()
+    if camera is not None:
+        options.camera_model = "PINHOLE"
+        options.camera_params = ",".join(str(camera[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    mode = pycolmap.CameraMode.AUTO if camera is None and not single_camera else pycolmap.CameraMode.SINGLE
+    pycolmap.import_images(database, images, mode, sorted(sizes), options)
+    with pycolmap.Database.open(database) as file:
+        found = {image.name: image for image in file.read_all_images()}
+        if missing := sorted(sizes.keys() - found.keys()):
+            text = f"COLMAP leaves out {len(missing)} of {len(sizes)} images, the first is {missing[0]}: a file that it"
+            raise ValueError(f"{text} cannot read or, where all share one camera, of another size")
+        for name, image in found.items():
+            stored = file.read_camera(image.camera_id)
+            read = stored.width, stored.height
+            if sizes[name] != read:
+                text = "{} was matched at {} x {} pixels, COLMAP reads {} x {}: match images at full size"
+                raise ValueError(text.format(name, *sizes[name], *read))
+        return {name: image.image_id for name, image in found.items()}
+
+
+def _write_pairs(
+    pycolmap: Any,
+    database: Path,
+    ids: dict[str, int],
+    pairs: Sequence[_Pair],
+    geometries: Sequence[_Geometry | None],
+) -> None:
+    """Write keypoints, which are all matched points of an image, matches and geometries to a database."""
+    seen: defaultdict[str, list[Array]] = defaultdict(list)
+    for pair in pairs:
+        for name, points in zip(pair.names, (pair.points1, pair.points2), strict=True):
+            seen[name].append(points)
+    keypoints = {name: np.unique(np.concatenate(parts), axis=0) for name, parts in seen.items()}
+    places = {name: {tuple(point): n for n, point in enumerate(points.tolist())} for name, points in keypoints.items()}
+
+    def indices(pair: _Pair, points1: Array, points2: Array) -> NDArray[np.uint32]:
+        views = zip(pair.names, (points1, points2), strict=True)
+        columns = [[places[name][tuple(point)] for point in points.tolist()] for name, points in views]
+        return np.array(columns, np.uint32).T
+
+    with pycolmap.Database.open(database) as file, pycolmap.DatabaseTransaction(file):
+        for name, points in keypoints.items():
+            file.write_keypoints(ids[name], points.astype(np.float32))
+        for pair, found in zip(pairs, geometries, strict=True):
+            numbers = ids[pair.names[0]], ids[pair.names[1]]
+            file.write_matches(*numbers, indices(pair, pair.points1, pair.points2))
+            if found is None:
+                continue
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = int(getattr(pycolmap.TwoViewGeometryConfiguration, found.config))
+            geometry.inlier_matches = indices(pair, found.points1, found.points2)
+            for name, matrix in found.matrices.items():
+                setattr(geometry, name, matrix)
+            if found.pose is not None:
+                R, t = found.pose
+                geometry.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(R), t)
+            file.write_two_view_geometry(*numbers, geometry)
