@@ -23,8 +23,7 @@ __all__ = ["EXAMPLES", "add_arguments", "run"]
 EXAMPLES = """\
 learnnorm export-colmap PHOTOS --out photos.db --single-camera
 learnnorm export-colmap PHOTOS --out photos.db --matches photos.h5"""
-NEXT = """\
-to reconstruct: mkdir sparse && python -c "import pycolmap; pycolmap.incremental_mapping('{}', '{}', 'sparse')\""""
+NEXT = "to reconstruct: python -c \"import pycolmap; pycolmap.incremental_mapping('{}', '{}', 'sparse')\""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
