@@ -9,6 +9,7 @@ each file. sizes.json is what benchmarks/sizes.py writes with --json. The README
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import re
 import sys
@@ -392,5 +393,6 @@ def rates_plot(name: str, stores: dict[str, int]) -> HTML:
 if __name__ == "__main__":
     plt.style.use(Path(__file__).parent / "matplotlibrc")
     with plt.rc_context({"svg.hashsalt": "sizes"}):
-        draw_relative(GREY_INK).savefig(sys.argv[1], metadata={"Date": None}, transparent=True)
+        source = hashlib.sha256((RESULTS / "sizes.json").read_bytes()).hexdigest()  # tests ask whether it is current
+        draw_relative(GREY_INK).savefig(sys.argv[1], metadata={"Date": None, "Source": source}, transparent=True)
     print(poses_summary().data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import importlib.util
 import json
 import re
@@ -119,6 +120,12 @@ def test_the_readme_has_poses_of_the_results():
     table = re.findall(r"^\| [^|]+ \| (\d+\.\d \| .*) \|$", TEXTS["README.md"], flags=re.MULTILINE)
     assert len(table) == 6
     assert [row for row in table if row.split(" | ") not in expected] == []
+
+
+def test_the_picture_of_the_readme_is_of_the_results():
+    """If not, run python docs/results_tables.py docs/images/sizes.svg."""
+    source = hashlib.sha256((DOCS / "results/sizes.json").read_bytes()).hexdigest()
+    assert source in (DOCS / "images/sizes.svg").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.name)
