@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
+from kornia_learnnorm.estimators.fundamental_stages import FundamentalRefinement
 from kornia_learnnorm.estimators.linear import essential_matrix, prepare_problem, solve_undetermined
-from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES
+from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
-from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, run_stages
-from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, read_condition
+from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, run_stages
+from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, check_whole_number, read_condition
 from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
@@ -44,15 +45,15 @@ class LearnedLayer(MatchLayer):
     features, residual_features, outputs = POINT_FEATURES, RESIDUAL_FEATURES, 2 * TRANSFORM_PARAMS
     # Arguments that files hold.
     architecture: tuple[str, ...] = ("width", "depth", "stages", "learn_transforms", "refine_steps")
+    added: ClassVar[dict[str, Any]] = {}  # those that files of earlier versions lack
 
     def __init__(
         self, model: TwoViewModel, width: int, depth: int, stages: int, learn_transforms: bool, refine_steps: int
     ) -> None:
         super().__init__()
-        numbers = {"width": (width, 1), "depth": (depth, 1), "stages": (stages, 1), "refine_steps": (refine_steps, 0)}
-        for name, (number, least) in numbers.items():
-            if not isinstance(number, int) or number < least:
-                raise ValueError(f"{name} must be a whole number, at least {least}, got {number!r}")
+        for name, number in {"width": width, "depth": depth, "stages": stages}.items():
+            check_whole_number(name, number, 1)
+        check_whole_number("refine_steps", refine_steps, 0)
         if not isinstance(learn_transforms, bool):
             raise ValueError(f"learn_transforms must be true or false, got {learn_transforms!r}")
         self.model, self.width, self.depth, self.stages = model, width, depth, stages
@@ -100,7 +101,7 @@ class LearnedLayer(MatchLayer):
 
         def build(path: Path, text: str) -> LearnedLayer:
             try:
-                architecture = dict(json.loads(text))
+                architecture = cls.added | dict(json.loads(text))
                 model = architecture.pop("model", Fundamental.name)  # files before the name was written
                 if model != cls.model_name:
                     raise ValueError(f"it estimates matrices of the model {model!r}, expected {cls.model_name!r}")
@@ -149,7 +150,10 @@ class LearnedLayer(MatchLayer):
     def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return matrices (B, S, 3, 3) and logits (B, S, N) of stages and final estimate, of determined sets."""
         options = self.learn_transforms, self.refine_steps, self.detach_stages
-        return run_stages(self.model, self.networks, problem, scores, *options)
+        return run_stages(self.model, self.networks, problem, scores, *options, self._refinement)
+
+    def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
+        return Refinement(self.model, problem, frame)
 
 
 class LearnedEstimate(NamedTuple):
@@ -175,9 +179,13 @@ class LearnedEightPoint(LearnedLayer):
     .. math:: w_i = \frac{\sigma(l_i)}{\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2}
 
     (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds an
-    SPD transform and Hartley's is that of the weighted points. A few robust steps of Levenberg-Marquardt on the Sampson
+    SPD transform and Hartley's is that of the weighted points. A few steps of reweighted least squares on the Sampson
     distances, weighted by :math:`\sigma(l_i)`, end each stage
-    (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`).
+    (:func:`~kornia_learnnorm.estimators.moments.descend`).
+
+    In the last stage, from 16 correspondences on, minimal samples of seven are drawn by :math:`\sigma(l_i)`. The matrix
+    of least robust cost over all correspondences, of these and of the network's, is fitted to all of them, weighted by
+    :math:`\sigma(l_i)^{0.2}`.
 
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
     their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
@@ -196,6 +204,7 @@ class LearnedEightPoint(LearnedLayer):
             networks get no gradient (``find_unused_parameters=True`` of DistributedDataParallel).
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
         refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
+        samples: minimal samples in the last stage; without (0), the last fit is that of the other stages.
 
     Attributes:
         detach_stages: send no gradient from a stage into the one before and don't refine the last, as when the layer
@@ -214,7 +223,8 @@ class LearnedEightPoint(LearnedLayer):
     """
 
     model_name = Fundamental.name
-    architecture = ("width", "depth", "stages", "learn_transforms", "rank2", "refine_steps")
+    architecture = ("width", "depth", "stages", "learn_transforms", "rank2", "refine_steps", "samples")
+    added: ClassVar[dict[str, Any]] = {"samples": 64}
 
     def __init__(
         self,
@@ -223,10 +233,15 @@ class LearnedEightPoint(LearnedLayer):
         stages: int = 3,
         learn_transforms: bool = True,
         rank2: Literal["projection", "optimal"] = "projection",
-        refine_steps: int = 10,
+        refine_steps: int = 6,
+        samples: int = 64,
     ) -> None:
         super().__init__(Fundamental(rank2), width, depth, stages, learn_transforms, refine_steps)
-        self.rank2 = rank2
+        check_whole_number("samples", samples, 0)
+        self.rank2, self.samples = rank2, samples
+
+    def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
+        return FundamentalRefinement(self.model, problem, frame, self.samples)
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:

@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.homography_stages import HomographyRefinement
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
 from kornia_learnnorm.estimators.match_features import CommonFrame
-from kornia_learnnorm.estimators.stages import run_stages
+from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.homography import Homography
 
@@ -149,6 +149,8 @@ class LearnedHomography(LearnedLayer):
         points1, points2 = problem.points1, problem.points2
         points1, points2 = torch.where(swapped, points2, points1), torch.where(swapped, points1, points2)
         ordered = LinearProblem.from_points(points1, points2, problem.weights, self.model)
-        options = self.learn_transforms, self.refine_steps, self.detach_stages, HomographyRefinement
-        M, logits = run_stages(self.model, self.networks, ordered, scores, *options)
+        M, logits = super()._run(ordered, scores)
         return torch.where(swapped[..., None], self.model.swap(M), M), logits
+
+    def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
+        return HomographyRefinement(Homography(), problem, frame)

@@ -10,7 +10,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, pad
 
-from kornia_learnnorm.geometry.checks import check_correspondences, check_mask, check_tensor, read_condition
+from kornia_learnnorm.geometry.checks import (
+    check_correspondences,
+    check_mask,
+    check_tensor,
+    check_whole_number,
+    read_condition,
+)
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
 __all__ = ["MatchRefiner", "RefinedMatches", "local_frames"]
@@ -83,9 +89,8 @@ class MatchRefiner(nn.Module):
 
     def __init__(self, patch_size: int = 11, width: int = 64, bound: float = 1.5) -> None:
         super().__init__()
-        for name, number, least in (("patch_size", patch_size, 5), ("width", width, 1)):
-            if not isinstance(number, int) or number < least:
-                raise ValueError(f"{name} must be a whole number, at least {least}, got {number!r}")
+        check_whole_number("patch_size", patch_size, 5)
+        check_whole_number("width", width, 1)
         if patch_size % 2 == 0:
             raise ValueError(f"patch_size must be odd, got {patch_size}")
         if not bound > 0:

@@ -16,7 +16,7 @@ from kornia_learnnorm.estimators.pose_stages import (
     POSE_RESIDUAL_FEATURES,
     run_pose_stages,
 )
-from kornia_learnnorm.geometry.checks import check_cameras
+from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number
 from kornia_learnnorm.geometry.dlt import MIN_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.pose import choose_pose
@@ -97,8 +97,7 @@ class LearnedRelativePose(LearnedLayer):
     ) -> None:
         eye = torch.eye(3)[None]
         super().__init__(Essential(eye, eye), width, depth, stages, False, refine_steps)
-        if not isinstance(samples, int) or samples < 0:
-            raise ValueError(f"samples must be a whole number, at least 0, got {samples!r}")
+        check_whole_number("samples", samples, 0)
         self.samples = samples
 
     @classmethod

@@ -34,7 +34,7 @@ def run_stages(
     learn_transforms: bool,
     refine_steps: int,
     detach_stages: bool,
-    refinement: Callable[..., Refinement] | None = None,
+    refinement: Callable[[LinearProblem, CommonFrame], Refinement],
 ) -> tuple[Tensor, Tensor]:
     """Return matrices (B, S, 3, 3) and logits (B, S, N) of the stages, for sets that determine their matrix.
 
@@ -46,7 +46,7 @@ def run_stages(
     features, factor = match_features(frame, scores, present), None
     found: list[tuple[Tensor, Tensor]] = []
     with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
-        refine = (refinement or Refinement)(model, problem, frame)
+        refine = refinement(problem, frame)
     dtype = next(networks.parameters()).dtype
     for network in networks:
         seen = features

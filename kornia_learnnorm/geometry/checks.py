@@ -17,6 +17,7 @@ __all__ = [
     "check_matrices",
     "check_pairs",
     "check_tensor",
+    "check_whole_number",
     "needs_gradient",
     "read_condition",
     "safe_divisor",
@@ -148,6 +149,12 @@ def read_condition(condition: Tensor) -> bool | None:
         return bool(condition)
     except RuntimeError:
         return None
+
+
+def check_whole_number(name: str, value: object, least: int) -> None:
+    """Raise a ValueError for anything but a whole number of at least ``least``."""
+    if not isinstance(value, int) or value < least:
+        raise ValueError(f"{name} must be a whole number, at least {least}, got {value!r}")
 
 
 def needs_gradient(*values: Tensor | None) -> bool:

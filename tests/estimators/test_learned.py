@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from scenes import (
     check_gradients,
     correspondences,
     rewrite_weights,
+    scenes,
     seeded,
     shaken_estimator,
     signless,
@@ -83,6 +86,40 @@ class TestSmallSets:
         assert up_to_sign(layer(*points).detach(), kln.find_fundamental(*points)) < 1e-6
 
 
+class TestSamples:
+    def test_find_the_matrix_where_the_weights_do_not(self):
+        """An untrained network gives all matches the same weight."""
+        scene = scenes("handheld", 10, 200, noise=0.1)
+        points2 = scene.points2.clone()
+        points2[:, :60] = 600 * uniform(10, 60, 2, seed=3)
+        errors = []
+        for samples in (0, 256):
+            torch.manual_seed(0)
+            layer = kln.LearnedEightPoint(width=16, depth=1, stages=1, samples=samples).double()
+            with torch.no_grad():
+                F_mat = layer(scene.points1, points2)
+            errors.append(kln.symmetric_epipolar_distance(scene.points1[:, 60:], scene.points2[:, 60:], F_mat))
+        without, found = (error.median(1).values for error in errors)
+        assert (found < without / 4).double().mean() >= 0.8
+
+    @pytest.mark.parametrize("number", [9, 15, 16, 40])
+    def test_padding_has_no_effect(self, number):
+        """Few present matches are not searched, however many rows there are."""
+        points, layer = correspondences("handheld", 3, number), shaken_double()
+        padded = [torch.cat([p, p[:, :1].expand(-1, 20, -1)], 1) for p in points]
+        mask = torch.arange(number + 20).expand(3, -1) < number
+        assert up_to_sign(layer(*padded, mask=mask).detach(), layer(*points).detach()) < 1e-6
+
+    def test_gradcheck(self):
+        """With many steps derivatives are those of the optimum, wherever the fit began."""
+        points, layer = correspondences("handheld", 1, 20), shaken_double(refine_steps=60)
+
+        def numbers(points1, points2):
+            return signless(layer(points1, points2))
+
+        check_gradients(numbers, *points, atol=1e-4, rtol=1e-2)
+
+
 class TestEstimate:
     def test_smoke(self, device, dtype):
         layer = shaken_estimator(stages=3).to(device)
@@ -131,6 +168,7 @@ class TestEstimate:
             ({"stages": 0}, "stages must be .* 1, got 0"),
             ({"refine_steps": -1}, "refine_steps must be .* 0, got -1"),
             ({"width": 0}, "width must be"),
+            ({"samples": -1}, "samples must be .* 0, got -1"),
             ({"depth": 1.5}, "depth must be .* got 1.5"),
             ({"learn_transforms": "no"}, "learn_transforms must be .* got 'no'"),
             ({"rank2": "no"}, "rank2 must be"),
@@ -161,6 +199,17 @@ class TestFiles:
         assert not layer.training
         for key, value in expected.state_dict().items():
             assert torch.equal(layer.state_dict()[key], value)
+
+    def test_file_of_an_earlier_version(self, file):
+        """Before, there were no samples."""
+
+        def drop(_, metadata):
+            architecture = json.loads(metadata["architecture"])
+            del architecture["samples"]
+            metadata["architecture"] = json.dumps(architecture)
+
+        rewrite_weights(file, drop)
+        assert kln.LearnedEightPoint.from_pretrained(file).samples == 64
 
     @pytest.mark.parametrize(
         "architecture", ["", "[]", '{"widht": 3}', '{"width": 10000}', '{"stages": 0}', '{"rank2": "no"}']

@@ -27,11 +27,13 @@ from scenes import (
 from torch.nn.functional import normalize
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators import pose_stages
+from kornia_learnnorm.estimators import moments, pose_stages
 from kornia_learnnorm.estimators.match_features import CommonFrame
+from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.models.essential import Essential
+from kornia_learnnorm.models.fundamental import Fundamental
 
 pytestmark = pytest.mark.numerical
 
@@ -127,21 +129,24 @@ def test_finds_the_truth_without_noise(kind, num_points):
 
 
 @pytest.mark.parametrize("kind", ["handheld", "driving"])
-def test_steps_on_moments_end_at_the_optimum_of_the_distances(kind):
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_steps_on_moments_end_at_the_optimum_of_the_distances(kind, calibrated):
     points1, points2, K1, K2 = inputs(kind, 5, 200)
     points1, points2 = (
         points + torch.randn(points.shape, generator=seeded(1)).to(points) for points in (points1, points2)
     )
     frame = CommonFrame.from_points(points1, points2, None)
     x1, x2 = (torch.cat([x, torch.ones_like(x[..., :1])], -1).mT.contiguous() for x in (frame.x1, frame.x2))
-    model, scale = Essential.of_cameras(K1, K2, frame.T, frame.T), 2 * frame.T[:, 0, 0, None]
-    evidence = pose_stages._Evidence.from_frame(model, frame, x1, x2)
-    axes, weights = pose_stages._axes(true_essential(scenes(kind, 5, 200))), torch.ones_like(points1[..., 0])
-    found = pose_stages._essential(pose_stages._descend(evidence, axes, weights, lambda _: scale.square(), 60))
-    for i, best in enumerate(found):
-        own = Essential(model.C1[i : i + 1], model.C2[i : i + 1])
-        cost = RobustCost(own, x1[i : i + 1], x2[i : i + 1], weights[:1], GemanMcClure(float(scale[i])))
-        optimum = minimize(cost, own.calibrated(best[None]), 100, 1e-10)[1].state.essential()[0]
+    scale = 2 * frame.T[:, 0, 0, None]
+    model = Essential.of_cameras(K1, K2, frame.T, frame.T) if calibrated else Fundamental()
+    F_mat = frame.inverse.mT @ scenes(kind, 5, 200).F_mat @ frame.inverse
+    start, weights = model.state(F_mat / torch.linalg.matrix_norm(F_mat, keepdim=True)), torch.ones(5, 1, 200).double()
+    found = moments.descend(Evidence.from_points(x1, x2), start, weights, lambda _: scale.square()[:, None], 60)
+    for i, best in enumerate(found.matrix()):
+        row = slice(i, i + 1)
+        own = Essential(model.C1[row], model.C2[row]) if calibrated else model
+        cost = RobustCost(own, x1[row], x2[row], weights[0], GemanMcClure(float(scale[i])))
+        optimum = minimize(cost, own.state(best[None]), 100, 1e-10)[1].state.matrix()[0]
         assert up_to_sign(best, optimum) < 1e-5
 
 

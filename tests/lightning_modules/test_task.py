@@ -70,7 +70,7 @@ def test_samples_lower_the_loss(tmp_path, precision):
 @pytest.mark.parametrize(
     ("make", "labels", "steps", "least"),
     [
-        (layer_task, True, 20, 0.05),
+        (layer_task, True, 40, 0.05),
         (layer_task, False, 50, 0.01),
         (sets_task, True, 60, 0.02),
         (pose_task, True, 60, 0.05),

@@ -1,0 +1,191 @@
+r"""Robust fits of matrices :math:`x_2^\top M x_1 = 0` to the second moments of the correspondences' design rows.
+
+Correspondences enter a step through the :math:`9 \times 9` matrix of the second moments of their rows alone,
+:math:`\sum_i w_i a_i a_i^\top`, and through the moments of their points: it costs little for ten matches and for
+thousands. Fundamental and essential matrices share all of it; the state says on which manifold the steps stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
+from kornia_learnnorm.geometry.checks import safe_divisor
+
+__all__ = ["Evidence", "descend", "draw_samples", "evenly_ranked", "geometric_scale", "least_cost", "pick"]
+
+NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
+MIN_PIVOT = 1e-6  # of the largest one, of a minimal sample that is not degenerate, such as by drawing a match twice
+DAMPING = 1e-9  # of the mean diagonal of the normal matrix, added to it
+
+
+class Evidence(NamedTuple):
+    """Correspondences in the common frame, and what their Sampson distances under matrices are made of."""
+
+    x1: Tensor  # homogeneous points, (B, 3, N)
+    x2: Tensor
+    rows: Tensor  # of the design matrix, for column-major entries, (B, 9, N)
+    products: Tensor  # x1 x1^T and x2 x2^T, for the squared normals of lines, (B, 18, N)
+
+    @classmethod
+    def from_points(cls, x1: Tensor, x2: Tensor) -> Evidence:
+        """Return the evidence of homogeneous points (B, 3, N)."""
+        products = torch.cat([(x[:, :, None] * x[:, None]).flatten(1, 2) for x in (x1, x2)], 1)
+        return cls(x1, x2, (x1[:, :, None] * x2[:, None]).flatten(1, 2), products)
+
+    def select(self, index: Tensor) -> Evidence:
+        """Return the correspondences of given indices (B, M)."""
+        return Evidence(*(value.gather(2, index[:, None].expand(-1, value.shape[1], -1)) for value in self))
+
+    def single(self) -> Evidence:
+        """Return the same in float32, which is enough to compare matrices."""
+        return Evidence(*(value.float() for value in self))
+
+    def squares(self, F_mat: Tensor) -> tuple[Tensor, Tensor]:
+        """Return squared Sampson distances under matrices (B, S, 3, 3) and gradient factors, each (B, S, N).
+
+        The factors turn squared algebraic residuals into squared distances.
+        """
+        forms = torch.stack([F_mat[:, :, :2].mT @ F_mat[:, :, :2], F_mat[..., :2] @ F_mat[..., :2].mT], 2).flatten(2)
+        norms = forms @ self.products
+        floor = NORMAL_FLOOR**2 * F_mat.square().sum((2, 3))[..., None] + torch.finfo(norms.dtype).tiny
+        factor = 1 / (norms + floor)
+        return (F_mat.mT.flatten(2) @ self.rows).square() * factor, factor
+
+    def losses(self, F_mat: Tensor, square_scale: Tensor) -> Tensor:
+        """Return Geman and McClure's loss (B, S, N) under matrices (B, S, 3, 3), of a squared scale (B, S or 1, 1)."""
+        return UNROLLED_LOSS(self.squares(F_mat)[0] / square_scale.to(F_mat))[0]
+
+    def moments(self, weights: Tensor) -> Tensor:
+        """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9)."""
+        return (self.rows[:, None] * weights[:, :, None]) @ self.rows.mT[:, None]
+
+
+def descend(
+    evidence: Evidence,
+    state: Any,
+    weights: Tensor,
+    square_scale: Callable[[Tensor], Tensor],
+    steps: int,
+    relaxation: float = 1.0,
+) -> Any:
+    r"""Return the states of matrices, S of each set, after steps of reweighted least squares; differentiable.
+
+    Each is a Gauss-Newton step on :math:`e^\top (M - X) e` of new weights. With squared distances
+    :math:`(e^\top a_i)^2 / e^\top B_i e` and factors held, the moments
+    :math:`M = \sum_i w_i a_i a_i^\top / e^\top B_i e` alone have another optimum:
+    :math:`X = \sum_i w_i (e^\top a_i)^2 B_i / (e^\top B_i e)^2` is what the factors add to the gradient.
+
+    States hold (B S) matrices, weights are (B, S, N). ``square_scale`` gives the squared scale of Geman and McClure's
+    loss, (B, S or 1, 1), from the squared distances (B, S, N). Steps are ``relaxation`` times Gauss and Newton's.
+
+    Reference:
+        W. Chojnacki, M. Brooks, A. van den Hengel, D. Gawley, On the fitting of surfaces to data with covariances,
+        IEEE Transactions on Pattern Analysis and Machine Intelligence, 2000.
+
+    """
+    F_mat = state.matrix()
+    for _ in range(steps):
+        squares, factor = evidence.squares(torch.unflatten(F_mat, 0, (-1, weights.shape[1])))
+        share = weights * UNROLLED_LOSS(squares / square_scale(squares))[1] * factor
+        points = (share * squares) @ evidence.products.mT
+        state, F_mat = _gauss_newton(
+            evidence.moments(share).flatten(0, 1), points.flatten(0, 1), state, F_mat, relaxation
+        )
+    return state
+
+
+def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float) -> Callable[[Tensor], Tensor]:
+    r"""Return the function from squared distances (B, S, N) to their squared scale (B, S, 1).
+
+    It is the geometric mean over correspondences weighted by ``inliers`` (B, N), times :math:`n / (n - p)` of
+    :math:`n = (\sum_i w_i)^2 / \sum_i w_i^2` effective correspondences, at least :math:`p + 1`, and ``dof`` parameters
+    :math:`p`: a matrix that was fitted to few correspondences leaves distances that are too small. ``floor`` is added
+    to the squared distances.
+    """
+    share = (inliers / safe_divisor(inliers.sum(1, keepdim=True)))[:, None]
+    number = (1 / safe_divisor(share.square().sum(2, keepdim=True))).clamp(min=dof + 1.0)
+    factor = number / (number - dof)
+
+    def square_scale(squares: Tensor) -> Tensor:
+        return factor * (share * (squares + floor).log()).sum(2, keepdim=True).exp()
+
+    return square_scale
+
+
+def least_cost(M: Tensor, real: Tensor, losses: Tensor, weights: Tensor, number: int) -> Tensor:
+    """Return the real matrices of least weighted sums of losses (B, S, N), (B, number, 3, 3)."""
+    cost = (losses @ weights.to(losses)[..., None])[..., 0]
+    cost = torch.where(real & cost.isfinite(), cost, torch.inf)
+    best = cost.topk(min(number, cost.shape[1]), 1, largest=False).indices
+    return M.gather(1, best[..., None, None].expand(-1, -1, 3, 3))
+
+
+def pick(state: Any, index: Tensor, number: int) -> Any:
+    """Return, of ``number`` states of each set, those of given indices (B,)."""
+    rows = index + number * torch.arange(index.shape[0], device=index.device)
+    return type(state)(*(value[rows] for value in state))
+
+
+def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int) -> tuple[Tensor, Tensor]:
+    """Return the null spaces (B S, 9 - size, 3, 3) of minimal samples, and which have no larger one, (B S,) bool.
+
+    They are drawn by the weights (B, N), without a generator of random numbers.
+    ``order`` (B, N) sorts the correspondences by their weights. The samples are those of multiples of the powers of the
+    root of :math:`x^{d + 1} = x + 1` for d = ``size``, which spread evenly (M. Roberts, 2018).
+    """
+    shares = weights.gather(1, order).cumsum(1)
+    shares = shares / shares[:, -1:]
+    steps = EVEN_ROOTS[size] ** -torch.arange(1, size + 1, dtype=shares.dtype, device=shares.device)
+    chances = (torch.arange(1, number + 1, device=shares.device)[:, None] * steps).frac().flatten()
+    ranks = (shares[:, None, :-1] < chances[:, None]).sum(-1)
+    rows = evidence.select(order.gather(1, ranks)).rows
+    rows = torch.unflatten(rows, 2, (number, size)).transpose(1, 2).flatten(0, 1)  # (B S, 9, size)
+    Q, R = torch.linalg.qr(rows, mode="complete")
+    pivots = R.diagonal(dim1=-2, dim2=-1).abs()
+    determined = pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1)
+    return torch.unflatten(Q[..., size:].mT, -1, (3, 3)).mT, determined
+
+
+def evenly_ranked(order: Tensor, most: int) -> Tensor:
+    """Return at most so many of sorted correspondences (B, N), evenly over their ranks."""
+    number = order.shape[1]
+    few = min(number, most)
+    return order[:, torch.arange(few, device=order.device) * number // few]
+
+
+EVEN_ROOTS = {5: 1.1347241384015194, 7: 1.0969815577985598}
+
+
+def _gauss_newton(M: Tensor, points: Tensor, state: Any, F_mat: Tensor, relaxation: float) -> tuple[Any, Tensor]:
+    """Return the states and matrices after a step that lowers the cost of M - X (B, 9, 9), or unchanged.
+
+    ``points`` (B, 18) are the second moments of the points of both views that X is made of.
+    """
+    trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+    points1, points2 = points.view(-1, 2, 3, 3).unbind(1)
+    flat = _FLAT.to(M)
+    # Kronecker products: the normal of x1's line is the first two rows of F x1, that of x2's the first columns of F.
+    X = points1[:, :, None, :, None] * flat[:, None] + flat[:, None, :, None] * points2[:, None, :, None]
+    M, difference = M / (trace + (trace == 0)), (M - X.view(-1, 9, 9)) / (trace + (trace == 0))
+    tangents, e = state.tangents(), F_mat.mT.reshape(-1, 9, 1)
+    normal = tangents.mT @ M @ tangents
+    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
+    damped = normal + damping * torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
+    step = torch.linalg.solve_ex(damped, tangents.mT @ (difference @ e))[0]
+    moved = state.retract(-relaxation * step[..., 0])
+    moved_F = moved.matrix()
+    new = moved_F.mT.reshape(-1, 9, 1)
+    # A step at the optimum, whose derivative is the optimum's, may raise the cost by rounding.
+    lower = new.mT @ difference @ new <= e.mT @ difference @ e + torch.finfo(M.dtype).eps
+    found = []
+    for value, old in zip(moved, state, strict=True):
+        found.append(torch.where(lower.view(-1, *[1] * (value.ndim - 1)), value, old))
+    return type(state)(*found), torch.where(lower, moved_F, F_mat)
+
+
+_FLAT = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))
