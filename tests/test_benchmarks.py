@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import importlib
 import json
 import math
@@ -258,3 +259,28 @@ def test_refined_matches_beside_found_and_tracked_ones(benchmark, tmp_path):
     pair = SimpleNamespace(points1=points, points2=points)
     tracked = refined.track([image, shift], pair)[1] - points
     torch.testing.assert_close(tracked, torch.tensor([[1.0, 0], [1, 0]]).double(), atol=0.02, rtol=0)
+
+
+def test_reconstruction(benchmark, real_data, tmp_path, monkeypatch, capsys):
+    """Four photographs of half the size."""
+    pytest.importorskip("pycolmap")
+    source, names = real_data / "images/photographs", [f"fountain-P11/000{number}.jpg" for number in range(3, 7)]
+    cameras = json.loads((source / "cameras.json").read_text())
+    half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
+    (tmp_path / "fountain-P11").mkdir()
+    for name in names:
+        with Image.open(source / name) as image:
+            image.reduce(2).crop((0, 0, 512, 341)).save(tmp_path / name, quality=95)
+        cameras[name]["K"] = (half @ cameras[name]["K"]).tolist()
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
+    table = tmp_path / "table.csv"
+    methods = ["--methods", "COLMAP", "RANSAC", "--csv", str(table)]
+    monkeypatch.setattr("sys.argv", ["reconstruction.py", str(tmp_path), *methods])
+    benchmark("reconstruction").main()
+    capsys.readouterr()
+    with table.open() as file:
+        rows = [*csv.DictReader(file)]
+    assert [(row["cameras"], row["verified by"]) for row in rows[:2]] == [("given", "COLMAP"), ("given", "RANSAC")]
+    for row in rows[:2]:
+        assert row["images"] == "4 of 4"
+        assert float(row["centres mm"]) < 50

@@ -15,8 +15,7 @@ from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_mat
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.protocol import INLIER_THRESHOLD
-from kornia_learnnorm.two_view.colmap_database import check_database, export_colmap
+from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, export_colmap
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
 
@@ -40,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--single-camera", action="store_true", help="all images share one camera")
     add = parser.add_argument_group("estimation").add_argument
     add("--weights", metavar="NAME_OR_PATH", help="a learned layer in the place of RANSAC")
-    text = "largest distance of inliers (default: %(default)s)"
-    add("--threshold", metavar="PX", type=float, default=INLIER_THRESHOLD, help=text)
+    text = "of RANSAC; inliers within twice of it (default: %(default)s)"
+    add("--threshold", metavar="PX", type=float, default=THRESHOLD, help=text)
     add("--seed", metavar="N", type=int, default=0, help="of RANSAC (default: %(default)s)")
     add_matching_arguments(parser.add_argument_group("matching"))
 

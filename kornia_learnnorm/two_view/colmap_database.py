@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import Size, stored_pixels
@@ -20,18 +21,25 @@ from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.writer import check_target
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, transfer_distance
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.geometry.transforms import transform_fundamental
+from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.optional import import_extra
-from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
+from kornia_learnnorm.protocol import RATIO
+from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
-from kornia_learnnorm.two_view.estimate_matches import estimate_matches
 from kornia_learnnorm.two_view.inputs import check_settings, read_cameras
-from kornia_learnnorm.two_view.parallax import find_main_plane
-from kornia_learnnorm.two_view.result import NoReliableMatrixError
+from kornia_learnnorm.two_view.warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms
 
-__all__ = ["DatabaseCounts", "check_database", "export_colmap"]
+__all__ = ["THRESHOLD", "DatabaseCounts", "check_database", "export_colmap"]
 
 CORNER = 0.5  # pixels from the corner of the first pixel to its centre
+THRESHOLD = 2.0  # pixels, of RANSAC
+INLIER_FACTOR = 2.0  # thresholds within which a match is an inlier: a few coarse ones are better than broken tracks
 MIN_INLIERS = 15  # of a verified pair, COLMAP's own number
+PLANAR_SHARE = 0.8  # of the inliers on one homography, COLMAP's own number
+MIN_SCORE = 1e-3  # a match of weight zero would never be sampled
 Array = NDArray[np.float64]
 
 
@@ -69,7 +77,7 @@ def export_colmap(
     K: Array | None = None,
     single_camera: bool = False,
     layer: LearnedEightPoint | None = None,
-    threshold: float = INLIER_THRESHOLD,
+    threshold: float = THRESHOLD,
     seed: int = 0,
     ratio: float = RATIO,
     turned: bool = True,
@@ -77,8 +85,8 @@ def export_colmap(
 ) -> DatabaseCounts:
     """Write the matches of a store and their two-view geometries as a COLMAP database, and return what it holds.
 
-    :func:`~kornia_learnnorm.estimate_matches` estimates each pair: a fundamental matrix, the homography of its main
-    plane, and with ``K`` an essential matrix and a pose. A pair with fewer than 15 inliers, or no more than random
+    :class:`~kornia_learnnorm.RANSAC` estimates the fundamental matrix of each pair and the homography of its main
+    plane, with ``K`` also an essential matrix and a pose. A pair with fewer than 15 inliers, or no more than random
     matches have, gets no geometry. Keypoints are the matched points. ``pycolmap.incremental_mapping`` and
     ``colmap mapper`` reconstruct from the database.
 
@@ -89,8 +97,8 @@ def export_colmap(
         K: camera (3, 3) of all images, pixels, without distortion. When not given, COLMAP derives cameras from EXIF, or
             from 1.2 times the longer side.
         single_camera: whether all images share one camera; with ``K`` they do.
-        layer: estimates the matrices in the place of RANSAC.
-        threshold: largest symmetric epipolar distance of an inlier, pixels.
+        layer: estimates the fundamental matrix in the place of RANSAC.
+        threshold: RANSAC's largest symmetric epipolar distance, pixels; inliers are the matches within twice of it.
         seed: seed of RANSAC.
         ratio: largest ratio of the nearest to the second-nearest descriptor distance, of matches that have one.
         turned: whether the points are those of images turned by EXIF, as a store has them, or of the files as they are,
@@ -155,25 +163,36 @@ def _estimate(
     pair: _Pair, layer: LearnedEightPoint | None, threshold: float, seed: int, camera: Array | None
 ) -> _Geometry | None:
     """Return the geometry of a pair, or None where too few matches agree."""
-    matches = pair.points1, pair.points2, pair.scores
+    if len(pair.scores) < MIN_INLIERS:
+        return None
+    points1, points2, scores = (torch.from_numpy(value) for value in (pair.points1, pair.points2, pair.scores))
+    K = None if camera is None else torch.from_numpy(camera)
     sampler = WeightedSampler if pair.scored else ProsacSampler
-    try:
-        found = estimate_matches(*matches, *pair.sizes, layer, threshold, seed, camera, camera, sampler)
-    except NoReliableMatrixError:
+    options: dict[str, Any] = {"inl_th": threshold, "distance": "symmetric", "seed": seed, "sampler": sampler}
+    matches = points1, points2, scores.clamp(min=MIN_SCORE)
+    if layer is None:
+        F_mat = RANSAC(**options).estimate(*matches, K, K).F_mat
+    else:
+        with torch.no_grad():
+            F_mat = layer.estimate(points1[None], points2[None], scores=scores[None]).F_mat[0]
+    widest = INLIER_FACTOR * threshold
+    inliers = symmetric_epipolar_distance(points1, points2, F_mat) < widest
+    number = int(inliers.sum())
+    if number < MIN_INLIERS or log_false_alarms(len(scores), number, widest, pair.sizes[1]) > MAX_LOG_FALSE_ALARMS:
         return None
-    codes = {warning.code for warning in found.warnings}
-    inliers = found.points1[found.inliers], found.points2[found.inliers]
-    if found.num_inliers < MIN_INLIERS or "chance" in codes:
-        return None
-    H_mat = find_main_plane(*inliers, threshold)
-    matrices = {"F": found.F_mat, "E": found.E_mat, "H": H_mat}
-    config = "PLANAR_OR_PANORAMIC" if "planar" in codes else "UNCALIBRATED" if camera is None else "CALIBRATED"
-    return _Geometry(
-        config,
-        {name: matrix.numpy() for name, matrix in matrices.items() if matrix is not None},
-        None if found.R is None or found.t is None else (found.R.numpy(), found.t.numpy()),
-        *(points.numpy() for points in inliers),
-    )
+    H_mat = RANSAC(model="homography", **options).estimate(*(value[inliers] for value in matches)).F_mat
+    on_plane = transfer_distance(points1[inliers][None], points2[inliers][None], H_mat[None]) < widest
+    matrices, pose, config = {"F": F_mat, "H": H_mat}, None, "UNCALIBRATED"
+    if K is not None:
+        config = "CALIBRATED"
+        matrices["E"] = nearest_essential(transform_fundamental(F_mat, K, K)[None])[0]
+        R, t = relative_pose(*(value[None] for value in (F_mat, K, K, points1, points2, inliers)))
+        if bool(R.isfinite().all()):
+            pose = R[0].numpy(), t[0].numpy()
+    if int(on_plane.sum()) > PLANAR_SHARE * number:
+        config = "PLANAR_OR_PANORAMIC"
+    arrays = {name: matrix.numpy() for name, matrix in matrices.items()}
+    return _Geometry(config, arrays, pose, pair.points1[inliers.numpy()], pair.points2[inliers.numpy()])
 
 
 def _write_images(
