@@ -16,15 +16,15 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     """Return a module of a package that the core does not need; without it, say which extra brings it and for what.
 
     Example:
-        >>> import_extra("no_such_module", "images", "reading images")
+        >>> import_extra("no_such_module", "images", "an image")
         Traceback (most recent call last):
-        ImportError: reading images needs no_such_module: run pip install '.[images]' in a checkout of kornia_learnnorm
+        ImportError: an image needs no_such_module: run pip install 'kornia-learnnorm[images]', in a checkout '.[images]'
 
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        text = f"{purpose} needs {module}: run pip install '.[{extra}]' in a checkout of kornia_learnnorm"
+        text = f"{purpose} needs {module}: run pip install 'kornia-learnnorm[{extra}]', in a checkout '.[{extra}]'"
         raise ImportError(text) from error
 
 

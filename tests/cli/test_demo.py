@@ -28,4 +28,4 @@ def test_a_port_in_use(refused):
 @pytest.mark.parametrize("missing", ["bokeh", "cv2", "PIL"])
 def test_a_missing_package_names_the_extra(refused, monkeypatch, missing):
     monkeypatch.setitem(sys.modules, missing, None)
-    refused(["demo", "--no-browser"], f"needs {missing}: run pip install '.[demo]'")
+    refused(["demo", "--no-browser"], f"needs {missing}: run pip install 'kornia-learnnorm[demo]'")

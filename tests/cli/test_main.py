@@ -201,7 +201,7 @@ def test_completion_knows_options_and_names(shell, capsys):
 
 def test_completion_names_what_to_install(monkeypatch, refused):
     monkeypatch.setitem(sys.modules, "shtab", None)
-    refused(["completion", "bash"], "needs shtab: run pip install '.[completion]'")
+    refused(["completion", "bash"], "needs shtab: run pip install 'kornia-learnnorm[completion]'")
 
 
 def test_output_whose_reader_has_ended_is_no_error(monkeypatch, capsys):
@@ -261,7 +261,7 @@ def test_a_missing_package_is_one_line(command, blocked, extra, tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     write_store("s.h5", synthetic_store(pairs=1, points=40))
     monkeypatch.setitem(sys.modules, blocked, None)
-    refused(command.split(), f"needs {blocked}: run pip install '.[{extra}]'")
+    refused(command.split(), f"needs {blocked}: run pip install 'kornia-learnnorm[{extra}]'")
 
 
 def test_json_of_a_checkpoint_has_its_metrics(trained, tmp_path, capsys, refused):
