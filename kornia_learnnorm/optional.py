@@ -16,9 +16,9 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     """Return a module of a package that the core does not need; without it, say which extra brings it and for what.
 
     Example:
-        >>> import_extra("no_such_module", "images", "an image")
+        >>> import_extra("no_module", "images", "an image")
         Traceback (most recent call last):
-        ImportError: an image needs no_such_module: run pip install 'kornia-learnnorm[images]', in a checkout '.[images]'
+        ImportError: an image needs no_module: run pip install 'kornia-learnnorm[images]', in a checkout '.[images]'
 
     """
     try:
