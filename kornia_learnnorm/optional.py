@@ -16,15 +16,16 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     """Return a module of a package that the core does not need; without it, say which extra brings it and for what.
 
     Example:
-        >>> import_extra("no_module", "images", "an image")
+        >>> import_extra("no_module", "hub", "it")
         Traceback (most recent call last):
-        ImportError: an image needs no_module: run pip install 'kornia-learnnorm[images]', in a checkout '.[images]'
+        ImportError: it needs no_module: run pip install 'kornia-learnnorm[hub]', in a checkout pip install '.[hub]'
 
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        text = f"{purpose} needs {module}: run pip install 'kornia-learnnorm[{extra}]', in a checkout '.[{extra}]'"
+        text = f"{purpose} needs {module}: run pip install 'kornia-learnnorm[{extra}]'"
+        text += f", in a checkout pip install '.[{extra}]'"
         raise ImportError(text) from error
 
 

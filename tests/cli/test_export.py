@@ -53,4 +53,4 @@ def test_what_cannot_be_written(words, message, refused, tmp_path, monkeypatch):
 def test_a_missing_package_names_its_extra(refused, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     words = ["export", "paper", "--format", "onnx", "--out", tmp_path / "a.onnx"]
-    refused(words, "run pip install 'kornia-learnnorm[onnx]', in a checkout '.[onnx]'")
+    refused(words, "run pip install 'kornia-learnnorm[onnx]', in a checkout pip install '.[onnx]'")
