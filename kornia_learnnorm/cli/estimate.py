@@ -15,7 +15,13 @@ from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
-from kornia_learnnorm.two_view.many_pairs import PairOptions, describe_failure, estimate_pairs, read_pair_list
+from kornia_learnnorm.two_view.many_pairs import (
+    PairOptions,
+    describe_failure,
+    estimate_pairs,
+    pairs_of_folder,
+    read_pair_list,
+)
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 __all__ = ["EXAMPLES", "add_arguments", "run"]
@@ -37,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 with warnings"
     )
-    parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help="files of image 1 and image 2")
+    parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help=argparse.SUPPRESS)  # in the usage
     picture = "picture of the matches; with --pairs, a folder"
     parser.add_argument("--out", metavar="PATH", type=Path, help=picture)
     parser.add_argument("--json", metavar="FILE", help="write the result to this file; -: standard output")
@@ -62,7 +68,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mask = "one or two: features count where it is white"
     add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
     many = parser.add_argument_group("many pairs")
-    many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line; a JSON line of each in --out")
+    listed = "two files a line, or a folder of images; results in --out"
+    many.add_argument("--pairs", metavar="LIST", type=Path, help=listed)
+    add = many.add_mutually_exclusive_group().add_argument
+    add("--gap", metavar="N", type=int, default=1, help=f"of a folder: images N apart {default}")
+    add("--exhaustive", dest="gap", action="store_const", const=None, help="of a folder: all pairs")
     add = many.add_mutually_exclusive_group().add_argument
     add("--jobs", type=int, default=-1, help=f"processes; -1: all cores {default}")
     add("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
@@ -82,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher", "matches")
     options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
     if args.pairs is not None:
-        found = estimate_pairs(read_pair_list(args.pairs), args.out, options, args.jobs, args.dask)
+        found = estimate_pairs(_read_pairs(args), args.out, options, args.jobs, args.dask)
         _print_pairs(found, args.out)
         _print_hint(args)
         if any(line["F"] is None for line in found):
@@ -108,6 +118,10 @@ def run(args: argparse.Namespace) -> int:
         print("\n".join([estimate.summary(), *(f"wrote    {path}" for path in (args.out, json_path) if path)]))
         _print_hint(args)
     return doubtful if estimate.warnings else 0
+
+
+def _read_pairs(args: argparse.Namespace) -> list[tuple[Path, Path]]:
+    return pairs_of_folder(args.pairs, args.gap) if args.pairs.is_dir() else read_pair_list(args.pairs)
 
 
 def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
@@ -169,7 +183,8 @@ def _check_options(args: argparse.Namespace) -> None:
     if args.pairs is not None:
         _check_many(args)
         return
-    if many := [f"--{name}" for name, default in (("jobs", -1), ("dask", None)) if getattr(args, name) != default]:
+    defaults = {"jobs": -1, "dask": None, "gap": 1}
+    if many := [f"--{name}" for name, default in defaults.items() if getattr(args, name) != default]:
         raise ValueError(f"{' and '.join(many)}: only for --pairs LIST, which was not given")
     if len(args.images) != 2:
         raise ValueError(f"two image files expected, got {len(args.images)}; --pairs LIST for many")
@@ -187,6 +202,8 @@ def _check_many(args: argparse.Namespace) -> None:
     given = {"image files": args.images, "--json": args.json, "--mask": args.mask}
     if wrong := [name for name, value in given.items() if value]:
         raise ValueError(f"--pairs {args.pairs}: cannot be combined with {' and '.join(wrong)}")
+    if args.gap != 1 and not args.pairs.is_dir():
+        raise ValueError(f"--pairs {args.pairs}: --gap and --exhaustive are for a folder of images")
     if args.out is None:
         raise ValueError("--pairs: --out FOLDER is needed for the results")
     if args.out.exists() and not args.out.is_dir():

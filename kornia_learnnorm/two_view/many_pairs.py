@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shlex
 import sys
@@ -11,11 +12,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from kornia_learnnorm.data.cameras import read_camera
+from kornia_learnnorm.data.datasets.folder import read_folder
+from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.images import image_size, import_cv2
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.files import exclusive, write_text
+from kornia_learnnorm.files import atomic_write, exclusive, write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
@@ -23,9 +28,11 @@ from kornia_learnnorm.two_view.estimate_pair import MAX_SIZE, check_matching, es
 from kornia_learnnorm.two_view.inputs import check_settings
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, package_versions
 
-__all__ = ["PairOptions", "describe_failure", "estimate_pairs", "read_pair_list"]
+__all__ = ["PairOptions", "describe_failure", "estimate_pairs", "pairs_of_folder", "read_pair_list"]
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
+TABLE = "pairs.csv"  # the same without the matches, in the order of the pairs
+COLUMNS = ("num_matches", "num_inliers", "predicted_error_px", "F", "E", "R", "t")  # of the table
 OPTIONS = "options.json"
 UNREADABLE = "unreadable"  # code of a pair of which an image cannot be read; tried again by the next run
 
@@ -91,10 +98,16 @@ def read_pair_list(path: str | Path) -> list[FilePair]:
     return list(dict.fromkeys(pairs))
 
 
+def pairs_of_folder(folder: Path, gap: int | None = 1) -> list[FilePair]:
+    """Return the image files of a folder that are ``gap`` apart by name in their subfolder, or all pairs for None."""
+    pairs, _ = choose_pairs(read_folder(folder), gap)
+    return [(pair.frame1.path, pair.frame2.path) for pair in pairs]
+
+
 def estimate_pairs(
     pairs: list[FilePair], folder: str | Path, options: PairOptions, jobs: int = -1, dask: str | None = None
 ) -> list[Line]:
-    """Estimate the pairs that are not done yet and append one JSON line each to ``pairs.jsonl``.
+    """Estimate the pairs that are not done yet, append a JSON line of each to ``pairs.jsonl`` and write ``pairs.csv``.
 
     A line has what :meth:`~kornia_learnnorm.two_view.result.PairEstimate.as_dict` returns, or
     :func:`describe_failure` where there is no matrix or an image cannot be read. The folder, created where it does not
@@ -127,7 +140,22 @@ def estimate_pairs(
                 file.flush()
                 done[pair] = line
                 bar.update()
+        _write_table(folder / TABLE, [done[pair] for pair in pairs])
     return [done[pair] for pair in pairs]
+
+
+def _write_table(path: Path, lines: list[Line]) -> None:
+    """Write a row of each pair, matrices row by row with spaces between the numbers, and the codes of the warnings."""
+
+    def cell(value: Any) -> Any:
+        return " ".join(map(str, np.ravel(value))) if isinstance(value, list) else value
+
+    with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["image1", "image2", *COLUMNS, "warnings"])
+        for line in lines:
+            files, codes = [line[view]["file"] for view in ("image1", "image2")], [w["code"] for w in line["warnings"]]
+            table.writerow([*files, *(cell(line.get(name)) for name in COLUMNS), " ".join(codes)])
 
 
 def _read_done(path: Path) -> dict[FilePair, Line]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -95,6 +97,7 @@ class TestOnePair:
             (["--K", "1,2"], ValueError, "camera 1,2: expected fx,fy,cx,cy, .* got 2 numbers"),
             (["--K", "a", "b", "c"], ValueError, "--K: one value for both images or one for each expected, got 3"),
             (["--dask", "tcp://a:1"], ValueError, "--dask: only for --pairs"),
+            (["--gap", "2"], ValueError, "--gap: only for --pairs"),
             (["--pairs", "l.txt", "--json", "-"], ValueError, "cannot be combined with image files and --json$"),
             (["--weights", "robust"], ValueError, "--weights robust: only --estimator learned has weights"),
         ],
@@ -167,12 +170,29 @@ class TestManyPairs:
             (["--out", "found", "--mask", "a.png"], ValueError, r"--pairs list\.txt: cannot be combined with --mask$"),
             (["--out", "found", "--estimator", "learned", "--weights", "no"], OSError, "no"),
             (["--out", "found", "--K", "none.txt"], FileNotFoundError, r"camera none\.txt"),
+            (["--out", "found", "--exhaustive"], ValueError, r"--gap and --exhaustive are for a folder of images"),
         ],
     )
     def test_bad_options_are_refused_before_the_work(self, many, options, error, message):
         with pytest.raises(error, match=message):
             many(*options)
         assert not Path("found").exists()
+
+    @pytest.mark.parametrize(("options", "pairs"), [([], 2), (["--gap", "2"], 1), (["--exhaustive"], 3)])
+    def test_a_folder(self, planes, command, options, pairs):
+        """One pair is solved, those with a blank image are not; the table says what the lines say."""
+        Path("photos").mkdir()
+        for name, source in (("a", "left"), ("b", "right"), ("c", "blank")):
+            shutil.copy(planes / f"{source}.png", f"photos/{name}.png")
+        assert command("--pairs", "photos", "--out", "found", "--jobs", "1", *options, images=()) == 3
+        lines = [json.loads(line) for line in Path("found/pairs.jsonl").read_text().splitlines()]
+        with Path("found/pairs.csv").open() as file:
+            rows = [*csv.DictReader(file)]
+        assert len(rows) == len(lines) == pairs
+        for row, line in zip(rows, lines, strict=True):
+            assert row["image1"] == line["image1"]["file"]
+            assert row["F"].split() == ([str(value) for value in np.ravel(line["F"])] if line["F"] else [])
+            assert row["warnings"].split() == [warning["code"] for warning in line["warnings"]]
 
     def test_lists(self, tmp_path):
         """Of names with spaces and comments, and bad ones."""
