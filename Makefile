@@ -9,7 +9,7 @@
 # make docs   set up, build the documentation in docs/_build/html, check its links and notebooks
 # make audit  report known vulnerabilities of the locked packages; never fails
 # make bench   set up, time all estimators beside Kornia's; DEVICE=cuda on a GPU
-# make wheel  build wheel and sdist in dist/, the same bytes for the same commit; make check-wheel checks their metadata
+# make wheel  build wheel and sdist in dist/, the same bytes for the same commit, and print the wheel's size; make check-wheel checks their metadata
 # make check-extras   install the wheel with each extra in an empty environment and use it; EXTRAS="core hub" for some. Takes long
 # make ablations DATA=<folder>, make table1 DATA=<folder>   train what is not trained yet, print the tables; -j 2 for two at once
 # make layer-ablations DATA=<folder>   those of the learned layer alone
@@ -184,6 +184,7 @@ bench: $(VENV)/.ready
 wheel: export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct 2>/dev/null || echo 1577836800)
 wheel: $(VENV)/.ready
 	$(BIN)/python -m build --no-isolation
+	@wc -c dist/*.whl
 
 check-wheel: wheel
 	@test -x $(TWINE)/bin/twine || { $(PYTHON) -m venv $(TWINE) && $(TWINE)/bin/python -m pip install --quiet twine==7.0.0; }

@@ -33,6 +33,7 @@ __all__ = [
     "weights_digest",
     "weights_format",
     "weights_model",
+    "weights_path",
 ]
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -140,8 +141,19 @@ def weights_digest(name: str | Path) -> str:
 
 
 def weights_path(name: str | Path) -> Path:
-    """Return the file of shipped weights, or the path that ends in ``.safetensors`` as it is."""
-    return Path(name) if Path(name).suffix == ".safetensors" else WEIGHTS / f"{name}.safetensors"
+    """Return the file of shipped weights, or the path that ends in ``.safetensors`` as it is.
+
+    Of some weights the wheel has the model card only: a FileNotFoundError says where their file is.
+    """
+    if Path(name).suffix == ".safetensors":
+        return Path(name)
+    path = WEIGHTS / f"{name}.safetensors"
+    if not path.is_file() and str(name) in {card.stem for card in WEIGHTS.glob("*.md")}:
+        raise FileNotFoundError(
+            f"the weights {str(name)!r} are not in the wheel: take kornia_learnnorm/weights/{path.name} from the"
+            f" repository or the source distribution, and give its path or put it into {WEIGHTS}"
+        )
+    return path
 
 
 def _metadata(path: Path) -> dict[str, str]:

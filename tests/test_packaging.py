@@ -35,15 +35,16 @@ def test_two_builds_are_the_same(wheels):
     assert wheels[0].name == wheels[1].name
     assert wheels[0].name.startswith(f"kornia_learnnorm-{kln.__version__}-")
     assert wheels[0].read_bytes() == wheels[1].read_bytes()
-    assert wheels[0].stat().st_size < 10e6
+    assert wheels[0].stat().st_size < 4e6
 
 
 def test_the_wheel_has_configurations_and_weights(wheels):
     names = set(zipfile.ZipFile(wheels[0]).namelist())
     for path in (ROOT / "configs").rglob("*.yaml"):
         assert f"lightning_modules/{path.relative_to(ROOT).as_posix()}" in names
+    left_out = {f"{name}.safetensors" for name in ("paper", "robust-pose", "robust-tiny")}  # for comparisons
     for path in (ROOT / "kornia_learnnorm/weights").iterdir():
-        assert path.relative_to(ROOT).as_posix() in names
+        assert (path.relative_to(ROOT).as_posix() in names) == (path.name not in left_out)
     tops = {name.partition("/")[0] for name in names}
     information = f"kornia_learnnorm-{kln.__version__}.dist-info"
     assert tops == {"kornia_learnnorm", "lightning_modules", "kornia_learnnorm_command.py", information}

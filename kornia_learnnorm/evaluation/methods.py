@@ -28,7 +28,7 @@ from kornia_learnnorm.normalizers.normalizer import Normalizer, normalizing_tran
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.optional import working_folder_importable
-from kornia_learnnorm.pretrained import WEIGHTS, shipped_weights, weights_format
+from kornia_learnnorm.pretrained import shipped_weights, weights_format, weights_path
 
 __all__ = ["Method", "default_methods", "find_method"]
 
@@ -49,10 +49,11 @@ def default_methods(weights: Sequence[str] = (), *, kept: bool = False) -> tuple
     """Return the names of the default methods: closed forms, weights, and the search as the limit of them all.
 
     Of two weights that have one name in tables, ``weights`` replace the shipped ones; ``kept`` adds ``KEPT_METHODS``.
+    Weights whose file is not installed are left out.
     """
     *closed_forms, search = CLOSED_FORMS
     given = {short_name_of(name) for name in weights}
-    shipped = [name for name in SHIPPED if name not in given]
+    shipped = [name for name in SHIPPED if name not in given and name in shipped_weights(FORMAT)]
     further = [name for name in KEPT_METHODS if kept and base_name(name) not in given]
     return (*closed_forms, *shipped, *weights, search, *further)
 
@@ -175,7 +176,7 @@ def identify_method(name: str) -> str:
         parts = (sys.modules[base.partition(":")[0]], inspect.getmodule(found), inspect.getmodule(type(found)))
         files = sorted({Path(file) for part in parts if (file := getattr(part, "__file__", None))})
     else:
-        files = [Path(base) if Path(base).is_file() else WEIGHTS / f"{base}.safetensors"]
+        files = [weights_path(base)]
     return f"{name} {sha256(b''.join(path.read_bytes() for path in files)).hexdigest()[:16]}"
 
 

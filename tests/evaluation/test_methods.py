@@ -14,6 +14,8 @@ from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
 from kornia_learnnorm.evaluation.methods import SHIPPED, default_methods, find_method, identify_method, short_names
 from kornia_learnnorm.evaluation.report.rates import was_trained_on
 from kornia_learnnorm.evaluation.tables import names_of
+from kornia_learnnorm.layer_export import load_layer
+from kornia_learnnorm.pretrained import WEIGHTS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -77,6 +79,17 @@ def test_names(tmp_path):
     assert default_methods([own], kept=True) == replaced
     with pytest.raises(ValueError, match="same name"):
         short_names([path, path])
+
+
+def test_weights_that_the_wheel_leaves_out(tmp_path, monkeypatch):
+    for name in ("paper.md", "crossview.md", "crossview.safetensors"):
+        (tmp_path / name).write_bytes((WEIGHTS / name).read_bytes())
+    monkeypatch.setattr("kornia_learnnorm.pretrained.WEIGHTS", tmp_path)
+    for load in (kln.LearnedNormalizer.from_pretrained, load_layer, find_method):
+        load("crossview")
+        with pytest.raises(FileNotFoundError, match="kornia_learnnorm/weights/paper"):
+            load("paper")
+    assert set(SHIPPED) & {*default_methods()} == {"crossview"}
 
 
 class TestTrainedOn:
