@@ -1,4 +1,4 @@
-"""The command ``learnnorm estimate``: the fundamental matrix of two image files, or of many pairs."""
+"""The command ``learnnorm estimate``: the fundamental matrix or homography of two image files, or of many pairs."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
+from kornia_learnnorm.two_view.inputs import MODELS
 from kornia_learnnorm.two_view.many_pairs import (
     PairOptions,
     describe_failure,
@@ -51,12 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--strict", action="store_true", help="exit with 3 where there are warnings")
     add = parser.add_argument_group("estimation").add_argument
     names, default = ("ransac", "learned"), "(default: %(default)s)"
+    add("--model", metavar="NAME", choices=MODELS, default=options.model, help=f"{', '.join(MODELS)} {default}")
     add("--estimator", metavar="NAME", choices=names, default=names[0], help=f"{', '.join(names)} {default}")
     add("--weights", metavar="NAME_OR_PATH", help="of the learned one (default: robust-synthetic)")
-    distance = f"largest epipolar distance of inliers {default}"
+    distance = f"largest distance of inliers {default}"
     add("--threshold", metavar="PX", type=float, default=options.threshold, help=distance)
     add("--seed", metavar="N", type=_seed, default=options.seed, help=default)
-    camera = "one or two of fx,fy,cx,cy, a file of 4 or 9 numbers, KITTI's calib.txt, exif; adds E, R, t"
+    camera = "one or two: fx,fy,cx,cy, a file, exif; adds E, R, t"
     add("--K", metavar="CAMERA", nargs="+", default=[], help=camera)
     add = parser.add_argument_group("matching").add_argument
     for name, known in (("detector", DETECTORS), ("matcher", MATCHERS)):
@@ -85,17 +87,17 @@ def _seed(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the fundamental matrix; write the picture and the JSON file if asked to, both or neither."""
+    """Print the matrix; write the picture and the JSON file if asked to, both or neither."""
     _check_options(args)
     doubtful = NO_MATRIX if args.strict else DOUBTFUL
     weights = (args.weights or "robust-synthetic") if args.estimator == "learned" else None
-    names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher", "matches")
+    names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher", "model", "matches")
     options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
     if args.pairs is not None:
         found = estimate_pairs(_read_pairs(args), args.out, options, args.jobs, args.dask)
         _print_pairs(found, args.out)
         _print_hint(args)
-        if any(line["F"] is None for line in found):
+        if any(line["model"] is None for line in found):
             return NO_MATRIX
         return doubtful if any(line["warnings"] for line in found) else 0
     (image1, image2), json_path = args.images, _json_path(args)
@@ -152,7 +154,7 @@ def _print_hint(args: argparse.Namespace) -> None:
 
 def _print_pairs(found: list[dict[str, Any]], folder: Path) -> None:
     """Print how many pairs have a matrix; to standard error, the first pairs without one and why."""
-    failed = [line for line in found if line["F"] is None]
+    failed = [line for line in found if line["model"] is None]
     warned = sum(bool(line["warnings"]) for line in found) - len(failed)
     text = f"wrote {folder}: {len(found) - len(failed)} of {len(found)} pairs solved"
     text += f", {len(failed)} failed" if failed else ""
@@ -161,7 +163,7 @@ def _print_pairs(found: list[dict[str, Any]], folder: Path) -> None:
         reasons = "; ".join(f"{warning['text']} ({warning['code']})" for warning in line["warnings"])
         print(f"failed: {line['image1']['file']} {line['image2']['file']}: {reasons}", file=sys.stderr)
     if len(failed) > MAX_FAILURES:
-        print(f"and {len(failed) - MAX_FAILURES} more: lines of pairs.jsonl whose F is null", file=sys.stderr)
+        print(f"and {len(failed) - MAX_FAILURES} more: lines of pairs.jsonl whose model is null", file=sys.stderr)
 
 
 def _json_path(args: argparse.Namespace) -> Path | None:
@@ -176,6 +178,8 @@ def _check_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that do not go together and for files that must not be written."""
     if args.weights is not None and args.estimator != "learned":
         raise ValueError(f"--weights {args.weights}: only --estimator learned has weights")
+    if args.estimator == "learned" and args.model == "homography":
+        raise ValueError("--estimator learned: only for fundamental matrices, leave it out with --model homography")
     for name, values in (("K", args.K), ("mask", args.mask)):
         if len(values) > 2:
             got = f"got {len(values)}; give the images before it"

@@ -49,7 +49,7 @@ CHECKPOINT_EXAMPLES = """\
 learnnorm {0} --config crossview --ckpt_path run/checkpoints/last.ckpt
 learnnorm {0} --config crossview --config own.yaml --ckpt_path last.ckpt"""
 TOOLS = {
-    "estimate": ("kornia_learnnorm.cli.estimate", "the fundamental matrix of two images"),
+    "estimate": ("kornia_learnnorm.cli.estimate", "the fundamental matrix or homography of two images"),
     "demo": ("kornia_learnnorm.cli.demo", "a page in the browser to try two images on"),
     "evaluate": ("kornia_learnnorm.cli.evaluate", "better rates and errors on stores of correspondences"),
     "robust": ("kornia_learnnorm.cli.robust", "robust estimators on stores"),

@@ -66,7 +66,7 @@ class MethodResult:
         """Return the median distance of correspondences (N, 2) to the matrix, pixels; NaN without one."""
         if self.estimate is None:
             return math.nan
-        return median(symmetric_epipolar_distance(points1, points2, self.estimate.F_mat)).item()
+        return median(symmetric_epipolar_distance(points1, points2, self.estimate.matrix)).item()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the estimate as ``learnnorm estimate --json`` writes it."""
@@ -125,7 +125,7 @@ def compare(
 
 def _estimate(matched: MatchedPair, layer: LearnedEightPoint | None) -> MethodResult:
     try:
-        return MethodResult(matched.estimate(layer))
+        return MethodResult(matched.estimate(layer, model="fundamental"))
     except NoReliableMatrixError as error:
         return MethodResult(None, str(_without_names(error)))
 

@@ -215,7 +215,7 @@ class Page:
         self._warnings.text, self._warnings.visible = text, bool(text)
 
     def _point(self, index: int, x: float, y: float) -> None:
-        matrices = {name: found.estimate.F_mat for name, found in self._results.items() if found.estimate is not None}
+        matrices = {name: found.estimate.matrix for name, found in self._results.items() if found.estimate is not None}
         if matrices:
             self._views[index].mark((x, y))
             self._views[1 - index].draw_lines({n: F.mT if index else F for n, F in matrices.items()}, (x, y))

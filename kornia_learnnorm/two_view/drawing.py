@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from kornia_learnnorm.data.images import import_cv2, scaling
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.two_view.result import PairEstimate
@@ -72,20 +73,25 @@ def draw_pair(
     estimate: PairEstimate,
     path: str | Path,
 ) -> None:
-    """Draw the matches in image 1 and epipolar lines in image 2, and write the picture whole or not at all.
+    """Draw the matches in image 1 and what the matrix says in image 2, and write the picture whole or not at all.
 
     Image 1 shows the inliers in blue, each with its motion to image 2, and the outliers in red. Image 2 shows the
-    epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10). The
-    predicted error is written above, warnings below. The images are grey or RGB, uint8, and may be reduced. Wide images
-    and those of unequal shapes are stacked, others stand side by side. The suffix of ``path`` decides the format.
+    epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10), or the
+    mean of it and image 1 as the homography moves it. The predicted error is written above, warnings below. The images
+    are grey or RGB, uint8, and may be reduced. Wide images and those of unequal shapes are stacked, others stand side
+    by side. The suffix of ``path`` decides the format.
     """
     for image, size in ((image1, estimate.size1), (image2, estimate.size2)):
         if abs(image.shape[1] * size[1] - image.shape[0] * size[0]) > max(size) + max(image.shape[:2]):
             raise ValueError(f"the estimate is of an image of {size[0]} x {size[1]} pixels, got shape {image.shape}")
-    outliers, num_lines = estimate.num_matches - estimate.num_inliers, min(NUM_LINES, estimate.num_inliers)
+    if moved := estimate.model == "homography":
+        image2, shown = _blend(image1, image2, estimate), "image 1 as H moves it, over image 2; predicted error of H"
+    else:
+        shown = f"{min(NUM_LINES, estimate.num_inliers)} epipolar lines; predicted error of F"
+    outliers = estimate.num_matches - estimate.num_inliers
     above = (
         f"Image 1: {estimate.num_inliers} inliers and their motion in blue, {outliers} outliers in red\n"
-        f"Image 2: {num_lines} epipolar lines; predicted error of F: typically {estimate.predicted_error:.2f} px"
+        f"Image 2: {shown}: typically {estimate.predicted_error:.2f} px"
     )
     below = [f"Warning ({warning.code}): {warning.text}." for warning in estimate.warnings]
     below = [line for text in below for line in textwrap.wrap(text, COLUMNS)]
@@ -94,7 +100,8 @@ def draw_pair(
     if below:
         figure.supxlabel("\n".join(below), x=0.01, ha="left", color=OUTLIER, fontsize=9, linespacing=1.2)
     draw_matches(axes1, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
-    _draw_lines(axes2, estimate)
+    if not moved:
+        _draw_lines(axes2, estimate)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, facecolor=figure.get_facecolor())
 
@@ -120,11 +127,27 @@ def _panels(
     return figure, panels
 
 
+def _blend(
+    image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8], estimate: PairEstimate
+) -> npt.NDArray[np.uint8]:
+    """Return the mean of image 2 and image 1 moved by the homography, RGB; image 2 alone where image 1 ends."""
+    colours = [np.broadcast_to(np.atleast_3d(image), (*image.shape[:2], 3)) for image in (image1, image2)]
+    S1, S2 = (
+        scaling(full, (image.shape[1], image.shape[0]))
+        for full, image in ((estimate.size1, image1), (estimate.size2, image2))
+    )
+    H_mat = (S2 @ estimate.matrix @ torch.linalg.inv(S1)).numpy()
+    covered = np.dstack([colours[0], np.full(image1.shape[:2], 255, np.uint8)])
+    moved = import_cv2().warpPerspective(covered, H_mat, image2.shape[1::-1])
+    share = moved[..., 3:] / 510
+    return np.asarray(share * moved[..., :3] + (1 - share) * colours[1], np.uint8)
+
+
 def _draw_lines(axes: Axes, estimate: PairEstimate) -> None:
     rows = torch.nonzero(estimate.inliers).flatten().numpy()
     chosen = np.random.default_rng(0).permutation(rows)[:NUM_LINES]
     points1, points2 = estimate.points1[chosen].numpy(), estimate.points2[chosen].numpy()
-    lines = np.pad(points1, ((0, 0), (0, 1)), constant_values=1.0) @ estimate.F_mat.numpy().T
+    lines = np.pad(points1, ((0, 0), (0, 1)), constant_values=1.0) @ estimate.matrix.numpy().T
     hues = np.linspace(0, 1, len(chosen), endpoint=False)
     rgb = import_matplotlib().colors.hsv_to_rgb(np.stack([hues, np.full_like(hues, 0.6), np.ones_like(hues)], 1))
     for line, color in zip(lines, rgb, strict=True):

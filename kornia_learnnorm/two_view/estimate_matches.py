@@ -1,10 +1,12 @@
-"""The fundamental matrix of the matches of two images, with its predicted error and the reasons to doubt it."""
+"""The fundamental matrix or homography of matches, with its predicted error and the reasons to doubt it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
+import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
@@ -15,13 +17,22 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
+from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
-from kornia_learnnorm.two_view.parallax import distances_from_plane, find_main_plane
-from kornia_learnnorm.two_view.predicted_error import nominal_camera, predict_error
+from kornia_learnnorm.two_view.model_choice import choose_model
+from kornia_learnnorm.two_view.parallax import Parallax
+from kornia_learnnorm.two_view.plane_pose import PlanePose, angle_between, plane_poses
+from kornia_learnnorm.two_view.predicted_error import (
+    CAMERA_ERROR,
+    PredictedError,
+    nominal_camera,
+    predict_error,
+    predict_transfer_error,
+)
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.two_view.solver import MIN_MATCHES, TwoViewSolver
+from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 from kornia_learnnorm.two_view.warnings import PairWarning, find_warnings
 
 __all__ = ["estimate_matches"]
@@ -41,8 +52,12 @@ def estimate_matches(
     K1: Points | None = None,
     K2: Points | None = None,
     sampler: Callable[..., Sampler] = ProsacSampler,
+    model: str = "auto",
 ) -> PairEstimate:
-    """Return the fundamental matrix of matches with its predicted error and the reasons to doubt it.
+    """Return the fundamental matrix or homography of matches with its predicted error and the reasons to doubt it.
+
+    The answer is a homography where the matches do not determine a fundamental matrix, as on a plane or where the
+    camera only turns, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`.
 
     Where less than half of the matches are inliers, RANSAC searches again among those near its matrix. Where one
     homography explains most inliers, the matrix of this homography and the parallax of the other matches is tried too,
@@ -55,14 +70,16 @@ def estimate_matches(
         scores: from 0 to 1 with shape (N,), 1 minus Lowe's ratio or a matcher's confidence; all equal when not given.
         size1: width and height of image 1; as large as its points need when not given.
         size2: width and height of image 2.
-        layer: estimates the matrix in the place of RANSAC.
-        threshold: largest symmetric epipolar distance of an inlier, and RANSAC's threshold, pixels.
+        layer: estimates the fundamental matrix in the place of RANSAC.
+        threshold: RANSAC's threshold, and the largest distance of an inlier, pixels: the symmetric epipolar distance,
+            or that of its point in image 2 from where the homography moves that in image 1.
         seed: seed of RANSAC and of the parts of the matches.
         K1: camera of image 1, (3, 3), in pixels.
         K2: camera of image 2; both or none.
         sampler: how the scores steer RANSAC, see :class:`~kornia_learnnorm.RANSAC`. A matcher's confidences, such as
             LightGlue's, want :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`: samples of the highest alone
             are worse.
+        model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
 
     Returns:
         the estimate; its matches are the given ones but for those left out, those that share a point with one of a
@@ -76,27 +93,30 @@ def estimate_matches(
             and invertible (3, 3) matrix.
 
     """
-    check_settings(threshold, seed, layer)
+    check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)
     points1, points2, scores = _usable_matches(*read_matches(points1, points2, scores), threshold)
     size1, size2 = read_size("size1", size1, points1), read_size("size2", size2, points2)
     solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras, sampler)
-    found = solver.search(size2)
-    F_mat, inliers = found.F_mat, solver.inliers(found.F_mat)
-    cameras = cameras or (nominal_camera(size1), nominal_camera(size2))
-    error = predict_error(found.F_parts, found.part_size, points1, points2, F_mat, inliers, *cameras)
-    pose = _find_pose(solver, F_mat, inliers)
+    choice, found, H_mat = choose_model(solver, model, size1, size2)
+    if choice.model == "homography":
+        answer = _answer_homography(solver, cast(Tensor, H_mat), None if found is None else found.matrix)
+    else:
+        answer = _answer_fundamental(solver, cast(Solution, found), cast(Parallax, choice.parallax), size1, size2)
+    doubts = find_warnings(points1, points2, answer.inliers, threshold, size2, answer.error.angle)
     return PairEstimate(
-        F_mat=F_mat,
-        **pose._asdict(),
-        estimator=solver.estimator,
+        choice=choice,
+        F_mat=answer.F_mat,
+        H_mat=H_mat,
+        **answer.pose._asdict(),
+        estimator=solver.estimator if choice.model == "fundamental" else RANSAC.__name__,
         points1=points1,
         points2=points2,
         scores=scores,
-        weights=inliers.double() if layer is None else found.weights,
-        inliers=inliers,
-        predicted_error=min(error.distance, float(max(size2))),
-        warnings=_all_warnings(solver, F_mat, size1, size2, error.angle, pose),
+        weights=answer.weights,
+        inliers=answer.inliers,
+        predicted_error=min(math.hypot(answer.error.distance, CAMERA_ERROR * max(size2)), float(max(size2))),
+        warnings=(*doubts, *answer.warnings),
         size1=size1,
         size2=size2,
         ratio=None,
@@ -123,33 +143,64 @@ def _usable_matches(
     return points1[kept], points2[kept], scores[kept]
 
 
-class _Pose(NamedTuple):  # all None without cameras, and R, t and front where two poses tie
+class _Pose(NamedTuple):  # all None without cameras; R, t and front also where two poses of an essential matrix tie
     E_mat: Tensor | None = None
     R: Tensor | None = None
     t: Tensor | None = None
     front: Tensor | None = None
+    n: Tensor | None = None
+    other_pose: PlanePose | None = None
 
 
-def _find_pose(solver: TwoViewSolver, F_mat: Tensor, inliers: Tensor) -> _Pose:
+class _Answer(NamedTuple):
+    F_mat: Tensor | None
+    inliers: Tensor
+    weights: Tensor
+    error: PredictedError
+    pose: _Pose = _Pose()
+    warnings: tuple[PairWarning, ...] = ()
+
+
+def _answer_fundamental(
+    solver: TwoViewSolver, found: Solution, parallax: Parallax, size1: Size, size2: Size
+) -> _Answer:
+    F_mat, inliers, matches = found.matrix, solver.inliers(found.matrix), (solver.points1, solver.points2)
+    cameras = solver.cameras or (nominal_camera(size1), nominal_camera(size2))
+    error = predict_error(found.parts, found.part_size, *matches, F_mat, inliers, *cameras)
+    answer = _Answer(F_mat, inliers, inliers.double() if solver.layer is None else found.weights, error)
     if solver.cameras is None:
-        return _Pose()
-    K1, K2 = solver.cameras
-    E_mat = nearest_essential(transform_fundamental(F_mat, K1, K2)[None])[0]
-    pair = (K1[None], K2[None], solver.points1[None], solver.points2[None])
-    R, t = relative_pose(F_mat[None], *pair, inliers[None])
-    return _Pose(E_mat, R[0], t[0], in_front(R, t, *pair)[0]) if bool(R.isfinite().all()) else _Pose(E_mat)
-
-
-def _all_warnings(
-    solver: TwoViewSolver, F_mat: Tensor, size1: Size, size2: Size, angle: float, pose: _Pose
-) -> tuple[PairWarning, ...]:
-    points1, points2, threshold = solver.points1, solver.points2, solver.threshold
-    distance = solver.distance(F_mat)
-    near = distance < threshold
-    H = None if solver.cameras else find_main_plane(points1[near], points2[near], threshold)
-    off_plane = None if H is None else distances_from_plane(points1, points2, H, size1, size2, threshold)
-    warnings = find_warnings(points1, points2, distance, off_plane, threshold, size2, angle)
-    if solver.cameras is None or pose.R is not None:
-        return warnings
+        if not parallax.planar:
+            return answer
+        return answer._replace(warnings=(PairWarning("planar", parallax.describe(solver.threshold)),))
+    E_mat = nearest_essential(transform_fundamental(F_mat, *cameras)[None])[0]
+    K1, K2, x1, x2 = (value[None] for value in (*cameras, *matches))
+    R, t = relative_pose(F_mat[None], K1, K2, x1, x2, inliers[None])
+    if bool(R.isfinite().all()):
+        return answer._replace(pose=_Pose(E_mat, R[0], t[0], in_front(R, t, K1, K2, x1, x2)[0]))
     text = "the matches do not decide between the four poses of the essential matrix"
-    return (*warnings, PairWarning("no_pose", text))
+    return answer._replace(pose=_Pose(E_mat), warnings=(PairWarning("no_pose", text),))
+
+
+def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | None) -> _Answer:
+    found, cameras, matches = solver.check_homography(H_mat), solver.cameras, (solver.points1, solver.points2)
+    inliers = found.weights > 0
+    about = found.parts, found.part_size, solver.points1, H_mat, inliers
+    answer = _Answer(F_mat, inliers, found.weights, predict_transfer_error(*about))
+    if cameras is None:
+        return answer
+    seen = (*cameras, *(points[inliers] for points in matches))
+    poses = plane_poses(H_mat, *seen)
+    if not poses:
+        text = "no plane in front of both cameras has this homography"
+        return answer._replace(warnings=(PairWarning("no_pose", text),))
+    if len(poses) > 1:  # matches off the plane agree with the true pose alone
+        support = solver.support(torch.stack([pose.fundamental(*cameras) for pose in poses]))
+        poses = [poses[row] for row in support.argsort(descending=True, stable=True).tolist()]
+    (R, t, n), *others = poses
+    angles = torch.tensor([angle_between(poses[0], plane_poses(part, *seen)) for part in found.parts]).double()
+    answer = answer._replace(error=predict_transfer_error(*about, angles))
+    if t is None:
+        return answer._replace(pose=_Pose(R=R))
+    front = in_front(R[None], t[None], *(value[None] for value in (*cameras, *matches)))[0]
+    pose = _Pose(poses[0].essential(), R, t, front, n, others[0] if others else None)
+    return answer._replace(F_mat=poses[0].fundamental(*cameras), pose=pose)

@@ -1,4 +1,4 @@
-"""The fundamental matrix of two images: features, one-to-one matches, and the estimate that they give."""
+"""The fundamental matrix or homography of two images: features, one-to-one matches, and the estimate that they give."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from kornia_learnnorm.data.matching.matchers import check_methods, match_both_wa
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points
+from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
@@ -58,8 +59,12 @@ def estimate_pair(
     max_size: int = MAX_SIZE,
     detector: str = "sift",
     matcher: str = "nearest",
+    model: str = "auto",
 ) -> PairEstimate:
-    """Return the fundamental matrix of two images with its matches, its predicted error and the reasons to doubt it.
+    """Return the fundamental matrix or homography of two images with its predicted error and the reasons to doubt it.
+
+    The answer is a homography where the matches do not determine a fundamental matrix, as on a plane or where the
+    camera only turns, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`.
 
     Matches are nearest neighbours in both directions that pass the ratio test in both, with 1 minus the larger ratio as
     score, or LightGlue's with its scores. Of those that share a point, the one of highest score counts.
@@ -70,10 +75,10 @@ def estimate_pair(
     Args:
         image1: file of image 1, or its values: grey with shape (H, W) or RGB with shape (H, W, 3), uint8.
         image2: file of image 2, or its values.
-        layer: estimates the matrix in the place of RANSAC.
+        layer: estimates the fundamental matrix in the place of RANSAC.
         ratio: largest ratio of the nearest to the second-nearest descriptor distance, of the matcher ``nearest``.
-        threshold: largest symmetric epipolar distance of an inlier, and RANSAC's threshold, pixels of the images as
-            they are matched.
+        threshold: RANSAC's threshold and the largest distance of an inlier, pixels of the images as they are matched,
+            see :func:`~kornia_learnnorm.estimate_matches`.
         seed: seed of RANSAC and of the parts of the matches that tell how stable the matrix is; equal images and seeds
             give equal estimates.
         K1: camera of image 1, (3, 3), pixels of the full image; with both, the result has an essential matrix and pose.
@@ -83,6 +88,7 @@ def estimate_pair(
         max_size: images with a longer side are matched reduced to it; points and F are those of the full images.
         detector: a key of ``kornia_learnnorm.data.matching.features.DETECTORS``.
         matcher: one of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
+        model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
 
     Returns:
         the estimate; all its numbers are finite.
@@ -97,10 +103,10 @@ def estimate_pair(
         ImportError: if OpenCV is not installed.
 
     """
-    check_settings(threshold, seed, layer)
+    check_settings(threshold, seed, layer, model)
     read_cameras(K1, K2)  # before the work begins
     pair = match_two_images(image1, image2, ratio, mask1, mask2, max_size, detector, matcher)
-    return pair.estimate(layer, threshold, seed, K1, K2)
+    return pair.estimate(layer, threshold, seed, K1, K2, model)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +132,7 @@ class MatchedPair:
         seed: int = 0,
         K1: Points | None = None,
         K2: Points | None = None,
+        model: str = "auto",
     ) -> PairEstimate:
         """Return the estimate of the matches; arguments and errors are those of :func:`estimate_pair`."""
         S1, S2 = scaling(self.full_size1, self.size1), scaling(self.full_size2, self.size2)
@@ -133,23 +140,27 @@ class MatchedPair:
         cameras = read_cameras(K1, K2)
         K1, K2 = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
 
-        def solve(points1: Tensor, points2: Tensor, scores: Tensor) -> PairEstimate:
+        def solve(model: str, points1: Tensor, points2: Tensor, scores: Tensor) -> PairEstimate:
             sizes = self.size1, self.size2
-            return estimate_matches(points1, points2, scores, *sizes, layer, threshold, seed, K1, K2, sampler)
+            return estimate_matches(points1, points2, scores, *sizes, layer, threshold, seed, K1, K2, sampler, model)
 
         try:
-            first = solve(self.points1[self.mutual], self.points2[self.mutual], self.scores[self.mutual])
+            first = solve(model, self.points1[self.mutual], self.points2[self.mutual], self.scores[self.mutual])
         except NoReliableMatrixError as error:
             raise _named(error, (self.path1, self.path2)) from error
-        found = first
-        if mutual_share(self.points1, self.points2, self.mutual, first.F_mat, threshold) < MIN_MUTUAL_SHARE:
+        found, unique = first, 1.0
+        if first.model == "fundamental":
+            unique = mutual_share(self.points1, self.points2, self.mutual, first.matrix, threshold)
+        if unique < MIN_MUTUAL_SHARE:
             false = self.points1[~self.mutual], self.points2[~self.mutual]
             matches = first.points1, first.points2, first.scores
-            found = resolve_ambiguity(first, *false, lambda kept: solve(*(value[kept] for value in matches)))
+            found = resolve_ambiguity(first, *false, lambda kept: solve("fundamental", *(x[kept] for x in matches)))
+            found = replace(found, choice=first.choice, H_mat=first.H_mat)
         scale = float(torch.stack([S1.diagonal()[:2], S2.diagonal()[:2]]).mean())
         return replace(
             found,
-            F_mat=unit_matrix(transform_fundamental(found.F_mat, S1, S2)),
+            F_mat=None if found.F_mat is None else unit_matrix(transform_fundamental(found.F_mat, S1, S2)),
+            H_mat=None if found.H_mat is None else unit_matrix(Homography().carry(found.H_mat, S1, S2)),
             points1=transform_points(found.points1[None], torch.linalg.inv(S1)[None])[0],
             points2=transform_points(found.points2[None], torch.linalg.inv(S2)[None])[0],
             predicted_error=found.predicted_error / scale,

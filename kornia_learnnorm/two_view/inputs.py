@@ -12,11 +12,12 @@ from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.geometry.checks import check_cameras
+from kornia_learnnorm.geometry.checks import check_cameras, check_choice
 
-__all__ = ["Cameras", "Points", "check_number", "check_settings", "check_whole"]
+__all__ = ["MODELS", "Cameras", "Points", "check_number", "check_settings", "check_whole"]
 __all__ += ["read_cameras", "read_matches", "read_size"]
 
+MODELS = ("auto", "fundamental", "homography")
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]
 
@@ -54,8 +55,8 @@ def read_size(name: str, size: Size | None, points: Tensor) -> Size:
     return int(size[0]), int(size[1])
 
 
-def check_settings(threshold: float, seed: int, layer: object = None) -> None:
-    """Raise a clear error for a threshold that is not positive, a seed out of range, or a layer of another class."""
+def check_settings(threshold: float, seed: int, layer: object = None, model: str = "auto") -> None:
+    """Raise a clear error for a threshold that is not positive, a seed out of range, or another layer or model."""
     check_number("threshold", threshold)
     if not 0 < threshold < float("inf"):
         raise ValueError(f"threshold must be positive and finite, got {threshold:g} px")
@@ -64,6 +65,9 @@ def check_settings(threshold: float, seed: int, layer: object = None) -> None:
         raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
     if not isinstance(layer, LearnedEightPoint | None):
         raise TypeError(f"layer must be a LearnedEightPoint or None, got {type(layer)}")
+    check_choice("model", model, MODELS)
+    if layer is not None and model == "homography":
+        raise ValueError("layer estimates fundamental matrices: leave it out with model homography")
 
 
 def check_number(name: str, value: object) -> None:

@@ -32,7 +32,7 @@ __all__ = ["PairOptions", "describe_failure", "estimate_pairs", "pairs_of_folder
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
 TABLE = "pairs.csv"  # the same without the matches, in the order of the pairs
-COLUMNS = ("num_matches", "num_inliers", "predicted_error_px", "F", "E", "R", "t")  # of the table
+COLUMNS = ("model", "num_matches", "num_inliers", "predicted_error_px", "F", "H", "E", "R", "t", "n")  # of the table
 OPTIONS = "options.json"
 UNREADABLE = "unreadable"  # code of a pair of which an image cannot be read; tried again by the next run
 
@@ -52,11 +52,12 @@ class PairOptions:
     max_size: int = MAX_SIZE
     detector: str = "sift"
     matcher: str = "nearest"
+    model: str = "auto"
     matches: bool = False  # results hold the matches
 
     def __post_init__(self) -> None:
         """Raise a clear error for options that are out of range or do not go together."""
-        check_settings(self.threshold, self.seed)
+        check_settings(self.threshold, self.seed, model=self.model)
         check_matching(self.ratio, self.max_size, self.detector, self.matcher)
 
     def arguments(self, image1: Path, image2: Path) -> dict[str, Any]:
@@ -169,7 +170,7 @@ def _read_done(path: Path) -> dict[FilePair, Line]:
 
 
 def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> Line:
-    """Return the JSON object of a pair without a matrix: ``F`` is null, and the warning has a code and a text."""
+    """Return the JSON object of a pair without a matrix: ``model`` is null, and the warning has a code and a text."""
 
     def describe(path: Path) -> Line:  # sizes are null where the file cannot be read
         width = height = 0
@@ -178,7 +179,7 @@ def describe_failure(code: str, text: str, image1: Path, image2: Path, options: 
         return {"file": str(path), "width": width or None, "height": height or None}
 
     return {
-        **dict.fromkeys(("F", "E", "R", "t", "predicted_error_px")),
+        **dict.fromkeys(("model", "F", "H", "E", "R", "t", "n", "predicted_error_px")),
         "warnings": [{"code": code, "text": text}],
         "image1": describe(image1),
         "image2": describe(image2),

@@ -27,7 +27,16 @@ from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 
-__all__ = ["distances_from_plane", "find_main_plane", "fit_plane_and_parallax", "parallax", "parallax_evidence"]
+__all__ = [
+    "MAX_LOG_CHANCE_PARALLAX",
+    "MIN_PLANAR_SHARE",
+    "Parallax",
+    "distances_from_plane",
+    "find_main_plane",
+    "fit_plane_and_parallax",
+    "parallax",
+    "parallax_evidence",
+]
 
 OFF_PLANE = 2.0  # thresholds; a match that the homography misses by more lies off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
@@ -35,7 +44,45 @@ MIN_PARALLAX_INLIERS = 3  # matches off the plane that a matrix must have to be 
 MAX_DISTORTION = 0.2  # of the radius at the corners of an image
 MAX_LM_STEPS = 10
 TOLERANCE = 1e-6  # cosine of offsets and derivatives at which Levenberg-Marquardt has converged
+MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
+PARALLAX_SCALES = (1.0, 0.5, 0.25, 0.125)  # of the threshold at which parallax is sought; SIFT errs by 0.1 px or so
+MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
 AT_INFINITY = 1e6  # halves of the diagonal; offset of a point that the homography moves to infinity
+
+
+class Parallax(NamedTuple):
+    """How much of the matches one homography explains, with the radial distortion that suits it best."""
+
+    near: float  # share of the inliers of F within the threshold of it
+    wide: float  # share of the inliers of F within three thresholds of it
+    log_chance: float  # log10 of the expected number of epipoles that chance gives as much parallax, at most 0
+
+    @property
+    def planar(self) -> bool:
+        """Whether the scene is a plane or the camera only turned: the matches do not determine F."""
+        return self.wide > MIN_PLANAR_SHARE and self.log_chance > MAX_LOG_CHANCE_PARALLAX
+
+    def describe(self, threshold: float) -> str:
+        """Return one sentence for people."""
+        text = f"one homography explains {self.near:.0%} of the inliers within {threshold:g} px and {self.wide:.0%} "
+        text += f"within {3 * threshold:g} px"
+        if self.planar:
+            return f"{text} (a plane, or a camera that only rotates), and the rest do not determine the epipole"
+        return f"{text}; the rest determine the epipole"
+
+
+def measure_parallax(
+    points1: Tensor, points2: Tensor, distance: Tensor, threshold: float, size1: Size, size2: Size
+) -> Parallax:
+    """Return the parallax of matches (N, 2) that are ``distance`` (N,) from the fundamental matrix, pixels."""
+    inliers = distance < threshold
+    H = find_main_plane(points1[inliers], points2[inliers], threshold)
+    if H is None:
+        return Parallax(0.0, 0.0, 0.0)
+    off_plane = distances_from_plane(points1, points2, H, size1, size2, threshold)
+    near, wide = (float((off_plane[inliers] < k * threshold).double().mean()) for k in (1, 3))
+    evidence = (parallax_evidence(off_plane, distance < k * threshold, k * threshold) for k in PARALLAX_SCALES)
+    return Parallax(near, wide, min(0.0, *evidence))
 
 
 def find_main_plane(points1: Tensor, points2: Tensor, threshold: float) -> Tensor | None:
@@ -49,9 +96,9 @@ def find_main_plane(points1: Tensor, points2: Tensor, threshold: float) -> Tenso
 
 
 def parallax(points1: Tensor, points2: Tensor, H: Tensor) -> Tensor:
-    """Return the distances (N,) of points2 from where a homography moves points1, pixels."""
+    """Return the distances (*, N) of points2 from where homographies (*, 3, 3) move points1, pixels."""
     moved = convert_points_to_homogeneous(points1) @ H.mT
-    distance: Tensor = (moved[:, :2] / moved[:, 2:] - points2).norm(dim=-1)
+    distance: Tensor = (moved[..., :2] / moved[..., 2:] - points2).norm(dim=-1)
     return distance.nan_to_num(nan=math.inf)
 
 

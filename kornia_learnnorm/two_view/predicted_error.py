@@ -1,4 +1,4 @@
-"""How far the fundamental matrix of matches may be off, from those of random parts of the matches."""
+"""How far the matrix of matches may be off, from those of random parts of the matches."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from typing import NamedTuple
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
+from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
+from kornia_learnnorm.two_view.parallax import parallax
 
-__all__ = ["PredictedError", "drop_failed_parts", "nominal_camera", "predict_error", "random_parts"]
+__all__ = ["CAMERA_ERROR", "PredictedError", "drop_failed_parts", "nominal_camera", "predict_error"]
+__all__ += ["predict_transfer_error", "random_parts"]
 
 NUM_PARTS = 12  # random parts of the matches that are solved again
 PART_INLIERS = 48  # expected in a part, where these are more than half and less than four fifths of all inliers
@@ -22,12 +25,13 @@ MIN_SUPPORT = 0.75  # of the inliers; the matrix of a part with fewer is that of
 MIN_SOLVED_PARTS = 4  # with fewer matrices of as much support, those of all parts count
 NOMINAL_FOCAL = 1.2  # of the longer image side: focal length where no camera is given
 COMMON_ERRORS = 400  # matches beyond which more do not help: the errors of neighbours are alike
+CAMERA_ERROR = 1e-4  # of the longer image side, in photographs: what matches do not tell, such as distortion
 
 
 class PredictedError(NamedTuple):
-    """Standard errors of a fundamental matrix."""
+    """Standard errors of a fundamental matrix or a homography."""
 
-    distance: float  # median symmetric epipolar distance, pixels
+    distance: float  # median symmetric epipolar distance, or distance in image 2 of points moved by H, pixels
     angle: float  # larger angle of the rotations and of the directions of translation, degrees
 
 
@@ -61,8 +65,6 @@ def predict_error(
     ``F_parts`` (P, 3, 3) are zeros where there is no matrix; a part has ``size`` of the matches (N, 2), of which
     ``inliers`` (N,) are those of ``F_mat`` (3, 3). The cameras (3, 3) may be guesses.
     """
-    number = len(points1)
-    unit = math.sqrt(1 / min(number, COMMON_ERRORS) / (1 / size - 1 / number))
     x1 = points1[inliers].expand(len(F_parts), -1, -1)
     x2 = _onto_lines(points1[inliers], points2[inliers], F_mat).expand(len(F_parts), -1, -1)
     distance = symmetric_epipolar_distance(x1, x2, F_parts).nan_to_num(nan=math.inf).median()
@@ -70,7 +72,26 @@ def predict_error(
     R, t = relative_pose(F_mat[None], *(value[:1] for value in (*cameras, x1, x2)))
     R_parts, t_parts = relative_pose(F_parts, *cameras, x1, x2)
     angles = pose_error(R_parts, t_parts, R.expand_as(R_parts), t.expand_as(t_parts))
-    angle = (math.sqrt(size / (number - size)) * angles.nan_to_num(nan=180.0)).clamp(max=180.0).median()
+    return _scale_to_all(distance, angles.nan_to_num(nan=180.0), size, len(points1))
+
+
+def predict_transfer_error(
+    H_parts: Tensor, size: int, points1: Tensor, H_mat: Tensor, inliers: Tensor, angles: Tensor | None = None
+) -> PredictedError:
+    """Return the standard errors of points that ``H_mat`` moves, and of its pose.
+
+    The latter is that of the angles (P,) to the poses of parts, zero without them. Other arguments are as for
+    :func:`predict_error`.
+    """
+    x1 = points1[inliers]
+    distance = parallax(x1, transform_points(H_mat[None], x1[None])[0], H_parts).median()
+    return _scale_to_all(distance, distance.new_zeros(1) if angles is None else angles, size, len(points1))
+
+
+def _scale_to_all(distance: Tensor, angles: Tensor, size: int, number: int) -> PredictedError:
+    """Return the standard errors of all matches from a distance and the angles (P,) to the matrices of parts."""
+    unit = math.sqrt(1 / min(number, COMMON_ERRORS) / (1 / size - 1 / number))
+    angle = (math.sqrt(size / (number - size)) * angles).clamp(max=180.0).median()
     return PredictedError(unit * float(distance), float(angle))
 
 

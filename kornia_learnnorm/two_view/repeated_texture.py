@@ -73,11 +73,11 @@ def resolve_ambiguity(
     def fitting(F_mat: Tensor) -> list[float]:  # shares of the false and of the coherent matches off the plane
         return [fitting_share(*x, plane, F_mat, first.threshold) for x in ((false1, false2), matches)]
 
-    best, (false, true) = first, fitting(first.F_mat)
+    best, (false, true) = first, fitting(first.matrix)
     if false > MIN_FALSE_SHARE or true < MIN_COHERENT_SHARE:
         with suppress(NoReliableMatrixError):
             second = again(coherent)
-            left, gained = fitting(second.F_mat)
+            left, gained = fitting(second.matrix)
             if left * true < MAX_SHARE_LEFT * false * gained:
                 best, false, true = second, left, gained
             if _agree(first, second, plane):
@@ -95,7 +95,7 @@ def _agree(first: PairEstimate, second: PairEstimate, H: Tensor) -> bool:
     for own, other in ((first, second), (second, first)):
         points1, points2 = own.points1[own.inliers], own.points2[own.inliers]
         off = parallax(points1, points2, H) > PARALLAX * own.threshold
-        distance = symmetric_epipolar_distance(points1[off], points2[off], other.F_mat)
+        distance = symmetric_epipolar_distance(points1[off], points2[off], other.matrix)
         if not float((distance < PARALLAX * own.threshold).double().mean()) >= MIN_AGREEING_SHARE:
             return False
     return True

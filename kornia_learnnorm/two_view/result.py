@@ -5,49 +5,90 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.median import median
+from kornia_learnnorm.two_view.parallax import Parallax, parallax
+from kornia_learnnorm.two_view.plane_pose import PlanePose
 from kornia_learnnorm.two_view.warnings import PairWarning
 
-__all__ = ["NoReliableMatrixError", "PairEstimate", "package_versions"]
+__all__ = ["ModelChoice", "NoReliableMatrixError", "PairEstimate", "package_versions"]
+
+CONVENTION = "x2^T F x1 = 0, x2 ~ H x1, x = (column, row, 1) in pixels, X2 = R X1 + t; F, H and E have unit norm"
 
 
 class NoReliableMatrixError(ValueError):
-    """The images or matches do not determine a fundamental matrix; ``code`` is one word for programs."""
+    """The images or matches do not determine a matrix; ``code`` is one word for programs."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
         self.code = code
 
 
+class ModelChoice(NamedTuple):
+    """Which matrix is the answer, and the numbers that decided; None where a matrix was not sought or not found."""
+
+    model: str  # "fundamental" or "homography"
+    reason: str  # one sentence for people
+    parallax: Parallax | None = None  # of the matches of the fundamental matrix
+    fundamental_inliers: int | None = None
+    homography_inliers: int | None = None
+    fundamental_gric: float | None = None
+    homography_gric: float | None = None
+
+    @property
+    def by_gric(self) -> str | None:
+        """Name of the model of smaller GRIC; None where there are not two."""
+        if self.fundamental_gric is None or self.homography_gric is None:
+            return None
+        return "fundamental" if self.fundamental_gric < self.homography_gric else "homography"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the reason and the numbers as what JSON can hold."""
+        return {**self._asdict(), "parallax": self.parallax and self.parallax._asdict()}
+
+
 @dataclass(frozen=True, eq=False)
 class PairEstimate:
-    r"""The fundamental matrix of two images and the correspondences behind it; pixels are those of the full images."""
+    r"""The fundamental matrix or homography of two images and the matches behind it; pixels of the full images."""
 
-    F_mat: Tensor  # (3, 3), float64, unit Frobenius norm, x2^T F x1 = 0 in pixels
-    E_mat: Tensor | None  # essential matrix (3, 3) nearest to K2^T F K1, unit Frobenius norm; None without cameras
+    choice: ModelChoice
+    F_mat: Tensor | None  # (3, 3), float64, unit Frobenius norm, x2^T F x1 = 0 in pixels; None where none was found
+    H_mat: Tensor | None  # (3, 3), float64, unit Frobenius norm, x2 ~ H x1 in pixels; None where none was found
+    E_mat: Tensor | None  # essential matrix (3, 3) nearest to K2^T F K1, unit norm; None without cameras or translation
     R: Tensor | None  # rotation (3, 3) of X2 = R X1 + t; None without cameras, and where two poses tie
-    t: Tensor | None  # direction of translation (3,); None without cameras
-    estimator: str  # what made F_mat: "RANSAC" or "LearnedEightPoint"
+    t: Tensor | None  # direction of translation (3,); None without cameras, and where the camera only turned
+    estimator: str  # what made the matrix: "RANSAC" or "LearnedEightPoint"
     points1: Tensor  # pixels of the matches in image 1, (N, 2), float64
     points2: Tensor  # pixels of the matches in image 2, (N, 2), float64
     scores: Tensor  # of each match, 1 minus its ratio or the matcher's score, (N,), float64
     weights: Tensor  # probability of each match to be an inlier as the estimator sees it, (N,), float64
-    inliers: Tensor  # mask of the matches with a distance to F_mat below the threshold, (N,), bool
+    inliers: Tensor  # mask of the matches with a distance to the matrix below the threshold, (N,), bool
     front: Tensor | None  # mask of the matches in front of both cameras, (N,), bool; None without cameras
-    predicted_error: float  # median symmetric epipolar distance of exact correspondences that is expected, pixels
-    warnings: tuple[PairWarning, ...]  # reasons to doubt F_mat; empty when all is well
+    predicted_error: float  # median distance of exact correspondences to the matrix that is expected, pixels
+    warnings: tuple[PairWarning, ...]  # reasons to doubt the matrix; empty when all is well
     size1: tuple[int, int]  # width and height of image 1
     size2: tuple[int, int]  # width and height of image 2
     ratio: float | None  # largest ratio of nearest to second-nearest descriptor distance; None where there is no limit
-    threshold: float  # largest symmetric epipolar distance of an inlier, pixels; of the full images as the points are
+    threshold: float  # largest distance of an inlier, pixels; of the full images as the points are
     seed: int
     path1: Path | None = None
     path2: Path | None = None
+    n: Tensor | None = None  # unit normal (3,) of the plane, n^T X1 > 0; None without cameras or a plane
+    other_pose: PlanePose | None = None  # second pose and normal that the plane allows; None where there is one alone
+
+    @property
+    def model(self) -> str:
+        """Name of the answer: ``fundamental`` or ``homography``."""
+        return self.choice.model
+
+    @property
+    def matrix(self) -> Tensor:
+        """The answer, (3, 3): ``H_mat`` or ``F_mat``."""
+        return cast(Tensor, self.H_mat if self.model == "homography" else self.F_mat)
 
     @property
     def num_matches(self) -> int:
@@ -61,9 +102,11 @@ class PairEstimate:
 
     @property
     def median_distance(self) -> float:
-        """Median symmetric epipolar distance of the inliers, pixels."""
+        """Median distance of the inliers to the matrix, pixels."""
         inlying = self.points1[self.inliers], self.points2[self.inliers]
-        return median(symmetric_epipolar_distance(*inlying, self.F_mat)).item()
+        if self.model == "homography":
+            return median(parallax(*inlying, self.matrix)).item()
+        return median(symmetric_epipolar_distance(*inlying, self.matrix)).item()
 
     def as_dict(self, matches: bool = True) -> dict[str, Any]:
         """Return all of it, or all but what each match has, as what JSON can hold."""
@@ -72,11 +115,16 @@ class PairEstimate:
             return {"file": None if path is None else str(path), "width": size[0], "height": size[1]}
 
         content = {
+            "model": self.model,
+            "choice": self.choice.as_dict(),
             "F": self.F_mat,
+            "H": self.H_mat,
             "E": self.E_mat,
             "R": self.R,
             "t": self.t,
-            "convention": "x2^T F x1 = 0, x = (column, row, 1) in pixels, X2 = R X1 + t; F and E have unit norm",
+            "n": self.n,
+            "other_pose": self.other_pose and {name: x.tolist() for name, x in self.other_pose._asdict().items()},
+            "convention": CONVENTION,
             "predicted_error_px": self.predicted_error,
             "warnings": [warning._asdict() for warning in self.warnings],
             "image1": view(self.path1, self.size1),
@@ -95,20 +143,28 @@ class PairEstimate:
         return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in content.items()}
 
     def summary(self) -> str:
-        """Return F row by row, the pose with cameras, the counts, the predicted error and the warnings as text."""
+        """Return the matrix row by row, the pose with cameras, the counts, predicted error and warnings as text."""
 
         def rows(M: Tensor) -> list[str]:
             return ["  " + " ".join(f"{value: .9e}" for value in row) for row in M.tolist()]
 
-        lines = ["F (x2^T F x1 = 0 in pixels, unit Frobenius norm)", *rows(self.F_mat)]
-        if self.R is not None and self.t is not None:
-            lines += ["R (X2 = R X1 + t)", *rows(self.R), "t (direction)", *rows(self.t[None])]
+        if self.model == "homography":
+            name, equation, distance = "H", "x2 ~ H x1", "distance in image 2"
+            meaning = "typical error in image 2 of points that H moves"
+        else:
+            name, equation, distance = "F", "x2^T F x1 = 0", "symmetric epipolar distance"
+            meaning = "typical error of epipolar lines where true matches lie"
+        lines = [f"{name} ({equation} in pixels, unit Frobenius norm)", *rows(self.matrix)]
+        if self.R is not None:
+            lines += ["R (X2 = R X1 + t)", *rows(self.R)]
+        lines += ["t (direction)", *rows(self.t[None])] if self.t is not None else []
+        lines += ["n (normal of the plane in camera 1)", *rows(self.n[None])] if self.n is not None else []
         ratio = "" if self.ratio is None else f" (ratio test {self.ratio:g})"
         share = self.num_inliers / self.num_matches
-        within = f"symmetric epipolar distance < {self.threshold:.3g} px, median {self.median_distance:.2f} px"
-        error = f"{self.predicted_error:.2f} px (typical error of epipolar lines where true matches lie)"
-        lines += [f"by       {self.estimator}, seed {self.seed}", f"matches  {self.num_matches}{ratio}"]
-        lines += [f"inliers  {self.num_inliers} ({share:.1%}), {within}", f"error    predicted error of F: {error}"]
+        within = f"{distance} < {self.threshold:.3g} px, median {self.median_distance:.2f} px"
+        lines += [f"model    {self.model}: {self.choice.reason}", f"by       {self.estimator}, seed {self.seed}"]
+        lines += [f"matches  {self.num_matches}{ratio}", f"inliers  {self.num_inliers} ({share:.1%}), {within}"]
+        lines += [f"error    predicted error of {name}: {self.predicted_error:.2f} px ({meaning})"]
         return "\n".join([*lines, *(f"warning  {warning.code}: {warning.text}" for warning in self.warnings)])
 
 

@@ -1,11 +1,11 @@
-"""The fundamental matrix of matches by RANSAC or a learned layer, plane and parallax, and parts of the matches."""
+"""The matrices of matches by RANSAC or a learned layer, plane and parallax, and parts of the matches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,16 +22,17 @@ from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view.inputs import Cameras
-from kornia_learnnorm.two_view.parallax import find_main_plane, fit_plane_and_parallax, parallax, parallax_evidence
+from kornia_learnnorm.two_view.parallax import (
+    MAX_LOG_CHANCE_PARALLAX,
+    MIN_PLANAR_SHARE,
+    find_main_plane,
+    fit_plane_and_parallax,
+    parallax,
+    parallax_evidence,
+)
 from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
-from kornia_learnnorm.two_view.warnings import (
-    MAX_LOG_CHANCE_PARALLAX,
-    MAX_LOG_FALSE_ALARMS,
-    MIN_PLANAR_SHARE,
-    log_false_alarms,
-    log_false_samples,
-)
+from kornia_learnnorm.two_view.warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
 
 __all__ = ["MIN_MATCHES", "TwoViewSolver"]
 
@@ -49,11 +50,11 @@ MAX_EMPTY_PARTS = 2  # parts with no more inliers than a search among random mat
 
 
 class Solution(NamedTuple):
-    """The matrix of all matches, and what tells how far it may be off."""
+    """The fundamental matrix or homography of all matches, and what tells how far it may be off."""
 
-    F_mat: Tensor  # (3, 3)
+    matrix: Tensor  # (3, 3)
     weights: Tensor  # of the matches as the estimator sees them, (N,)
-    F_parts: Tensor  # matrices of random parts, without those of failed searches, (P, 3, 3)
+    parts: Tensor  # matrices of random parts, without those of failed searches, (P, 3, 3)
     part_size: int  # matches in a part
 
 
@@ -75,9 +76,9 @@ class TwoViewSolver:
         """Name of the class that estimates."""
         return RANSAC.__name__ if self.layer is None else type(self.layer).__name__
 
-    def search(self, size2: Size) -> Solution:
-        """Return the best matrix of all matches and of random parts; raise NoReliableMatrixError for few inliers."""
-        F_mat, weights = self.solve()
+    def search(self, first: Solution, size2: Size) -> Solution:
+        """Return the best matrix of :meth:`solve` and random parts; raise NoReliableMatrixError for few inliers."""
+        F_mat, weights = first.matrix, first.weights
         parts = random_parts(len(weights), int(self.inliers(F_mat).sum()), self.seed)
         F_parts = self._solve_parts(F_mat, parts, size2)
         F_mat = self.improve(F_mat, F_parts)
@@ -87,8 +88,25 @@ class TwoViewSolver:
             raise NoReliableMatrixError("no_consensus", f"{text}, at least {MIN_MATCHES} are needed")
         return Solution(F_mat, weights, drop_failed_parts(F_parts, self.support(F_parts), agree), parts.shape[1])
 
-    def solve(self) -> tuple[Tensor, Tensor]:
-        """Return the matrix (3, 3) of the matches, and their weights (N,), without a look at parts of them."""
+    def homography(self, size2: Size) -> Tensor | None:
+        """Return the homography (3, 3) that most matches agree with; None for fewer than nine, or as many by chance."""
+        H_mat = self._ransac("homography").F_mat
+        matches, agree = len(self.scores), int((self.parallax(H_mat) < self.threshold).sum())
+        by_chance = log_false_alarms(matches, agree, self.threshold, size2, "homography") > MAX_LOG_FALSE_ALARMS
+        return None if agree < MIN_MATCHES or by_chance else H_mat
+
+    def check_homography(self, H_mat: Tensor) -> Solution:
+        """Return a homography (3, 3) of all matches with those of the matches near it in random parts."""
+        distance = self.parallax(H_mat)
+        inliers, near = distance < self.threshold, distance < NEAR * self.threshold
+        agree = int(inliers.sum())
+        parts = random_parts(len(inliers), agree, self.seed)
+        H_parts = torch.stack([self.part(rows[near[rows]])._ransac("homography").F_mat for rows in parts])  # noqa: SLF001
+        support = (self.parallax(H_parts) < self.threshold).sum(-1)
+        return Solution(H_mat, inliers.double(), drop_failed_parts(H_parts, support, agree), parts.shape[1])
+
+    def solve(self) -> Solution:
+        """Return the fundamental matrix of the matches without a look at parts of them."""
         if self.layer is None:
             found = self._ransac()
             F_mat, weights = self._search_near(found.F_mat), found.inliers.double()
@@ -100,7 +118,7 @@ class TwoViewSolver:
             F_mat = self._try_plane_and_parallax(F_mat)
         elif self.layer is not None:
             F_mat = self._refine(F_mat)
-        return F_mat, weights
+        return Solution(F_mat, weights, F_mat.new_zeros(0, 3, 3), 0)
 
     def improve(self, F_mat: Tensor, F_parts: Tensor) -> Tensor:
         """Return the matrix (3, 3) of all matches, or that of a part (P, 3, 3), refined, where it scores higher."""
@@ -116,6 +134,10 @@ class TwoViewSolver:
     def distance(self, F_mat: Tensor) -> Tensor:
         """Return the symmetric epipolar distances of the matches to a matrix (3, 3), (N,), pixels."""
         return symmetric_epipolar_distance(self.points1, self.points2, F_mat)
+
+    def parallax(self, H_mat: Tensor) -> Tensor:
+        """Return the distances (*, N) of points2 from where homographies (*, 3, 3) move points1, pixels."""
+        return parallax(self.points1, self.points2, H_mat)
 
     def inliers(self, F_mat: Tensor) -> Tensor:
         """Return which matches lie within the threshold of a matrix (3, 3), (N,) bool."""
@@ -139,15 +161,16 @@ class TwoViewSolver:
         """Return the MSAC score of a matrix (3, 3); zero for a matrix of zeros."""
         return float(self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1).score.sum())
 
-    def _ransac(self) -> RansacResult:
-        ransac = RANSAC(inl_th=self.threshold, seed=self.seed, sampler=self.sampler)
-        return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *(self.cameras or ()))
+    def _ransac(self, model: Literal["fundamental", "homography"] = "fundamental") -> RansacResult:
+        ransac = RANSAC(inl_th=self.threshold, seed=self.seed, sampler=self.sampler, model=model)
+        cameras = self.cameras or () if model == "fundamental" else ()
+        return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *cameras)
 
     def _solve_parts(self, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
         """Return the matrices of the parts; of few matches, only of the first where these find no more than chance."""
         matches, found = len(self.scores), F_mat[None]
         for rows in parts:
-            found = torch.cat([found, self.part(rows).solve()[0][None]])
+            found = torch.cat([found, self.part(rows).solve().matrix[None]])
             if matches > FEW_MATCHES:  # a late part can find what all others missed
                 continue
             most, failed = int(self.support(found).max()), len(found) - 1

@@ -1,4 +1,4 @@
-"""Reasons to doubt the fundamental matrix of an image pair, from the matches alone, without a ground truth."""
+"""Reasons to doubt the matrix of an image pair, from the matches alone, without a ground truth."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
-from kornia_learnnorm.two_view.parallax import parallax_evidence
 
-__all__ = ["MAX_LOG_CHANCE_PARALLAX", "MAX_LOG_FALSE_ALARMS", "MIN_INLIERS", "MIN_PLANAR_SHARE", "PairWarning"]
+__all__ = ["MAX_LOG_FALSE_ALARMS", "MIN_INLIERS", "PairWarning"]
 __all__ += ["find_warnings", "log_false_alarms", "log_false_samples"]
 
 MAX_ANGLE = 8.0  # degrees; a pose that moves by more in half of the parts is unstable
@@ -20,33 +19,22 @@ MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
 MIN_SPREAD = 0.02  # of the image diagonal; standard deviation of the inliers across their longest direction
 SEARCH_SAMPLES = 50_000  # minimal samples of a search that finds nothing
 MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of random models with as much support
-MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
-PARALLAX_SCALES = (1.0, 0.5, 0.25, 0.125)  # of the threshold at which parallax is sought; SIFT errs by 0.1 px or so
-MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
 
 
 class PairWarning(NamedTuple):
-    """A reason to doubt a fundamental matrix."""
+    """A reason to doubt a matrix."""
 
     code: str  # few_inliers, chance, clustered, planar, unstable, ambiguous or no_pose
     text: str  # one sentence for people
 
 
 def find_warnings(
-    points1: Tensor,
-    points2: Tensor,
-    distance: Tensor,
-    off_plane: Tensor | None,
-    threshold: float,
-    size2: Size,
-    angle: float,
+    points1: Tensor, points2: Tensor, inliers: Tensor, threshold: float, size2: Size, angle: float
 ) -> tuple[PairWarning, ...]:
-    """Return the reasons to doubt the matrix of matches (N, 2); none when all is well.
+    """Return the reasons to doubt the matrix of matches (N, 2) with a mask of inliers (N,); none when all is well.
 
-    The matches are ``distance`` (N,) from the matrix and ``off_plane`` (N,), if given, from the plane that explains
-    most inliers, pixels. ``angle`` is that of the :class:`~kornia_learnnorm.two_view.predicted_error.PredictedError`.
+    ``angle`` is that of the :class:`~kornia_learnnorm.two_view.predicted_error.PredictedError`.
     """
-    inliers = distance < threshold
     found, total, matches = {}, int(inliers.sum()), len(inliers)
     if total < MIN_INLIERS:
         found["few_inliers"] = f"only {total} of {matches} matches agree on the matrix"
@@ -56,13 +44,6 @@ def find_warnings(
     if spread < MIN_SPREAD:
         text = f"the inliers lie close to one line or one point: {spread:.1%} of the image diagonal apart"
         found["clustered"] = text
-    if off_plane is not None:
-        near, wide = (float((off_plane[inliers] < k * threshold).double().mean()) for k in (1, 3))
-        evidence = min(parallax_evidence(off_plane, distance < k * threshold, k * threshold) for k in PARALLAX_SCALES)
-        if wide > MIN_PLANAR_SHARE and evidence > MAX_LOG_CHANCE_PARALLAX:
-            text = f"one homography explains {near:.0%} of the inliers within {threshold:g} px and {wide:.0%} within "
-            text += f"{3 * threshold:g} px (a plane, or a camera that only rotates), and the rest do not determine the "
-            found["planar"] = text + "epipole"
     if angle > MAX_ANGLE:
         found["unstable"] = f"the pose changes by {angle:.0f} degrees when the matches are drawn anew"
     return tuple(PairWarning(*item) for item in found.items())
@@ -73,15 +54,21 @@ def _spread(points: Tensor) -> float:
     return float(torch.linalg.svdvals(points - points.mean(0))[-1]) / math.sqrt(len(points))
 
 
-def log_false_alarms(matches: int, inliers: int, threshold: float, size: Size) -> float:
+def log_false_alarms(matches: int, inliers: int, threshold: float, size: Size, model: str = "fundamental") -> float:
     """Return log10 of the expected number of matrices with as many inliers among as many random matches.
 
-    Models from seven matches, and the probability that a random point of image 2 lies within the threshold, pixels, of
-    a line (L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches between two images and
-    estimate the fundamental matrix, IJCV 2004).
+    Fundamental matrices from seven matches, and the probability that a random point of image 2 lies within the
+    threshold, pixels, of a line (L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches between
+    two images and estimate the fundamental matrix, IJCV 2004); homographies from four, and of a point (L. Moisan, P.
+    Moulon, P. Monasse, Automatic homographic registration of a pair of images, with a contrario elimination of
+    outliers, IPOL 2012).
     """
-    tests = max(1, matches - 7) * math.comb(matches, inliers) * math.comb(inliers, 7)
-    return math.log10(max(1, tests)) + (inliers - 7) * _log_strip(threshold, size)
+    if model == "fundamental":
+        sample, log_share = 7, _log_strip(threshold, size)
+    else:
+        sample, log_share = 4, math.log10(min(1.0, math.pi * threshold**2 / math.prod(size)))
+    tests = max(1, matches - sample) * math.comb(matches, inliers) * math.comb(inliers, sample)
+    return math.log10(max(1, tests)) + (inliers - sample) * log_share
 
 
 def log_false_samples(matches: int, inliers: int, threshold: float, size: Size) -> float:

@@ -19,7 +19,7 @@ from kornia_learnnorm.two_view.many_pairs import read_pair_list
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
-from two_planes import HEIGHT, WIDTH  # noqa: E402 (needs OpenCV)
+from two_planes import HEIGHT, WIDTH, K, R, t  # noqa: E402 (needs OpenCV)
 
 
 @pytest.fixture
@@ -41,11 +41,12 @@ class TestOnePair:
         lines = capsys.readouterr().out.splitlines()
         printed = [[float(value) for value in line.split()] for line in lines[1:4]]
         assert np.allclose(printed, result.F_mat.numpy(), rtol=1e-8)
-        assert re.match(r"by +RANSAC, seed 0", lines[4])
-        assert re.match(rf"matches +{result.num_matches} \(ratio test 0\.8\)", lines[5])
-        assert re.match(rf"inliers +{result.num_inliers} ", lines[6])
-        assert f"predicted error of F: {result.predicted_error:.2f} px (typical error of epipolar lines" in lines[7]
-        assert len(lines) == 8
+        assert re.match(r"model +fundamental: one homography explains", lines[4])
+        assert re.match(r"by +RANSAC, seed 0", lines[5])
+        assert re.match(rf"matches +{result.num_matches} \(ratio test 0\.8\)", lines[6])
+        assert re.match(rf"inliers +{result.num_inliers} ", lines[7])
+        assert f"predicted error of F: {result.predicted_error:.2f} px (typical error of epipolar lines" in lines[8]
+        assert len(lines) == 9
         assert not list(Path().iterdir())
 
     def test_writes_picture_and_json(self, command, capsys):
@@ -60,8 +61,9 @@ class TestOnePair:
 
     def test_exit_codes(self, command, planes, capsys):
         """4 with a warning, 3 where there is no matrix; no picture is written in the latter case."""
-        assert command("--strict", images=("left", "plane")) == 3
-        assert command("--json", "F.json", images=("left", "plane")) == 4
+        plane = ("--model", "fundamental", "--json", "F.json")
+        assert command("--strict", *plane, images=("left", "plane")) == 3
+        assert command(*plane, images=("left", "plane")) == 4
         assert "points1" not in json.loads(Path("F.json").read_text())
         assert "\nwarning  planar: one homography explains" in capsys.readouterr().out
         assert "planar" in [warning["code"] for warning in json.loads(Path("F.json").read_text())["warnings"]]
@@ -70,11 +72,25 @@ class TestOnePair:
         assert captured.out == "wrote    F.json\n"
         assert "no reliable matrix (no_motion): " in captured.err
         failure = json.loads(Path("F.json").read_text())
-        assert [failure[name] for name in ("F", "E", "R", "t", "predicted_error_px")] == [None] * 5
+        assert [failure[name] for name in ("model", "F", "H", "R", "t", "predicted_error_px")] == [None] * 6
         assert [warning["code"] for warning in failure["warnings"]] == ["no_motion"]
         assert failure["image1"] == {"file": f"{planes}/left.png", "width": WIDTH, "height": HEIGHT}
         assert [failure[name] for name in ("estimator", "seed", "ratio", "threshold_px")] == ["RANSAC", 0, 0.8, 1]
         assert [path.name for path in Path().iterdir()] == ["F.json"]
+
+    def test_a_plane_is_solved_by_its_homography(self, command, capsys):
+        pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
+        camera = ("--K", "300,300,160,120")
+        assert command("--out", "pair.png", "--json", "H.json", *camera, images=("left", "plane")) == 0
+        assert capsys.readouterr().out.startswith("H (x2 ~ H x1 in pixels, unit Frobenius norm)\n")
+        content = json.loads(Path("H.json").read_text())
+        assert (content["model"], content["warnings"]) == ("homography", [])
+        true = K @ (R + np.outer(t, [0, 0, 1]) / 4) @ np.linalg.inv(K)
+        assert np.allclose(content["H"], true / np.linalg.norm(true), atol=2e-3)
+        assert np.allclose(content["R"], R, atol=0.02)
+        assert np.dot(content["t"], t / np.linalg.norm(t)) > np.cos(np.radians(5))
+        assert content["n"][2] > np.cos(np.radians(5))
+        assert cv2.imread("pair.png").shape[1] == 1200
 
     def test_mask_camera_and_json_to_standard_output(self, command, result, capsys):
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
@@ -96,6 +112,7 @@ class TestOnePair:
             (["--out", "pair.png"], ImportError, r"pip install '\.\[report\]'"),  # without Matplotlib
             (["--K", "1,2"], ValueError, "camera 1,2: expected fx,fy,cx,cy, .* got 2 numbers"),
             (["--K", "a", "b", "c"], ValueError, "--K: one value for both images or one for each expected, got 3"),
+            (["--estimator", "learned", "--model", "homography"], ValueError, "only for fundamental matrices"),
             (["--dask", "tcp://a:1"], ValueError, "--dask: only for --pairs"),
             (["--gap", "2"], ValueError, "--gap: only for --pairs"),
             (["--pairs", "l.txt", "--json", "-"], ValueError, "cannot be combined with image files and --json$"),

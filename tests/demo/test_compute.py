@@ -91,7 +91,7 @@ class TestCompare:
         assert results["Hartley"].as_dict()["predicted_error_px"] is None
 
     def test_a_method_without_a_matrix_says_why(self, example, results, monkeypatch):
-        def estimate(matched, layer):
+        def estimate(matched, layer, model):
             if layer is not None:
                 raise NoReliableMatrixError("no_consensus", "1 and 2: nothing agrees")
             return results["RANSAC"].estimate

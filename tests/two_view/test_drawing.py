@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kornia_learnnorm.two_view.drawing import draw_line, draw_pair, import_matplotlib
-from kornia_learnnorm.two_view.result import PairEstimate
+from kornia_learnnorm.two_view.result import ModelChoice, PairEstimate
 from kornia_learnnorm.two_view.warnings import PairWarning
 
 image_module = pytest.importorskip("matplotlib.image")  # Matplotlib may not be installed
@@ -26,7 +26,8 @@ def make_pair(width: int = 160, height: int = 120, points: int = 30) -> tuple[np
     F_mat = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / 2**0.5
     matches = (points1, points2, torch.ones(points), inliers.double(), inliers)
     sizes, settings = ((width, height), (width, height)), (0.8, 1.0, 0)  # ratio, threshold, seed
-    estimate = PairEstimate(F_mat, None, None, None, "RANSAC", *matches, None, 0.1, (), *sizes, *settings)
+    matrices = ModelChoice("fundamental", ""), F_mat, None, None, None, None
+    estimate = PairEstimate(*matrices, "RANSAC", *matches, None, 0.1, (), *sizes, *settings)
     return image1, image2, estimate
 
 
@@ -88,6 +89,16 @@ class TestDrawPair:
         height, width = (np.ptp(places) for places in (picture == [0, 1, 0]).all(2).nonzero())
         assert width / height == pytest.approx(0.7, abs=0.02)
         assert picture.shape[0] > 1200 / 3 + height
+
+    def test_a_homography_moves_image_1(self, draw):
+        """A shift by half of image 1, which is green, over a magenta image 2: grey where both are."""
+        image1, image2 = (np.tile(np.uint8(colour), (120, 160, 1)) for colour in ([0, 255, 0], [255, 0, 255]))
+        shift = torch.tensor([[1.0, 0, 80], [0, 1, 0], [0, 0, 1]]).double()
+        choice = ModelChoice("homography", "")
+        picture = draw(image1, image2, dataclasses.replace(make_pair()[2], choice=choice, H_mat=shift))
+        share = [(np.abs(picture - colour).max(2) < 0.01).mean() for colour in ([1, 0, 1], [0.5, 0.5, 0.5])]
+        assert share[0] == pytest.approx(share[1], rel=0.1)
+        assert share[0] > 0.1
 
     def test_warnings_are_written_below(self, draw, picture):
         image1, image2, estimate = make_pair()

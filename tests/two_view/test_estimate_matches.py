@@ -13,11 +13,14 @@ from scenes import epipolar_distances, seeded, uniform
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.two_view import estimate_matches as module
-from kornia_learnnorm.two_view.solver import TwoViewSolver
+from kornia_learnnorm.two_view.solver import Solution, TwoViewSolver
 
-pytest.importorskip("cv2", reason="OpenCV is not installed")
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
 SCENE = handheld(1, 160, seeded(), noise=0.3)
+K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+TINY = kln.LearnedEightPoint.from_pretrained("robust-tiny")
+SIZES = {"size1": (640, 480), "size2": (640, 480)}
 CAMERAS = {"K1": SCENE.K1[0], "K2": SCENE.K2[0]}
 
 
@@ -25,6 +28,14 @@ def make_matches(outliers: int = 40):
     """The matches of the scene with random ones among them."""
     wrong = uniform(outliers, 4) * SCENE.image_size[0].repeat(2)
     return torch.cat([torch.cat([SCENE.points1[0], SCENE.points2[0]], -1), wrong]).split(2, -1)
+
+
+def see_plane(R, t, noise: float = 0.2, depth: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
+    """Matches of points of the plane Z = depth in coordinates of camera 1."""
+    rng = np.random.default_rng(int(depth))
+    x1 = rng.uniform([0, 0], [640, 480], (150, 2))
+    x2 = (np.c_[x1, np.ones(150)] @ np.linalg.inv(K).T * depth @ R.T + t) @ K.T
+    return x1, x2[:, :2] / x2[:, 2:] + rng.normal(0, 1, (150, 2)) * noise
 
 
 @pytest.fixture(scope="module")
@@ -52,16 +63,62 @@ class TestEstimateMatches:
         assert (result.ratio, content["ratio"]) == (None, None)
         assert "ratio" not in result.summary()
 
-    def test_cameras_solve_a_plane(self):
-        """Points of the plane Z = 5: not determined without cameras."""
-        rng = np.random.default_rng(0)
-        K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
-        x1 = rng.uniform([0, 0], [640, 480], (150, 2))
-        x2 = (np.c_[x1, np.ones(150)] @ np.linalg.inv(K).T * 5 + [0.8, 0.1, 0.1]) @ K.T
-        x2 = x2[:, :2] / x2[:, 2:] + rng.normal(0, 0.2, (150, 2))
-        sizes = {"size1": (640, 480), "size2": (640, 480)}
-        assert "planar" in codes(kln.estimate_matches(x1, x2, **sizes))
-        assert "planar" not in codes(kln.estimate_matches(x1, x2, **sizes, K1=K, K2=K))
+    def test_a_plane(self):
+        """Points of the plane Z = 5: it determines no fundamental matrix without cameras."""
+        x1, x2 = see_plane(np.eye(3), [0.8, 0.1, 0.1])
+        found = kln.estimate_matches(x1, x2, **SIZES, model="fundamental")
+        assert (found.model, found.H_mat) == ("fundamental", None)
+        assert "planar" in codes(found)
+        found = kln.estimate_matches(x1, x2, **SIZES)
+        assert (found.model, codes(found), found.R) == ("homography", [], None)
+        assert found.num_inliers > 140
+        exact1, exact2 = see_plane(np.eye(3), [0.8, 0.1, 0.1], noise=0.0)
+        moved = np.c_[exact1, np.ones(150)] @ found.matrix.numpy().T
+        error = np.median(np.linalg.norm(moved[:, :2] / moved[:, 2:] - exact2, axis=1))
+        assert 0.2 < found.predicted_error / error < 5
+        assert found.F_mat is not None
+        assert "\nmodel    homography: one homography explains" in found.summary()
+        content = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+        assert (content["model"], content["H"]) == ("homography", found.H_mat.tolist())
+        assert content["choice"]["parallax"]["wide"] == 1.0
+
+    def test_the_pose_of_a_plane(self):
+        R, t = cv2.Rodrigues(np.array([0.02, -0.05, 0.01]))[0], np.array([0.8, 0.1, 0.1])
+        found = kln.estimate_matches(*see_plane(R, t), **SIZES, K1=K, K2=K)
+        assert (found.model, codes(found), found.other_pose) == ("homography", [], None)
+        assert np.degrees(np.arccos((np.trace(found.R.numpy().T @ R) - 1) / 2)) < 0.5
+        assert found.t.numpy() @ t / np.linalg.norm(t) > np.cos(np.radians(2))
+        assert found.n[2] > np.cos(np.radians(2))
+        assert found.front[found.inliers].all()
+        assert np.median(epipolar_distances(*see_plane(R, t, noise=0.0), found.F_mat)) < 0.5
+        assert "\nn (normal of the plane in camera 1)\n" in found.summary()
+
+    def test_two_poses_of_a_plane(self):
+        """Of a camera that moves forwards: matches off the plane agree with the true one alone."""
+        R, t = np.eye(3), np.array([0.3, 0.1, 0.8])
+        matches = (np.concatenate(pair) for pair in zip(see_plane(R, t), see_plane(R, t, depth=4.0), strict=True))
+        found = kln.estimate_matches(*matches, **SIZES, K1=K, K2=K, model="homography")
+        assert found.t.numpy() @ t / np.linalg.norm(t) > np.cos(np.radians(3))
+        assert found.other_pose.t.numpy() @ t / np.linalg.norm(t) < np.cos(np.radians(6))
+        assert {*found.as_dict()["other_pose"]} == {"R", "t", "n"}
+
+    def test_a_camera_that_turns(self):
+        R = cv2.Rodrigues(np.array([0.02, -0.1, 0.01]))[0]
+        found = kln.estimate_matches(*see_plane(R, [0.0, 0, 0]), **SIZES, K1=K, K2=K)
+        assert (found.model, codes(found), found.t, found.n, found.E_mat) == ("homography", [], None, None, None)
+        assert np.allclose(found.R, R, atol=2e-3)
+        json.dumps(found.as_dict(), allow_nan=False)
+
+    def test_a_homography_that_is_asked_for(self, matches):
+        """Of a scene with relief: it moves few matches right. Of a mirror with cameras: no pose."""
+        found = kln.estimate_matches(*see_plane(np.eye(3), [0.8, 0.1, 0.1]), **SIZES, model="homography")
+        assert (found.F_mat, found.choice.parallax, found.estimator) == (None, None, "RANSAC")
+        json.dumps(found.as_dict(), allow_nan=False)
+        points1 = uniform(60, 2, high=400)
+        mirrored = kln.estimate_matches(
+            points1, points1 * torch.tensor([-1.0, 1]) + 400, **SIZES, K1=K, K2=K, model="homography"
+        )
+        assert (codes(mirrored), mirrored.R) == (["no_pose"], None)
 
     def test_a_tie_between_poses(self, matches, monkeypatch):
         nothing = torch.full((1, 3, 3), torch.nan).double()
@@ -79,7 +136,7 @@ class TestEstimateMatches:
         def counted(self):
             calls.append(self)
             F_mat = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # of a sideways motion
-            return F_mat if agree else torch.zeros(3, 3).double(), torch.zeros(number).double()
+            return Solution(F_mat if agree else torch.zeros(3, 3).double(), torch.zeros(number).double(), F_mat[:0], 0)
 
         points = uniform(2, number, 2, high=500)
         points[1, :, 1] += 1000 + torch.arange(number)  # no row in common with image 1
@@ -90,7 +147,7 @@ class TestEstimateMatches:
         assert len(calls) == solved
 
     def test_the_learned_layer(self, matches):
-        found = kln.estimate_matches(*matches, layer=kln.LearnedEightPoint.from_pretrained("robust-tiny"))
+        found = kln.estimate_matches(*matches, layer=TINY)
         assert found.estimator == "LearnedEightPoint"
         assert found.weights[found.inliers].mean() > found.weights[~found.inliers].mean() + 0.3
 
@@ -155,6 +212,8 @@ def test_no_matrix(points1, shift, code):
         ({"seed": -1}, ValueError, r"seed must lie in \[0, 2\^63\), got -1"),
         ({"seed": None}, TypeError, "seed must be a whole number, got None"),
         ({"layer": "robust"}, TypeError, "layer must be a LearnedEightPoint or None, got <class 'str'>"),
+        ({"model": "affine"}, ValueError, "model must be 'auto' or 'fundamental' or 'homography', got 'affine'"),
+        ({"layer": TINY, "model": "homography"}, ValueError, "layer estimates fundamental matrices: leave it out"),
         ({"size1": (0, 0)}, ValueError, r"size1 must be a positive width and height, got \(0, 0\)"),
         ({"size2": (640.5, 480)}, TypeError, "width and height of size2 must be a whole number, got 640.5"),
         ({"size2": (640,)}, ValueError, r"size2 must be a positive width and height, got \(640,\)"),

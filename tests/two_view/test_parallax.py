@@ -12,10 +12,13 @@ from hypothesis import strategies as st
 from scenes import epipolar_distances
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.two_view import parallax as parallax_module
 from kornia_learnnorm.two_view.parallax import (
+    Parallax,
     distances_from_plane,
     find_main_plane,
     fit_plane_and_parallax,
+    measure_parallax,
     parallax,
     parallax_evidence,
 )
@@ -148,5 +151,35 @@ class TestDistancesFromPlane:
 def test_a_bent_plane_is_planar(distortion):
     """Without the distortion, the bend counts as parallax, and the wrong matrix comes without a warning."""
     pytest.importorskip("cv2", reason="OpenCV is not installed")
-    found = kln.estimate_matches(*matches(distortion), size1=SIZE, size2=SIZE)
+    found = kln.estimate_matches(*matches(distortion), size1=SIZE, size2=SIZE, model="fundamental")
     assert "planar" in [warning.code for warning in found.warnings]
+
+
+class TestMeasureParallax:
+    """Of the identity, under which a hundred points stay or move along one direction."""
+
+    points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (100, 2)))
+
+    def measured(self, shift, distance, monkeypatch) -> Parallax:
+        monkeypatch.setattr(parallax_module, "find_main_plane", lambda *_: torch.eye(3).double())
+        monkeypatch.setattr(parallax_module, "distances_from_plane", lambda *_: shift)
+        distance = torch.full((100,), distance, dtype=torch.float64)
+        return measure_parallax(self.points, self.points, distance, 1.0, (640, 480), (640, 480))
+
+    def test_without_parallax(self, monkeypatch):
+        found = self.measured(torch.zeros(100), 0.3, monkeypatch)
+        assert (found, found.planar) == ((1.0, 1.0, 0.0), True)
+        assert "explains 100% of the inliers within 1 px" in found.describe(1.0)
+
+    def test_two_fifths_off_the_plane(self, monkeypatch):
+        found = self.measured(torch.cat([torch.zeros(60), torch.linspace(10, 60, 40)]), 0.3, monkeypatch)
+        assert (found.near, found.wide, found.planar) == (pytest.approx(0.6), pytest.approx(0.6), False)
+        assert found.log_chance < -20
+
+    @pytest.mark.parametrize(
+        ("relief", "distance", "planar"), [(1.5, 0.3, False), (1.5, 0.7, True), (0.4, 0.1, False), (0.4, 0.3, True)]
+    )
+    def test_little_relief(self, relief, distance, planar, monkeypatch):
+        """Parallax in one direction is evidence where the matches fit within less than half of it."""
+        shift = torch.where(torch.arange(100) < 60, relief, 0.0)
+        assert self.measured(shift, distance, monkeypatch).planar == planar

@@ -43,6 +43,6 @@ def test_relief_below_the_threshold():
     noisy = tuple(points + torch.from_numpy(noise * rng.normal(size=(number, 2))) for points in exact)
     scores = torch.ones(number).double()
     ransac = kln.RANSAC(inl_th=1.0, seed=0).estimate(*noisy, scores).F_mat
-    found = TwoViewSolver(*noisy, scores, 1.0, 0).solve()[0]
+    found = TwoViewSolver(*noisy, scores, 1.0, 0).solve().matrix
     error, worse = (np.median(epipolar_distances(*exact, F_mat)) for F_mat in (found, ransac))
     assert error < 0.7 * worse

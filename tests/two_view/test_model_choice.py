@@ -1,0 +1,96 @@
+"""Which of both matrices is the answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_learnnorm.two_view import model_choice
+from kornia_learnnorm.two_view.model_choice import choose_model, compute_gric
+from kornia_learnnorm.two_view.parallax import Parallax
+from kornia_learnnorm.two_view.result import NoReliableMatrixError
+from kornia_learnnorm.two_view.solver import TwoViewSolver
+
+pytest.importorskip("cv2", reason="OpenCV is not installed")
+
+SIZE = (640, 480)
+
+
+def make_solver(relief: float, outliers: int = 0, plane: int = 150) -> TwoViewSolver:
+    """Matches of a camera that moves sideways along a wall, of which a third stands out by a share of its distance."""
+    rng = np.random.default_rng(0)
+    x1 = rng.uniform([0, 0], SIZE, (plane, 2))
+    x2 = x1 + np.where(np.arange(plane)[:, None] % 3, [40.0, 10], np.array([40.0, 10]) / (1 - relief))
+    x1, x2 = (x + rng.normal(0, 0.2, x.shape) for x in (x1, x2))
+    wrong = rng.uniform([0, 0, 0, 0], [*SIZE, *SIZE], (outliers, 4))
+    points = (torch.from_numpy(x) for x in (np.r_[x1, wrong[:, :2]], np.r_[x2, wrong[:, 2:]]))
+    return TwoViewSolver(*points, torch.ones(plane + outliers).double(), 1.0, 0)
+
+
+class TestChooseModel:
+    @pytest.mark.parametrize(("relief", "model"), [(0.0, "homography"), (0.1, "fundamental")])
+    def test_relief_decides(self, relief, model):
+        choice, found, H_mat = choose_model(make_solver(relief, outliers=50), "auto", SIZE, SIZE)
+        assert (choice.model, choice.parallax.planar) == (model, model == "homography")
+        assert choice.reason == choice.parallax.describe(1.0)
+        assert found.matrix.shape == H_mat.shape == (3, 3)
+        assert choice.fundamental_inliers > 100
+        assert choice.homography_inliers > 60
+
+    def test_gric_must_agree(self, monkeypatch):
+        """Where parallax is no more than chance but F explains the matches better, it stays, with its warning."""
+        monkeypatch.setattr(model_choice, "measure_parallax", lambda *_: Parallax(1.0, 1.0, 0.0))
+        for relief, model in ((0.1, "fundamental"), (0.0, "homography")):
+            choice = choose_model(make_solver(relief), "auto", SIZE, SIZE)[0]
+            assert (choice.model, choice.by_gric) == (model, model)
+
+    def test_what_is_asked_for(self):
+        solver = make_solver(0.0)
+        choice, found, H_mat = choose_model(solver, "fundamental", SIZE, SIZE)
+        assert (choice.model, choice.parallax.planar, H_mat) == ("fundamental", True, None)
+        choice, found, H_mat = choose_model(solver, "homography", SIZE, SIZE)
+        assert (choice.model, choice.parallax, found) == ("homography", None, None)
+        assert np.allclose(H_mat / H_mat[2, 2], [[1, 0, 40], [0, 1, 10], [0, 0, 1]], atol=0.5)
+
+    @pytest.mark.parametrize("missed", ["all", "most"])
+    def test_a_search_for_the_fundamental_matrix_that_failed(self, missed, monkeypatch):
+        """Random matrices agree with few of the matches of a wall with relief."""
+        solver = make_solver(0.1)
+
+        def search(self, first, size2):
+            if missed == "all":
+                raise NoReliableMatrixError("no_consensus", "8 of 150 matches agree")
+            return first._replace(matrix=torch.tensor([[0.0, 0, 1], [0, 0, 0], [-1, 0, 90]]).double())
+
+        monkeypatch.setattr(TwoViewSolver, "search", search)
+        choice, found, H_mat = choose_model(solver, "auto", SIZE, SIZE)
+        assert choice.model == "homography"
+        assert (found is None) == (missed == "all")
+        assert H_mat is not None
+
+    def test_no_matrix(self):
+        solver = make_solver(0.0, outliers=30, plane=0)
+        for model in ("auto", "homography"):
+            with pytest.raises(NoReliableMatrixError, match="30 matches agree") as caught:
+                choose_model(solver, model, SIZE, SIZE)
+            assert caught.value.code == "no_consensus"
+
+
+def test_gric():
+    """By hand: of six matches, three have a distance of 0.5 px to the lines, and two are moved 3 px too far."""
+    x1 = torch.from_numpy(np.random.default_rng(0).uniform(100, 500, (6, 2)))
+    x2 = x1 + torch.tensor([[0, 0.5**0.5], [0, -(0.5**0.5)], [0, 0.5**0.5], [0, 0.1], [3, 0], [3, 0]])
+    rows = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # epipolar lines are the rows
+    found = compute_gric(x1, x2, rows, torch.eye(3).double(), 1.0, False)
+    squares1 = np.array([0.25, 0.25, 0.25, 0.005, 0, 0])
+    variance = 0.005 / 0.455
+    for cost, squares, most, dimension, dof in zip(
+        found, (squares1, [0.25, 0.25, 0.25, 0.005, 4.5, 4.5]), (2, 4), (3, 2), (7, 8), strict=True
+    ):
+        misfit = np.minimum(np.array(squares) / variance, most).sum()
+        assert cost == pytest.approx(misfit + 6 * dimension * np.log(4) + dof * np.log(24))
+    assert compute_gric(x1, x2, rows, torch.eye(3).double(), 1.0, True)[0] == pytest.approx(found[0] - 2 * np.log(24))
+    exact = compute_gric(x1, x1, rows, torch.eye(3).double(), 1.0, False)
+    assert np.isfinite(exact).all()
+    assert exact[1] < exact[0]
