@@ -2,14 +2,21 @@
 
 The pairs are rendered, so their truth is exact: kinds of `render_kind`, and `outliers`, which are correspondences of
 synthetic scenes with 0.5 px noise among 10 to 90 % random matches. A pair is determined if at least 5 % of its exact
-correspondences lie more than 1 px from the best homography. An answer is right if its rotation and its direction of
-translation, taken from F, the true cameras and its inliers, are both within 10 degrees of the truth; where the camera
-only turns, every answer is wrong. Errors in pixels are medians of the symmetric epipolar distance of exact
-correspondences; the predicted ones are compared with them over the answers without a warning. Prints progress to
-stderr.
+correspondences lie more than 1 px from the best homography. A fundamental matrix is right if its rotation and its
+direction of translation, taken from F, the true cameras and its inliers, are both within 10 degrees of the truth; where
+the camera only turns, it is wrong. A homography is right if it moves 95 % of the exact correspondences to within 2 px
+and, with --cameras, its pose is within 10 degrees. Errors in pixels are medians over the exact correspondences, of the
+symmetric epipolar distance or the distance from where H moves a point; the predicted ones are compared with them over
+the answers without a warning. `F` counts the pairs of which F is chosen, `GRIC: F` those of which GRIC alone would not
+choose the homography (P. Torr, A. Fitzgibbon, A. Zisserman, The problem of degeneracy in structure and motion recovery
+from uncalibrated image sequences, IJCV 1999). Prints progress to stderr.
 
     python benchmarks/pairs.py [--pairs 200] [--kinds KIND ...] [--seed 0] [--estimator ransac|learned]
-        [--weights NAME] [--cameras] [--size 640 480] [--cache FOLDER] [--json FILE]
+        [--weights NAME] [--model auto|fundamental|homography] [--cameras] [--outliers SHARE ...] [--size 640 480]
+        [--cache FOLDER] [--json FILE] [--csv FILE]
+
+With --outliers, random matches are mixed into those of the images, with scores like theirs: the first pair of a kind
+gets the first of these shares of outliers, the second the second, and so on, in turn.
 """
 
 import argparse
@@ -25,6 +32,7 @@ import cv2
 import numpy as np
 import torch
 from rendered import KINDS, render_kind
+from results_file import write_csv
 from torch import Tensor
 
 import kornia_learnnorm as kln
@@ -33,9 +41,11 @@ from kornia_learnnorm.data.synthetic.render import RenderedPair
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.geometry.pose import relative_pose
-from kornia_learnnorm.metrics.poses import pose_error
+from kornia_learnnorm.metrics.poses import pose_error, rotation_error
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
-from kornia_learnnorm.two_view.estimate_pair import estimate_pair
+from kornia_learnnorm.two_view.estimate_pair import estimate_pair, match_two_images
+from kornia_learnnorm.two_view.inputs import MODELS
+from kornia_learnnorm.two_view.parallax import parallax
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 OUTLIERS = "outliers"
@@ -44,6 +54,7 @@ NOISE = 0.5  # pixels, standard deviation per coordinate of these matches
 MAX_POSE_ERROR = 10.0  # degrees; an answer with a larger one is wrong
 PARALLAX = 1.0  # pixels from the best homography
 MIN_PARALLAX = 0.05  # share of the exact correspondences beyond it in a pair that determines F
+MAX_TRANSFER = 2.0  # pixels, of the other correspondences under a homography that is right
 
 
 class Case(NamedTuple):
@@ -90,6 +101,17 @@ def contaminated(seed: int) -> Case:
     return Case(OUTLIERS, seed, (matches[:, :2], matches[:, 2:]), (width, height), *truth)
 
 
+def mixed(case: Case, share: float) -> Case:
+    """Return the matches of a pair of images with a share of random ones among them, whose scores are like theirs."""
+    pair, generator = match_two_images(*case.read), torch.Generator().manual_seed(case.seed)
+    true = torch.cat([pair.points1, pair.points2, pair.scores[:, None]], 1)[pair.mutual]
+    number = round(len(true) * share / (1 - share))
+    places = torch.rand((number, 4), generator=generator).double() * torch.tensor([*pair.size1, *pair.size2])
+    scores = true[torch.randint(len(true), (number, 1), generator=generator)[:, 0], 4:]
+    points1, points2, scores = torch.cat([true, torch.cat([places, scores], 1)]).split([2, 2, 1], 1)
+    return case._replace(read=(points1, points2, scores[:, 0]), size=pair.size1)
+
+
 def is_determined(points1: Tensor, points2: Tensor) -> bool:
     """Return whether exact correspondences determine F: enough of them lie off the best homography."""
     _, mask = cv2.findHomography(points1.numpy(), points2.numpy(), cv2.RANSAC, PARALLAX)
@@ -103,17 +125,27 @@ def estimate(case: Case, options: dict[str, Any]) -> PairEstimate:
     return estimate_matches(*case.read, size1=case.size, size2=case.size, **options)
 
 
-def error_of_pose(case: Case, F_mat: Tensor, points1: Tensor, points2: Tensor, inliers: Tensor) -> float:
-    """Return the larger error of rotation and translation, degrees; infinite where one is not defined."""
-    K, batch = case.K[None], (value.double()[None] for value in (F_mat, points1, points2))
-    F_mat, points1, points2 = batch
-    R, t = relative_pose(F_mat, K, K, points1, points2, inliers[None])
-    return pose_error(R[0], t[0], case.R, case.t).nan_to_num(nan=math.inf).item()
+def error_of_pose(case: Case, found: PairEstimate) -> float:
+    """Return the larger error of rotation and translation, degrees; infinite where one is not defined.
+
+    Of a homography, NaN without cameras, and infinite where it takes a plane for a rotation or the other way round.
+    """
+    if found.model == "fundamental":
+        K = case.K[None]
+        points1, points2, F_mat = (value.double()[None] for value in (found.points1, found.points2, found.F_mat))
+        R, t = relative_pose(F_mat, K, K, points1, points2, found.inliers[None])
+        return pose_error(R[0], t[0], case.R, case.t).nan_to_num(nan=math.inf).item()
+    if found.R is None:
+        return math.nan
+    if found.t is None:
+        return math.inf if case.t.any() else rotation_error(found.R, case.R).item()
+    return pose_error(found.R, found.t, case.R, case.t).nan_to_num(nan=math.inf).item()
 
 
-def error_in_pixels(case: Case, F_mat: Tensor) -> float:
-    """Return the median symmetric epipolar distance of the exact correspondences."""
-    return kln.symmetric_epipolar_distance(case.points1, case.points2, F_mat.double()).median().item()
+def errors_in_pixels(case: Case, found: PairEstimate) -> Tensor:
+    """Return the distances of the exact correspondences to the matrix."""
+    distance = parallax if found.model == "homography" else kln.symmetric_epipolar_distance
+    return distance(case.points1, case.points2, found.matrix.double())
 
 
 def score(case: Case, solve: Callable[[Case], PairEstimate]) -> dict[str, Any]:
@@ -122,6 +154,7 @@ def score(case: Case, solve: Callable[[Case], PairEstimate]) -> dict[str, Any]:
     An exception that is no refusal is a fault of the estimator; it is recorded, and the other pairs go on.
     """
     record: dict[str, Any] = {"kind": case.kind, "seed": case.seed, "refused": None, "crashed": None, "warnings": []}
+    record |= {"model": None, "gric": None}
     record["determined"] = is_determined(case.points1, case.points2)
     start, found = time.perf_counter(), None
     try:
@@ -136,8 +169,12 @@ def score(case: Case, solve: Callable[[Case], PairEstimate]) -> dict[str, Any]:
         return record
     record["warnings"] = [str(warning.code) for warning in found.warnings]
     record["matches"], record["inliers"] = len(found.points1), int(found.inliers.sum())
-    record["pose_error"] = error_of_pose(case, found.F_mat, found.points1, found.points2, found.inliers)
-    record["true_error"], record["predicted_error"] = error_in_pixels(case, found.F_mat), float(found.predicted_error)
+    record["model"], record["gric"], errors = found.model, found.choice.by_gric, errors_in_pixels(case, found)
+    record["pose_error"], record["true_error"] = error_of_pose(case, found), errors.median().item()
+    record["predicted_error"] = float(found.predicted_error)
+    record["right"] = not record["pose_error"] > MAX_POSE_ERROR
+    if found.model == "homography":
+        record["right"] &= bool((errors > MAX_TRANSFER).double().mean() < MIN_PARALLAX)
     return record
 
 
@@ -146,7 +183,7 @@ def outcome(record: dict[str, Any]) -> str:
     for name in ("refused", "crashed"):
         if record[name] is not None:
             return name
-    name = "right" if record["pose_error"] <= MAX_POSE_ERROR else "wrong"
+    name = "right" if record["right"] else "wrong"
     return f"{name}, flagged" if record["warnings"] else name
 
 
@@ -159,6 +196,8 @@ def described(record: dict[str, Any]) -> str:
 COUNTS: dict[str, Callable[[dict[str, Any]], bool]] = {
     "pairs": lambda record: outcome(record) != "",
     "determined": lambda record: record["determined"],
+    "F": lambda record: record["model"] == "fundamental",
+    "GRIC: F": lambda record: record["model"] is not None and record["gric"] != "homography",
     "right": lambda record: outcome(record).startswith("right"),
     "wrong": lambda record: outcome(record).startswith("wrong"),
     "refused": lambda record: outcome(record) == "refused",
@@ -178,13 +217,12 @@ def by_kind(records: Iterable[dict[str, Any]]) -> dict[str, list[dict[str, Any]]
     return {**groups, "all": [record for group in groups.values() for record in group]}
 
 
-def count_table(records: Sequence[dict[str, Any]]) -> str:
-    """Return how many pairs of each kind came to what."""
-    rows = [
+def count_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Return how many pairs of each kind came to what, a row each."""
+    return [
         [kind, *(str(sum(map(counts, group))) for counts in COUNTS.values())]
         for kind, group in by_kind(records).items()
     ]
-    return format_table(["kind", *COUNTS], rows)
 
 
 def calibration_table(records: Sequence[dict[str, Any]]) -> str:
@@ -210,8 +248,9 @@ def calibration_table(records: Sequence[dict[str, Any]]) -> str:
 def failures(records: Iterable[dict[str, Any]]) -> list[str]:
     """Return a line for each answer that is wrong without a warning."""
     return [
-        f"{r['kind']} {r['seed']}: pose error {r['pose_error']:.1f} degrees, true error {r['true_error']:.2f} px, "
-        f"predicted {r['predicted_error']:.2f} px, {r['inliers']} of {r['matches']} matches are inliers"
+        f"{r['kind']} {r['seed']}: {r['model']}, pose error {r['pose_error']:.1f} degrees, "
+        f"true error {r['true_error']:.2f} px, predicted {r['predicted_error']:.2f} px, "
+        f"{r['inliers']} of {r['matches']} matches are inliers"
         for r in records
         if outcome(r) == "wrong"
     ]
@@ -225,10 +264,13 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="first seed of each kind")
     parser.add_argument("--estimator", choices=["ransac", "learned"], default="ransac")
     parser.add_argument("--weights", default="robust-synthetic", help="name or file of the learned estimator's weights")
+    parser.add_argument("--model", choices=MODELS, default="auto")
+    parser.add_argument("--outliers", type=float, nargs="+", help="shares of random matches, in turn")
     parser.add_argument("--cameras", action="store_true", help="give the true cameras to the estimator")
     parser.add_argument("--size", type=int, nargs=2, default=[640, 480], help="width and height of the images, pixels")
     parser.add_argument("--cache", type=Path, help="folder that keeps the rendered pairs; empty it for a new renderer")
     parser.add_argument("--json", help="write a record of every pair to this file")
+    parser.add_argument("--csv", help="write the table of counts to this file")
     options = parser.parse_args(args)
     layer = kln.LearnedEightPoint.from_pretrained(options.weights) if options.estimator == "learned" else None
     if options.cache:
@@ -236,18 +278,24 @@ def main(args: Sequence[str] | None = None) -> None:
 
     def solve(case: Case) -> PairEstimate:
         cameras = {"K1": case.K, "K2": case.K} if options.cameras else {}
-        return estimate(case, {"layer": layer, **cameras})
+        return estimate(case, {"layer": layer, "model": options.model, **cameras})
 
     records = []
     for index in range(options.pairs):
         kind, seed = options.kinds[index % len(options.kinds)], options.seed + index // len(options.kinds)
         case = contaminated(seed) if kind == OUTLIERS else rendered(kind, seed, tuple(options.size), options.cache)
+        if options.outliers and case.size is None:
+            case = mixed(case, options.outliers[(seed - options.seed) % len(options.outliers)])
         records.append(score(case, solve))
         print(f"{index + 1}/{options.pairs} {kind} {seed}: {described(records[-1])}", file=sys.stderr, flush=True)
-    print(f"\n{len(records)} pairs, {options.estimator}\n\n{count_table(records)}\n\n{calibration_table(records)}")
+    header, counts = ["kind", *COUNTS], count_rows(records)
+    table = format_table(header, counts)
+    print(f"\n{len(records)} pairs, {options.estimator}\n\n{table}\n\n{calibration_table(records)}")
     if wrong := failures(records):
         print("\nWrong without a warning:\n\n" + "\n".join(f"- {line}" for line in wrong))
     print(f"{np.mean([record['seconds'] for record in records]):.2f} s per estimate", file=sys.stderr)
+    if options.csv:
+        write_csv(options.csv, [header, *counts])
     if options.json:
         finite = [
             {name: value if not isinstance(value, float) or math.isfinite(value) else None for name, value in r.items()}

@@ -1,14 +1,19 @@
 """Measure the pose errors of `estimate_pair` on real image pairs, beside RANSAC and other packages on its matches.
 
-The pairs are consecutive frames of TUM RGB-D (poses up to 0.1 s away) and of KITTI odometry 06. Every estimator gets
-the one-to-one matches of `estimate_pair`; poses are taken from F, the true cameras and the matches within 1 px of F.
-The error is the larger of the angles of rotation and translation; an answer is wrong above 10 degrees, or without a
-pose. With cameras, as with `--K`, F has five parameters instead of seven. The last table is of random subsets of the
-matches of every fourth pair. Prints progress to stderr.
+The pairs are consecutive frames of TUM RGB-D (poses up to 0.1 s away) and of KITTI odometry 06, and photographs of
+buildings, neighbours and three apart. Every estimator gets the one-to-one matches of `estimate_pair`; poses are taken
+from F, the true cameras and the matches within 1 px of F, or from H where it is the answer and cameras are known. The
+error is the larger of the angles of rotation and translation; an answer is wrong above 10 degrees, or without a pose,
+but for a homography without cameras, which has none. With cameras, as with `--K`, F has five parameters instead of
+seven. The true error in pixels is that of the epipolar lines of F, where the true ones put the inliers; it is known as
+well as the poses are. The last table is of random subsets of the matches of every fourth pair. Prints progress to
+stderr.
 
-    python benchmarks/real_pairs.py DATA [--datasets tum kitti] [--pairs 50] [--every 4] [--json FILE]
+    python benchmarks/real_pairs.py DATA [--datasets tum kitti photographs] [--methods DETECTOR+MATCHER ...]
+        [--pairs 50] [--every 4] [--json FILE] [--csv FILE]
 
-DATA holds the folders `tum/SEQUENCE` and `kitti/sequences/06`, `kitti/poses/06.txt`.
+DATA holds the folders `tum/SEQUENCE`, `kitti/sequences/06`, `kitti/poses/06.txt`, and `images/photographs` with a file
+cameras.json: for each image K and camera_to_world.
 """
 
 import argparse
@@ -16,24 +21,29 @@ import json
 import math
 import sys
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from kornia.geometry.epipolar import get_closest_point_on_epipolar_line
+from results_file import write_csv
 from torch import Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.datasets.frames import FramePair
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
+from kornia_learnnorm.data.images import image_size
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, find_peer
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import write_text
 from kornia_learnnorm.metrics.poses import pose_error
+from kornia_learnnorm.two_view.estimate_pair import MatchedPair, match_two_images
 from kornia_learnnorm.two_view.result import PairEstimate
 
 DATASETS: dict[str, dict[str, Any]] = {"tum": {"max_difference": 0.1}, "kitti": {"sequences": ["06"]}}
+PHOTOGRAPHS, GAPS = "photographs", (1, 3)  # photographs so many images apart are pairs
 PEERS = {"opencv-usac-magsac": "OpenCV USAC_MAGSAC", "poselib": "PoseLib"}  # where installed
 OWN = "estimate_pair"
 SIZES = (8, 32, 128, 512, 0)  # matches of a subset; 0 for all
@@ -51,6 +61,8 @@ class Pair(NamedTuple):
     number: int
     frames: FramePair
     calibrated: bool
+    method: str  # detector and matcher
+    matched: MatchedPair
 
     @property
     def cameras(self) -> dict[str, Tensor]:
@@ -61,6 +73,18 @@ class Pair(NamedTuple):
     def K(self) -> tuple[Tensor, Tensor]:  # noqa: N802
         """Return the true cameras."""
         return torch.from_numpy(self.frames.frame1.K), torch.from_numpy(self.frames.frame2.K)
+
+
+def read_pairs(dataset: str, data: Path) -> list[FramePair]:
+    """Return the image pairs of a dataset."""
+    if dataset != PHOTOGRAPHS:
+        return [FramePair(*pair) for pair in pairwise(read_dataset(dataset, data / dataset, **DATASETS[dataset]))]
+    folder, frames = data / "images" / dataset, []
+    for name, known in sorted(json.loads((folder / "cameras.json").read_text(encoding="utf-8")).items()):
+        camera, pose = (np.array(known[key]) for key in ("K", "camera_to_world"))
+        frames.append(Frame(folder / name, name, name.split("/")[0], image_size(folder / name), camera, pose))
+    pairs = [pair for gap in GAPS for pair in zip(frames, frames[gap:], strict=False)]
+    return [FramePair(*pair) for pair in pairs if pair[0].sequence == pair[1].sequence]
 
 
 def error_of_pose(pair: Pair, F_mat: Tensor, points1: Tensor, points2: Tensor) -> float:
@@ -74,20 +98,34 @@ def error_of_pose(pair: Pair, F_mat: Tensor, points1: Tensor, points2: Tensor) -
     return pose_error(R, t, true_R, true_t).nan_to_num(nan=math.inf).item()
 
 
+def true_error(pair: Pair, found: PairEstimate) -> float:
+    """Return the median distance of the inliers to F, each moved to the true epipolar line of its point in image 1."""
+    points1, points2 = (points[found.inliers][None] for points in (found.points1, found.points2))
+    exact = get_closest_point_on_epipolar_line(points1, points2, torch.from_numpy(pair.frames.F)[None])
+    return kln.symmetric_epipolar_distance(points1, exact, found.matrix[None]).median().item()
+
+
 def run_own(pair: Pair, solve: Callable[..., PairEstimate]) -> tuple[Record, PairEstimate | None]:
     """Return the record of an estimate of this package, and the estimate where there is one."""
     try:
         found = solve(**pair.cameras)
     except kln.NoReliableMatrixError as error:
         return {"refused": error.code, "error": math.inf, "warnings": [error.code]}, None
-    return {
+    record = {
         "refused": None,
-        "error": error_of_pose(pair, found.F_mat, found.points1, found.points2),
+        "model": found.model,
+        "error": math.inf,
         "warnings": [warning.code for warning in found.warnings],
         "inliers": found.num_inliers,
         "matches": found.num_matches,
         "predicted": found.predicted_error,
-    }, found
+    }
+    if found.model == "fundamental":
+        record["error"] = error_of_pose(pair, found.matrix, found.points1, found.points2)
+        record["true"] = true_error(pair, found)
+    elif found.R is not None and found.t is not None:
+        record["error"] = pose_error(found.R, found.t, *map(torch.from_numpy, pair.frames.motion)).item()
+    return record, found
 
 
 def run_others(pair: Pair, peers: dict[str, Any], size: Tensor, *matches: Tensor) -> dict[str, float]:
@@ -109,8 +147,8 @@ def run_others(pair: Pair, peers: dict[str, Any], size: Tensor, *matches: Tensor
 
 def measure(pair: Pair, peers: dict[str, Any], sizes: Sequence[int]) -> list[Record]:
     """Return the records of all matches and of random subsets of them, with their number as `size`, 0 for all."""
-    own, found = run_own(pair, lambda **cameras: kln.estimate_pair(*(f.path for f in pair.frames), **cameras))
-    base = {"dataset": pair.dataset, "pair": pair.number, "calibrated": pair.calibrated}
+    own, found = run_own(pair, pair.matched.estimate)
+    base = {"dataset": pair.dataset, "method": pair.method, "pair": pair.number, "calibrated": pair.calibrated}
     if found is None:
         return [{**base, "size": 0, OWN: own}]
     pixels = torch.tensor([found.size1, found.size2], dtype=torch.int32)
@@ -139,18 +177,21 @@ def pair_table(records: Sequence[Record]) -> str:
     """Return a row for each pair: errors, inliers, predicted error and warnings."""
     rows = []
     for record in records:
-        own = record[OWN]
+        own, cells = record[OWN], ["-"] * 4
         numbers = [f"{error_of(record, name):.2f}" for name in (OWN, "RANSAC")]
-        counts = f"{own['inliers']} of {own['matches']}" if not own["refused"] else "-"
-        predicted = f"{own['predicted']:.2f}" if not own["refused"] else "-"
-        rows.append([str(record["pair"]), *numbers, counts, predicted, ", ".join(own["warnings"]) or "none"])
-    header = ["pair", f"{OWN}: degrees", "RANSAC: degrees", "inliers", "predicted px", "warnings"]
+        if not own["refused"]:
+            cells = [own["model"], f"{own['inliers']} of {own['matches']}", f"{own['predicted']:.2f}"]
+            cells += [f"{own['true']:.2f}" if "true" in own else "-"]
+        rows.append([str(record["pair"]), *numbers, *cells, ", ".join(own["warnings"]) or "none"])
+    header = ["pair", f"{OWN}: degrees", "RANSAC: degrees", "model", "inliers", "predicted px", "true px", "warnings"]
     return format_table(header, rows)
 
 
 def is_silent(record: Record, name: str) -> bool:
-    """Return whether an answer is wrong without a warning; only this package's estimate can warn or refuse."""
-    return error_of(record, name) > MAX_POSE_ERROR and not (name == OWN and record[OWN]["warnings"])
+    """Return whether an answer is wrong without a warning; only this package's estimate can warn or choose H."""
+    own = record[OWN]
+    told = own["warnings"] or (own["model"] == "homography" and not record["calibrated"])
+    return error_of(record, name) > MAX_POSE_ERROR and not (name == OWN and told)
 
 
 def summary_rows(records: Sequence[Record], names: Sequence[str], label: Sequence[str]) -> list[list[str]]:
@@ -161,10 +202,18 @@ def summary_rows(records: Sequence[Record], names: Sequence[str], label: Sequenc
         errors = np.array([error_of(record, name) for record in records])
         numbers = [f"{value:.2f}" for value in (np.median(errors), errors.max())]
         near = str(int(((errors <= MAX_RATIO * reference) & np.isfinite(errors)).sum()))
-        flagged = str(sum(bool(record[OWN]["warnings"]) for record in records)) if name == OWN else "-"
         silent = str(sum(is_silent(record, name) for record in records))
-        rows.append([*label, PEERS.get(name, name), str(len(records)), *numbers, near, flagged, silent])
+        own = own_cells(records) if name == OWN else ["-"] * 5
+        rows.append([*label, PEERS.get(name, name), str(len(records)), *numbers, near, silent, *own])
     return rows
+
+
+def own_cells(records: Sequence[Record]) -> list[str]:
+    """Return how many answers are flagged, how many are F, and quantiles of their predicted over their true error."""
+    own = [record[OWN] for record in records]
+    ratios = [record["predicted"] / record["true"] for record in own if "true" in record]
+    quantiles = [f"{value:.2f}" for value in np.quantile(ratios, [0.1, 0.5, 0.9])] if ratios else ["-"] * 3
+    return [str(sum(bool(record["warnings"]) for record in own)), str(len(ratios)), *quantiles]
 
 
 def subset_rows(records: Sequence[Record], names: Sequence[str], label: Sequence[str]) -> list[list[str]]:
@@ -186,36 +235,40 @@ def subset_rows(records: Sequence[Record], names: Sequence[str], label: Sequence
     return rows
 
 
-def print_tables(records: Sequence[Record], peers: Sequence[str]) -> None:
-    """Print a table of pairs for each dataset, then the summary and the subsets."""
+def print_tables(records: Sequence[Record], peers: Sequence[str], csv: str | None) -> None:
+    """Print a table of pairs for each dataset, then the summary, which is also written, and the subsets."""
     names = [OWN, "RANSAC", *peers]
     summary: list[list[str]] = []
     subsets: list[list[str]] = []
-    for dataset, calibrated in ((d, c) for d in DATASETS for c in (False, True)):
-        mine = [r for r in records if (r["dataset"], r["calibrated"]) == (dataset, calibrated)]
+    label = ["set", "matches", "cameras", "estimator"]
+    for key in dict.fromkeys((r["dataset"], r["method"], r["calibrated"]) for r in records):
+        mine = [r for r in records if (r["dataset"], r["method"], r["calibrated"]) == key]
         whole = [record for record in mine if record["size"] == 0]
-        if not whole:
-            continue
-        cameras = "with" if calibrated else "without"
-        print(f"{dataset}, {cameras} cameras\n\n{pair_table(whole)}\n")
-        summary += summary_rows(whole, names, [dataset, cameras])
-        subsets += subset_rows(mine, names, [dataset, cameras])
-    counts = ["pairs", "median degrees", "largest", f"within {MAX_RATIO:g} times RANSAC", "flagged", "silently wrong"]
-    print("Summary\n\n" + format_table(["set", "cameras", "estimator", *counts], summary))
+        cells = [*key[:2], "with" if key[2] else "without"]
+        print(f"{', '.join(cells)} cameras\n\n{pair_table(whole)}\n")
+        summary += summary_rows(whole, names, cells)
+        subsets += subset_rows(mine, names, cells)
+    counts = ["pairs", "median degrees", "largest", f"within {MAX_RATIO:g} times RANSAC", "silently wrong"]
+    counts += ["flagged", "F", *(f"predicted / true: {share} %" for share in (10, 50, 90))]
+    print("Summary\n\n" + format_table([*label, *counts], summary))
+    if csv:
+        write_csv(csv, [[*label, *counts], *summary])
     if subsets:
         sizes = [f"{size or 'all'} matches" for size in SIZES]
         print("\nSubsets: median degrees (silently wrong)\n")
-        print(format_table(["set", "cameras", "estimator", *sizes], subsets))
+        print(format_table([*label, *sizes], subsets))
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Estimate the pairs, print the tables and write the numbers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="folder with tum/ and kitti/")
-    parser.add_argument("--datasets", nargs="+", choices=[*DATASETS], default=[*DATASETS])
+    parser.add_argument("data", type=Path, help="folder with tum/, kitti/ and images/photographs/")
+    parser.add_argument("--datasets", nargs="+", choices=[*DATASETS, PHOTOGRAPHS], default=[*DATASETS, PHOTOGRAPHS])
+    parser.add_argument("--methods", nargs="+", default=["sift+nearest"], help="DETECTOR+MATCHER")
     parser.add_argument("--pairs", type=int, default=50, help="first pairs of each set")
     parser.add_argument("--every", type=int, default=4, help="subsets are drawn of each so many-th pair; 0 for none")
     parser.add_argument("--json", help="write a record of every pair to this file")
+    parser.add_argument("--csv", help="write the summary to this file")
     options = parser.parse_args(args)
     peers = {name: {} for name in PEERS}
     for name in PEERS:
@@ -225,15 +278,16 @@ def main(args: Sequence[str] | None = None) -> None:
             print(error, file=sys.stderr)
             del peers[name]
     records: list[Record] = []
-    for dataset in options.datasets:
-        frames = read_dataset(dataset, options.data / dataset, **DATASETS[dataset])[: options.pairs + 1]
-        for number, both in enumerate(pairwise(frames)):
+    for dataset, method in product(options.datasets, options.methods):
+        for number, frames in enumerate(read_pairs(dataset, options.data)[: options.pairs]):
+            detector, matcher = method.split("+")
+            matched = match_two_images(*(frame.path for frame in frames), detector=detector, matcher=matcher)
+            sizes = SIZES if options.every and number % options.every == 0 else ()
             for calibrated in (False, True):
-                sizes = SIZES if options.every and number % options.every == 0 else ()
                 solvers = {name: solver[calibrated] for name, solver in peers.items()}
-                records += measure(Pair(dataset, number, FramePair(*both), calibrated), solvers, sizes)
-            print(f"{dataset} {number}", file=sys.stderr, flush=True)
-    print_tables(records, [*peers])
+                records += measure(Pair(dataset, number, frames, calibrated, method, matched), solvers, sizes)
+            print(f"{dataset} {method} {number}", file=sys.stderr, flush=True)
+    print_tables(records, [*peers], options.csv)
     if options.json:
         write_text(options.json, json.dumps(_finite(records), indent=1, allow_nan=False) + "\n")
 

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from kornia.geometry.linalg import transform_points
 from make_sequences import texture
 from PIL import Image
 from torch import Tensor
@@ -44,11 +45,17 @@ def case(pairs):
     return pairs.rendered("room", 0, (160, 120), None)
 
 
-def answer(case, F_mat: Tensor, *codes: str) -> SimpleNamespace:
+def answer(case, F_mat: Tensor, *codes: str, **more) -> SimpleNamespace:
     """An estimate, as far as the benchmark reads it."""
     warnings, inliers = [SimpleNamespace(code=code) for code in codes], torch.ones(len(case.points1), dtype=torch.bool)
-    points = {"points1": case.points1, "points2": case.points2}
-    return SimpleNamespace(F_mat=F_mat, warnings=warnings, predicted_error=1.0, inliers=inliers, **points)
+    points = {"points1": case.points1, "points2": case.points2, "inliers": inliers}
+    matrices = {"model": "fundamental", "matrix": F_mat, "F_mat": F_mat, "H_mat": None, "R": None, "t": None}
+    matrices["choice"] = SimpleNamespace(by_gric="homography")
+    return SimpleNamespace(**{**matrices, **points, "warnings": warnings, "predicted_error": 1.0, **more})
+
+
+def answer_homography(case, H_mat: Tensor, **more) -> SimpleNamespace:
+    return answer(case, true_matrix(case), model="homography", matrix=H_mat, H_mat=H_mat, **more)
 
 
 def true_matrix(case) -> Tensor:
@@ -81,6 +88,19 @@ class TestPairs:
         assert pairs.outcome(record) == "wrong"
         assert pairs.outcome(record | {"warnings": ["planar"]}) == "wrong, flagged"
 
+    def test_right_and_wrong_homographies(self, pairs, case):
+        H_mat = case.K @ case.R @ torch.linalg.inv(case.K)
+        turned = case._replace(t=torch.zeros(3).double(), points2=transform_points(H_mat[None], case.points1[None])[0])
+        for R, outcome in ((None, "right"), (case.R, "right"), (torch.diag(torch.tensor([-1.0, -1, 1])), "wrong")):
+            found = answer_homography(turned, H_mat, R=None if R is None else R.double())
+            record = pairs.score(turned, lambda case, found=found: found)
+            assert (pairs.outcome(record), record["model"], record["gric"]) == (outcome, "homography", "homography")
+            assert record["true_error"] < 1e-6
+        assert pairs.outcome(pairs.score(case, lambda case: answer_homography(case, H_mat))) == "wrong"
+        # A rotation where the camera moved, and a translation of the wrong sign.
+        assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R)) == math.inf
+        assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R, t=-case.t)) == pytest.approx(180)
+
     def test_a_fault_of_the_estimator_is_no_refusal(self, pairs, case, capsys):
         def solve(case):
             raise error
@@ -105,19 +125,28 @@ class TestPairs:
         assert kln.symmetric_epipolar_distance(case.points1, case.points2, true_matrix(case)).max() < 1e-6
         assert pairs.is_determined(case.points1, case.points2)
 
+    @pytest.mark.parametrize("share", [0.0, 0.75])
+    def test_random_matches_among_those_of_the_images(self, pairs, case, share):
+        mixed = pairs.mixed(case, share)
+        distance = kln.symmetric_epipolar_distance(*mixed.read[:2], true_matrix(case))
+        assert (distance > 6).double().mean().item() == pytest.approx(0.9 * share, abs=0.1)
+        assert mixed.read[2].min() >= 0.2
+        assert mixed.size == (160, 120)
+
     def test_tables(self, pairs):
         base = {"seed": 3, "refused": None, "crashed": None, "warnings": [], "matches": 20, "inliers": 9}
-        base |= {"pose_error": 0.0, "predicted_error": 1.0, "true_error": 1.0}
+        base |= {"pose_error": 0.0, "predicted_error": 1.0, "true_error": 1.0, "right": True}
+        base |= {"model": "fundamental", "gric": "homography"}
         room, plane = base | {"kind": "room", "determined": True}, base | {"kind": "plane", "determined": False}
         records = [room | {"predicted_error": 3.0, "true_error": 1.5}, room | {"warnings": ["planar"]}]
-        records += [room | {"refused": "blank"}, room | {"pose_error": 11.0}, plane | {"refused": "no_motion"}]
-        records += [plane | {"pose_error": error, "warnings": ["planar"]} for error in (math.inf, 2.0)]
-        _, _, *rows = table_rows(pairs.count_table(records))
-        # Pairs, determined, right, wrong, refused, crashed, warned, silently wrong; right but flagged; refused wrongly.
-        assert {kind: [*map(int, cells)] for kind, *cells in rows} == {
-            "room": [4, 4, 2, 1, 1, 0, 1, 1, 1, 1],
-            "plane": [3, 0, 1, 1, 1, 0, 2, 0, 1, 0],
-            "all": [7, 4, 3, 2, 2, 0, 3, 1, 2, 1],
+        records += [room | {"refused": "blank"}, room | {"right": False}, plane | {"refused": "no_motion"}]
+        records += [plane | {"right": right, "warnings": ["planar"], "model": "homography"} for right in (False, True)]
+        # Pairs, determined, F, F by GRIC, right, wrong, refused, crashed, warned, silently wrong; right,
+        # flagged; determined, refused.
+        assert {kind: [*map(int, cells)] for kind, *cells in pairs.count_rows(records)} == {
+            "room": [4, 4, 4, 0, 2, 1, 1, 0, 1, 1, 1, 1],
+            "plane": [3, 0, 1, 0, 1, 1, 1, 0, 2, 0, 1, 0],
+            "all": [7, 4, 5, 0, 3, 2, 2, 0, 3, 1, 2, 1],
         }
         _, _, first, *_ = table_rows(pairs.calibration_table(records))
         assert first == ["room", "2", "1.25", "2", "1.1", "1.5", "1.9"]  # ratios 2 and 1
@@ -142,13 +171,14 @@ class TestRealPairs:
         pose[:3, :3], pose[:3, 3] = case.R.mT, -case.R.mT @ case.t  # camera 2 to camera 1, which is the world
         first = Frame(Path("1.png"), "1.png", "room", (160, 120), case.K.numpy(), np.eye(4))
         second = Frame(Path("2.png"), "2.png", "room", (160, 120), case.K.numpy(), pose)
-        return real_pairs.Pair("tum", 3, FramePair(first, second), calibrated=True)
-
-    def test_all_get_the_same_matches_and_cameras_where_known(self, real_pairs, real_pair, case, monkeypatch):
         order = torch.randperm(len(case.points1), generator=torch.Generator().manual_seed(0))[:60]
         matches = case.points1[order], case.points2[order]
-        found = kln.estimate_matches(*matches, size1=(160, 120), size2=(160, 120))
-        monkeypatch.setattr(kln, "estimate_pair", lambda *_, **__: found)
+        matched = SimpleNamespace(
+            estimate=lambda **K: kln.estimate_matches(*matches, size1=(160, 120), size2=(160, 120), **K)
+        )
+        return real_pairs.Pair("tum", 3, FramePair(first, second), True, "sift+nearest", matched)
+
+    def test_all_get_the_same_matches_and_cameras_where_known(self, real_pairs, real_pair, case):
         given = []
 
         def peer(x1, x2, sizes, seed, threshold, *cameras):
@@ -160,7 +190,10 @@ class TestRealPairs:
         assert given == [(60, 1), (8, 1), (20, 1)]
         assert records[0]["poselib"] < 1e-5
         assert [record["poselib"] for record in records[1:]] == [math.inf] * 2
-        assert records[0]["estimate_pair"]["inliers"] == found.num_inliers
+        own = records[0]["estimate_pair"]
+        assert (own["model"], own["inliers"]) == ("fundamental", 60)
+        assert own["error"] < 1e-3
+        assert own["true"] < 1e-3
         assert records[1]["estimate_pair"]["refused"] == "few_matches"
         assert real_pairs.measure(real_pair._replace(calibrated=False), {"poselib": peer}, ())
         assert given[-1] == (60, 0)
