@@ -34,7 +34,7 @@ from kornia_learnnorm.two_view.colmap_database import export_colmap
 
 HEADER = ["scene", "matches", "cameras", "verified by", "pairs", "inliers", "images"]
 HEADER += ["reprojection px", "centres mm", "one left out mm", "verify s", "reconstruct s"]
-METHODS = ("COLMAP", "RANSAC", "robust")  # the last are weights of LearnedEightPoint
+METHODS = ("COLMAP", "RANSAC")  # others are weights of LearnedEightPoint
 
 
 class Scene(NamedTuple):
@@ -58,7 +58,7 @@ def read_scene(folder: Path, work: Path, detector: str, matcher: str) -> Scene:
 
 def verify(scene: Scene, database: Path, method: str, known: bool) -> tuple[int, int, float]:
     """Write a database; return the verified pairs, their inliers and the seconds that verifying took."""
-    layer = None if method in METHODS[:2] else LearnedEightPoint.from_pretrained(method)
+    layer = None if method in METHODS else LearnedEightPoint.from_pretrained(method)
     start = time.perf_counter()
     export_colmap(scene.store, scene.folder, database, scene.K if known else None, True, layer, jobs=1)
     if method == "COLMAP":
@@ -124,10 +124,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", nargs="+", help="subfolders (default: all)")
-    parser.add_argument("--methods", nargs="+", default=METHODS, help="COLMAP, RANSAC, or weights (default: all)")
-    parser.add_argument(
-        "--matches", nargs="+", default=["sift+nearest"], help="DETECTOR+MATCHER (default: %(default)s)"
-    )
+    text = "COLMAP, RANSAC or weights, such as robust (default: COLMAP RANSAC)"
+    parser.add_argument("--methods", metavar="NAME", nargs="+", default=METHODS, help=text)
+    text = "detectors and matchers (default: %(default)s)"
+    parser.add_argument("--matches", metavar="DETECTOR+MATCHER", nargs="+", default=["sift+nearest"], help=text)
     parser.add_argument("--csv", help="write the table to this file")
     args = parser.parse_args()
     torch.set_num_threads(1)
