@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import platform
 import secrets
@@ -9,7 +10,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["atomic_write", "exclusive", "short_name", "write_text"]
+__all__ = ["atomic_write", "exclusive", "full_disk_names", "short_name", "write_text"]
+
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT)  # error numbers
+
+
+@contextmanager
+def full_disk_names(path: str | Path) -> Iterator[None]:
+    """Let the OSError of a full disk, which names no file, name ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno in FULL_DISK:
+            error.filename = str(path)
+        raise
 
 
 @contextmanager
@@ -30,13 +44,14 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     try:
         temporary.touch()  # a new file shows the mode that the process' umask allows
         mode = temporary.stat().st_mode
-        yield temporary
+        with full_disk_names(temporary):
+            yield temporary
         temporary.chmod(mode)  # some writers create files that only their owner can read
         temporary.replace(path)
     except OSError as error:
         if error.filename != str(temporary):
             raise
-        raise type(error)(error.errno, f"cannot write {path}: {error.strerror}") from error
+        raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

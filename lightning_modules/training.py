@@ -21,7 +21,7 @@ from pytorch_lightning.utilities import rank_zero_only
 from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
-from kornia_learnnorm.files import exclusive
+from kornia_learnnorm.files import exclusive, full_disk_names
 from kornia_learnnorm.optional import working_folder_importable
 from lightning_modules.callbacks import Checkpoints, ExpectedTime, ExportWeights, WritePredictions
 from lightning_modules.config_files import config_names, names_task, with_config_paths
@@ -97,6 +97,7 @@ class TrainingCLI(LightningCLI):
                     raise FileExistsError(f"{folder} is a file: expected a folder for the run, or a new name")
                 folder.mkdir(parents=True, exist_ok=True)
                 stack.enter_context(exclusive(folder))
+                stack.enter_context(full_disk_names(folder))
                 last = folder / "checkpoints" / "last.ckpt"
                 if last.exists() and self.config[subcommand].get("ckpt_path") is None:
                     raise FileExistsError(

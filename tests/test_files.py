@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 
@@ -59,6 +61,38 @@ def test_a_failed_write_keeps_the_old_file(tmp_path):
         raise RuntimeError("stop")
     assert path.read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["F.json"]
+
+
+@pytest.mark.parametrize(("error", "named"), [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, False)])
+def test_a_full_disk_names_the_file(tmp_path, error, named):
+    """The file that was written, not those around it."""
+    outer, inner = tmp_path / "outer.json", tmp_path / "inner.json"
+    with (
+        pytest.raises(OSError, match=os.strerror(error)) as caught,
+        atomic_write(outer),
+        atomic_write(inner) as temporary,
+        atomic_write(temporary),
+    ):
+        raise OSError(error, os.strerror(error))
+    assert caught.value.filename == (str(inner) if named else None)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_commands_name_the_file_on_a_full_disk(tmp_path, monkeypatch, planes, refused):
+    pytest.importorskip("matplotlib")
+
+    def full(self, *args, **kwargs):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    images, picture, report = (planes / "left.png", planes / "right.png"), tmp_path / "a.png", tmp_path / "a.json"
+    for place, path in (("matplotlib.figure.Figure.savefig", picture), ("pathlib.Path.write_text", report)):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, full)
+            refused(["estimate", *images, "--out", picture, "--json", report], f"No space left on device: '{path}'")
+    with monkeypatch.context() as patch:
+        patch.setattr("h5py.File", full)
+        refused(["synthesize", tmp_path], f"cannot write {tmp_path / 'synthetic.h5'}: No space left on device")
+    assert [*tmp_path.iterdir()] == []
 
 
 @pytest.mark.usefixtures("program")

@@ -18,9 +18,10 @@ from kornia_learnnorm.data.cameras import read_camera
 from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.images import image_size, import_cv2
+from kornia_learnnorm.data.matching.features import MissingWeightsError
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
-from kornia_learnnorm.files import atomic_write, exclusive, write_text
+from kornia_learnnorm.files import atomic_write, exclusive, full_disk_names, write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
@@ -132,6 +133,7 @@ def estimate_pairs(
         tqdm = import_extra("tqdm", "images", "estimating many pairs").tqdm
         with (
             open_workers(jobs, dask) as workers,
+            full_disk_names(folder / RESULTS),
             (folder / RESULTS).open("a", encoding="utf-8") as file,
             tqdm(total=len(pairs), initial=len(pairs) - len(todo), unit="pair", file=sys.stderr) as bar,
             workers.results(_estimate, ((*pair, options) for pair in todo)) as results,
@@ -195,6 +197,8 @@ def _estimate(image1: Path, image2: Path, options: PairOptions) -> Line:
     import_cv2().setNumThreads(1)
     try:
         return estimate_pair(image1, image2, **options.arguments(image1, image2)).as_dict(options.matches)
+    except MissingWeightsError:  # of all pairs
+        raise
     except (ValueError, OSError) as error:
         code = error.code if isinstance(error, NoReliableMatrixError) else UNREADABLE
         return describe_failure(code, str(error), image1, image2, options)

@@ -21,10 +21,14 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import check_grey, import_cv2
 
-__all__ = ["DETECTORS", "READS_COLOUR", "Features", "check_mask", "detect_aliked", "detect_disk", "detect_keynet"]
-__all__ += ["detect_rootsift", "detect_sift", "detect_xfeat", "keep_features", "pretrained"]
+__all__ = ["DETECTORS", "READS_COLOUR", "Features", "MissingWeightsError", "check_mask", "detect_aliked", "detect_disk"]
+__all__ += ["detect_keynet", "detect_rootsift", "detect_sift", "detect_xfeat", "keep_features", "pretrained"]
 
 MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is of the mask's edge
+
+
+class MissingWeightsError(OSError):
+    """Weights of a network of Kornia are not in the cache and could not be downloaded."""
 
 
 class Features(NamedTuple):
@@ -152,7 +156,7 @@ class _ErrorsOnly(StringIO):
 
 @lru_cache(maxsize=2)  # a detector and a matcher
 def pretrained(name: str, load: Callable[..., Any], *args: Any) -> Any:
-    """Return the network of Kornia that ``load(*args)`` makes; OSError if its weights cannot be loaded."""
+    """Return the network of Kornia that ``load(*args)`` makes; MissingWeightsError if its weights cannot be loaded."""
     try:
         with warnings.catch_warnings(), redirect_stderr(_ErrorsOnly()):
             warnings.simplefilter("ignore", UserWarning)  # one for each attempt to download
@@ -160,7 +164,8 @@ def pretrained(name: str, load: Callable[..., Any], *args: Any) -> Any:
     except (OSError, RuntimeError, EOFError, UnpicklingError) as error:  # the last two: a truncated file in the cache
         get = "run the command once with access to the internet, or save the file of the address as the path"
         folder = f"{torch.hub.get_dir()}/checkpoints"
-        raise OSError(f"the weights of {name} are not in {folder} and could not be loaded: {error} ({get})") from error
+        text = f"the weights of {name} are not in {folder} and could not be loaded: {error} ({get})"
+        raise MissingWeightsError(text) from error
 
 
 def _features(image: NDArray[np.uint8], points: torch.Tensor, descriptors: torch.Tensor) -> Features:

@@ -16,6 +16,7 @@ from kornia_learnnorm.data.matching import matchers as matching
 from kornia_learnnorm.data.matching.features import (
     DETECTORS,
     Features,
+    MissingWeightsError,
     detect_disk,
     detect_keynet,
     detect_rootsift,
@@ -26,6 +27,7 @@ from kornia_learnnorm.data.matching.features import (
 from kornia_learnnorm.data.matching.matchers import MATCHERS, match_features
 from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.two_view.many_pairs import PairOptions, estimate_pairs
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
@@ -192,6 +194,17 @@ def test_weights_without_a_network_are_one_line(monkeypatch, tmp_path, refused, 
     refused(["estimate", *images, "--detector", "xfeat"], "the weights of XFeat are not in")
     refused(["estimate", *images, "--detector", "xfeat"], f"{tmp_path}/hub/checkpoints/xfeat.pt")
     refused(["estimate", *images, "--detector", "aliked"], "/aliked-n16.pth")
+
+
+def test_weights_without_a_network_end_a_list_of_pairs(monkeypatch, tmp_path, planes):
+    """They are no fault of one pair."""
+    monkeypatch.setattr(
+        "kornia.feature.xfeat.load_state_dict_from_url", Mock(side_effect=urllib.error.URLError("none"))
+    )
+    pairs, out = [(planes / "left.png", planes / "right.png")], tmp_path / "out"
+    with pytest.raises(MissingWeightsError, match="the weights of XFeat are not in"):
+        estimate_pairs(pairs, out, PairOptions(detector="xfeat"), jobs=1)
+    assert (out / "pairs.jsonl").read_text() == ""
 
 
 class TestKeepFeatures:
