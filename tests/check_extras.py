@@ -63,7 +63,10 @@ CHECKS = {
     ],
     "report": ["learnnorm report run", "test -s run/report.html"],
     "dask": [f'python -c "{ON_A_CLUSTER}"'],
-    "colmap": ["learnnorm match colmap colmap/images --model colmap/model --out colmap.h5 --jobs 1"],
+    "colmap": [
+        "learnnorm match colmap colmap/images --model colmap/model --out colmap.h5 --jobs 1",
+        "learnnorm export-colmap colmap/images --matches colmap.h5 --out colmap.db --jobs 1",
+    ],
     "demo": [f'python -c "{SERVED_PAGE}"'],
     "onnx": ["learnnorm export crossview --format onnx --out crossview.onnx", "test -s crossview.onnx"],
     "completion": ["learnnorm completion bash | bash -n"],
