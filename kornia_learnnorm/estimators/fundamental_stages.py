@@ -33,15 +33,16 @@ SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances 
 SAMPLE_SIZE = 7
 MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
 SHORTLIST = 4  # matrices of minimal samples that are compared on all matches
-MIN_MATCHES = 16  # for which samples are drawn: among few, some fit most of them by chance
+# Matches, and the sum of their probabilities, from which samples are drawn: among few, some fit most of them by chance.
+MIN_MATCHES, MIN_INLIERS = 16, 8
 
 
 class FundamentalRefinement(Refinement):
     r"""Reweighted least squares of a stage's fundamental matrices on Geman and McClure's loss of Sampson distances.
 
-    In the last stage, sets of at least 16 matches are searched: the matrix competes with those of minimal samples that
-    are drawn by the probabilities of inliers, and the one of least cost of all matches, whatever their probabilities,
-    is fitted to them.
+    In the last stage, sets of at least 16 matches, eight of which are to be inliers, are searched: the matrix competes
+    with those of minimal samples that are drawn by the probabilities of inliers, and the one of least cost of all
+    matches, whatever their probabilities, is fitted to them.
     """
 
     def __init__(self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, samples: int) -> None:
@@ -72,7 +73,9 @@ class FundamentalRefinement(Refinement):
             return fit(state, weights, scale, steps).matrix()
         with torch.no_grad():
             found = self._most_consistent(torch.stack([state.matrix(), M], 1), weights, square(state))
-        few = ((weights > 0).sum(1, keepdim=True) < MIN_MATCHES)[..., None]
+        present = weights > 0
+        few = (present.sum(1) < MIN_MATCHES) | ((probability * present).sum(1) < MIN_INLIERS)
+        few = few[:, None, None]
         # The choice has no derivative; through the zero, transforms still get a gradient of zero.
         axes = torch.where(few[..., None], state.axes, found.axes + 0.0 * state.axes)
         state = Rank2(axes, torch.where(few, state.A, found.A + 0.0 * state.A))

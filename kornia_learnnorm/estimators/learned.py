@@ -183,9 +183,9 @@ class LearnedEightPoint(LearnedLayer):
     distances, weighted by :math:`\sigma(l_i)`, end each stage
     (:func:`~kornia_learnnorm.estimators.moments.descend`).
 
-    In the last stage, from 16 correspondences on, minimal samples of seven are drawn by :math:`\sigma(l_i)`. The matrix
-    of least robust cost over all correspondences, of these and of the network's, is fitted to all of them, weighted by
-    :math:`\sigma(l_i)^{0.2}`.
+    In the last stage of sets of 16 correspondences and more, with :math:`\sum_i \sigma(l_i) \ge 8`, minimal samples of
+    seven are drawn by :math:`\sigma(l_i)`. Of their matrices and the network's, the one of least robust cost over all
+    correspondences is fitted to all of them, weighted by :math:`\sigma(l_i)^{0.2}`.
 
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
     their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
