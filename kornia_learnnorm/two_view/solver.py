@@ -17,6 +17,7 @@ from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
@@ -101,7 +102,8 @@ class TwoViewSolver:
         inliers, near = distance < self.threshold, distance < NEAR * self.threshold
         agree = int(inliers.sum())
         parts = random_parts(len(inliers), agree, self.seed)
-        H_parts = torch.stack([self.part(rows[near[rows]])._ransac("homography").F_mat for rows in parts])  # noqa: SLF001
+        solvers = [self.part(rows[near[rows]]) for rows in parts if int(near[rows].sum()) >= Homography.min_points]
+        H_parts = torch.stack([solver._ransac("homography").F_mat for solver in solvers])  # noqa: SLF001 (its own class)
         support = (self.parallax(H_parts) < self.threshold).sum(-1)
         return Solution(H_mat, inliers.double(), drop_failed_parts(H_parts, support, agree), parts.shape[1])
 
