@@ -25,7 +25,7 @@ from kornia_learnnorm.files import atomic_write, short_name
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from lightning_modules.task import EstimatorTask
 
-__all__ = ["Checkpoints", "ExpectedTime", "ExportWeights", "WritePredictions"]
+__all__ = ["AgainstStart", "Checkpoints", "ExpectedTime", "ExportWeights", "WritePredictions"]
 
 MEASURED_STEPS = 10  # steps whose mean time is multiplied, after one that does not count
 
@@ -120,6 +120,49 @@ class ExpectedTime(Callback):
         """Print the time of the steps since the start, validation included."""
         steps = trainer.global_step + 1 - self._first
         _print_above_bar(f"{steps} steps in {_duration(time.monotonic() - self._begin)}")
+
+
+class AgainstStart(Callback):
+    """Compare the errors of the validation with those before the first step.
+
+    Before it a new normaliser is its base, such as Hartley's normalisation, and other models are the weights that they
+    start from. ``num_sanity_val_steps=-1`` of the trainer makes the sanity check the whole validation.
+
+    Attributes:
+        start: the errors before the first step, by the names of the metrics; empty where they were not measured.
+        last: the errors of the last validation.
+        step: number of steps before the last validation.
+    """
+
+    def __init__(self) -> None:
+        self.start: dict[str, float] = {}
+        self.last: dict[str, float] = {}
+        self.step = 0
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Keep the errors."""
+        names = [f"val/{name}" for name in getattr(pl_module, "errors", ())]
+        errors = {name: float(value) for name, value in trainer.callback_metrics.items() if name in names}
+        if not trainer.sanity_checking:
+            self.last, self.step = errors, trainer.global_step
+        elif trainer.global_step == 0 and trainer.num_sanity_val_steps == float("inf"):
+            self.start = errors
+
+    def summary(self) -> str:
+        """Return whether the last errors are below those at the start, and all of them."""
+        better = sum(self.last[name] < value for name, value in self.start.items())
+        verdict = "better" if better else "not better"
+        verdict += f" in {better} of {len(self.start)} errors" if 0 < better < len(self.start) else ""
+        pairs = [f"{name} {self.last[name]:.3f}, at the start {value:.3f}" for name, value in self.start.items()]
+        return f"{verdict} than at the start: {'; '.join(pairs)}"
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed training needs."""
+        return {"start": self.start}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the errors at the start of the training that is resumed."""
+        self.start = state_dict["start"]
 
 
 def _print_above_bar(text: str) -> None:

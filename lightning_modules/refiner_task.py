@@ -109,6 +109,7 @@ class RefinerTask(EstimatorTask):
     """
 
     loss: HeldOutLoss
+    errors = ("median_moved",)
 
     def __init__(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import pytorch_lightning as pl
 import torch
@@ -112,6 +112,9 @@ class EstimatorTask(pl.LightningModule):
         sample_gradient: largest norm of one set's gradient with respect to the outputs of a network, before the batch's
             average, since near-degenerate sets have gradients a thousand times the typical one. None for no limit.
     """
+
+    # Metrics of the validation whose decrease is what the training is for.
+    errors: ClassVar = ("log_sed", *(f"median_{name}" for name in SIZES.values()))
 
     def __init__(
         self,
@@ -259,15 +262,15 @@ class EstimatorTask(pl.LightningModule):
             for name, baseline in BASELINES.items():
                 other = symmetric_epipolar_distance(*points, baseline(*points)).mean(-1)
                 self._log(f"better_than_{name}", (residual < other)[comparable(residual, other)].double())
-        self._log("left_out", torch.tensor(float(left_out)), shown=False)
+        self._log("left_out", torch.tensor(float(left_out)))
 
     test_step = validation_step
 
-    def _log(self, name: str, value: Tensor, shown: bool = True) -> None:
+    def _log(self, name: str, value: Tensor) -> None:
         metric = cast(Metric, self.metrics[name])
         metric.update(value)
         stage = "test" if self.trainer.testing else "val"
-        self.log(f"{stage}/{name}", metric, prog_bar=shown, on_epoch=True, on_step=False)
+        self.log(f"{stage}/{name}", metric, prog_bar=name in self.errors, on_epoch=True, on_step=False)
 
     def predict_step(self, batch: MatchSets, batch_idx: int) -> dict[str, Tensor]:
         """Return matrices, mean residuals and, of a normaliser, transforms of a batch."""

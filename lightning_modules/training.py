@@ -23,7 +23,7 @@ from torch import Tensor
 
 from kornia_learnnorm.files import exclusive, full_disk_names
 from kornia_learnnorm.optional import working_folder_importable
-from lightning_modules.callbacks import Checkpoints, ExpectedTime, ExportWeights, WritePredictions
+from lightning_modules.callbacks import AgainstStart, Checkpoints, ExpectedTime, ExportWeights, WritePredictions
 from lightning_modules.config_files import config_names, names_task, with_config_paths
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import EstimatorTask
@@ -71,6 +71,7 @@ class TrainingCLI(LightningCLI):
             (Checkpoints(), ModelCheckpoint, config["enable_checkpointing"] is not False),
             (ExportWeights(), ExportWeights, True),
             (WritePredictions(), WritePredictions, True),
+            (AgainstStart(), AgainstStart, True),
             (bar, ProgressBar, config["enable_progress_bar"] is not False),
         ):
             if wanted and not any(isinstance(callback, kind) for callback in callbacks):
@@ -124,6 +125,16 @@ class TrainingCLI(LightningCLI):
             )
 
     before_validate = before_test = before_predict = before_fit
+
+    def after_fit(self) -> None:
+        """Print whether the validation's errors are below those at the start, if they were measured there."""
+        (found,) = (callback for callback in self.trainer.callbacks if isinstance(callback, AgainstStart))  # type: ignore[attr-defined]
+        if not found.start:
+            return
+        if found.step < self.trainer.global_step:
+            self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)
+        if self.trainer.is_global_zero:
+            print(found.summary())
 
 
 def _state_dict(path: str) -> dict[str, Tensor]:
@@ -186,7 +197,7 @@ def run(args: list[str]) -> dict[str, float]:
                 datamodule_class=CorrespondenceDataModule,
                 args=[command, *options],
                 auto_configure_optimizers=False,
-                trainer_defaults={"callbacks": [ExpectedTime()]},
+                trainer_defaults={"callbacks": [ExpectedTime()], "num_sanity_val_steps": -1},
                 parser_kwargs={"prog": "learnnorm", **raises, command: raises},
                 save_config_kwargs={"overwrite": True},
             )

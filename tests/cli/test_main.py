@@ -298,7 +298,10 @@ def test_a_training_says_where_it_runs_and_how_long(tmp_path, caplog, capsys):
     with caplog.at_level("INFO"):
         assert main(["fit", "--config=crossview-synthetic", *options, f"--trainer.default_root_dir={tmp_path}"]) == 0
     assert f"device cpu, 13 steps; results in {tmp_path}" in caplog.messages
-    assert " 4/4 " in capsys.readouterr().out  # of an epoch, in Lightning's bar
+    printed = capsys.readouterr().out
+    assert " 4/4 " in printed  # of an epoch, in Lightning's bar
+    assert re.search(r"\n(not )?better than at the start: val/log_sed \S+, at the start \S+\n$", printed)
+    assert "better_than" not in printed  # nearly 1 from the first steps on
     assert [text for text in caplog.messages if re.fullmatch(r"about \d+ s for the remaining 2 steps, .*", text)]
     assert [text for text in caplog.messages if re.fullmatch(r"13 steps in \d+ s", text)]
     assert [text for text in caplog.messages if re.search("available|Tip|Seed", text)] == []  # Lightning's own
