@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_learnnorm.data.datasets.colmap import FIRST_DISTORTION, read_pinhole
 from kornia_learnnorm.data.datasets.kitti import read_calibration
 from kornia_learnnorm.data.datasets.textfiles import camera_matrix
 from kornia_learnnorm.data.images import focal_length_35mm, image_size
@@ -15,6 +16,7 @@ from kornia_learnnorm.data.images import focal_length_35mm, image_size
 __all__ = ["exif_camera", "read_camera"]
 
 KITTI_CAMERA = "P0"  # projection of image_0 in a calib.txt
+STRECHA_SIZE = 26  # numbers of a file: the camera matrix, distortion (3), rotation (9), centre (3), width and height
 FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
 
 
@@ -23,7 +25,8 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
 
     Args:
         text: ``fx,fy,cx,cy``; a text file of these four or of all nine numbers; a ``calib.txt`` of KITTI, of which
-            ``P0`` counts, the camera of ``image_0``; or ``exif``.
+            ``P0`` counts, the camera of ``image_0``; a ``cameras.txt`` of COLMAP with one camera; a ``.camera`` file
+            of Strecha et al. (CVPR 2008), whose first three rows are the matrix; or ``exif``. Both without distortion.
         image: the photograph that ``exif`` is read from, see :func:`exif_camera`.
 
     FileNotFoundError if there is no such file; ValueError if the numbers are not those of a camera.
@@ -32,13 +35,16 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
         if image is None:
             raise ValueError("camera exif: an image file expected, got none")
         return exif_camera(image)
-    expected = "expected fx,fy,cx,cy, a file of four or nine numbers, KITTI's calib.txt, or exif"
+    expected = "expected fx,fy,cx,cy, a file of four or nine numbers, KITTI's calib.txt, COLMAP's cameras.txt,"
+    expected += " Strecha's .camera or exif"
     content = text
     try:
         if "," not in text or Path(text).exists():
             content = Path(text).read_text(encoding="utf-8")
             if any(line.startswith(f"{KITTI_CAMERA}:") for line in content.splitlines()):
                 return read_calibration(Path(text), KITTI_CAMERA)[0]
+            if not FIRST_DISTORTION.keys().isdisjoint(content.split()):
+                return read_pinhole(Path(text))
         numbers = np.array(content.replace(",", " ").split(), float)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"camera {text}: no such file; {expected}") from error
@@ -46,6 +52,10 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
         raise ValueError(f"camera {text}: {expected}: {error}") from error
     if numbers.size == 4:
         numbers = camera_matrix(*numbers)
+    if numbers.size == STRECHA_SIZE:
+        if numbers[9:12].any():
+            raise ValueError(f"camera {text}: no distortion expected, got {numbers[9:12].tolist()}")
+        numbers = numbers[:9]
     if numbers.size != 9:
         raise ValueError(f"camera {text}: {expected}, got {numbers.size} numbers")
     K: NDArray[np.float64] = numbers.reshape(3, 3)

@@ -33,6 +33,52 @@ def test_calibration_of_kitti(tmp_path):
         read_camera(str(path))
 
 
+HEADER = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("1 PINHOLE 640 480 700 710 320 240", [700, 710, 319.5, 239.5]),
+        ("3 SIMPLE_PINHOLE 640 480 700 320 240", [700, 700, 319.5, 239.5]),
+        ("1 SIMPLE_RADIAL 640 480 700 320 240 0", [700, 700, 319.5, 239.5]),
+        ("1 OPENCV 640 480 700 710 320 240 0 0 0 0", [700, 710, 319.5, 239.5]),
+        ("1 SIMPLE_RADIAL 640 480 700 320 240 0.1", "a camera without distortion, as of colmap image_undistorter"),
+        ("1 PINHOLE 640 480 700 710 320", "a camera without distortion"),
+        ("1 PINHOLE 640 480 700 710 320 a", "line 3: numbers of a PINHOLE camera expected"),
+        ("PINHOLE 640 480", "line 3: an identifier and a camera model"),
+        ("1 PINHOLE 640 480 700 710 320 240\n2 PINHOLE 640 480 1 1 1 1", "one camera expected, got 2"),
+        ("1 FOV 640 480 700 710 320 240 1", "could not convert string to float: "),
+    ],
+)
+def test_cameras_of_colmap(tmp_path, line, expected):
+    """The centre of the top left pixel is (0.5, 0.5) in COLMAP."""
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"{HEADER}{line}\n")
+    if isinstance(expected, str):
+        with pytest.raises(ValueError, match=expected):
+            read_camera(str(path))
+        return
+    K = read_camera(str(path))
+    assert [K[0, 0], K[1, 1], K[0, 2], K[1, 2]] == expected
+    assert K[2].tolist() == [0, 0, 1]
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    _, model, width, height, *params = line.split()
+    camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=[*map(float, params)])
+    assert np.array_equal(K, camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+
+
+def test_camera_of_strecha(tmp_path):
+    path = tmp_path / "0000.jpg.camera"
+    rows = ["2700 0 1500", "0 2710 1000", "0 0 1", "{} 0 0", *["1 0 0", "0 1 0", "0 0 1"], "-14 -5 0.1", "3072 2048"]
+    text = "\n".join(rows)
+    path.write_text(text.format(0))
+    assert read_camera(str(path)).tolist() == [[2700, 0, 1500], [0, 2710, 1000], [0, 0, 1]]
+    path.write_text(text.format(0.1))
+    with pytest.raises(ValueError, match=r"no distortion expected, got \[0\.1, "):
+        read_camera(str(path))
+
+
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [

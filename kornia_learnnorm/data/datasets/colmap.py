@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
+from kornia_learnnorm.data.datasets.textfiles import camera_matrix, text_lines
 from kornia_learnnorm.data.images import image_size
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["covisible_pairs", "read_colmap"]
+__all__ = ["FIRST_DISTORTION", "covisible_pairs", "read_colmap", "read_pinhole"]
 
 # Index of the first distortion parameter of a camera model (COLMAP's source, sensor/models.h). These parameters are the
 # first of OpenCV's k1, k2, p1, p2.
@@ -62,6 +63,24 @@ def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int 
         shared = Counter(chain.from_iterable(observers[point] for point in points))
         for other in sorted(other for other, count in shared.items() if other > index and count >= min_points):
             yield FramePair(ordered[index], ordered[other])
+
+
+def read_pinhole(path: Path) -> NDArray[np.float64]:
+    """Return the matrix (3, 3) of the one camera, without distortion, of a ``cameras.txt``; ValueError for others.
+
+    Its principal point is that of a frame, see :func:`read_colmap`.
+    """
+    lines = list(text_lines(path, "COLMAP cameras"))
+    if len(lines) != 1:
+        raise ValueError(f"{path}: one camera expected, got {len(lines)}")
+    words = lines[0].text.split()
+    if len(words) < 5 or words[1] not in FIRST_DISTORTION:
+        raise lines[0].error(f"an identifier and a camera model of {', '.join(FIRST_DISTORTION)}")
+    first = FIRST_DISTORTION[words[1]]
+    params = lines[0].numbers(words[4:], len(words[4:]), f"numbers of a {words[1]} camera")
+    if len(params) < first or params[first:].any():
+        raise lines[0].error("a camera without distortion, as of colmap image_undistorter,")
+    return camera_matrix(params[0], params[first - 3], *(params[first - 2 : first] - 0.5))
 
 
 def _reconstruction(model: Path) -> Any:
