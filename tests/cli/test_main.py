@@ -1,6 +1,7 @@
 """The command line, on files that the tests write."""
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -10,6 +11,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -322,6 +324,13 @@ def test_an_interrupted_training_exits_as_interrupted(number, code, tmp_path, mo
     assert capsys.readouterr().err.endswith("interrupted\n") is (code == 130)
     assert last.is_file()
     assert not Path("runs/crossview-synthetic/weights.safetensors").exists()
+
+
+def test_a_training_names_its_folder_on_a_full_disk(trained, tmp_path, monkeypatch, refused):
+    error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr("lightning_modules.callbacks.ExpectedTime.on_train_start", Mock(side_effect=error))
+    command = ["fit", *trained[1], f"--trainer.default_root_dir={tmp_path}"]
+    refused(command, f"No space left on device: '{tmp_path}'")
 
 
 def test_a_training_writes_its_weights_once_whatever_its_callbacks(trained, tmp_path, capsys):
