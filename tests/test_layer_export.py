@@ -19,7 +19,7 @@ from kornia_learnnorm import (
     LearnedRelativePose,
     Whitening,
 )
-from kornia_learnnorm.estimators import pose_stages
+from kornia_learnnorm.estimators import fundamental_stages, pose_stages
 from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 from kornia_learnnorm.pretrained import shipped_weights
 
@@ -95,8 +95,10 @@ def check_gradients_of_program(program, layer, *points, **given) -> None:
     torch.testing.assert_close(*found, rtol=1e-3, atol=1e-6)
 
 
-def test_any_batch_and_number_of_points_also_without_the_package(tmp_path):
-    layer = shaken_estimator(stages=1, depth=1, refine_steps=1)
+def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monkeypatch):
+    for name in ("STAGE_STEPS", "LOCAL_STEPS"):
+        monkeypatch.setattr(fundamental_stages, name, 1)
+    layer = shaken_estimator(stages=1, depth=1, refine_steps=1, samples=8)
     program = export_layer(layer, ["mask", "scores"])
     run, cases = program.module(), []
     for points, given in (masked_sets(*size) for size in SIZES):
