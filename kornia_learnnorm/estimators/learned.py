@@ -179,9 +179,9 @@ class LearnedEightPoint(LearnedLayer):
     .. math:: w_i = \frac{\sigma(l_i)}{\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2}
 
     (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds an
-    SPD transform and Hartley's is that of the weighted points. A few steps of reweighted least squares on the Sampson
+    SPD transform and Hartley's is that of the weighted points. A few robust steps of Levenberg-Marquardt on the Sampson
     distances, weighted by :math:`\sigma(l_i)`, end each stage
-    (:func:`~kornia_learnnorm.estimators.moments.descend`).
+    (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`).
 
     In the last stage of sets of 16 correspondences and more, with :math:`\sum_i \sigma(l_i) \ge 8`, minimal samples of
     seven are drawn by :math:`\sigma(l_i)`. Of their matrices and the network's, the one of least robust cost over all
@@ -233,7 +233,7 @@ class LearnedEightPoint(LearnedLayer):
         stages: int = 3,
         learn_transforms: bool = True,
         rank2: Literal["projection", "optimal"] = "projection",
-        refine_steps: int = 6,
+        refine_steps: int = 10,
         samples: int = 64,
     ) -> None:
         super().__init__(Fundamental(rank2), width, depth, stages, learn_transforms, refine_steps)
