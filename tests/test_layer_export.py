@@ -96,8 +96,7 @@ def check_gradients_of_program(program, layer, *points, **given) -> None:
 
 
 def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monkeypatch):
-    for name in ("LOCAL_STEPS",):
-        monkeypatch.setattr(fundamental_stages, name, 1)
+    monkeypatch.setattr(fundamental_stages, "LOCAL_STEPS", 1)
     layer = shaken_estimator(stages=1, depth=1, refine_steps=1, samples=8)
     program = export_layer(layer, ["mask", "scores"])
     run, cases = program.module(), []

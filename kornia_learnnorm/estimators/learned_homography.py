@@ -74,6 +74,7 @@ class LearnedHomography(LearnedLayer):
 
     """
 
+    model: Homography
     model_name = Homography.name
     architecture = ("width", "depth", "stages", "refine_steps")
 
@@ -153,4 +154,4 @@ class LearnedHomography(LearnedLayer):
         return torch.where(swapped[..., None], self.model.swap(M), M), logits
 
     def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
-        return HomographyRefinement(Homography(), problem, frame)
+        return HomographyRefinement(self.model, problem, frame)
