@@ -18,7 +18,6 @@ from kornia_learnnorm import (
     symmetric_epipolar_distance,
     transfer_distance,
 )
-from kornia_learnnorm.geometry.distances import line_norms, sampson_scale, symmetric_scale
 
 ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x2^T F x1 = y1 - y2
 ORIGIN = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])  # both epipoles are at the origin
@@ -126,45 +125,6 @@ class TestSymmetricEpipolarDistance:
         distance = symmetric_epipolar_distance(points1, points2, find_fundamental(points1, points2))
         assert distance[:, :3].isinf().all()
         assert distance[:, 3:].isfinite().all()
-
-
-def test_sampson_is_nearly_the_distance_to_the_nearest_exact_correspondence():
-    """Move a pair along the gradient of its constraint by a known length."""
-    scene = scenes("orbit", 10, 20, noise=0.0)
-    x1, x2, F = homogeneous(scene.points1.numpy()), homogeneous(scene.points2.numpy()), scene.F_mat.numpy()
-    direction = np.concatenate([(x2 @ F)[..., :2], (x1 @ F.swapaxes(1, 2))[..., :2]], -1)
-    moved = 0.01 * torch.from_numpy(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
-    found = sampson_distance(scene.points1 + moved[..., :2], scene.points2 + moved[..., 2:], scene.F_mat)
-    np.testing.assert_allclose(found.numpy(), 0.01, rtol=1e-3)
-
-
-class TestDistanceScales:
-    @pytest.mark.parametrize("scale", [sampson_scale, symmetric_scale])
-    def test_derivatives(self, scale):
-        norms = [uniform(5, low=0.5, seed=k).requires_grad_() for k in (0, 1)]
-        value, *slopes = scale(*norms)
-        for got, want in zip(slopes, torch.autograd.grad(value.sum(), norms), strict=True):
-            torch.testing.assert_close(got.detach(), want)
-        assert torch.equal(scale(*norms, slopes=False)[0], value)
-
-
-class TestLineNorms:
-    @pytest.mark.parametrize("weighted", [False, True])
-    def test_agrees_with_numpy(self, weighted):
-        F_mat = uniform(5, 3, 3, low=-1)
-        x1, x2 = (uniform(5, 8, 3, low=-1, seed=seed) for seed in (1, 2))
-        weights = uniform(5, 8) * (torch.arange(8) > 2) if weighted else None
-        found = line_norms(x1.mT, x2.mT, F_mat, weights, floor=0.5)
-        for norm, lines in zip(found, (x2.numpy() @ F_mat.numpy(), x1.numpy() @ F_mat.mT.numpy()), strict=True):
-            norms = np.linalg.norm(lines[..., :2], axis=-1)
-            mean = np.average(norms, axis=1, weights=None if weights is None else weights.numpy())
-            np.testing.assert_allclose(norm.numpy(), norms + 0.5 * mean[:, None])
-
-    def test_is_positive_on_the_epipole(self):
-        x = torch.tensor([[[0.0, 0.0, 1.0], [3.0, 4.0, 1.0]]]).mT
-        for norms in line_norms(x, x, ORIGIN):  # lines (0, 0), (4, -3): mean 2.5
-            np.testing.assert_allclose(norms[0].numpy(), [0.0025, 5.0025], rtol=1e-5)
-        assert all((norms > 0).all() for norms in line_norms(x[..., :1], x[..., :1], ORIGIN))
 
 
 class TestTransferDistance:

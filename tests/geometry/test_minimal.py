@@ -5,17 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from scenes import SCENES, correspondences, epipolar_distances, up_to_sign
+from scenes import SCENES, correspondences, up_to_sign
 
-from kornia_learnnorm import find_fundamental
 from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.minimal import are_independent, solve_samples
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import PairScorer
-
-NOISY = ["driving", "handheld", "orbit"]
 
 
 def coordinates(points1, points2):
@@ -26,13 +21,6 @@ def coordinates(points1, points2):
 
 def are_determined(x1, x2, shift):
     return are_independent(design_matrix(x1, x2), x1, x2, shift)
-
-
-def solve(points1, points2):
-    """Matrices of pixels."""
-    scorer = PairScorer(points1.flatten(0, 1), points2.flatten(0, 1), 1.0, Fundamental())
-    F = scorer.to_pixels(solve_samples(*coordinates(points1, points2), 0.01))
-    return F / torch.linalg.matrix_norm(F, keepdim=True)
 
 
 def reference(x1, x2) -> np.ndarray:
@@ -62,15 +50,6 @@ class TestSolve:
         for found, expected in zip(F, reference(x1, x2), strict=True):
             assert up_to_sign(found[None], expected[None]) < 1e-5
 
-    @pytest.mark.parametrize("name", NOISY)
-    def test_as_the_solver_of_any(self, name):
-        """Both end near the optimal correction of the same null vector, along different ways."""
-        points = correspondences(name, 200, noise=0.3)
-        found, expected = solve(*points), find_fundamental(*points, rank2="optimal")
-        assert np.median([up_to_sign(f[None], e[None]) for f, e in zip(found, expected, strict=True)]) < 2e-3
-        distances = [np.median(epipolar_distances(*points, F).mean(1)) for F in (found, expected)]
-        assert distances[0] == pytest.approx(distances[1], rel=0.1)
-
     def test_leaves_undetermined_samples_out(self):
         points1, points2 = correspondences("handheld", 6)
         for points in (points1, points2):
@@ -80,19 +59,6 @@ class TestSolve:
         assert torch.allclose(solve_samples(x1, x2, 0.01), solve_samples(x1[others], x2[others], 0.01))
         for few in (slice(2, 3), slice(0)):
             assert solve_samples(x1[few], x2[few], 0.01).shape == (0, 3, 3)
-
-    @given(order=st.permutations(range(8)))
-    def test_neither_the_order_of_the_points_nor_of_the_views_counts(self, order):
-        points1, points2 = correspondences("orbit", 5)
-        assert up_to_sign(solve(points1, points2), solve(points1[:, order], points2[:, order])) < 1e-6
-        assert up_to_sign(solve(points1, points2), solve(points2, points1).mT) < 1e-6
-
-    @given(scale=st.floats(0.1, 10), x=st.floats(-1e4, 1e4), y=st.floats(-1e4, 1e4))
-    def test_similarities_of_the_pixels(self, scale, x, y):
-        points = correspondences("orbit", 5)
-        moved = [scale * p + torch.tensor([x, y], dtype=p.dtype) for p in points]
-        distances = epipolar_distances(*points, solve(*points)).mean(1)
-        np.testing.assert_allclose(epipolar_distances(*moved, solve(*moved)).mean(1), scale * distances, rtol=1e-4)
 
 
 class TestDetermined:
