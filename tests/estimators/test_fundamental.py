@@ -10,20 +10,16 @@ from hypothesis import strategies as st
 from pairwise import pairwise
 from scenes import (
     SCENES,
-    check_gradients,
     correspondences,
-    derivative,
     eight_point,
     hartley_difference,
     numpy_hartley,
     numpy_whitening,
-    signless,
     uniform,
     up_to_sign,
 )
-from torch.autograd import gradcheck
 
-from kornia_learnnorm import Hartley, Identity, ReweightedWhitening, Whitening, find_fundamental
+from kornia_learnnorm import Hartley, Identity, Whitening, find_fundamental
 
 # Each normaliser with its independent computation.
 REFERENCES = {
@@ -31,11 +27,6 @@ REFERENCES = {
     "hartley": (Hartley(), numpy_hartley),
     "whitening": (Whitening(), numpy_whitening),
 }
-
-
-def unit_square(batch_size: int, num_points: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Correspondences of no epipolar geometry, well conditioned for finite differences."""
-    return tuple(uniform(batch_size, num_points, 2, low=-1, seed=seed) for seed in (1, 2))
 
 
 class TestFindFundamental:
@@ -81,34 +72,3 @@ class TestFindFundamental:
 def test_wrong_rank2(rank2):
     with pytest.raises(ValueError, match=f"rank2 must be 'projection' or 'optimal', got {rank2}"):
         find_fundamental(torch.rand(2, 8, 2), torch.rand(2, 8, 2), rank2=rank2)
-
-
-class TestGradients:
-    """In pixels, of every layer, see test_eight_point.py; of the optimal correction, test_rank2.py."""
-
-    @pytest.mark.parametrize("normalizer", [Identity(), Hartley(), Whitening(), ReweightedWhitening(iterations=2)])
-    @pytest.mark.parametrize("num_points", [8, 9])
-    def test_first(self, normalizer, num_points):
-        values = [*unit_square(1, num_points), uniform(1, num_points, low=0.2, seed=3)]
-        check_gradients(lambda *v: signless(find_fundamental(*v, normalizer)), *values)
-        check_gradients(lambda p, q: signless(find_fundamental(p, q, normalizer=normalizer)), *values[:2])
-
-    @pytest.mark.parametrize("normalizer", [Hartley(), Whitening()])
-    def test_second_of_more_with_weights(self, normalizer):
-        """Of eight without weights see test_eight_point.py."""
-        values = [*unit_square(1, 9), uniform(1, 9, low=0.2, seed=3)]
-        check_gradients(derivative(lambda *v: signless(find_fundamental(*v, normalizer))), *values)
-
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_with_respect_to_transforms(self, num_points):
-        points1, points2 = unit_square(2, num_points)
-        T1, T2 = (T.clone().requires_grad_() for T in Hartley()(points1, points2))
-        assert gradcheck(lambda *T: signless(find_fundamental(points1, points2, normalizer=lambda *_: T)), [T1, T2])
-
-    def test_undetermined_null_vector_of_eight_has_no_gradient(self):
-        points = uniform(3, 8, 1, low=-1) * torch.tensor([1.0, 0.5])
-        points1, points2 = points.clone().requires_grad_(), (2 * points).requires_grad_()  # two lines
-        F_mat = find_fundamental(points1, points2, normalizer=Identity())
-        # Of T2^T F T1, only the null vector depends on the points when T does not.
-        for gradient in torch.autograd.grad(signless(F_mat).sum(), [points1, points2]):
-            assert gradient.count_nonzero() == 0

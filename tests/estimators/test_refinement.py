@@ -1,4 +1,7 @@
-"""Levenberg-Marquardt against Gauss-Newton in NumPy on numerical derivatives, and the properties it must have."""
+"""Levenberg-Marquardt against Gauss-Newton in NumPy on numerical derivatives, and the properties it must have.
+
+Of fundamental matrices, invariances and zero weights are in test_contract.py.
+"""
 
 from __future__ import annotations
 
@@ -11,179 +14,230 @@ from pairwise import pairwise
 from scenes import (
     SCENES,
     correspondences,
+    cross,
     epipolar_distances,
-    hartley_difference,
     in_hartley,
     least_squares,
     numpy_hartley,
     numpy_sampson,
     scenes,
     signless,
+    true_essential,
     uniform,
     unit,
     up_to_sign,
 )
 from torch.autograd import gradcheck
 
-from kornia_learnnorm import find_fundamental, sampson_distance, symmetric_epipolar_distance
-from kornia_learnnorm.estimators.refinement import refine_fundamental
-from kornia_learnnorm.estimators.robust_losses import (
-    Cauchy,
-    GemanMcClure,
-    Huber,
-    Truncated,
-    squared_loss,
-)
+from kornia_learnnorm import find_fundamental, refine_essential, refine_fundamental
+from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated, squared_loss
 
-DISTANCES = {"sampson": sampson_distance, "symmetric": symmetric_epipolar_distance}
+# Distances in pixels, those of Sampson with signs.
+DISTANCES = {"sampson": numpy_sampson, "symmetric": epipolar_distances}
 LOSSES = [squared_loss, Huber(0.5), Cauchy(0.5), GemanMcClure(2.0), Truncated(3.0)]
+NAMED = ["driving", "handheld", "orbit"]
+both = pytest.mark.parametrize("calibrated", [False, True])
 
 
-def numpy_distances(F, points1, points2, kind: str) -> np.ndarray:
-    """Distances in pixels, (N,), of which those of Sampson have signs."""
-    return numpy_sampson(points1, points2, F) if kind == "sampson" else epipolar_distances(points1, points2, F)
+def problem(calibrated: bool, name: str = "handheld", batch_size: int = 3, num_points: int = 40, **options):
+    """A function that refines matrices of a scene's points, points and cameras, and matrices to start from."""
+    scene = scenes(name, batch_size, num_points, **{"noise": 0.5} | options)
+    points = scene.points1, scene.points2
+    if calibrated:
+        return refine_essential, (points, (scene.K1, scene.K2)), true_essential(scene)
+    return refine_fundamental, (points, ()), find_fundamental(*points)
 
 
-def gauss_newton(F, points1, points2, kind: str) -> float:
-    """Least cost found from F, as F = [a b a*s + b*t] (epipole by two ratios)."""
+def disturbed(M, size: float = 0.02) -> torch.Tensor:
+    return M + size * uniform(*M.shape, low=-1, seed=7)
+
+
+def fundamental_chart(F, points1, points2):
+    """Matrices [a b a*s + b*t] about F by eight numbers (epipole by two ratios), and those of F."""
     T1, T2 = (numpy_hartley(p[None])[0] for p in (points1, points2))
     F = unit(np.linalg.inv(T2).T @ F @ np.linalg.inv(T1))
     # Turn the epipole of view 1 to the third axis, where the last column of F vanishes and the chart is centred.
     V = np.linalg.svd(F)[2].T
 
-    def distances(q):
-        columns = np.column_stack([q[:6].reshape(3, 2), q[:6].reshape(3, 2) @ q[6:]])
-        return numpy_distances(T2.T @ columns @ V.T @ T1, points1, points2, kind)
+    def chart(q):
+        return T2.T @ np.column_stack([q[:6].reshape(3, 2), q[:6].reshape(3, 2) @ q[6:]]) @ V.T @ T1
 
-    return least_squares(distances, np.concatenate([(F @ V)[:, :2].reshape(6), np.zeros(2)]))
+    return chart, np.concatenate([(F @ V)[:, :2].reshape(6), np.zeros(2)])
 
 
-class TestRefineFundamental:
-    @pytest.mark.parametrize("batch_size", [0, 1, 5])
-    def test_what_it_returns_beside_the_matrix(self, batch_size, device, dtype):
-        points = [uniform(batch_size, 20, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
-        found = refine_fundamental(*points, uniform(batch_size, 3, 3).to(device), max_iterations=5)
-        assert [value.dtype for value in found] == [dtype, dtype, dtype, torch.int64, torch.bool]
-        assert all(value.shape == (batch_size,) and value.device.type == device.type for value in found[1:])
+def essential_chart(R, t, K1, K2):
+    """Matrices of pixels about those of a pose by a rotation vector and two angles of t, and five zeros."""
+    t = t / np.linalg.norm(t)
+    side = np.linalg.svd(t[None])[2][1:]
 
-    @pairwise(name=["driving", "handheld", "orbit"], kind=DISTANCES, num_points=[12, 40])
-    def test_agrees_with_numpy(self, name, kind, num_points):
-        points1, points2 = correspondences(name, 3, num_points, noise=0.5)
-        F0 = find_fundamental(points1, points2)
-        found = refine_fundamental(points1, points2, F0, distance=kind, max_iterations=200)
-        arguments = zip(F0.numpy(), points1.numpy(), points2.numpy(), strict=True)
-        expected = [gauss_newton(*values, kind) for values in arguments]
-        assert found.converged.all()
-        assert found.cost.numpy() == pytest.approx(expected, rel=1e-6)
+    def chart(q):
+        angle = np.linalg.norm(q[:3]) + 1e-300
+        k = cross(q[:3] / angle)
+        turned = (np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k) @ R
+        return np.linalg.inv(K2).T @ cross(t + q[3:] @ side) @ turned @ np.linalg.inv(K1)
 
-    @pytest.mark.parametrize("kind", DISTANCES)
-    @pytest.mark.parametrize("loss", LOSSES)
-    def test_costs_are_those_of_the_matrices(self, kind, loss):
-        points1, points2 = correspondences("handheld", 10, 15)
-        weights, F0 = uniform(10, 15), find_fundamental(points1, points2)
-        found = refine_fundamental(points1, points2, F0, weights, kind, loss)
-        for F_mat, cost in ((F0, found.cost_before), (found.F_mat, found.cost)):
-            expected = (weights * loss(DISTANCES[kind](points1, points2, F_mat).square())[0]).sum(-1)
-            np.testing.assert_allclose(cost.numpy(), expected.numpy(), rtol=1e-8)
+    return chart, np.zeros(5)
 
-    @pytest.mark.parametrize("kind", DISTANCES)
-    @pytest.mark.parametrize("loss", LOSSES)
-    def test_nothing_near_the_optimum_costs_less(self, kind, loss):
-        points1, points2 = correspondences("orbit", 10, 30, noise=0.5)
-        found = refine_fundamental(points1, points2, find_fundamental(points1, points2), None, kind, loss, 300)
-        assert found.converged.all()
-        T1, T2 = (torch.from_numpy(numpy_hartley(points)) for points in (points1, points2))
-        F_hat = torch.from_numpy(in_hartley(found.F_mat, points1, points2))
-        for seed in range(5):
-            near = T2.mT @ (F_hat + 1e-3 * uniform(10, 3, 3, low=-1, seed=seed)) @ T1
-            cost = refine_fundamental(points1, points2, near, None, kind, loss, 0).cost
-            assert (cost > found.cost * (1 - 1e-9)).all()
 
-    @pytest.mark.parametrize("kind", DISTANCES)
-    @pytest.mark.parametrize("num_points", [8, 20])
-    def test_exact_points(self, kind, num_points):
-        scene = scenes("orbit", 20, num_points, noise=0.0)
-        T1, T2 = (torch.from_numpy(numpy_hartley(points)) for points in scene[:2])
-        F_hat = torch.from_numpy(in_hartley(scene.F_mat, *scene[:2]))
-        for F0 in (scene.F_mat, T2.mT @ (F_hat + 1e-4 * uniform(20, 3, 3, low=-1)) @ T1):
-            found = refine_fundamental(*scene[:2], F0, distance=kind, max_iterations=200)
-            assert found.converged.all()
-            assert (found.cost < 1e-16).all()
+@both
+@pytest.mark.parametrize("batch_size", [0, 1, 5])
+def test_smoke(calibrated, batch_size, device, dtype):
+    points = [uniform(batch_size, 20, 2, high=600, seed=k).to(device, dtype) for k in (0, 1)]
+    K = torch.tensor([[500.0, 0, 300], [0, 510, 200], [0, 0, 1]], device=device)
+    refine, cameras = (refine_essential, (K, K)) if calibrated else (refine_fundamental, ())
+    found = refine(*points, uniform(batch_size, 3, 3).to(device), *cameras, max_iterations=5)
+    assert [value.dtype for value in found] == [*(3 + calibrated) * [dtype], torch.int64, torch.bool]
+    assert [value.shape for value in found] == [*(1 + calibrated) * [(batch_size, 3, 3)], *4 * [(batch_size,)]]
+    assert all(value.device.type == device.type for value in found)
 
-    @pytest.mark.parametrize("loss", LOSSES[1:])
-    def test_robust_losses_see_past_outliers(self, loss):
-        scene = scenes("orbit", 20, 60, noise=0.2, outliers=0.1)
-        F0 = find_fundamental(scene.points1, scene.points2, torch.where(scene.inliers, 1.0, 1e-9))
-        squares, robust = (refine_fundamental(scene.points1, scene.points2, F0, loss=x) for x in (squared_loss, loss))
-        errors = [
-            np.median(epipolar_distances(scene.points1, scene.points2, found.F_mat)[scene.inliers.numpy()])
-            for found in (squares, robust)
-        ]
-        assert errors[1] < 0.5 * errors[0]
 
-    @given(
-        st.integers(0, 2**31),
-        st.sampled_from([8, 9, 30]),
-        st.sampled_from(sorted(SCENES)),
-        st.sampled_from(sorted(DISTANCES)),
-        st.sampled_from(LOSSES),
-        st.integers(0, 12),
+@pairwise(name=NAMED, kind=DISTANCES, num_points=[12, 40], calibrated=[False, True])
+def test_agrees_with_numpy(name, kind, num_points, calibrated):
+    scene = scenes(name, 3, num_points, noise=0.5)
+    refine, (points, cameras), start = problem(calibrated, name, 3, num_points)
+    found = refine(*points, start, *cameras, distance=kind, max_iterations=200)
+    arguments = (scene.R, scene.t, *cameras) if calibrated else (start, *points)
+    for row, (*own, x1, x2) in enumerate(zip(*(value.numpy() for value in (*arguments, *points)), strict=True)):
+        chart, q = (essential_chart if calibrated else fundamental_chart)(*own)
+        expected = least_squares(
+            lambda q, c=chart, x=(x1, x2): DISTANCES[kind](*x, c(q)), q, 1e-7 if calibrated else 1e-6
+        )
+        assert found.cost[row].item() == pytest.approx(expected, rel=1e-6)
+    assert found.converged.all()
+
+
+@both
+@pytest.mark.parametrize("kind", DISTANCES)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_costs_are_those_of_the_matrices(calibrated, kind, loss):
+    refine, (points, cameras), start = problem(calibrated, batch_size=10, num_points=15)
+    weights = uniform(10, 15)
+    found = refine(*points, start, *cameras, weights, distance=kind, loss=loss)
+    before = torch.linalg.inv(cameras[1]).mT @ start @ torch.linalg.inv(cameras[0]) if calibrated else start
+    for F_mat, cost in ((before, found.cost_before), (found.F_mat, found.cost)):
+        squares = torch.from_numpy(DISTANCES[kind](*points, F_mat) ** 2)
+        np.testing.assert_allclose(cost, (weights * loss(squares)[0]).sum(-1), rtol=1e-7)
+    assert (found.cost <= found.cost_before).all()
+
+
+def test_essential_matrices():
+    refine, (points, (K1, K2)), start = problem(True)
+    found = refine(*points, disturbed(start).requires_grad_(), K1, K2)
+    np.testing.assert_allclose(np.linalg.svd(found.E_mat)[1], np.tile([0.5**0.5, 0.5**0.5, 0], (3, 1)), atol=1e-12)
+    expected = torch.linalg.inv(K2).mT @ found.E_mat @ torch.linalg.inv(K1)
+    assert up_to_sign(found.F_mat, expected) < 1e-10
+    assert not any(value.requires_grad for value in found)
+
+
+@pytest.mark.parametrize("kind", DISTANCES)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_nothing_near_the_optimum_costs_less(kind, loss):
+    _, (points, _), start = problem(False, "orbit", 10, 30)
+    found = refine_fundamental(*points, start, None, kind, loss, 300)
+    assert found.converged.all()
+    T1, T2 = (torch.from_numpy(numpy_hartley(p)) for p in points)
+    F_hat = torch.from_numpy(in_hartley(found.F_mat, *points))
+    for seed in range(5):
+        near = T2.mT @ (F_hat + 1e-3 * uniform(10, 3, 3, low=-1, seed=seed)) @ T1
+        cost = refine_fundamental(*points, near, None, kind, loss, 0).cost
+        assert (cost > found.cost * (1 - 1e-9)).all()
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "kind", "num_points"),
+    [*((False, kind, number) for kind in DISTANCES for number in (8, 20)), *((True, "sampson", n) for n in (5, 6, 20))],
+)
+def test_exact_points(calibrated, kind, num_points):
+    refine, (points, cameras), start = problem(
+        calibrated, "handheld" if calibrated else "orbit", 20, num_points, noise=0.0
     )
-    def test_cost_never_rises_and_rank_two_holds(self, seed, num_points, name, kind, loss, max_iterations):
-        points1, points2 = correspondences(name, 5, num_points, seed)
-        F0 = find_fundamental(points1, points2)
-        found = refine_fundamental(points1, points2, F0, None, kind, loss, max_iterations)
-        assert (found.cost <= found.cost_before).all()
-        assert (found.iterations <= max_iterations).all()
-        assert np.linalg.norm(found.F_mat.numpy(), axis=(1, 2)) == pytest.approx(1, abs=1e-14)
-        for F in (found.F_mat.numpy(), in_hartley(found.F_mat, points1, points2)):
-            assert (np.linalg.svd(F)[1][:, 2] < 1e-12).all()
-
-    @pytest.mark.parametrize("num_points", [20, 3000])  # as one part and as several
-    @pytest.mark.parametrize("weighted", [False, True])
-    def test_matrices_may_share_points(self, num_points, weighted):
-        points = correspondences("handheld", 1, num_points, noise=0.5)
-        weights = uniform(1, num_points, low=0.1) if weighted else None
-        F0 = find_fundamental(*(p[:, :16].view(2, 8, 2) for p in points)).repeat(6, 1, 1)
-        many = [None if value is None else value.expand(12, *value.shape[1:]) for value in (*points, weights)]
-        shared = refine_fundamental(*points, F0, weights, loss=Cauchy(1.0), max_iterations=8)
-        copied = refine_fundamental(*many[:2], F0, many[2], loss=Cauchy(1.0), max_iterations=8)
-        assert hartley_difference(shared.F_mat, copied.F_mat, *many[:2]) < 1e-7
-        assert torch.equal(shared.iterations, copied.iterations)
-
-    def test_shared_points_take_the_gradients_of_all(self):
-        points = correspondences("orbit", 1, 14, noise=1.0)
-        F0 = find_fundamental(*points).repeat(3, 1, 1)
-        gradients = []
-        for count in (1, 3):
-            values = [value.repeat(count, 1, 1).requires_grad_() for value in points]
-            found = refine_fundamental(*values, F0, max_iterations=60)
+    if not calibrated:
+        T1, T2 = (torch.from_numpy(numpy_hartley(p)) for p in points)
+        near = T2.mT @ disturbed(torch.from_numpy(in_hartley(start, *points)), 1e-4) @ T1
+    for M in (start, disturbed(start, 1e-3) if calibrated else near):
+        found = refine(*points, M, *cameras, distance=kind, max_iterations=200)
+        assert (found.cost < 1e-16).all()
+        if num_points > 6:
             assert found.converged.all()
-            gradients.append([g.sum(0) for g in torch.autograd.grad(signless(found.F_mat).sum(), values)])
-        for one, many in zip(*gradients, strict=True):
-            torch.testing.assert_close(one, many, rtol=1e-4, atol=1e-8)
+        if calibrated and num_points > 6:
+            assert up_to_sign(found.E_mat, start) < 1e-7
 
-    @pytest.mark.parametrize("loss", [squared_loss, Cauchy(0.5)])
-    def test_tolerance_trades_steps_for_cost(self, loss):
-        points1, points2 = correspondences("driving", 20, 100, noise=0.5)
-        F0 = find_fundamental(points1, points2)
-        loose, tight = (refine_fundamental(points1, points2, F0, loss=loss, tolerance=t) for t in (1e-3, 1e-7))
-        assert loose.converged.all()
-        assert (loose.iterations <= tight.iterations).all()
-        assert loose.iterations.sum() < 0.5 * tight.iterations.sum()
-        assert (loose.cost <= tight.cost * 1.002).double().mean() > 0.9
 
-    def test_returns_the_start_where_no_step_is_possible(self):
-        points1, points2 = correspondences("handheld", 5, 12)
-        F0 = find_fundamental(points1, points2)
+@pytest.mark.parametrize("loss", LOSSES[1:])
+def test_robust_losses_see_past_outliers(loss):
+    scene = scenes("orbit", 20, 60, noise=0.2, outliers=0.1)
+    F0 = find_fundamental(scene.points1, scene.points2, torch.where(scene.inliers, 1.0, 1e-9))
+    squares, robust = (refine_fundamental(scene.points1, scene.points2, F0, loss=x) for x in (squared_loss, loss))
+    errors = [
+        np.median(epipolar_distances(scene.points1, scene.points2, found.F_mat)[scene.inliers.numpy()])
+        for found in (squares, robust)
+    ]
+    assert errors[1] < 0.5 * errors[0]
 
-        def broken(squares):
-            return squares, torch.full_like(squares, torch.nan)
 
-        found = refine_fundamental(points1, points2, F0, loss=broken)
-        assert up_to_sign(found.F_mat, F0) < 1e-12
-        assert torch.equal(found.cost, found.cost_before)
-        assert not found.converged.any()
+@given(
+    st.integers(0, 2**31),
+    st.sampled_from([8, 9, 30]),
+    st.sampled_from(sorted(SCENES)),
+    st.sampled_from(sorted(DISTANCES)),
+    st.sampled_from(LOSSES),
+    st.integers(0, 12),
+)
+def test_cost_never_rises_and_rank_two_holds(seed, num_points, name, kind, loss, max_iterations):
+    points1, points2 = correspondences(name, 5, num_points, seed)
+    F0 = find_fundamental(points1, points2)
+    found = refine_fundamental(points1, points2, F0, None, kind, loss, max_iterations)
+    assert (found.cost <= found.cost_before).all()
+    assert (found.iterations <= max_iterations).all()
+    assert np.linalg.norm(found.F_mat.numpy(), axis=(1, 2)) == pytest.approx(1, abs=1e-14)
+    for F in (found.F_mat.numpy(), in_hartley(found.F_mat, points1, points2)):
+        assert (np.linalg.svd(F)[1][:, 2] < 1e-12).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 7.0, 1e3])
+def test_order_views_and_unit_do_not_matter_to_essential_matrices(scale):
+    refine, (points, K), start = problem(True)
+    start, order = disturbed(start), torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    found, shuffled = (refine(*p, start, *K) for p in (points, [p[:, order] for p in points]))
+    assert up_to_sign(found.E_mat, shuffled.E_mat) < 1e-7
+    assert up_to_sign(found.E_mat, refine(*points[::-1], start.mT, *K[::-1]).E_mat.mT) < 1e-7
+    T = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
+    scaled = refine(*(scale * p for p in points), start, *(T @ camera for camera in K))
+    assert up_to_sign(found.E_mat, scaled.E_mat) < 1e-7
+    np.testing.assert_allclose(scaled.cost, scale**2 * found.cost)
+
+
+@both
+@pytest.mark.parametrize("num_points", [20, 3000])  # as one part and as several
+@pytest.mark.parametrize("weighted", [False, True])
+def test_matrices_may_share_points(calibrated, num_points, weighted):
+    refine, (points, cameras), start = problem(calibrated, batch_size=1, num_points=num_points)
+    weights, cameras = uniform(1, num_points, low=0.1) if weighted else None, [K[0] for K in cameras]
+    starts = disturbed(start.repeat(8, 1, 1), 0.02 if calibrated else 1e-6)
+    many = [None if value is None else value.expand(8, *value.shape[1:]) for value in (*points, weights)]
+    options = {"loss": Cauchy(1.0), "max_iterations": 8}
+    shared = refine(*points, starts, *cameras, weights, **options)
+    copied = refine(*many[:2], starts, *cameras, many[2], **options)
+    assert up_to_sign(shared.F_mat, copied.F_mat) < 1e-7
+    assert torch.equal(shared.iterations, copied.iterations)
+
+
+@pytest.mark.parametrize("loss", [squared_loss, Cauchy(0.5)])
+def test_tolerance_trades_steps_for_cost(loss):
+    _, (points, _), start = problem(False, "driving", 20, 100)
+    loose, tight = (refine_fundamental(*points, start, loss=loss, tolerance=t) for t in (1e-3, 1e-7))
+    assert loose.converged.all()
+    assert (loose.iterations <= tight.iterations).all()
+    assert loose.iterations.sum() < 0.5 * tight.iterations.sum()
+    assert (loose.cost <= tight.cost * 1.002).double().mean() > 0.9
+
+
+def test_returns_the_start_where_no_step_is_possible():
+    _, (points, _), start = problem(False, batch_size=5, num_points=12)
+    found = refine_fundamental(*points, start, loss=lambda squares: (squares, torch.full_like(squares, torch.nan)))
+    assert up_to_sign(found.F_mat, start) < 1e-12
+    assert torch.equal(found.cost, found.cost_before)
+    assert not found.converged.any()
 
 
 class TestGradients:
@@ -204,6 +258,18 @@ class TestGradients:
         # A central difference of the iteration stops within 1e-7 of the gradient's zero.
         assert gradcheck(refined, [*points, weights], eps=1e-5, atol=1e-3, rtol=1e-3, fast_mode=True)
 
+    def test_shared_points_take_the_gradients_of_all(self):
+        points = correspondences("orbit", 1, 14, noise=1.0)
+        F0 = find_fundamental(*points).repeat(3, 1, 1)
+        gradients = []
+        for count in (1, 3):
+            values = [value.repeat(count, 1, 1).requires_grad_() for value in points]
+            found = refine_fundamental(*values, F0, max_iterations=60)
+            assert found.converged.all()
+            gradients.append([g.sum(0) for g in torch.autograd.grad(signless(found.F_mat).sum(), values)])
+        for one, many in zip(*gradients, strict=True):
+            torch.testing.assert_close(one, many, rtol=1e-4, atol=1e-8)
+
     def test_without_gradients_the_result_is_the_same(self):
         points1, points2 = correspondences("orbit", 5, 12)
         F0 = find_fundamental(points1, points2).requires_grad_()
@@ -221,35 +287,52 @@ class TestGradients:
         assert (gradient == 0).all()
 
 
-class TestObjectives:
-    @pytest.mark.parametrize("loss", LOSSES)
-    def test_weights_of_losses(self, loss):
-        squares = uniform(50, high=20).requires_grad_()
-        value, weight = loss(squares)
-        torch.testing.assert_close(weight.detach(), torch.autograd.grad(value.sum(), squares)[0])
-        assert loss(torch.zeros(1))[0] == 0
-        assert loss(torch.zeros(1))[1] == 1
+@pytest.mark.parametrize("loss", LOSSES)
+def test_weights_of_losses(loss):
+    squares = uniform(50, high=20).requires_grad_()
+    value, weight = loss(squares)
+    torch.testing.assert_close(weight.detach(), torch.autograd.grad(value.sum(), squares)[0])
+    assert [part.item() for part in loss(torch.zeros(1))] == [0, 1]
 
-    @pytest.mark.parametrize("kind", [Huber, Cauchy, GemanMcClure, Truncated])
-    @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
-    def test_scale_must_be_positive(self, kind, scale):
+
+@pytest.mark.parametrize("kind", [Huber, Cauchy, GemanMcClure, Truncated])
+def test_scale_must_be_positive(kind):
+    for scale in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match=f"scale must be positive, got {scale}"):
             kind(scale)
-        with pytest.raises(TypeError, match="scale must be a number of pixels, got '1'"):
-            kind("1")
+    with pytest.raises(TypeError, match="scale must be a number of pixels, got '1'"):
+        kind("1")
+
+
+POINTS, EYE = uniform(2, 10, 2), torch.eye(3, dtype=torch.float64)
+WRONG_OPTIONS = [
+    ({"loss": "huber"}, TypeError, "loss must be a function or an instance .* got 'huber'"),
+    ({"distance": "foo"}, ValueError, "distance must be"),
+    ({"max_iterations": 2.5}, TypeError, "max_iterations must be a whole number, got 2.5"),
+    ({"max_iterations": -1}, ValueError, "max_iterations and tolerance must be >= 0, got -1 and 1e-07"),
+    ({"tolerance": -0.5}, ValueError, "max_iterations and tolerance must be >= 0, got 50 and -0.5"),
+    ({"tolerance": float("nan")}, ValueError, "max_iterations and tolerance must be >= 0, got 50 and nan"),
+]
+WRONG_OF_ESSENTIAL = [
+    ({"points1": POINTS[:, :4], "points2": POINTS[:, :4]}, ValueError, "at least 5 correspondences .* got 4"),
+    ({"points2": POINTS[:1]}, ValueError, "must pair up"),
+    ({"E_mat": EYE[None]}, ValueError, "one matrix per set of points is needed, got 1 matrices and 2 sets"),
+    ({"E_mat": None}, TypeError, "E_mat must be a floating-point tensor"),
+    ({"K1": None}, ValueError, "K1 and K2 must be given together, got only K2"),
+    ({"K1": EYE.repeat(3, 1, 1)}, ValueError, r"K1 must have shape \[3, 3\] or \[2, 3, 3\], got \[3, 3, 3\]"),
+]
 
 
 @pytest.mark.parametrize(
-    ("option", "error", "message"),
+    ("refine", "wrong", "error", "message"),
     [
-        ({"loss": "huber"}, TypeError, "loss must be a function or an instance .* got 'huber'"),
-        ({"max_iterations": 2.5}, TypeError, "max_iterations must be a whole number, got 2.5"),
-        ({"max_iterations": -1}, ValueError, "max_iterations and tolerance must be >= 0, got -1 and 1e-07"),
-        ({"tolerance": -0.5}, ValueError, "max_iterations and tolerance must be >= 0, got 50 and -0.5"),
-        ({"tolerance": float("nan")}, ValueError, "max_iterations and tolerance must be >= 0, got 50 and nan"),
+        *((refine, *case) for refine in (refine_fundamental, refine_essential) for case in WRONG_OPTIONS),
+        *((refine_essential, *case) for case in WRONG_OF_ESSENTIAL),
     ],
 )
-def test_wrong_options(option, error, message):
-    """Of the points, weights and matrices see test_contract.py."""
+def test_wrong_arguments(refine, wrong, error, message):
+    """Of the points, weights and matrices that refine_fundamental gets see test_contract.py."""
+    start = {"F_mat": EYE.repeat(2, 1, 1)} if refine is refine_fundamental else {"E_mat": EYE.repeat(2, 1, 1)}
+    cameras = {} if refine is refine_fundamental else {"K1": EYE, "K2": EYE}
     with pytest.raises(error, match=message):
-        refine_fundamental(uniform(1, 10, 2), uniform(1, 10, 2), uniform(1, 3, 3), **option)
+        refine(**{"points1": POINTS, "points2": POINTS, **start, **cameras} | wrong)
