@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["atomic_write", "exclusive", "full_disk_names", "short_name", "write_text"]
-
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT)  # error numbers
 
 

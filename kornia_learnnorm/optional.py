@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["import_extra", "working_folder_importable"]
-
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
     """Return a module of a package that the core does not need; without it, say which extra brings it and for what.

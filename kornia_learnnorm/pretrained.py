@@ -22,20 +22,6 @@ from torch import nn
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import working_folder_importable
 
-__all__ = [
-    "check_architecture",
-    "describe_part",
-    "find_part",
-    "load_module",
-    "name_part",
-    "save_module",
-    "shipped_weights",
-    "weights_digest",
-    "weights_format",
-    "weights_model",
-    "weights_path",
-]
-
 WEIGHTS = Path(__file__).parent / "weights"
 CLASSES = {  # of the modules that files hold, by the format
     "kornia_learnnorm.normalizer.v1": "LearnedNormalizer",

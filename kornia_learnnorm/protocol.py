@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["INLIER_THRESHOLD", "MAX_FILTERED", "MAX_RESIDUAL", "PROTOCOLS", "RATIO", "THRESHOLDS"]
-
 RATIO = 0.8  # of the distances to the nearest and second-nearest descriptor; a filtered match lies below (Lowe's ratio)
 MAX_FILTERED = 1000  # filtered matches kept of an image pair
 MAX_RESIDUAL = 60.0  # pixels; samples with a larger residual under the un-normalised eight-point algorithm are dropped

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import yaml
 
-__all__ = ["config_names", "find_config", "names_task", "with_config_paths"]
-
 OPTIONS = ("-c", "--config")
 PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
 FOLDER = PACKAGED if PACKAGED.is_dir() else Path(__file__).parents[1] / "configs"  # of the repository

@@ -8,8 +8,6 @@ import pytorch_lightning as pl
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
-__all__ = ["one_cycle"]
-
 
 def one_cycle(optimizer: Optimizer, trainer: pl.Trainer, warm_up: float) -> OneCycleLR:
     """Return the cycle over the steps of a training, up to the optimiser's learning rate."""

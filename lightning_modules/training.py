@@ -28,8 +28,6 @@ from lightning_modules.config_files import config_names, names_task, with_config
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import EstimatorTask
 
-__all__ = ["TrainingCLI", "is_first_process", "run"]
-
 # Of what Lightning prints about devices, seeds and checkpoints, only warnings concern who trains.
 LOGGERS = (
     "lightning_fabric.utilities.seed",

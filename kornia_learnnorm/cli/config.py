@@ -6,8 +6,6 @@ import argparse
 
 from lightning_modules.config_files import config_names, find_config
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
-
 EXAMPLES = """\
 learnnorm config crossview > full.yaml
 learnnorm fit --config full.yaml --trainer.default_root_dir runs/own"""

@@ -9,8 +9,6 @@ from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS, check_methods
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
-
 PORT = 5006
 EXAMPLES = """\
 learnnorm demo

@@ -25,8 +25,6 @@ from kornia_learnnorm.two_view.many_pairs import (
 )
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
-
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf", ".svg")
 EXAMPLES = """\
 learnnorm estimate left.png right.png --K 700,700,320,240 --out pair.png

@@ -18,8 +18,6 @@ from kornia_learnnorm.evaluation.tables import Table, format_table, names_of, ta
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["EXAMPLES", "add_arguments", "add_json_argument", "json_tables", "run"]
-
 EXAMPLES = """\
 learnnorm evaluate store.h5 --methods Hartley crossview Hartley+LM --size 16
 learnnorm evaluate store.h5 --out run && learnnorm report run"""

@@ -11,8 +11,6 @@ import torch
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
-
 EXAMPLES = """\
 learnnorm export robust --format pt2 --out robust.pt2 --inputs mask scores
 learnnorm export robust --format onnx --out robust.onnx"""

@@ -17,8 +17,6 @@ from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, export_colmap
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
-
 EXAMPLES = """\
 learnnorm export-colmap PHOTOS --out photos.db --single-camera
 learnnorm export-colmap PHOTOS --out photos.db --matches photos.h5"""

@@ -17,8 +17,6 @@ from typing import Any
 import kornia_learnnorm
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["main", "make_parser"]
-
 EXAMPLES = """\
 learnnorm estimate left.png right.png --out pair.png
 learnnorm fit --config crossview-synthetic"""

@@ -19,8 +19,6 @@ from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.data.writer import check_target
 
-__all__ = ["EXAMPLES", "add_arguments", "add_matching_arguments", "print_skipped", "run"]
-
 EXAMPLES = """\
 learnnorm match folder PHOTOS --out photos.h5
 learnnorm match kitti ROOT --sequences 00 03 --out kitti.h5 --jobs 2"""

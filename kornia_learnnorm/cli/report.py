@@ -9,8 +9,6 @@ from pathlib import Path
 from kornia_learnnorm.cli.evaluate import add_json_argument, json_tables
 from kornia_learnnorm.evaluation.report.pages import print_summary, print_tables, write_report
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
-
 EXAMPLES = """\
 learnnorm evaluate store.h5 --out run && learnnorm report run
 learnnorm robust store.h5 --out run && learnnorm report run"""

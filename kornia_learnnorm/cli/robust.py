@@ -10,8 +10,6 @@ from kornia_learnnorm.evaluation.robust.robust_estimators import DEFAULT_ESTIMAT
 from kornia_learnnorm.evaluation.robust.robust_run import DEFAULT_OPTIONS, record_robust
 from kornia_learnnorm.evaluation.tables import names_of
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
-
 EXAMPLES = """\
 learnnorm robust store.h5 --out run && learnnorm report run
 learnnorm robust store.h5 --out run --estimators RANSAC poselib"""

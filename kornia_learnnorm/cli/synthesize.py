@@ -9,8 +9,6 @@ from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
 from kornia_learnnorm.data.synthetic.synthetic_store import SCENES, synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
-__all__ = ["EXAMPLES", "add_arguments", "run"]
-
 EXAMPLES = """\
 learnnorm synthesize folder
 learnnorm synthesize folder --pairs 5 --scenes orbit --points 200"""

@@ -13,8 +13,6 @@ from kornia_learnnorm.data.datasets.kitti import read_calibration
 from kornia_learnnorm.data.datasets.textfiles import camera_matrix
 from kornia_learnnorm.data.images import focal_length_35mm, image_size
 
-__all__ = ["exif_camera", "read_camera"]
-
 KITTI_CAMERA = "P0"  # projection of image_0 in a calib.txt
 STRECHA_SIZE = 26  # numbers of a file: the camera matrix, distortion (3), rotation (9), centre (3), width and height
 FILM_DIAGONAL = math.hypot(36, 24)  # millimetres

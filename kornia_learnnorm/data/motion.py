@@ -5,8 +5,6 @@ from __future__ import annotations
 from kornia.geometry.epipolar import cross_product_matrix, fundamental_from_essential
 from torch import Tensor
 
-__all__ = ["fundamental_from_motion"]
-
 
 def fundamental_from_motion(K1: Tensor, K2: Tensor, R: Tensor, t: Tensor) -> Tensor:
     r"""Return :math:`F = K_2^{-\top} [t]_\times R K_1^{-1}` with unit norm, for a motion :math:`X_2 = R X_1 + t`.

@@ -14,9 +14,6 @@ from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.checks import check_cameras, check_choice
 
-__all__ = ["MODELS", "Cameras", "Points", "check_number", "check_settings", "check_whole"]
-__all__ += ["read_cameras", "read_matches", "read_size"]
-
 MODELS = ("auto", "fundamental", "homography")
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]

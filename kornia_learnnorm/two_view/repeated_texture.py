@@ -21,8 +21,6 @@ from kornia_learnnorm.two_view.parallax import find_main_plane, parallax
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.warnings import MIN_INLIERS, PairWarning
 
-__all__ = ["coherent_matches", "fitting_share", "mutual_share", "resolve_ambiguity"]
-
 NUM_NEIGHBOURS = 48  # matches nearest to a match in an image
 ROUNDS = 2  # in the second, neighbours count by their own share in the first
 MIN_COHERENT = 0.8  # of the weights of the neighbours, in both images, have the parallax of a coherent match

@@ -35,8 +35,6 @@ from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 from kornia_learnnorm.two_view.warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
 
-__all__ = ["MIN_MATCHES", "TwoViewSolver"]
-
 MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
 MIN_SCORE_GAIN = 1.02  # of another hypothesis over the one found first, which otherwise stays
 MIN_SCORE = 1e-3  # a match of weight zero would never be sampled

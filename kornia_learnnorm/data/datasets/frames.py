@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from kornia_learnnorm.data.images import Size, import_cv2, read_colour, read_image, scaling
 from kornia_learnnorm.data.motion import fundamental_from_motion
 
-__all__ = ["Frame", "FramePair", "read_frame", "resize_frames"]
-
 
 def _unknown(*shape: int) -> NDArray[np.float64]:
     return np.full(shape, np.nan)

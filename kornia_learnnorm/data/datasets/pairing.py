@@ -10,8 +10,6 @@ from kornia_learnnorm.data.datasets.colmap import covisible_pairs
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
 from kornia_learnnorm.data.datasets.textfiles import text_lines
 
-__all__ = ["choose_pairs", "listed_pairs", "pair_frames"]
-
 
 def choose_pairs(
     frames: Sequence[Frame],

@@ -16,8 +16,6 @@ from kornia_learnnorm.data.datasets.kitti import read_kitti
 from kornia_learnnorm.data.datasets.splits import sequence_folders, split_sequences
 from kornia_learnnorm.data.datasets.tum import read_tum
 
-__all__ = ["DATASETS", "missing_ground_truth", "read_dataset"]
-
 # name: title, reader, and the options that the reader takes
 DATASETS: dict[str, tuple[str, Callable[..., list[Frame]], tuple[str, ...]]] = {
     "kitti": ("KITTI odometry", read_kitti, ("sequences", "split", "camera")),

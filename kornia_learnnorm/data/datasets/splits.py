@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["SPLITS", "choose_sequences", "sequence_folders", "split_sequences"]
-
 # Sequences by dataset and split, as B. Fan et al. choose them (A revisit of the normalized eight-point algorithm and a
 # self-supervised deep solution, section 5.1); None for all sequences that no other split names. StMarysChurch of
 # Cambridge Landmarks has its own lists of training and test images, which `read_cambridge` reads.

@@ -11,8 +11,6 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from numpy.typing import NDArray
 
-__all__ = ["TextLine", "camera_matrix", "rigid_motion", "text_lines"]
-
 Array = NDArray[np.float64]
 
 

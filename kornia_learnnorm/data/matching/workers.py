@@ -14,8 +14,6 @@ from typing import Any, TypeVar
 
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["Workers", "check_jobs", "open_workers", "restart_crashed"]
-
 MAX_RESTARTS = 3  # consecutive worker crashes without progress
 
 Result = TypeVar("Result")

@@ -9,9 +9,6 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_p
 from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
-__all__ = ["draw_depths", "fixed_camera", "log_uniform", "motions", "normal", "random_cameras", "random_motions"]
-__all__ += ["spread_points", "student_t", "uniform", "viewing_rays"]
-
 MOTION_CANDIDATES = 4  # per scene
 GROUND_SHARE = 0.9  # of the points whose ray meets the ground plane
 

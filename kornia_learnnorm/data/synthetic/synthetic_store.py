@@ -10,8 +10,6 @@ import torch
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.synthetic.scenes import TwoViewScene, forward_driving, handheld, orbit
 
-__all__ = ["SCENES", "synthetic_store"]
-
 SCENES: dict[str, Callable[..., TwoViewScene]] = {
     "forward driving": forward_driving,
     "hand-held": handheld,

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["set_maximum"]
-
 
 def set_maximum(features: Tensor, absent: Tensor | None, dim: int, keepdim: bool = False) -> Tensor:
     """Return the maximum over the present points along ``dim``, zero where all are absent.
