@@ -24,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 from results_file import write_csv
 
-from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
+from kornia_learnnorm.data.datasets.reading import read_folder
 from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned import LearnedEightPoint

@@ -21,10 +21,9 @@ from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
-from kornia_learnnorm.metrics.better_rate import comparable
-from kornia_learnnorm.normalizers.hartley import Hartley
+from kornia_learnnorm.metrics.statistics import comparable
+from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
-from kornia_learnnorm.normalizers.whitening import Whitening
 from lightning_modules.schedule import one_cycle
 
 __all__ = ["EstimatorTask", "Median", "SetLoss", "adamw", "cameras_of"]

@@ -20,7 +20,7 @@ from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 

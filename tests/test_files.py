@@ -11,7 +11,7 @@ import pytest
 
 from kornia_learnnorm import files
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.files import atomic_write, exclusive
 

@@ -11,9 +11,8 @@ from pathlib import Path
 import torch
 
 from kornia_learnnorm.evaluation.methods import KEPT_METHODS, SHIPPED, default_methods, short_name_of, short_names
-from kornia_learnnorm.evaluation.report.rates import HEADER, method_rows, was_trained_on
-from kornia_learnnorm.evaluation.runs.predict import SampleOptions
-from kornia_learnnorm.evaluation.runs.prediction_run import Run, read_run, record_run, temporary_run
+from kornia_learnnorm.evaluation.report.method_tables import HEADER, method_rows, was_trained_on
+from kornia_learnnorm.evaluation.runs.prediction_run import Run, SampleOptions, read_run, record_run, temporary_run
 from kornia_learnnorm.evaluation.tables import Table, format_table, names_of, tables_as_json
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.protocol import RATIO

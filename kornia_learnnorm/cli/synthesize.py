@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
-from kornia_learnnorm.data.synthetic.synthetic_store import SCENES, synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import SCENES, synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 EXAMPLES = """\

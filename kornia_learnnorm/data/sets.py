@@ -10,7 +10,7 @@ from torch import Tensor
 from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test
 from kornia_learnnorm.estimators.linear import find_fundamental
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.normalizers.identity import Identity
+from kornia_learnnorm.normalizers.closed_form import Identity
 from kornia_learnnorm.protocol import RATIO
 
 __all__ = ["MatchSets", "draw_samples", "plain_residual"]

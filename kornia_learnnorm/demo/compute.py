@@ -20,7 +20,7 @@ from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.linear import find_fundamental
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.median import median
+from kornia_learnnorm.metrics.statistics import median
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.two_view.estimate_pair import MatchedPair, match_two_images
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate

@@ -22,7 +22,7 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
-from kornia_learnnorm.normalizers.hartley import Hartley
+from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer, normalizing_transforms
 
 __all__ = [

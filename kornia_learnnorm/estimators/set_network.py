@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.normalizers.networks.pooling import set_maximum
+from kornia_learnnorm.normalizers.networks.crossview import set_maximum
 
 __all__ = ["SetWeightingNetwork"]
 

@@ -21,12 +21,10 @@ from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.files import short_name
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.normalizers.hartley import Hartley
-from kornia_learnnorm.normalizers.identity import Identity
+from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
 from kornia_learnnorm.normalizers.learned_normalizer import FORMAT, LearnedNormalizer
 from kornia_learnnorm.normalizers.normalizer import Normalizer, normalizing_transforms
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
-from kornia_learnnorm.normalizers.whitening import Whitening
 from kornia_learnnorm.optional import working_folder_importable
 from kornia_learnnorm.pretrained import shipped_weights, weights_format, weights_path
 

@@ -14,7 +14,7 @@ from kornia_learnnorm.geometry import transforms
 from kornia_learnnorm.geometry.checks import read_condition
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform, transform_points
-from kornia_learnnorm.normalizers import hartley, identity, reweighted, whitening
+from kornia_learnnorm.normalizers import closed_form, reweighted
 from kornia_learnnorm.normalizers.networks import crossview, paper
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, transforms_of
@@ -30,7 +30,7 @@ from kornia_learnnorm.pretrained import (
 
 __all__ = ["LearnedNormalizer"]
 
-BASES = (hartley, identity, reweighted, whitening)  # modules of the bases that a file may name
+BASES = (closed_form, reweighted)  # modules of the bases that a file may name
 FORMAT = "kornia_learnnorm.normalizer.v1"
 
 

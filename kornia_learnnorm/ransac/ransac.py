@@ -20,7 +20,7 @@ from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
-from kornia_learnnorm.normalizers.hartley import Hartley
+from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
 from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally

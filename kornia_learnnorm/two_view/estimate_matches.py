@@ -14,7 +14,7 @@ from kornia_learnnorm.data.matching.matchers import one_to_one
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.pose import in_front, relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.metrics.median import median
+from kornia_learnnorm.metrics.statistics import median
 from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.ransac import RANSAC

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from kornia_learnnorm.data.cameras import read_camera
-from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
+from kornia_learnnorm.data.datasets.reading import read_folder
 from kornia_learnnorm.data.images import image_size, import_cv2
 from kornia_learnnorm.data.matching.features import MissingWeightsError
 from kornia_learnnorm.data.matching.workers import open_workers

@@ -27,16 +27,8 @@ from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 
-__all__ = [
-    "MAX_LOG_CHANCE_PARALLAX",
-    "MIN_PLANAR_SHARE",
-    "Parallax",
-    "distances_from_plane",
-    "find_main_plane",
-    "fit_plane_and_parallax",
-    "parallax",
-    "parallax_evidence",
-]
+__all__ = ["MAX_LOG_CHANCE_PARALLAX", "MIN_PLANAR_SHARE", "Parallax", "distances_from_plane", "find_main_plane"]
+__all__ += ["fit_plane_and_parallax", "parallax", "parallax_evidence"]
 
 OFF_PLANE = 2.0  # thresholds; a match that the homography misses by more lies off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.metrics.median import median
+from kornia_learnnorm.metrics.statistics import median
 from kornia_learnnorm.two_view.parallax import Parallax, parallax
 from kornia_learnnorm.two_view.plane_pose import PlanePose
 from kornia_learnnorm.two_view.warnings import PairWarning

@@ -15,13 +15,13 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.sets import draw_samples
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.diagnostics import diagnose
-from kornia_learnnorm.evaluation.report.accuracy import report_tables
+from kornia_learnnorm.evaluation.report.method_tables import report_tables
 from kornia_learnnorm.evaluation.runs.prediction_run import read_run
 from kornia_learnnorm.evaluation.tables import tables_as_json
-from kornia_learnnorm.metrics.bootstrap import bootstrap_interval
+from kornia_learnnorm.metrics.statistics import bootstrap_interval
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from kornia_learnnorm.cli import synthesize
 from kornia_learnnorm.cli.main import TOOLS, TRAINING, main, make_parser
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.render import render_pair
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from lightning_modules.config_files import find_config
 

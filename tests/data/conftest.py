@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 
 
 @pytest.fixture(scope="session")

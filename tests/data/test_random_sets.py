@@ -10,11 +10,10 @@ from kornia.geometry.epipolar import cross_product_matrix
 from scenes import correspondences, scenes, seeded
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.augmentation import augment
-from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
+from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets, augment
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.synthetic.random_matches import random_matches, random_planes, wide_baseline
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 

@@ -9,7 +9,7 @@ from kornia_learnnorm.data.random_sets import StoreSets
 from kornia_learnnorm.data.sets import draw_samples, plain_residual
 from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
 from kornia_learnnorm.data.synthetic import handheld
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import robust_estimators
 from kornia_learnnorm.evaluation.robust.robust_run import shuffled_pair

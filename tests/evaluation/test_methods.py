@@ -10,9 +10,9 @@ import torch
 import yaml
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.evaluation.methods import SHIPPED, default_methods, find_method, identify_method, short_names
-from kornia_learnnorm.evaluation.report.rates import was_trained_on
+from kornia_learnnorm.evaluation.report.method_tables import was_trained_on
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.layer_export import load_layer
 from kornia_learnnorm.pretrained import WEIGHTS
@@ -31,7 +31,7 @@ def scene():
     [
         ("Hartley", kln.Hartley()),
         ("crossview", kln.LearnedNormalizer.from_pretrained()),
-        ("kornia_learnnorm.normalizers.whitening:Whitening", kln.Whitening()),
+        ("kornia_learnnorm.normalizers.closed_form:Whitening", kln.Whitening()),
         ("kornia_learnnorm:Whitening", kln.Whitening()),
     ],
 )

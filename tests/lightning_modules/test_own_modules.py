@@ -12,7 +12,7 @@ from scenes import correspondences, rewrite_weights
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 
 PAGE = Path(__file__).parents[2] / "docs/own-modules.md"

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.metrics.better_rate import BetterRate, better_rate
+from kornia_learnnorm.metrics.statistics import BetterRate, better_rate
 
 INF, NAN = float("inf"), float("nan")
 NUMBERS = st.sampled_from([0.0, 0.5, 1.0, 2.0, INF, NAN])

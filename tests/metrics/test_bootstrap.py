@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.metrics.bootstrap import bootstrap_interval, paired_bootstrap
+from kornia_learnnorm.metrics.statistics import bootstrap_interval, paired_bootstrap
 
 INF, NAN = float("inf"), float("nan")
 

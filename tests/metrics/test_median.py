@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.metrics.median import median
+from kornia_learnnorm.metrics.statistics import median
 
 
 @pytest.mark.parametrize("number", [1, 2, 5, 8])

@@ -1,4 +1,4 @@
-"""Reading a dataset by its name, and naming the ground truth that it lacks."""
+"""Reading a dataset by its name, or a folder of images, and naming the ground truth that is missing."""
 
 from __future__ import annotations
 
@@ -10,11 +10,34 @@ import numpy as np
 
 from kornia_learnnorm.data.datasets.cambridge import read_cambridge
 from kornia_learnnorm.data.datasets.colmap import read_colmap
-from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.kitti import read_kitti
 from kornia_learnnorm.data.datasets.splits import sequence_folders, split_sequences
 from kornia_learnnorm.data.datasets.tum import read_tum
+from kornia_learnnorm.data.images import image_size
+
+__all__ = ["read_folder"]
+
+SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}  # in any case
+
+
+def read_folder(root: str | Path) -> list[Frame]:
+    """Return the images of a folder and its subfolders as frames by folder and name, each folder a sequence.
+
+    Images have the suffix png, jpg, jpeg, bmp, tif, tiff, webp, pgm or ppm, whatever the case; hidden files and folders
+    are skipped. A folder without images is a FileNotFoundError.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise FileNotFoundError(f"no folder at {root}")
+    paths = [path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()]
+    names = [path.relative_to(root).as_posix() for path in paths]
+    names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
+    if not names:
+        raise FileNotFoundError(f"no images ({', '.join(sorted(SUFFIXES))}) in {root}")
+    names.sort(key=lambda name: (name.rpartition("/")[0], name))
+    return [Frame(root / name, name, name.rpartition("/")[0], image_size(root / name)) for name in names]
+
 
 # name: title, reader, and the options that the reader takes
 DATASETS: dict[str, tuple[str, Callable[..., list[Frame]], tuple[str, ...]]] = {

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from kornia_learnnorm.evaluation.methods import CLOSED_FORMS, REFINED, base_name
-from kornia_learnnorm.evaluation.report.rates import papers_data
+from kornia_learnnorm.evaluation.report.method_tables import papers_data
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.two_view.drawing import import_matplotlib
 

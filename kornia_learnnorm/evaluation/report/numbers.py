@@ -9,10 +9,8 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.runs.prediction_run import RunCell
 from kornia_learnnorm.evaluation.tables import Cell, Number
-from kornia_learnnorm.metrics.better_rate import comparable
-from kornia_learnnorm.metrics.bootstrap import bootstrap_interval, paired_bootstrap
-from kornia_learnnorm.metrics.median import median
 from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.statistics import bootstrap_interval, comparable, median, paired_bootstrap
 
 BASELINE = "Hartley"  # the method that all others are compared with
 RESAMPLES = 2000  # bootstrap resamples of a paired test

@@ -13,10 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kornia_learnnorm.evaluation.report.accuracy import report_tables
 from kornia_learnnorm.evaluation.report.figures import ReportPicture, report_figures
+from kornia_learnnorm.evaluation.report.method_tables import papers_data, report_tables, with_baseline
 from kornia_learnnorm.evaluation.report.numbers import MIN_BOOTSTRAP_PAIRS
-from kornia_learnnorm.evaluation.report.rates import papers_data, with_baseline
 from kornia_learnnorm.evaluation.report.robust_tables import robust_tables
 from kornia_learnnorm.evaluation.report.run_summary import robust_summary, run_summary
 from kornia_learnnorm.evaluation.robust.robust_run import RobustRun, read_robust

@@ -5,8 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.report import numbers
+from kornia_learnnorm.evaluation.report.method_tables import papers_data
 from kornia_learnnorm.evaluation.report.numbers import median_number
-from kornia_learnnorm.evaluation.report.rates import papers_data
 from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
 from kornia_learnnorm.evaluation.tables import Cell, Number, Table

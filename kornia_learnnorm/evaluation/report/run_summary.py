@@ -16,8 +16,7 @@ from kornia_learnnorm.evaluation.report.robust_tables import MAX_ERROR, pairs_wi
 from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
-from kornia_learnnorm.metrics.bootstrap import PairedDifference, paired_bootstrap
-from kornia_learnnorm.metrics.median import median
+from kornia_learnnorm.metrics.statistics import PairedDifference, median, paired_bootstrap
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, THRESHOLDS
 
 # The errors of methods, the most telling first: what is known of the first that is known decides.

@@ -16,9 +16,23 @@ from torch.nn.functional import normalize
 from kornia_learnnorm.geometry.checks import weighted_mean
 from kornia_learnnorm.geometry.dlt import design_matrix, null_vector
 from kornia_learnnorm.geometry.matrices import smallest_singular_vectors
-from kornia_learnnorm.normalizers.networks.pooling import set_maximum
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
+
+
+def set_maximum(features: Tensor, absent: Tensor | None, dim: int, keepdim: bool = False) -> Tensor:
+    """Return the maximum over the present points along ``dim``, zero where all are absent.
+
+    ``absent`` marks the rows that are no points and broadcasts to the features. The gradient goes to one point for each
+    maximum.
+    """
+    if absent is not None:
+        features = torch.where(absent, -torch.inf, features)
+    # Not `amax` with a gradient: torch.compile makes NaN of it under autocast to bfloat16, since it compares the
+    # maximum, which is rounded, with features computed again, which are not. Without one, `amax` is faster for eights.
+    maximum = features.max(dim, keepdim).values if features.requires_grad else features.amax(dim, keepdim)
+    return maximum if absent is None else torch.where(absent.all(dim, keepdim), 0.0, maximum)
+
 
 MAX_POINTS = 16384  # of all sets that a network evaluates at once, where no gradient is wanted
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import batch_norm, layer_norm
 
-from kornia_learnnorm.normalizers.networks.pooling import set_maximum
+from kornia_learnnorm.normalizers.networks.crossview import set_maximum
 
 __all__ = ["PaperNetwork"]
 

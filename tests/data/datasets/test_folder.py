@@ -1,8 +1,8 @@
 import numpy as np
 from make_sequences import SIZE, names
 
-from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.pairing import pair_frames
+from kornia_learnnorm.data.datasets.reading import read_folder
 
 
 def test_frames(written):

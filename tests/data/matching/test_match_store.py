@@ -20,9 +20,9 @@ from make_sequences import write_image
 from PIL import Image
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.datasets.folder import read_folder
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairing import pair_frames
+from kornia_learnnorm.data.datasets.reading import read_folder
 from kornia_learnnorm.data.matching import match_store
 from kornia_learnnorm.data.matching.features import Features
 from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches, match_frames

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.evaluation.report.accuracy import report_tables
+from kornia_learnnorm.evaluation.report.method_tables import papers_data, rate_tables, report_tables
 from kornia_learnnorm.evaluation.report.numbers import mean_share, median_number, number, paired_change
-from kornia_learnnorm.evaluation.report.rates import papers_data, rate_tables
 from kornia_learnnorm.evaluation.report.robust_tables import PRINTED, robust_tables
 from kornia_learnnorm.evaluation.robust.robust_run import read_robust
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell, read_run

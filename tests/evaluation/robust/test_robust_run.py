@@ -11,7 +11,7 @@ import torch
 
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import peers
 from kornia_learnnorm.evaluation.robust.robust_estimators import find_estimator, run_estimator

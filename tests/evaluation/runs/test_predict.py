@@ -10,8 +10,8 @@ import torch
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.sets import MatchSets
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
-from kornia_learnnorm.evaluation.runs.predict import consensus, predict
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
+from kornia_learnnorm.evaluation.runs.prediction_run import consensus, predict
 from kornia_learnnorm.metrics.inliers import f1_score, inlier_share
 from kornia_learnnorm.protocol import THRESHOLDS
 

@@ -18,12 +18,11 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.sets import plain_residual
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.synthetic_store import synthetic_store
+from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method
 from kornia_learnnorm.evaluation.runs import prediction_run
-from kornia_learnnorm.evaluation.runs.predict import ERRORS, SampleOptions
-from kornia_learnnorm.evaluation.runs.prediction_run import read_run, temporary_run
+from kornia_learnnorm.evaluation.runs.prediction_run import ERRORS, SampleOptions, read_run, temporary_run
 from kornia_learnnorm.evaluation.runs.results_store import file_name
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import layer_norm
 
-from kornia_learnnorm.normalizers.networks.pooling import set_maximum
+from kornia_learnnorm.normalizers.networks.crossview import set_maximum
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Whitening of each view."""
+r"""Closed forms: no normalisation, Hartley's, and whitening."""
 
 from __future__ import annotations
 
@@ -10,7 +10,45 @@ from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import whitening_from_moments
 from kornia_learnnorm.normalizers.normalizer import ProblemNormalizer
 
-__all__ = ["Whitening"]
+__all__ = ["Hartley", "Identity", "Whitening"]
+
+
+class Identity(ProblemNormalizer):
+    """No normalisation: both transforms are the identity (the original eight-point algorithm, in pixels).
+
+    Example:
+        >>> T1, T2 = Identity()(torch.rand(2, 8, 2), torch.rand(2, 8, 2))
+        >>> T1[0]
+        tensor([[1., 0., 0.],
+                [0., 1., 0.],
+                [0., 0., 1.]])
+
+    """
+
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+        """Return identities with shape :math:`(B, 3, 3)`."""
+        eye = torch.eye(3, dtype=problem.x1.dtype, device=problem.x1.device).expand(problem.x1.shape[0], 3, 3)
+        return eye, eye
+
+
+class Hartley(ProblemNormalizer):
+    r"""Hartley's normalisation: centroid to the origin, mean distance from it :math:`\sqrt 2` (Fan et al., Eq. 4).
+
+    Coincident points keep their scale.
+
+    Example:
+        >>> import torch
+        >>> points = torch.tensor([[[0.0, 0.0], [4.0, 0.0], [0.0, 4.0], [4.0, 4.0]]])
+        >>> Hartley()(points, points)[0]
+        tensor([[[ 0.5000,  0.0000, -1.0000],
+                 [ 0.0000,  0.5000, -1.0000],
+                 [ 0.0000,  0.0000,  1.0000]]])
+
+    """
+
+    def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
+        """Return the transforms :math:`(B, 3, 3)` of both views."""
+        return problem.T1, problem.T2
 
 
 class Whitening(ProblemNormalizer):
