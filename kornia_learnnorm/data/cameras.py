@@ -19,15 +19,10 @@ FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
 
 
 def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float64]:
-    """Return a camera matrix with shape (3, 3), pixels.
+    """Return a camera matrix (3, 3), pixels, of ``fx,fy,cx,cy``, a file of a camera, or ``exif`` of an image.
 
-    Args:
-        text: ``fx,fy,cx,cy``; a text file of these four or of all nine numbers; a ``calib.txt`` of KITTI, of which
-            ``P0`` counts, the camera of ``image_0``; a ``cameras.txt`` of COLMAP with one camera; a ``.camera`` file
-            of Strecha et al. (CVPR 2008), whose first three rows are the matrix; or ``exif``. Both without distortion.
-        image: the photograph that ``exif`` is read from, see :func:`exif_camera`.
-
-    FileNotFoundError if there is no such file; ValueError if the numbers are not those of a camera.
+    A file has these four or all nine numbers, or is KITTI's ``calib.txt``, of which ``P0`` counts, COLMAP's
+    ``cameras.txt`` or a ``.camera`` of Strecha et al. (CVPR 2008) with one camera without distortion.
     """
     if text == "exif":
         if image is None:
@@ -63,11 +58,7 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
 
 
 def exif_camera(path: str | Path) -> NDArray[np.float64]:
-    """Return the camera matrix (3, 3), pixels, that the EXIF data of a photograph suggest; wrong for cropped ones.
-
-    The focal length is EXIF's equivalent on 35 mm film, by the images' diagonals; the principal point is the centre. A
-    file without such a focal length is a ValueError.
-    """
+    """Return the camera matrix (3, 3), pixels, by EXIF's focal length on 35 mm film; wrong for cropped photographs."""
     size = image_size(path)
     if size == (0, 0):
         raise ValueError(f"camera exif: {path} is not an image")

@@ -18,9 +18,7 @@ from torch import Tensor
 
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["Size", "check_grey", "content_mask", "focal_length_35mm", "image_size", "import_cv2", "read_colour"]
-__all__ += ["read_image", "read_mask", "reduced_size", "resize_image", "scale_points", "scaling"]
-__all__ += ["stored_pixels"]
+__all__ = ["check_grey", "content_mask", "image_size", "read_colour", "read_image", "read_mask", "scaling"]
 
 Size = tuple[int, int]  # width and height, pixels
 
@@ -32,8 +30,6 @@ REDUCING_GAP = 2.0  # the last step of reducing, which is filtered, is by this f
 ORIENTATION, EXIF_IFD, FOCAL_LENGTH_35MM = 0x0112, 0x8769, 0xA405  # tags
 QUARTER_TURNS = (5, 6, 7, 8)  # orientations that swap width and height
 MIRRORED_X, MIRRORED_Y = (2, 3, 7, 8), (3, 4, 6, 7)  # orientations of files whose x or y run the other way
-# Names in PIL.Image.Transpose of the turns that undo the orientations from 2 on.
-TURNS = ("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90")
 MAX_BLACK = 2  # largest grey value of a black frame
 MAX_UNEVEN = 0.05  # share of a frame's row or column that may differ from its median; more is noise of a dark image
 MIN_USED = 128  # smallest grey value of a mask's pixel that counts
@@ -61,8 +57,8 @@ def check_grey(image: NDArray[np.uint8], colour: bool = False) -> None:
 def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint8]:
     """Return the grey values :math:`(H, W)`, uint8, of an image file, turned as its EXIF orientation says.
 
-    They are those of OpenCV's ``IMREAD_GRAYSCALE``, which in other formats than PNG and JPEG can be a level higher (two
-    for CMYK). Of an animation the first image is read; transparency is over black.
+    They are those of OpenCV's ``IMREAD_GRAYSCALE``, up to a level higher in other formats than PNG and JPEG (two for
+    CMYK). Of an animation the first image is read; transparency is over black.
 
     Args:
         path: a file in any format that Pillow decodes.
@@ -102,7 +98,7 @@ def _decode(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
     with open_image(path) as image:
         image.verify()  # the checksums of a PNG, which decoding skips
     with open_image(path) as image:
-        turn = _orientation(image)
+        turned = _orientation(image) > 1
         width, height = size = reduced_size(image.size, max_size)
         # for a grey image a JPEG gives its luma channel, without a way through RGB
         drafted = image.draft(mode, None if size == image.size else (2 * width, 2 * height))
@@ -115,8 +111,8 @@ def _decode(path: Path, mode: str, max_size: int | None) -> NDArray[np.uint8]:
         clear = "transparency" in image.info or image.mode[-1] in "Aa"
         image = image.convert("RGBA" if clear else "L" if image.mode in ("1", "L") else "RGB")
     image = image if size == image.size else _reduce(image, size, box)
-    if 2 <= turn <= 8:
-        image = image.transpose(import_pillow().Transpose[TURNS[turn - 2]])
+    if turned:
+        image = import_extra("PIL.ImageOps", "images", "reading images").exif_transpose(image)
     if clear:  # over black
         image = import_pillow().fromarray(np.asarray(image.convert("RGBa"))[..., :3])
     if (image.mode, mode) == ("RGB", "L"):
@@ -134,10 +130,7 @@ def _orientation(image: Any) -> int:
 def stored_pixels(
     path: Path, points: NDArray[Any], size: Sequence[int], turned: bool = True
 ) -> tuple[NDArray[np.float64], Size]:
-    """Return pixels (N, 2) and the (width, height) of an image that EXIF turns in the file as it is stored.
-
-    They are returned as they are, in float64, if they are not ``turned``.
-    """
+    """Return pixels (N, 2) and the (width, height) of an image, ``turned`` by EXIF or not, in the file as stored."""
     turn = 1
     if turned:
         with open_image(path) as image:
@@ -218,18 +211,11 @@ def scaling(size_from: Size, size_to: Size) -> Tensor:
     return torch.tensor([[x, 0.0, x / 2 - 0.5], [0.0, y, y / 2 - 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
-def scale_points(points: NDArray[Any], size_from: Size, size_to: Size) -> NDArray[np.float64]:
-    """Return pixels :math:`(*, 2)` of an image of one (width, height) in it at another, by :func:`scaling`."""
-    factors = scaling(size_from, size_to).diagonal()[:2].numpy()
-    return np.asarray((np.asarray(points, np.float64) + 0.5) * factors - 0.5)
-
-
 def read_mask(path: str | Path, size: Size, max_size: int | None = None) -> NDArray[np.bool_]:
-    """Return which pixels of an image count by a mask file, (H, W) bool: those above 127.
+    """Return which pixels of an image count by a mask file, (H, W) bool: those above 127, not transparent.
 
-    :func:`read_image` reads the file, so transparent pixels do not count; ``max_size`` is the limit that the image was
-    read with. A mask without a pixel that counts is a ValueError, and one that does not
-    have the (width, height) of the image file, turned by EXIF.
+    ``max_size`` is the limit that the image was read with. A mask without a pixel that counts, or without the (width,
+    height) of the image file, turned by EXIF, is a ValueError.
     """
     mask = read_image(path, max_size) >= MIN_USED
     got = image_size(path)
@@ -241,11 +227,10 @@ def read_mask(path: str | Path, size: Size, max_size: int | None = None) -> NDAr
 
 
 def content_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-    """Return which pixels are inside of a black frame, (H, W) bool; None if there is no frame.
+    """Return which pixels are inside of a black frame, (H, W) bool; None without one, or if all pixels are black.
 
-    The frame is made of the outermost rows and columns with grey values of at most 2, of which 95 % or more are equal.
-    The rows and columns of a dark photograph have noise and are kept. An image that is black all over has no frame.
-    Other arrays than grey values in uint8 are a TypeError or a ValueError.
+    The frame is made of the outermost rows and columns with grey values of at most 2, of which 95 % or more are equal;
+    those of a dark photograph have noise. Other arrays than grey values in uint8 are a TypeError or a ValueError.
     """
     check_grey(image)
     inside = [np.flatnonzero(~_black_rows(lines)) for lines in (image, image.T)]

@@ -7,11 +7,7 @@ from torch import Tensor
 
 
 def fundamental_from_motion(K1: Tensor, K2: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    r"""Return :math:`F = K_2^{-\top} [t]_\times R K_1^{-1}` with unit norm, for a motion :math:`X_2 = R X_1 + t`.
-
-    The cameras, pixels, and the rotations have shape :math:`(*, 3, 3)`, the translations :math:`(*, 3)`. The result is
-    NaN where :math:`t = 0`, a camera matrix is singular or an argument is NaN (Hartley and Zisserman, equation 9.12).
-    """
+    r"""Return :math:`F = K_2^{-\top} [t]_\times R K_1^{-1}` of unit norm, (*, 3, 3); NaN where t is zero or NaN."""
     F_mat: Tensor = fundamental_from_essential(cross_product_matrix(t) @ R, K1, K2)
     scale: Tensor = F_mat.norm(dim=(-2, -1), keepdim=True)
     return F_mat / scale

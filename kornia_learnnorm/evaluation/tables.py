@@ -71,12 +71,7 @@ def _is_known(cell: Cell) -> bool:
 
 
 def tables_as_json(command: str, tables: Sequence[Table]) -> str:
-    """Return the tables of a command as a JSON object with ``command``, ``version`` and ``tables``.
-
-    Each table has ``title``, ``text`` and ``rows``, objects by the names of the columns. A cell is a number; an object
-    with ``value`` and, where the table has them, ``low`` and ``high`` (interval), ``p``, ``std`` and ``trained_on``;
-    null where the table is empty or has ``-``; otherwise its text. Numbers are rounded as in the printed table.
-    """
+    """Return the tables of a command as a JSON object: rows by the names of columns, null for an unknown cell."""
 
     def value(cell: Cell) -> Any:
         return cell.as_json() if isinstance(cell, Number) else cell if _is_known(cell) else None
@@ -90,10 +85,7 @@ def tables_as_json(command: str, tables: Sequence[Table]) -> str:
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[Cell]], form: str = "pipe", **options: Any) -> str:
-    """Return a table with padded columns, the first aligned left and the others right, as Markdown by default.
-
-    ``form`` and ``options`` are for ``tabulate``.
-    """
+    """Return a table, the first column aligned left and the others right; ``form`` and ``options`` are tabulate's."""
     tabulate = import_extra("tabulate", "images", "printing tables").tabulate
     options |= {"colalign": ("left", *["right"] * (len(header) - 1)), "disable_numparse": True}
     return str(tabulate([[*map(str, row)] for row in rows], [*header], tablefmt=form, **options))

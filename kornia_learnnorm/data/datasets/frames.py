@@ -82,10 +82,7 @@ def resize_frames(frames: Iterable[Frame], size: Size) -> list[Frame]:
 
 
 def read_frame(frame: Frame, colour: bool = False) -> NDArray[np.uint8]:
-    """Return grey values (H, W) or colours (H, W, 3) of a frame as it is matched: undistorted, resized.
-
-    Undistortion keeps the camera matrix; pixels without a source in the file become black.
-    """
+    """Return grey values (H, W) or colours (H, W, 3) of a frame as it is matched: undistorted, resized."""
     cv2 = import_cv2()
     image = (read_colour if colour else read_image)(frame.path)
     if image.shape[1::-1] != frame.size:

@@ -18,10 +18,7 @@ def choose_pairs(
     model: Path | None = None,
     min_points: int | None = None,
 ) -> tuple[list[FramePair], str]:
-    """Return pairs of frames and, in words, how they were chosen: listed, by common points, or ``gap`` apart.
-
-    Without a ``gap``, None, they are all pairs.
-    """
+    """Return pairs of frames, listed, by common points, ``gap`` apart or for None all, and how they were chosen."""
     found: Iterable[FramePair]
     if listed is not None:
         found, text = listed_pairs(frames, listed), f"listed in {listed.name}"
@@ -50,12 +47,8 @@ def pair_frames(frames: Iterable[Frame], gap: int = 1) -> Iterator[FramePair]:
 
 
 def listed_pairs(frames: Sequence[Frame], path: str | Path) -> Iterator[FramePair]:
-    """Yield the pairs that a file lists as hloc does: two names a line with white space between, no line twice.
-
-    Empty lines and comments are skipped; the same names in the other order are another pair.
-    """
-    path = Path(path)
-    named = {frame.name: frame for frame in frames}
+    """Yield the pairs that a file lists as hloc does: two names a line with white space between, no line twice."""
+    path, named = Path(path), {frame.name: frame for frame in frames}
     first: dict[tuple[str, ...], int] = {}
     for line in text_lines(path, "list of pairs"):
         names = tuple(line.text.split())

@@ -50,10 +50,7 @@ DATASETS: dict[str, tuple[str, Callable[..., list[Frame]], tuple[str, ...]]] = {
 
 
 def read_dataset(dataset: str, root: str | Path, **options: Any) -> list[Frame]:
-    """Return the frames of a dataset, a key of :data:`DATASETS`; ``root`` of ``colmap`` is the folder of the images.
-
-    The options are arguments of the dataset's reader, and ``split``, a key of ``splits.SPLITS[dataset]``.
-    """
+    """Return the frames of a dataset, a key of ``DATASETS``, by the arguments of its reader or ``split``."""
     if dataset not in DATASETS:
         raise ValueError(f"a dataset must be one of {', '.join(DATASETS)}, got {dataset!r}")
     _, read, known = DATASETS[dataset]

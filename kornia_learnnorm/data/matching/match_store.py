@@ -210,10 +210,7 @@ def _match(
 
 
 class FeatureCache:
-    """Keep the features of frames in a folder, each until the last of all ``pairs`` with the frame is released.
-
-    The context manager starts with an empty folder, without what a killed run left, and removes it at the end.
-    """
+    """Keep the features of frames in a folder, each until the last of all ``pairs`` with the frame is released."""
 
     def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
         self.folder = folder

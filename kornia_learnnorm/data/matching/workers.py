@@ -29,10 +29,7 @@ class Workers:
 
     @contextmanager
     def results(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Iterator[Any]]:
-        """Yield an iterator over the results in order; leaving the context cancels the remaining calls.
-
-        A process imports the function from its module. The arguments are consumed as processes become free.
-        """
+        """Yield an iterator over the results in order; leaving the context cancels the remaining calls."""
         from joblib import Parallel, delayed
 
         # A new Parallel for each list: after a killed process, an old one mixes late results into the next list.
@@ -49,10 +46,7 @@ class Workers:
 def restart_crashed(
     run: Callable[[], Generator[Result, None, None]], log: Callable[[str], Any]
 ) -> Generator[Result, None, None]:
-    """Yield the results of ``run()``, called again for the rest after a worker crashed.
-
-    OSError if workers crash again and again without a result between.
-    """
+    """Yield the results of ``run()``, called again for the rest after a worker crashed, a few times in a row."""
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
     restarts = 0
@@ -78,10 +72,7 @@ def check_jobs(jobs: int) -> None:
 
 @contextmanager
 def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
-    """Yield worker processes on this machine, -1 for as many as it has cores, or those of a Dask scheduler's address.
-
-    OSError if the cluster cannot be reached, or Dask gives up a task that killed several workers.
-    """
+    """Yield worker processes on this machine, -1 for as many as it has cores, or those of a scheduler of Dask."""
     joblib = import_extra("joblib", "images", "matching many pairs")
     check_jobs(jobs)
     if dask is None:

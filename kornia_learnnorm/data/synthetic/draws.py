@@ -82,10 +82,7 @@ def spread_points(size: Tensor, num_points: int, generator: Generator, clustered
 def draw_depths(
     points1: Tensor, K: Tensor, near: float, far: float, height: Tensor, generator: Generator, tilt: float = 0.0
 ) -> Tensor:
-    """Draw depths ``(B, N)``: log-uniform, but of the points whose ray meets the ground, ``GROUND_SHARE`` lie on it.
-
-    The ground plane is ``height`` below the camera; ``tilt`` is the standard deviation of its slopes.
-    """
+    """Draw depths ``(B, N)``: log-uniform, or of most rays that meet it, those of a ground ``height`` below."""
     batch_size, num_points = points1.shape[:2]
     free = log_uniform((batch_size, num_points), near, far, generator)
     slopes = tilt * normal((batch_size, 2), generator)

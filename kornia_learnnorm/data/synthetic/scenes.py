@@ -216,11 +216,7 @@ def synthetic_store(
     outliers: float = 0.2,
     scenes: Sequence[str] = tuple(SCENES),
 ) -> CorrespondenceStore:
-    """Return a store of synthetic scenes, ``pairs`` of each kind; the kinds are keys of :data:`SCENES`.
-
-    Noise is in pixels, ``outliers`` the share of gross outliers. Lowe's ratio is drawn so that the ratio test of 0.8
-    keeps all inliers and half of the outliers.
-    """
+    """Return a store of synthetic scenes, ``pairs`` of each kind; the ratio test of 0.8 keeps half of the outliers."""
     if pairs < 1 or points < 8:
         raise ValueError(f"at least 1 pair of each scene and 8 points are needed, got {pairs} and {points}")
     unknown = set(scenes) - set(SCENES)

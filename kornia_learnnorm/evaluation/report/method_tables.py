@@ -113,12 +113,7 @@ def _pairs_of(store: str) -> tuple[str, float, float]:
 
 
 def method_rows(predictions: Mapping[str, Mapping[str, Tensor]]) -> list[list[Cell]]:
-    """Return a row per method in the order of :data:`HEADER`, from the errors of each sample, pixels, (S,).
-
-    ``own`` is the mean symmetric epipolar distance of a sample's points, ``truth`` the median one of its pair's
-    ground-truth inliers, NaN where there are none. The mean leaves out samples whose residual is infinite for any
-    method (a point on an epipole). Without Hartley or whitening among the methods, their rates are empty.
-    """
+    """Return a row per method for ``HEADER``; means leave out samples with an infinite residual of any method."""
 
     def rate(name: str, baseline: str, quantity: str) -> Cell:
         if name == baseline or baseline not in predictions:

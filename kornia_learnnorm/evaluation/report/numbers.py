@@ -57,8 +57,7 @@ def better_share(cell: RunCell, name: str, baseline: str, quantity: str, rows: T
 def paired_change(values: Tensor, baseline: Tensor, pair: Tensor | None = None, *, logarithms: bool = False) -> Cell:
     """Return the mean difference of two methods with its 95 % interval and p-value, from a paired bootstrap over pairs.
 
-    Without ``pair`` each number is of its own pair. Differences of ``logarithms`` become changes of the geometric mean,
-    %. The number is unknown if no pair has a finite difference, and the mean alone if too few have.
+    Differences of ``logarithms`` become changes of the geometric mean, %; the mean stands alone if pairs are too few.
     """
     pair = torch.arange(len(values)) if pair is None else pair
     valid = (values - baseline).isfinite()
@@ -72,10 +71,7 @@ def paired_change(values: Tensor, baseline: Tensor, pair: Tensor | None = None, 
 
 
 def pose_numbers(rotation_error: Tensor, translation_error: Tensor) -> list[Cell]:
-    """Return AUC at 5, 10 and 20 degrees and mAA(10) of relative poses, %; unknown if no true pose is known.
-
-    Both errors are in degrees, infinite for a failure and NaN where the true pose is not known.
-    """
+    """Return AUC at 5, 10 and 20 degrees and mAA(10) of errors in degrees, %; unknown if no true pose is known."""
     error = torch.maximum(rotation_error, translation_error)
     error = error[~error.isnan()]
     if len(error) == 0:

@@ -56,10 +56,7 @@ class Report(NamedTuple):
 
 
 def write_report(folder: str | Path) -> Report:
-    """Write ``report.md``, ``report.html`` and the pictures into the folder of ``evaluate``, ``robust`` or both.
-
-    Raise FileNotFoundError if there is no run, ValueError if a file of it is damaged.
-    """
+    """Write ``report.md``, ``report.html`` and the pictures into the folder of ``evaluate``, ``robust`` or both."""
     folder = Path(folder)
     summary, about, tables = list[str](), list[str](), list[Table]()
     pictures, missing = list[ReportPicture](), list[str]()

@@ -67,9 +67,7 @@ def record_robust(
 ) -> list[str]:
     """Compute the missing results of a run; return the estimators that were left out: their packages are not installed.
 
-    ``stores`` are paths by their names in tables, ``estimators`` names for ``find_estimator``, ``options`` those that
-    differ from ``DEFAULT_OPTIONS``. The results of ``redo`` are computed again. ``command`` is the command line that
-    asks for it, for the report. The errors are those of ``record_run``.
+    Arguments and errors are those of ``record_run``; the results of ``redo`` are computed again.
     """
     folder, options = Path(folder), {**DEFAULT_OPTIONS, **(options or {})}
     for name, value in options.items():
@@ -136,10 +134,7 @@ def even_pairs(total: int, number: int) -> list[int]:
 
 
 def shuffled_pair(store: CorrespondenceStore, pair: int, protocol: str, seed: int, order: int = 0) -> EvaluatedPair:
-    """Return the correspondences of an image pair; ``order`` is a second seed of their order.
-
-    The protocol ``filtered`` draws at most 1,000 matches that pass the ratio test, ``unfiltered`` takes all.
-    """
+    """Return the correspondences of an image pair, at most 1,000 filtered ones; ``order`` is a seed of their order."""
     rows = store.rows(pair, PROTOCOLS[protocol])
     if protocol == "filtered":
         rows = np.random.default_rng([seed, pair]).permutation(rows)[:MAX_FILTERED]
@@ -151,11 +146,7 @@ def shuffled_pair(store: CorrespondenceStore, pair: int, protocol: str, seed: in
 
 
 def measure(pair: EvaluatedPair, F_mat: Tensor, threshold: float) -> dict[str, float]:
-    """Return ``inliers``, ``f1``, ``error`` (px), ``rotation_error`` and ``translation_error`` (degrees) of a matrix.
-
-    They are NaN where the pair lacks the ground truth. A failed estimate is zero or NaN. The inliers of the estimate
-    within 1 px decide between the four poses of the matrix.
-    """
+    """Return ``inliers``, ``f1``, ``error`` (px) and errors of the pose (degrees) of a matrix, NaN where unknown."""
     x1, x2 = pair.points1, pair.points2
     near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD
     pose = relative_pose(F_mat[None], pair.K[:1], pair.K[1:], x1[None], x2[None], near[None])

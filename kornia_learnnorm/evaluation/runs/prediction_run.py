@@ -71,10 +71,7 @@ class SampleOptions:
 def predict(
     method: Method, samples: MatchSets, store: CorrespondenceStore, max_ratio: float | None, agreement: bool = True
 ) -> Arrays:
-    """Return a method's matrices of the samples of a store, their errors and diagnostics, arrays (S, ...).
-
-    They are named as in ``ERRORS``, and ``AGREEMENT`` where wanted, on matches with Lowe's ratio below ``max_ratio``.
-    """
+    """Return a method's matrices of the samples of a store, ``ERRORS`` and, where wanted, ``AGREEMENT``, (S, ...)."""
     truth = ground_truth_inliers(store)
     parts = [
         _predict_batch(method, samples.select(rows), store, truth)
@@ -105,10 +102,7 @@ def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStor
 
 
 def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio: float | None) -> dict[str, Tensor]:
-    """Return ``inliers``, a share, and ``f1``, (S, thresholds), of matrices (S, 3, 3) on all matches of their pairs.
-
-    F1 is NaN where the ground truth has no inliers.
-    """
+    """Return ``inliers``, a share, and ``f1``, (S, thresholds), of matrices (S, 3, 3) on all matches of their pairs."""
     inliers = F_mat.new_full((len(F_mat), len(THRESHOLDS)), torch.nan)
     f1 = inliers.clone()
     for index in torch.unique(pair).tolist():
@@ -135,10 +129,7 @@ def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None)
 
 
 def ground_truth_inliers(store: CorrespondenceStore) -> Tensor:
-    """Return each pair's matches that pass the ratio test and lie within 1 px of their ground-truth epipolar lines.
-
-    They are points (x1, y1, x2, y2), (P, 200, 4) float64, padded with NaN; all NaN for a pair with fewer than 16.
-    """
+    """Return the filtered matches of each pair within 1 px of the truth, (P, 200, 4), NaN for less, all below 16."""
     result = torch.full((len(store), MAX_INLIERS, 4), torch.nan, dtype=torch.float64)
     for pair, F_mat in enumerate(torch.from_numpy(store.F)):
         x1, x2 = pair_matches(store, pair, RATIO)
@@ -201,15 +192,10 @@ def record_run(
     complete: bool = True,
     command: str = "",
 ) -> None:
-    """Compute what a run does not have yet.
+    """Compute what a run does not have yet; a ValueError or OSError tells what is wrong, at the end of a failed method.
 
-    ``stores`` are paths by the names that tables give them, ``methods`` names for ``find_method``. A run that
-    is ``complete`` has all that a report shows: also the shares of inliers and F1. ``command`` is the command line that
-    asks for it, for the report.
-
-    A ValueError tells that the folder holds a run of other options, a store or a method is wrong, a file is damaged,
-    or, at the end, that a method has failed; an OSError that a file is missing or cannot be written, or that another
-    process writes this run.
+    ``stores`` are paths by the names that tables give them, ``methods`` names for ``find_method``. A run that is
+    ``complete`` has shares of inliers and F1, too. ``command`` is the command line that asks for it, for the report.
     """
     options = SampleOptions() if options is None else options
     folder, names = Path(folder), short_names(methods)

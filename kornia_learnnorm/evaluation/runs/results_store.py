@@ -65,10 +65,7 @@ def run_folder(folder: Path) -> Iterator[None]:
 
 
 def record(folder: Path, section: str, jobs: Iterable[Job], total: int, known: Collection[str]) -> str:
-    """Do the jobs whose files are missing, with a bar of ``total`` jobs; return why methods failed, empty if none has.
-
-    Methods that failed leave the run, with their files, unless they are ``known``: the run had them before.
-    """
+    """Do the jobs whose files are missing; return why methods failed, which leave the run unless it had them before."""
     tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
     failed = dict[str, str]()
     with tqdm(total=total, unit="file", disable=None) as bar:
@@ -116,11 +113,10 @@ def read_section(folder: Path, section: str) -> About | None:
 def begin_section(
     folder: Path, section: str, stores: Stores, about: About, redo: Collection[str] = (), command: str = ""
 ) -> About:
-    """Write what a run is computed from, or refuse a folder of other options; more stores and methods may join a run.
+    """Write what a run is computed from, or refuse a folder of other options; return what the section was before.
 
     ``about`` has the options and, by the names in ``JOINED``, what each method or estimator is, None for one whose
-    package is not installed. The descriptions of ``redo`` may change. ``command`` is noted with the date of today.
-    Return what the section was before, empty for a new one.
+    package is not installed. Stores and methods may join; the descriptions of ``redo`` may change.
     """
     about = about | {
         "stores": {
