@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import sys
 
 import pytest
 
@@ -23,9 +22,3 @@ def test_a_port_in_use(refused):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         refused(["demo", "--no-browser", f"--port={port}"], f"--port {port}: cannot listen there")
-
-
-@pytest.mark.parametrize("missing", ["bokeh", "cv2", "PIL"])
-def test_a_missing_package_names_the_extra(refused, monkeypatch, missing):
-    monkeypatch.setitem(sys.modules, missing, None)
-    refused(["demo", "--no-browser"], f"needs {missing}: run pip install 'kornia-learnnorm[demo]'")

@@ -131,20 +131,6 @@ class TestOnePair:
             command("--seed", str(2**63))
         assert f"a whole number from 0 to 2^63 - 1 expected, got {2**63}" in capsys.readouterr().err
 
-    def test_failures_write_nothing(self, command, result, monkeypatch, capsys):
-        """Not even the picture, when the last step fails."""
-
-        def full(path, text):
-            Path(path).write_text("half")
-            raise OSError("no space left")
-
-        monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: result)
-        monkeypatch.setattr(command_module, "write_text", full)
-        with pytest.raises(OSError, match="no space left"):
-            command("--out", "pair.png", "--json", "F.json")
-        assert not list(Path().iterdir())
-        assert capsys.readouterr().out == ""
-
 
 class TestManyPairs:
     @pytest.fixture

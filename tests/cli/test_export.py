@@ -1,6 +1,5 @@
 """The command that writes layers as programs, whose content ``tests/test_layer_export.py`` checks."""
 
-import sys
 from unittest.mock import Mock
 
 import pytest
@@ -48,9 +47,3 @@ def test_what_cannot_be_written(words, message, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(["export", *words], message)
     assert [*tmp_path.iterdir()] == []
-
-
-def test_a_missing_package_names_its_extra(refused, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    words = ["export", "paper", "--format", "onnx", "--out", tmp_path / "a.onnx"]
-    refused(words, "run pip install 'kornia-learnnorm[onnx]', in a checkout pip install '.[onnx]'")

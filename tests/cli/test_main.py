@@ -201,11 +201,6 @@ def test_completion_knows_options_and_names(shell, capsys):
     assert all(word in printed for word in (*TOOLS, "fit", "max-samples", "kitti", "crossview-synthetic"))
 
 
-def test_completion_names_what_to_install(monkeypatch, refused):
-    monkeypatch.setitem(sys.modules, "shtab", None)
-    refused(["completion", "bash"], "needs shtab: run pip install 'kornia-learnnorm[completion]'")
-
-
 def test_output_whose_reader_has_ended_is_no_error(monkeypatch, capsys):
     read, write = os.pipe()
     os.close(read)
@@ -257,7 +252,14 @@ def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, 
 
 @pytest.mark.parametrize(
     ("command", "blocked", "extra"),
-    [("evaluate s.h5", "h5py", "images"), ("fit", "lightning_modules.training", "train")],
+    [
+        ("evaluate s.h5", "h5py", "images"),
+        ("fit", "lightning_modules.training", "train"),
+        ("completion bash", "shtab", "completion"),
+        ("export paper --format onnx --out a.onnx", "onnx", "onnx"),
+        ("export-colmap . --out a.db", "pycolmap", "colmap"),
+        *(("demo --no-browser", package, "demo") for package in ("bokeh", "cv2", "PIL")),
+    ],
 )
 def test_a_missing_package_is_one_line(command, blocked, extra, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)

@@ -212,18 +212,3 @@ class TestErrors:
         with pytest.raises(ValueError, match=message):
             export(images, turned=broken is None)
         assert not [*images.glob("*.db*"), *images.glob(".*")]  # nothing is left
-
-    def test_arguments(self, images):
-        for wrong, error, message in [
-            ({"threshold": 0.0}, ValueError, "threshold must be positive"),
-            ({"seed": -1}, ValueError, "seed"),
-            ({"layer": "robust"}, TypeError, "LearnedEightPoint"),
-            ({"K": np.zeros((3, 3))}, ValueError, "K1"),
-        ]:
-            with pytest.raises(error, match=message):
-                export(images, **wrong)
-
-    def test_without_pycolmap(self, images, monkeypatch):
-        monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
-        with pytest.raises(ImportError, match=r"a COLMAP database needs pycolmap: .*\[colmap\]"):
-            export(images)

@@ -12,22 +12,7 @@ from scenes import epipolar_distances
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
-from kornia_learnnorm.two_view.predicted_error import (
-    drop_failed_parts,
-    nominal_camera,
-    predict_error,
-    predict_transfer_error,
-    random_parts,
-)
-
-
-def test_failed_searches_do_not_count():
-    """Of 100 inliers, a matrix of a part must have 75; with fewer than four such matrices all count."""
-    F_parts = torch.eye(3).double() * torch.arange(1.0, 7.0)[:, None, None]
-    support = torch.tensor([110, 75, 74, 20, 90, 80])
-    assert drop_failed_parts(F_parts, support, 100)[:, 0, 0].tolist() == [1, 2, 5, 6]
-    assert len(drop_failed_parts(F_parts, support, 101)) == 6
-    assert torch.equal(drop_failed_parts(F_parts, support, 10), F_parts)
+from kornia_learnnorm.two_view.predicted_error import predict_error, predict_transfer_error, random_parts
 
 
 @pytest.mark.parametrize("number", [40, 200])
@@ -74,20 +59,9 @@ def test_of_homographies(number):
     assert {one.angle for one in found} == {0.0}
 
 
-def test_angles_of_homographies():
-    """Half of the matches have as large an error as what they differ by from all."""
-    points, inliers = torch.rand(100, 2).double(), torch.ones(100, dtype=torch.bool)
-    about = torch.eye(3).double().repeat(3, 1, 1), 50, points, torch.eye(3).double(), inliers
-    assert predict_transfer_error(*about, torch.tensor([1.0, 2.0, 180.0])) == (0.0, 2.0)
-
-
 def test_it_is_infinite_where_parts_have_no_matrix():
     scene = handheld(1, 50, torch.Generator().manual_seed(0), noise=0.0)
     x1, x2, F_mat, K1, K2 = (value[0] for value in (scene.points1, scene.points2, scene.F_mat, scene.K1, scene.K2))
     found = predict_error(torch.zeros(12, 3, 3).double(), 40, x1, x2, F_mat, torch.ones(50, dtype=torch.bool), K1, K2)
     assert found.distance == math.inf
     assert found.angle > 100
-
-
-def test_nominal_camera():
-    assert nominal_camera((640, 480)).tolist() == [[768, 0, 320], [0, 768, 240], [0, 0, 1]]

@@ -9,7 +9,6 @@ from scenes import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import orbit
-from kornia_learnnorm.two_view import solver as module
 from kornia_learnnorm.two_view.solver import TwoViewSolver
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
@@ -47,14 +46,3 @@ def test_relief_below_the_threshold():
     found = TwoViewSolver(*noisy, scores, 1.0, 0).solve().matrix
     error, worse = (np.median(epipolar_distances(*exact, F_mat)) for F_mat in (found, ransac))
     assert error < 0.7 * worse
-
-
-def test_parts_without_matches_near_a_homography(monkeypatch):
-    """Of 20 matches that move by 7 px among 80 that move by 200 or 300; the second part has none of the former."""
-    points1, row = torch.from_numpy(np.random.default_rng(0).uniform(0, 500, (100, 2))), torch.arange(100)[:, None]
-    points2 = points1 + torch.where(row < 20, 7.0, 200.0 + 100 * (row % 2))
-    monkeypatch.setattr(module, "random_parts", lambda *_: torch.stack([torch.arange(60), torch.arange(40, 100)]))
-    H_mat = torch.tensor([[1.0, 0, 7], [0, 1, 7], [0, 0, 1]]).double()
-    found = TwoViewSolver(points1, points2, torch.ones(100).double(), 1.0, 0).check_homography(H_mat)
-    assert (int(found.weights.sum()), found.parts.shape, found.part_size) == (20, (1, 3, 3), 60)
-    assert np.allclose(found.parts[0] / found.parts[0, 2, 2], H_mat, atol=1e-6)

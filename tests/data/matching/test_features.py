@@ -223,10 +223,3 @@ class TestKeepFeatures:
         assert found.descriptors[:, 0].tolist() == np.flatnonzero(away).tolist()
         assert np.array_equal(found.points, points[away].astype(np.float32))
         assert found.size == (width, height)
-
-    def test_wrong_masks(self):
-        features = self.features(np.zeros((2, 2)), (30, 40))
-        with pytest.raises(TypeError, match="a mask must be an array of bool, got uint8"):
-            keep_features(features, np.ones((40, 30), np.uint8))
-        with pytest.raises(ValueError, match=r"shape of its image, \(40, 30\), got \(30, 40\)"):
-            keep_features(features, np.ones((30, 40), bool))
