@@ -48,6 +48,11 @@ def scenes(name: str, batch_size: int = 20, num_points: int = 8, seed: int = 0, 
     return SCENES[name](batch_size, num_points, seeded(seed), **options)
 
 
+def one_scene(name: str, num_points: int, seed: int = 0, **options: float) -> TwoViewScene:
+    """One scene, without the dimension of the batch."""
+    return TwoViewScene(*(value[0] for value in scenes(name, 1, num_points, seed, **options)))
+
+
 def correspondences(name: str = "handheld", *args, **options) -> tuple[Tensor, Tensor]:
     scene = scenes(name, *args, **options)
     return scene.points1, scene.points2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import cross, homogeneous, scenes, true_essential, uniform, up_to_sign
+from scenes import cross, homogeneous, one_scene, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
@@ -16,25 +16,21 @@ from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 
 def pair(name: str = "handheld", num_points: int = 200, noise: float = 0.3, outliers: float = 0.4, seed: int = 0):
     """Correspondences (N, 2) of one pair, both cameras, its essential matrix, and which are no outliers."""
-    scene = scenes(name, 1, num_points, seed, noise=noise, outliers=outliers)
-    return (scene.points1[0], scene.points2[0]), (scene.K1[0], scene.K2[0]), true_essential(scene)[0], scene.inliers[0]
+    scene = one_scene(name, num_points, seed, noise=noise, outliers=outliers)
+    E_mat = torch.linalg.cross(scene.t[:, None], scene.R, dim=0)
+    return (scene.points1, scene.points2), (scene.K1, scene.K2), E_mat, scene.inliers
 
 
 def plane(num_points: int = 60, off_plane: int = 0, seed: int = 0):
     """Noise-free correspondences of a plane, and some points behind it; both cameras, their E, R and t."""
-    scene = scenes("handheld", 1, num_points, seed, noise=0.0, outliers=0.0)
-    K1, K2, R, t = scene.K1[0].numpy(), scene.K2[0].numpy(), scene.R[0].numpy(), scene.t[0].numpy()
-    rays = homogeneous(scene.points1[0].numpy()) @ np.linalg.inv(K1).T
+    scene = one_scene("handheld", num_points, seed, noise=0.0, outliers=0.0)
+    K1, K2, R, t = (value.numpy() for value in (scene.K1, scene.K2, scene.R, scene.t))
+    rays = homogeneous(scene.points1.numpy()) @ np.linalg.inv(K1).T
     depth = 4 / (rays @ np.array([0.2, -0.1, 1.0]))
     depth[:off_plane] *= np.linspace(1.2, 3, off_plane)
     x2 = (depth[:, None] * rays @ R.T + 0.5 * t / np.linalg.norm(t)) @ K2.T
-    return (
-        (scene.points1[0], torch.from_numpy(x2[:, :2] / x2[:, 2:])),
-        (scene.K1[0], scene.K2[0]),
-        true_essential(scene),
-        R,
-        t,
-    )
+    points = scene.points1, torch.from_numpy(x2[:, :2] / x2[:, 2:])
+    return points, (scene.K1, scene.K2), torch.from_numpy(cross(t) @ R), R, t
 
 
 def of_pixels(E_mat, K1, K2) -> torch.Tensor:
@@ -46,22 +42,6 @@ def estimate(points, cameras, weights=None, **options):
 
 
 class TestSmoke:
-    @pytest.mark.parametrize("refine", [True, False])
-    def test_shapes(self, refine, device, dtype):
-        points, cameras, _, _ = pair()
-        found = estimate([p.to(device, dtype) for p in points], [K.to(device) for K in cameras], refine=refine)
-        assert [value.shape for value in (found.E_mat, found.F_mat, found.inliers)] == [(3, 3), (3, 3), (200,)]
-        assert found.E_mat.dtype == dtype
-        values = torch.linalg.svdvals(found.E_mat.double()).tolist()
-        assert values == pytest.approx([0.5**0.5, 0.5**0.5, 0.0], abs=1e-6)
-
-    def test_forward_and_estimate(self):
-        points, (K1, K2), _, _ = pair()
-        found, (F_mat, inliers) = estimate(points, (K1, K2)), RANSAC(seed=0)(*points, K1=K1, K2=K2)
-        assert torch.equal(found.F_mat, F_mat)
-        assert torch.equal(found.inliers, inliers)
-        assert torch.equal(inliers, kln.sampson_distance(*points, F_mat) <= 1)
-
     @pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
     def test_weights(self, sampler):
         points, cameras, E, true = pair(outliers=0.7, seed=1)
@@ -72,13 +52,6 @@ class TestSmoke:
 
 
 class TestExceptions:
-    def test_cameras(self):
-        """What else is refused is tested with check_cameras."""
-        with pytest.raises(ValueError, match=r"K1 .* got \[1, 3, 3\]"):
-            RANSAC().estimate(uniform(20, 2), uniform(20, 2, seed=1), None, torch.eye(3)[None], torch.eye(3))
-        with pytest.raises(ValueError, match="at least 5 correspondences are needed, got 4"):
-            RANSAC()(uniform(4, 2), uniform(4, 2, seed=1), K1=torch.eye(3), K2=torch.eye(3))
-
     def test_failure(self):
         """Five matches fit exactly: no other one confirms the matrix."""
         found = estimate((uniform(5, 2), uniform(5, 2, seed=1)), (torch.eye(3), torch.eye(3)))
@@ -86,20 +59,11 @@ class TestExceptions:
 
 
 class TestAccuracy:
-    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
-    @pytest.mark.parametrize("num_points", [7, 60])
-    def test_exact_points(self, name, num_points):
-        points, cameras, E, _ = pair(name, num_points, noise=0.0, outliers=0.0)
-        found = estimate(points, cameras)
-        assert found.inliers.all()
-        if num_points > 7:  # of fewer, others fit within the threshold
-            assert up_to_sign(found.E_mat[None], E[None]) < 1e-6
-
     def test_mostly_a_plane(self):
         """Samples of eight are degenerate or need points off the plane; samples of five do not."""
         points, cameras, E, _, _ = plane(off_plane=6)
         found = estimate(points, cameras)
-        assert up_to_sign(found.E_mat[None], E) < 1e-6
+        assert up_to_sign(found.E_mat[None], E[None]) < 1e-6
         assert found.inliers.all()
 
     @pytest.mark.parametrize("seed", range(3))
@@ -124,13 +88,13 @@ class TestAccuracy:
 
 def distorted(seed: int):
     """Correspondences of a lens that moves the corners inwards by 3 %, and the cameras, E, R and t of a pinhole."""
-    scene = scenes("handheld", 1, 300, seed, noise=0.3, outliers=0.3)
+    scene = one_scene("handheld", 300, seed, noise=0.3, outliers=0.3)
     points = []
-    for pixels, K in ((scene.points1[0], scene.K1[0]), (scene.points2[0], scene.K2[0])):
+    for pixels, K in ((scene.points1, scene.K1), (scene.points2, scene.K2)):
         offset = pixels - K[:2, 2]
         square = offset.square().sum(-1, keepdim=True)
         points.append(K[:2, 2] + offset * (1 - 0.03 * square / square.max()))
-    return points, (scene.K1[0], scene.K2[0]), scene.R, scene.t
+    return points, (scene.K1, scene.K2), scene.R[None], scene.t[None]
 
 
 def error_of_pose(F_mat, points, cameras, R, t):
@@ -185,27 +149,6 @@ class TestInFront:
         found = estimate((points1, points2), cameras)
         alone = estimate((points1[front], points2[front]), cameras)
         assert up_to_sign(found.E_mat[None], alone.E_mat[None]) < 2e-3
-
-
-class TestInvariances:
-    @pytest.mark.parametrize("seed", range(2))
-    def test_neither_the_order_of_the_points_nor_of_the_views_counts(self, seed):
-        points, cameras, _, _ = pair("driving", 100, seed=seed)
-        order = torch.randperm(100, generator=torch.Generator().manual_seed(1))
-        found, swapped = estimate(points, cameras), estimate(points[::-1], cameras[::-1])
-        again = estimate([p[order] for p in points], cameras)
-        for inliers, E_mat in ((swapped.inliers, swapped.E_mat.mT), (again.inliers[order.argsort()], again.E_mat)):
-            assert (found.inliers == inliers).float().mean() > 0.97
-            assert up_to_sign(found.E_mat[None], E_mat[None]) < 0.02
-
-    @pytest.mark.parametrize("scale", [0.1, 30.0])
-    def test_scale_of_the_pixels(self, scale):
-        points, cameras, _, _ = pair(outliers=0.2)
-        T = torch.diag(torch.tensor([scale, scale, 1.0])).double()
-        scaled = estimate([scale * p for p in points], [T @ K for K in cameras], inl_th=scale)
-        found = estimate(points, cameras)
-        assert up_to_sign(found.E_mat[None], scaled.E_mat[None]) < 1e-2
-        assert (found.inliers == scaled.inliers).float().mean() > 0.97
 
 
 @pytest.mark.parametrize(("distortion", "least", "most"), [(0.005, 0, 1), (0.1, 7, 8)])

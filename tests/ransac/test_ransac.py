@@ -11,24 +11,25 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from kornia.feature import LightGlueMatcher, laf_from_center_scale_ori
 from kornia.geometry import ransac as kornia_ransac
 from kornia.geometry.linalg import transform_points
-from scenes import epipolar_distances, scenes, shaken, uniform, up_to_sign
+from scenes import epipolar_distances, one_scene, scenes, shaken, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
-from kornia_learnnorm.data.matching.features import detect_aliked
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.metrics.inliers import f1_score
 from kornia_learnnorm.ransac.samplers import WeightedSampler
 
 
 def pair(name: str = "handheld", num_points: int = 400, noise: float = 0.3, outliers: float = 0.4, seed: int = 0):
     """Correspondences (N, 2) of one pair, its matrix, and which are no outliers."""
-    scene = scenes(name, 1, num_points, seed, noise=noise, outliers=outliers)
-    return scene.points1[0], scene.points2[0], scene.F_mat[0], scene.inliers[0]
+    scene = one_scene(name, num_points, seed, noise=noise, outliers=outliers)
+    return scene.points1, scene.points2, scene.F_mat, scene.inliers
+
+
+def cameras_of(scene, calibrated: bool) -> dict[str, torch.Tensor]:
+    return {"K1": scene.K1, "K2": scene.K2} if calibrated else {}
 
 
 def failed(result) -> bool:
@@ -36,14 +37,29 @@ def failed(result) -> bool:
     return not bool(F_mat.any()) and not bool(inliers.any())
 
 
+both = pytest.mark.parametrize("calibrated", [False, True])
+
+
 class TestResult:
-    def test_shapes(self, device, dtype):
-        points1, points2, _, _ = pair(num_points=100)
-        F_mat, inliers = RANSAC(seed=0)(points1.to(device, dtype), points2.to(device, dtype))
+    @both
+    @pytest.mark.parametrize("refine", [True, False])
+    def test_shapes(self, calibrated, refine, device, dtype):
+        scene = one_scene("handheld", 100, noise=0.3, outliers=0.4)
+        cameras = {name: K.to(device) for name, K in cameras_of(scene, calibrated).items()}
+        ransac, points = RANSAC(seed=0, refine=refine), [p.to(device, dtype) for p in (scene.points1, scene.points2)]
+        F_mat, inliers = ransac(*points, **cameras)
         assert (F_mat.shape, F_mat.dtype, F_mat.device.type) == ((3, 3), dtype, device.type)
         assert (inliers.shape, inliers.dtype, inliers.device.type) == ((100,), torch.bool, device.type)
         assert F_mat.norm().item() == pytest.approx(1)
         assert torch.linalg.svdvals(F_mat.double())[2] < 1e-7
+        found = ransac.estimate(*points, **cameras)
+        assert torch.equal(found.F_mat, F_mat)
+        assert torch.equal(found.inliers, inliers)
+        if calibrated:
+            assert found.E_mat.dtype == dtype
+            values = torch.linalg.svdvals(found.E_mat.double()).tolist()
+            assert values == pytest.approx([0.5**0.5, 0.5**0.5, 0.0], abs=1e-6)
+            assert torch.equal(inliers, kln.sampson_distance(*points, F_mat) <= 1)
 
     @pytest.mark.parametrize("normalizer", [None, kln.Whitening(), shaken()])
     @pytest.mark.parametrize("rank2", [None, "projection", "optimal"])
@@ -55,9 +71,7 @@ class TestResult:
 
     def test_estimate(self):
         points1, points2 = pair()[:2]
-        ransac = RANSAC(seed=0)
-        result = ransac.estimate(points1, points2)
-        torch.testing.assert_close(ransac(points1, points2), (result.F_mat, result.inliers), rtol=0, atol=0)
+        result = RANSAC(seed=0).estimate(points1, points2)
         distances = kln.sampson_distance(points1, points2, result.F_mat)
         expected = (1 - distances.square()).clamp(min=0).sum()
         assert result.score == pytest.approx(expected.item(), rel=1e-6)
@@ -74,6 +88,7 @@ class TestResult:
         assert not torch.equal(given, RANSAC(**options)(*points)[0])
 
 
+NAMED = ["driving", "handheld", "orbit"]
 POINTS, NAN = uniform(20, 2), float("nan")
 
 
@@ -100,33 +115,41 @@ class TestExceptions:
             with pytest.raises(error, match=message):
                 RANSAC(**wrong)
 
-    def test_correspondences(self):
-        for points1, points2, weights, error, message in [
-            (POINTS.long(), POINTS, None, TypeError, "points1 must be .* got torch.int64"),
-            (POINTS[None], POINTS[None], None, ShapeError, r"\[1, 20, 2\]"),
-            (POINTS, POINTS[1:], None, ValueError, r"\[20, 2\] and \[19, 2\]"),
-            (POINTS[:7], POINTS[:7], None, ValueError, "at least 8 .* got 7"),
-            (POINTS, POINTS, torch.ones(19), ValueError, r"weights .* \[20\], got \[19\]"),
-            (POINTS, POINTS, torch.full((20,), NAN), ValueError, "finite and not negative"),
+    @both
+    def test_correspondences(self, calibrated):
+        cameras, least = ({"K1": torch.eye(3), "K2": torch.eye(3)}, 5) if calibrated else ({}, 8)
+        for points1, points2, change, error, message in [
+            (POINTS.long(), POINTS, {}, TypeError, "points1 must be .* got torch.int64"),
+            (POINTS[None], POINTS[None], {}, ShapeError, r"\[1, 20, 2\]"),
+            (POINTS, POINTS[1:], {}, ValueError, r"\[20, 2\] and \[19, 2\]"),
+            (POINTS[: least - 1], POINTS[: least - 1], {}, ValueError, f"at least {least} .* got {least - 1}"),
+            (POINTS, POINTS, {"weights": torch.ones(19)}, ValueError, r"weights .* \[20\], got \[19\]"),
+            (POINTS, POINTS, {"weights": torch.full((20,), NAN)}, ValueError, "finite and not negative"),
+            (POINTS, POINTS, {"K1": torch.eye(3)[None]}, ValueError, r"K1 .* got (only K1|\[1, 3, 3\])"),
         ]:
             with pytest.raises(error, match=message):
-                RANSAC()(points1, points2, weights)
+                RANSAC()(points1, points2, **cameras | change)
 
 
 class TestAccuracy:
-    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
+    @pytest.mark.parametrize(
+        ("name", "num_points", "calibrated"),
+        [("handheld", 400, False), *((name, number, True) for name in NAMED for number in (7, 60))],
+    )
+    def test_exact_points(self, name, num_points, calibrated):
+        scene = one_scene(name, num_points, noise=0.0, outliers=0.0)
+        found = RANSAC(seed=0).estimate(scene.points1, scene.points2, **cameras_of(scene, calibrated))
+        assert found.inliers.all()
+        if num_points > 7:  # of fewer, others fit within the threshold
+            assert up_to_sign(found.F_mat[None], scene.F_mat[None]) < (1e-6 if calibrated else 1e-8)
+
+    @pytest.mark.parametrize("name", NAMED)
     @pytest.mark.parametrize("options", [{}, {"distance": "symmetric", "inl_th": 2.0}])
     def test_finds_the_inliers(self, name, options):
         points1, points2, _, true = pair(name)
         _, inliers = RANSAC(seed=0, **options)(points1, points2)
         assert inliers[true].float().mean() > 0.9
         assert inliers[~true].float().mean() < 0.15  # outliers can lie on their lines
-
-    def test_exact_points(self):
-        points1, points2, F_true, _ = pair(noise=0.0, outliers=0.0)
-        F_mat, inliers = RANSAC(seed=0)(points1, points2)
-        assert up_to_sign(F_mat[None], F_true[None]) < 1e-8
-        assert inliers.all()
 
     @pytest.mark.long
     @pytest.mark.parametrize("name", ["kitti_06", "tum_fr3_office"])
@@ -140,36 +163,6 @@ class TestAccuracy:
             scores.append([f1_score(*points, F_mat, truth, 1.0).item() for F_mat in F_mats])
         ours, theirs = np.nanmean(scores, 0)
         assert ours > theirs - 0.01
-
-
-class TestInPlaceOfKornia:
-    """The same call of ``kornia.geometry.RANSAC`` and of this class, on what matchers of Kornia give."""
-
-    @staticmethod
-    def check(points1, points2, exact, weights=None):
-        for ransac in (kornia_ransac.RANSAC("fundamental", inl_th=1.0, seed=0), RANSAC(inl_th=1.0, seed=0)):
-            F_mat, inliers = ransac(points1, points2, weights)
-            assert (F_mat.shape, F_mat.dtype) == ((3, 3), points1.dtype)
-            assert (inliers.shape, inliers.dtype) == (points1.shape[:1], torch.bool)
-            assert kln.symmetric_epipolar_distance(*exact, F_mat.double()).median() < 1
-
-    def test_lightglue_matcher(self, cached_weights):
-        cached_weights("aliked-n16.pth", "aliked_lightglue_v0-1_arxiv-pth")
-        pytest.importorskip("cv2")
-        room = render_pair(0, width=320, height=240)
-        sides = [detect_aliked(image, 500) for image in (room.image1, room.image2)]
-        points, rows = ([torch.from_numpy(getattr(side, part)) for side in sides] for part in ("points", "descriptors"))
-        lafs = [laf_from_center_scale_ori(side[None]) for side in points]
-        with torch.inference_mode():
-            score, index = LightGlueMatcher("aliked")(*rows, *lafs, (240, 320), (240, 320))
-        matches = (side[column] for side, column in zip(points, index.mT, strict=True))
-        exact = torch.from_numpy(room.points1), torch.from_numpy(room.points2)
-        self.check(*matches, exact, score[:, 0])
-
-    @pytest.mark.parametrize("num_points", [5000, 12000])
-    def test_dense_matches(self, num_points):
-        points1, points2, _, _ = pair(num_points=num_points, noise=0.5, outliers=0.3)
-        self.check(points1.float(), points2.float(), pair(num_points=num_points, noise=0.0, outliers=0.0)[:2])
 
 
 class TestSeeds:
@@ -311,15 +304,6 @@ class TestHardInput:
             assert F_mat.isfinite().all()
             assert inliers.all()
 
-    def test_rows_that_are_not_finite_are_as_if_absent(self):
-        points1, points2, _, _ = pair(num_points=200)
-        F_mat, inliers = RANSAC(seed=0)(points1, points2)
-        with_bad1 = torch.cat([points1, torch.full((3, 2), torch.nan), points1[:2]])
-        with_bad2 = torch.cat([points2, points2[:3], torch.full((2, 2), -torch.inf)])
-        again, more = RANSAC(seed=0)(with_bad1, with_bad2)
-        assert torch.equal(F_mat, again)
-        assert torch.equal(more, torch.cat([inliers, torch.zeros(5, dtype=torch.bool)]))
-
     @pytest.mark.parametrize("planes", [1, 2])
     def test_planes(self, planes):
         """Two planes determine the matrix, one does not."""
@@ -336,15 +320,19 @@ class TestHardInput:
 
 
 @pytest.mark.long
-@settings(max_examples=8)
+@both
+@settings(max_examples=6)
 @given(scale=st.floats(0.1, 10), x=st.floats(-1e4, 1e4), y=st.floats(-1e4, 1e4), order=st.permutations(range(100)))
-def test_invariances(scale, x, y, order):
+def test_invariances(calibrated, scale, x, y, order):
     """To similarities of the pixels, to the order of the rows and to a swap of the views."""
-    points = pair("handheld", 100, noise=0.1)[:2]
-    F_mat, inliers = RANSAC(seed=0)(*points)
-    moved = RANSAC(inl_th=scale, seed=0)(*(scale * p + torch.tensor([x, y]).double() for p in points))[1]
-    shuffled = RANSAC(seed=0)(*(p[order] for p in points))[1]
-    swapped, same = RANSAC(seed=0)(*points[::-1])
+    scene = one_scene("handheld", 100, noise=0.1, outliers=0.4)
+    points, cameras = (scene.points1, scene.points2), cameras_of(scene, calibrated)
+    F_mat, inliers = RANSAC(seed=0)(*points, **cameras)
+    T = torch.tensor([[scale, 0, x], [0, scale, y], [0, 0, 1]], dtype=torch.float64)
+    moved_cameras = {name: T @ K for name, K in cameras.items()}
+    moved = RANSAC(inl_th=scale, seed=0)(*(scale * p + T[:2, 2] for p in points), **moved_cameras)[1]
+    shuffled = RANSAC(seed=0)(*(p[order] for p in points), **cameras)[1]
+    swapped, same = RANSAC(seed=0)(*points[::-1], **dict(zip(cameras, [*cameras.values()][::-1], strict=True)))
     for found, expected in ((moved, inliers), (shuffled, inliers[order]), (same, inliers)):
         assert (found == expected).float().mean() > 0.95
     errors = [epipolar_distances(*(p[inliers] for p in points), F).mean() for F in (F_mat, swapped.mT)]

@@ -10,20 +10,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.ransac.samplers import ProsacSampler, UniformSampler, WeightedSampler, draw_distinct
+from kornia_learnnorm.ransac.samplers import ProsacSampler, UniformSampler, WeightedSampler
 
 GROWTH = ProsacSampler.MAX_SAMPLES
 CPU = torch.device("cpu")
-
-
-class TestDrawDistinct:
-    @given(totals=st.lists(st.integers(8, 40), min_size=1, max_size=50), seed=st.integers(0, 2**32))
-    def test_distinct_and_in_range(self, totals, seed):
-        drawn = draw_distinct(torch.tensor(totals), 8, torch.Generator().manual_seed(seed))
-        assert drawn.shape == (len(totals), 8)
-        for row, total in zip(drawn.tolist(), totals, strict=True):
-            assert len(set(row)) == 8
-            assert 0 <= min(row) <= max(row) < total
 
 
 class TestUniform:

@@ -44,15 +44,6 @@ class TestBest:
         counts = scorer.inliers(best.F_mat).sum(-1).numpy()
         assert np.abs(counts - (own <= 1.5).sum(-1)).max() <= 1  # a distance next to the threshold
 
-    def test_fewer_than_asked_for(self, pair, matrices, factor):
-        scorer = PairScorer(*pair, 1.5, Fundamental(distance=factor))
-        matrices = scorer.from_pixels(matrices)
-        assert len(scorer.best(matrices[:3], 8).F_mat) <= 3
-        assert scorer.best(matrices[:0], 8).F_mat.shape == (0, 3, 3)
-        best, joined = scorer.best(matrices, 8), scorer.best(matrices[100:], 8).join(scorer.best(matrices[:100], 8), 8)
-        assert torch.equal(best.F_mat, joined.F_mat)
-        assert torch.allclose(best.score, joined.score)  # products of other shapes round differently
-
     def test_shortlist(self, pair, matrices, factor):
         points, rows = [p.repeat(3, 1) for p in pair], torch.randperm(1500, generator=torch.Generator().manual_seed(2))
         scorer = PairScorer(*points, 1.5, Fundamental(distance=factor), rows)
@@ -67,12 +58,6 @@ class TestBest:
     def test_nothing_speaks_for_zero_or_nan(self, pair, factor):
         F = torch.tensor([0.0, torch.nan, torch.inf]).double()[:, None, None].expand(3, 3, 3)
         assert len(PairScorer(*pair, 1.0, Fundamental(distance=factor)).best(F, 3).F_mat) == 0
-
-    def test_distances_and_pixels(self, pair, matrices, factor):
-        scorer = PairScorer(*pair, 1.5, Fundamental(distance=factor), torch.arange(10))
-        got = np.stack([scorer.distances(F) for F in scorer.from_pixels(matrices)])
-        assert np.allclose(got, distances(*pair, matrices, factor), rtol=1e-6)
-        assert all(map(torch.allclose, scorer.pixels, pair))
 
 
 class TestFiniteAndBounded:
