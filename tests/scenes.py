@@ -70,12 +70,16 @@ def paper() -> LearnedNormalizer:
     return LearnedNormalizer(kln.Hartley(), kln.PaperNetwork(16, 3), paper_transform)
 
 
+def last_layer(normalizer: LearnedNormalizer) -> torch.nn.Linear:
+    return getattr(normalizer.network, "set_network", normalizer.network).head[-1]
+
+
 def shaken(normalizer: LearnedNormalizer | None = None, scale: float = 0.3, seed: int = 0) -> LearnedNormalizer:
     """A learned normaliser whose last layer holds random numbers, so that it differs from its base."""
     torch.manual_seed(seed)
     normalizer = small(kln.ReweightedWhitening()) if normalizer is None else normalizer
     with torch.no_grad():
-        for value in getattr(normalizer.network, "set_network", normalizer.network).head[-1].parameters():
+        for value in last_layer(normalizer).parameters():
             value.normal_(0, scale)
     return normalizer.eval()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 
 import numpy as np
@@ -16,6 +17,7 @@ from scenes import (
     correspondences,
     epipolar_distances,
     hartley_difference,
+    last_layer,
     mapped,
     paper,
     rewrite_weights,
@@ -38,8 +40,8 @@ def public(module: nn.Module) -> dict[str, object]:
 
 
 @pytest.fixture(params=[small, paper])
-def normalizer(request):
-    return shaken(request.param())
+def untrained(request):
+    return request.param()
 
 
 @pytest.fixture
@@ -57,6 +59,17 @@ class TestForward:
         for w in (None, uniform(5, num_points, low=0.1)):
             expected = normalizer.base(*(p.double() for p in points), w)
             torch.testing.assert_close(normalizer(*points, w), tuple(T.to(dtype) for T in expected), rtol=0, atol=0)
+
+    def test_untrained_can_start_to_learn(self, untrained):
+        torch.cat(untrained(*correspondences("handheld", 4, 12))).sum().backward()
+        assert last_layer(untrained).weight.grad.abs().sum() > 0
+        assert all(parameter.grad.isfinite().all() for parameter in untrained.parameters())
+
+    def test_the_network_computes_in_its_own_dtype(self, untrained):
+        normalizer, points = shaken(untrained).double(), correspondences("handheld", 4, 12)
+        double, single = normalizer(*points), copy.deepcopy(normalizer).float()(*points)
+        torch.testing.assert_close(single, double, rtol=1e-3, atol=1e-3)
+        assert not any(torch.equal(rounded, exact) for rounded, exact in zip(single, double, strict=True))
 
     def test_defaults_are_those_of_the_shipped_weights(self):
         LearnedNormalizer().load_state_dict(LearnedNormalizer.from_pretrained("crossview").state_dict())
