@@ -3,8 +3,6 @@
 Arguments are names of extras, ``core`` for none; without arguments, all of them are checked.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Print the requirements of the core, except torch, at the lower bounds of pyproject.toml."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cases of a test in which every two values of every two parameters meet, far fewer than the full product."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from itertools import combinations, product
 

@@ -1,7 +1,5 @@
 """What the tests of the core share: scenes, references in NumPy, and comparisons that know about sign and scale."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The scores of benchmarks/pairs.py on cases whose outcome is known, its tables, and what the other benchmarks time."""
 
-from __future__ import annotations
-
 import argparse
 import csv
 import importlib

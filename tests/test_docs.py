@@ -1,7 +1,5 @@
 """The README and the pages: commands parse, tables are those of the results, public names are in the reference."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import importlib.util

@@ -1,7 +1,5 @@
 """The scripts in examples/, cut short: they run, what they train gets better."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Locks of folders and files, in this process and against others."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Layers in folders and repositories of the Hugging Face Hub, without network."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

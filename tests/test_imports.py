@@ -1,7 +1,5 @@
 """Which room may import which, which libraries the core needs, and what importing the package loads."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

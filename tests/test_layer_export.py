@@ -1,7 +1,5 @@
 """Exported layers against eager ones: in this process, in one without this package, compiled ahead of time, as ONNX."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The wheel: the same bytes from the same files, configurations and weights in it, the version of the package."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Two images of two planes, the left half nearer than the right one, and their true geometry."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """The command ``learnnorm estimate`` on one pair and on many."""
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -1,7 +1,5 @@
 """The tables that ``evaluate`` prints and ``report`` makes of them, on files that the tests write."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from dataclasses import replace

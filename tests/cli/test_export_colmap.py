@@ -1,7 +1,5 @@
 """The command that writes a COLMAP database."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")

@@ -1,7 +1,5 @@
 """The command that makes stores of correspondences from images."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

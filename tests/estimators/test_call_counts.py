@@ -1,7 +1,5 @@
 """Guards of the speed that do not depend on the machine: operations and factorisations of a forward pass."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from pathlib import Path

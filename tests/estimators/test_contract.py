@@ -1,7 +1,5 @@
 """What every estimate of F promises: shapes, no dependence on order, scale or absent points, finite values, errors."""
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import product
 

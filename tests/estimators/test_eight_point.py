@@ -1,7 +1,5 @@
 """The eight-point algorithm as a layer: masks, zero weights, flags, finite gradients, precision, back ends."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

@@ -1,7 +1,5 @@
 """Finite values and gradients on degenerate and extreme samples."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The eight-point algorithm against a reference in NumPy, OpenCV, and the properties that it must have."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

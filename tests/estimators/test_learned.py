@@ -1,7 +1,5 @@
 """The learned eight-point algorithm: invariances, small sets, scores, stages, files, errors."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

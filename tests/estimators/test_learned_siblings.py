@@ -1,7 +1,5 @@
 """The learned relative pose and homography: truth, invariances, small and degenerate sets, gradients, files, errors."""
 
-from __future__ import annotations
-
 import pickle
 
 import pytest

@@ -1,7 +1,5 @@
 """The refiner of matches: identity before training, Lucas-Kanade, frames, symmetry, masks, gradients, files, errors."""
 
-from __future__ import annotations
-
 import pickle
 
 import cv2

@@ -1,7 +1,5 @@
 """Correspondences from matches by index, in the formats of matching networks."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

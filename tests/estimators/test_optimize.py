@@ -1,7 +1,5 @@
 """Unrolled robust refinement, against the refinement that runs to convergence."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from scenes import check_gradients, correspondences, homogeneous, signless, uniform, up_to_sign

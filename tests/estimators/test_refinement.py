@@ -3,8 +3,6 @@
 Of fundamental matrices, invariances and zero weights are in test_contract.py.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Runs of predictions and of robust estimators that the tests of reports and runs share."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Diagnostics of a normalisation against NumPy, and what does not change them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Methods by name, and what their weights were trained on."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The searched normaliser: never worse than its base, as good as a random search, and what it may not do."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The checks, the dtype and the averages that all modules share."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError

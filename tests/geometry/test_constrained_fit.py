@@ -1,7 +1,5 @@
 """Reweighted least squares on the singularity constraint against null spaces in numpy and Levenberg-Marquardt."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

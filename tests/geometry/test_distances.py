@@ -1,7 +1,5 @@
 """Residuals of correspondences against formulas in NumPy and OpenCV."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

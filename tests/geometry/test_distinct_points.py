@@ -1,7 +1,5 @@
 """Matches that share a point: the mask against a loop, and what they do to RANSAC."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

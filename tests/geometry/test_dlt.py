@@ -1,7 +1,5 @@
 """The linear algebra of the design matrix against NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

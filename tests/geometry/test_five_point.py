@@ -1,7 +1,5 @@
 """Essential matrices in the span of four: those of minimal samples."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from scenes import scenes, true_essential

@@ -1,7 +1,5 @@
 """Closed forms of matrices of three rows and columns against NumPy's decompositions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Minimal samples solved many at once against the solver that takes any, and samples that determine nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

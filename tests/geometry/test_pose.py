@@ -1,7 +1,5 @@
 """Relative poses against ground truth and Kornia's triangulation."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

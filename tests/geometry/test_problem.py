@@ -1,7 +1,5 @@
 """The linear problem: solved once, carried to other coordinates, and handed down through the layer."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Both rank-2 corrections: against constrained least squares and a truncated decomposition in NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The matrices of rank 2 in a span of two, against OpenCV's seven-point algorithm."""
 
-from __future__ import annotations
-
 import cv2
 import torch
 from scenes import correspondences, homogeneous, up_to_sign

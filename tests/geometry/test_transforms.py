@@ -1,7 +1,5 @@
 """The builders of transforms against NumPy and the matrix exponential."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Refiners of matches: sets with images from stores, the loss, and a training on rendered pairs by the command line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

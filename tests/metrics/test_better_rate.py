@@ -1,7 +1,5 @@
 """The better rate against counting by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The bootstrap against another one, alone and of paired differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

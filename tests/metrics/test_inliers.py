@@ -1,7 +1,5 @@
 """Inlier share, F1 and epipolar error against sets of correspondences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

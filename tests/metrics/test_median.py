@@ -1,7 +1,5 @@
 """The median against NumPy."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

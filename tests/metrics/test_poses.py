@@ -1,7 +1,5 @@
 """Pose errors by construction, recall curves and accuracies by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

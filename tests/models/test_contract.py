@@ -1,7 +1,5 @@
 """Swapped views and the optimiser of the contract, beside what the tests of layers and RANSAC have."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from scenes import corner_error, correspondences, plane, uniform, up_to_sign

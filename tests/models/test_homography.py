@@ -1,7 +1,5 @@
 """The homography's residuals against Kornia's distances, minimal samples, and what find_homography adds to the DLT."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from kornia.geometry.epipolar import normalize_points

@@ -1,7 +1,5 @@
 """Steps on the manifolds against what they must keep, and tangents against central differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """What every normaliser promises: shapes, no dependence on order, view or absent points, finite values, errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

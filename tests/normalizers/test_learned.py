@@ -1,7 +1,5 @@
 """The learned normaliser: its base, its invariances, its files."""
 
-from __future__ import annotations
-
 import copy
 import json
 

@@ -1,7 +1,5 @@
 """Reweighted whitening against its own algorithm in NumPy, and what it promises."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

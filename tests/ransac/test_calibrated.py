@@ -1,7 +1,5 @@
 """RANSAC with known cameras against the truth of synthetic scenes, a plane among them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """RANSAC against ground truth and Kornia's, and on the input that makes robust estimators hang."""
 
-from __future__ import annotations
-
 import time
 from itertools import count
 

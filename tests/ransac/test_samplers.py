@@ -1,7 +1,5 @@
 """Minimal samples against counts, a sequential PROSAC and NumPy's draws without replacement."""
 
-from __future__ import annotations
-
 from math import ceil, comb
 
 import numpy as np

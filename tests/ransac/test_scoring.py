@@ -1,7 +1,5 @@
 """Scores in float32 by matrix products against distances one by one, and samples that determine nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The soft RANSAC against NumPy, and its gradients against enumeration and finite differences."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The number of threads comes back, however the block ends and whoever else is in one."""
 
-from __future__ import annotations
-
 from threading import Barrier, Thread
 
 import pytest

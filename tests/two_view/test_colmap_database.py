@@ -1,7 +1,5 @@
 """Databases of COLMAP: read back and reconstructed by pycolmap, from exact projections of points that are known."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pictures of an estimate."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimate of matches, its errors and its invariances."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimate of two images, against the true geometry of rendered ones, and its errors."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which of both matrices is the answer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The matrix of a plane and parallax, the evidence for an epipole, and distances from a plane that a lens bends."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

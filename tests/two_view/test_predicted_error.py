@@ -1,7 +1,5 @@
 """The predicted error of a matrix against the true one."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

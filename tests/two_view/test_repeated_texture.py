@@ -1,7 +1,5 @@
 """Coherent matches, and estimates of repeated texture, where false matches agree with each other."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

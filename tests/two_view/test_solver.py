@@ -1,7 +1,5 @@
 """The matrix of matches: searches among many outliers, and scenes that are nearly a plane."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Reasons to doubt a matrix."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reports as Markdown and HTML."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """Tables of runs: better rates, accuracy, motion, robust estimators."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Summaries of runs, from errors that the tests write."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,7 +1,5 @@
 """Robust estimators by name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

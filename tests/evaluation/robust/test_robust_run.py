@@ -1,7 +1,5 @@
 """Runs of robust estimators: the correspondences that they get, what is computed, kept, refused and left out."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """What a run keeps, against closed forms and functions of one pair."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Runs of predictions: what is computed, kept, refused and left out."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re

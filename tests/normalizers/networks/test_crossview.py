@@ -1,7 +1,5 @@
 """The cross-view network and its set network: what each depends on, and which answers are possible."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The paper's network: its size, its answers against NumPy, its gradients, and the normaliser made of it."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
