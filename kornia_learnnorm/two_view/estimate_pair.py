@@ -22,7 +22,7 @@ from kornia_learnnorm.data.images import (
     scaling,
 )
 from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Features, check_mask, keep_features
-from kornia_learnnorm.data.matching.matchers import check_methods, match_both_ways, match_features
+from kornia_learnnorm.data.matching.matchers import check_methods, match_both_ways, match_lightglue
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points
@@ -194,7 +194,7 @@ def match_two_images(
             raise _named(NoReliableMatrixError("blank", text), (path1, path2))
     about = features1.size, features2.size, full_size1, full_size2
     if matcher != "nearest":
-        points1, points2, scores = (part.double() for part in match_features(features1, features2, detector, matcher))
+        points1, points2, scores = (part.double() for part in match_lightglue(features1, features2, detector))
         return MatchedPair(points1, points2, scores, scores >= 0, *about, None, path1, path2)
     matches, back = match_both_ways(features1, features2)
     larger = torch.maximum(matches.ratio, back)

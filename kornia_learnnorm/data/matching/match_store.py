@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair, read_frame
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Features
-from kornia_learnnorm.data.matching.matchers import check_methods, match_features, one_to_one
+from kornia_learnnorm.data.matching.matchers import check_methods, match_lightglue, match_nearest, one_to_one
 from kornia_learnnorm.data.matching.workers import Workers, open_workers, restart_crashed
 from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test
 from kornia_learnnorm.data.writer import StoreWriter, check_target
@@ -63,10 +64,14 @@ def match_frames(
     pair: FramePair, features1: Features, features2: Features, options: MatchOptions, place: int = 0
 ) -> CorrespondenceStore:
     """Return a store of one pair: its matches, one-to-one and in an order of the seed and of ``place``, its index."""
-    matches = match_features(features1, features2, options.detector, options.matcher)
-    arrays = matches.points1, matches.points2, matches.ratio, matches.score
-    kept = one_to_one(matches.points1, matches.points2, -matches.score)
-    points1, points2, ratio, score = (part[kept].numpy() for part in arrays)
+    if options.matcher == "nearest":
+        found1, found2, ratios = match_nearest(features1, features2)
+        scores = 1 - ratios
+    else:
+        found1, found2, scores = match_lightglue(features1, features2, options.detector)
+        ratios = torch.full_like(scores, torch.nan)
+    kept = one_to_one(found1, found2, -scores)
+    points1, points2, ratio, score = (part[kept].numpy() for part in (found1, found2, ratios, scores))
     order = np.random.default_rng([options.seed, place]).permutation(len(ratio))
     if options.max_matches is not None:
         passes = passes_ratio_test(ratio[order], RATIO)

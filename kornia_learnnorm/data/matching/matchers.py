@@ -15,8 +15,7 @@ from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.features import DETECTORS, Features, detect_sift, pretrained
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 
-__all__ = ["MATCHERS", "Matches", "ScoredMatches", "check_methods", "match_both_ways", "match_features"]
-__all__ += ["match_images", "match_lightglue", "match_nearest", "one_to_one"]
+__all__ = ["Matches", "match_both_ways", "match_images", "match_lightglue", "match_nearest", "one_to_one"]
 
 MATCHERS = ("nearest", "lightglue")  # names on the command line
 # What Kornia calls the features of a detector for which it has weights of LightGlue.
@@ -37,24 +36,6 @@ class Matches(NamedTuple):
     # Distance of the nearest over that of the second-nearest descriptor, in [0, 1], (N,), float32. A small ratio is a
     # distinctive match (D. Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004, section 7.1).
     ratio: Tensor
-
-    @property
-    def score(self) -> Tensor:
-        """Return 1 minus the ratio, (N,)."""
-        return 1 - self.ratio
-
-
-class ScoredMatches(NamedTuple):
-    """Correspondences of two images by a matcher that gives scores and no ratios, one row per match."""
-
-    points1: Tensor  # pixels (x, y) in image 1, (N, 2), float32
-    points2: Tensor  # pixels of their matches in image 2, (N, 2), float32
-    score: Tensor  # the matcher's confidence, from 0 to 1, (N,), float32
-
-    @property
-    def ratio(self) -> Tensor:
-        """Return NaN, (N,): there are no ratios, and no ratio test applies."""
-        return torch.full_like(self.score, torch.nan)
 
 
 def match_nearest(features1: Features, features2: Features) -> Matches:
@@ -90,11 +71,12 @@ def _nearest(features1: Features, features2: Features) -> tuple[NDArray[np.int64
     return index2, torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
 
 
-def match_lightglue(features1: Features, features2: Features, detector: str = "disk") -> ScoredMatches:
-    """Match the features of a detector with Kornia's LightGlue for it (P. Lindenberger et al., ICCV 2023).
+def match_lightglue(features1: Features, features2: Features, detector: str = "disk") -> tuple[Tensor, Tensor, Tensor]:
+    """Return the matches of a detector's features by Kornia's LightGlue for it (P. Lindenberger et al., ICCV 2023).
 
-    A score is LightGlue's probability of the match, above 0.1. An image of fewer than two features, a detector without
-    weights, or descriptors of another one are a ValueError; weights that cannot be loaded an OSError.
+    They are points in both images, (N, 2), and LightGlue's probability of the match, above 0.1, (N,). An image of fewer
+    than two features, a detector without weights, or descriptors of another one are a ValueError; weights that cannot
+    be loaded an OSError.
     """
     _check(features1, features2)
     check_methods(detector, "lightglue")
@@ -108,14 +90,7 @@ def match_lightglue(features1: Features, features2: Features, detector: str = "d
         found = network({"image0": _lightglue_input(features1), "image1": _lightglue_input(features2)})
     index1, index2 = found["matches"][0].numpy().T
     points1, points2 = torch.from_numpy(features1.points[index1]), torch.from_numpy(features2.points[index2])
-    return ScoredMatches(points1, points2, found["scores"][0].clamp(0.0, 1.0).float().clone())
-
-
-def match_features(features1: Features, features2: Features, detector: str, matcher: str) -> Matches | ScoredMatches:
-    """Return the matches of a detector's features by a matcher's name, :func:`match_nearest` or LightGlue."""
-    return (
-        match_nearest(features1, features2) if matcher == "nearest" else match_lightglue(features1, features2, detector)
-    )
+    return points1, points2, found["scores"][0].clamp(0.0, 1.0).float().clone()
 
 
 def check_methods(detector: str, matcher: str) -> None:

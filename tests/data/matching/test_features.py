@@ -24,7 +24,7 @@ from kornia_learnnorm.data.matching.features import (
     keep_features,
     pretrained,
 )
-from kornia_learnnorm.data.matching.matchers import MATCHERS, match_features
+from kornia_learnnorm.data.matching.matchers import match_lightglue, match_nearest
 from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.two_view.many_pairs import PairOptions, estimate_pairs
@@ -101,12 +101,11 @@ def test_lightglue_of_random_weights(monkeypatch):
     rng = np.random.default_rng(0)
     points, rows = rng.uniform(0, 90, (2, 30, 2)), rng.normal(size=(2, 30, 128))
     sides = [Features(*map(np.float32, side), (100, 90)) for side in zip(points, rows, strict=True)]
-    matches = matching.match_lightglue(*sides)
-    assert matches.points1.shape == matches.points2.shape == (len(matches.score), 2)
-    assert len(matches.score) > 0
-    assert all(part.dtype == torch.float32 for part in matches)
-    assert ((matches.score >= 0) & (matches.score <= 1)).all()
-    assert matches.ratio.isnan().all()
+    points1, points2, score = matching.match_lightglue(*sides)
+    assert points1.shape == points2.shape == (len(score), 2)
+    assert len(score) > 0
+    assert all(part.dtype == torch.float32 for part in (points1, points2, score))
+    assert ((score >= 0) & (score <= 1)).all()
     with pytest.raises(ValueError, match=r"LightGlue of disk needs .* 128 columns, got float32 with 64 columns"):
         matching.match_lightglue(*(side._replace(descriptors=side.descriptors[:, :64]) for side in sides))
 
@@ -155,10 +154,9 @@ def test_matches_of_trained_networks_are_true(cached_weights, detector, files, l
     cached_weights(*files, lightglue)
     pair = render_pair(seed=0, width=240, height=180)
     sides = [DETECTORS[detector](image, 300) for image in (pair.image1, pair.image2)]
-    for matcher in MATCHERS:
-        matches = match_features(*sides, detector, matcher)
-        kept = matches.score > 0.2
-        points = matches.points1[kept][None].double(), matches.points2[kept][None].double()
+    points1, points2, ratio = match_nearest(*sides)
+    for found1, found2, score in ((points1, points2, 1 - ratio), match_lightglue(*sides, detector)):
+        points = (found[score > 0.2][None].double() for found in (found1, found2))
         found = symmetric_epipolar_distance(*points, torch.from_numpy(pair.F_mat)[None])[0]
         assert len(found) > 50
         assert (found < 2).double().mean() > share
