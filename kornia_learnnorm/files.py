@@ -26,11 +26,7 @@ def full_disk_names(path: str | Path) -> Iterator[None]:
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Give a temporary file beside ``path``, of its suffix, which takes its place only if the block succeeds.
-
-    Raises OSError before the block if the folder of ``path`` does not exist or is not writable, ValueError if ``path``
-    is a folder or a device.
-    """
+    """Give a temporary file beside ``path``, of its suffix, which takes its place only if the block succeeds."""
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist")
@@ -62,11 +58,10 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def exclusive(path: str | Path) -> Iterator[None]:
-    """Hold the lock of a folder or a file that a run writes, so that no other run writes it too.
+    """Hold the lock of a folder or a file that a run writes; BlockingIOError names another process that holds it.
 
-    The system releases the lock when the process ends, however it ends. The lock is a file, ``.lock`` in the folder or
-    ``.NAME.lock`` beside the file, which is there while the lock is held; a killed process leaves it, without effect.
-    Raises BlockingIOError with the name of the process that holds the lock, OSError if it cannot be written.
+    The lock is a file, ``.lock`` in the folder or ``.NAME.lock`` beside the file; a killed process leaves it, without
+    effect.
     """
     from filelock import FileLock, Timeout  # a requirement of torch
 
@@ -102,13 +97,7 @@ def _holder(file: Path) -> str:
 
 
 def short_name(path: str | Path) -> str:
-    """Return the name of a store or of weights for tables; of ``weights.safetensors``, the name of its folder.
-
-    Example:
-        >>> short_name("data/tum.h5@0:9"), short_name("runs/mine/weights.safetensors")
-        ('tum@0:9', 'mine')
-
-    """
+    """Return the name of a store or of weights for tables; of ``weights.safetensors``, the name of its folder."""
     path = Path(path)
     name = path.resolve().parent.name if path.name == "weights.safetensors" else path.name
     return name.removesuffix(".safetensors").replace(".h5", "")

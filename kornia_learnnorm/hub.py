@@ -54,15 +54,9 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
     ``config.json``, which names the class of the layer, and a model card, ``README.md``, unless there is one already.
 
     Args:
-        layer: the layer.
-
-    Attributes:
-        layer: the layer, with all methods of its class.
-
-    Raises:
-        TypeError: if the layer is none of :class:`~kornia_learnnorm.LearnedEightPoint`,
-            :class:`~kornia_learnnorm.LearnedRelativePose`, :class:`~kornia_learnnorm.LearnedHomography`,
-            :class:`~kornia_learnnorm.LearnedNormalizer` and :class:`~kornia_learnnorm.MatchRefiner`.
+        layer: a :class:`~kornia_learnnorm.LearnedEightPoint`, :class:`~kornia_learnnorm.LearnedRelativePose`,
+            :class:`~kornia_learnnorm.LearnedHomography`, :class:`~kornia_learnnorm.LearnedNormalizer` or
+            :class:`~kornia_learnnorm.MatchRefiner`; TypeError for others. The attribute ``layer`` has it.
 
     Example:
         >>> import tempfile

@@ -37,17 +37,9 @@ POSE_OUTPUTS = ("E_mat", "R", "t", "determined", "weights")
 
 
 def load_layer(name: str | Path) -> EightPoint | LearnedLayer:
-    """Load trained weights as a layer: an estimator's as they are, a normaliser's inside :class:`EightPoint`.
+    """Load trained weights, by name or file, as a layer in evaluation mode; a normaliser's inside :class:`EightPoint`.
 
-    Args:
-        name: name of weights that ship with the package, or the path of a ``.safetensors`` file.
-
-    Returns:
-        the layer, in evaluation mode.
-
-    Raises:
-        FileNotFoundError: if there are no such weights; the message lists those that ship.
-        ValueError: if the file is not one of this package.
+    FileNotFoundError if there are no such weights, ValueError if the file is not one of this package.
 
     Example:
         >>> load_layer("crossview").normalizer.max_points
@@ -56,9 +48,8 @@ def load_layer(name: str | Path) -> EightPoint | LearnedLayer:
     """
     file_format = weights_format(name)
     if file_format is None:
-        raise FileNotFoundError(
-            f"no weights {str(name)!r}: expected a .safetensors file or one of {', '.join(shipped_weights())}"
-        )
+        known = ", ".join(shipped_weights())
+        raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {known}")
     if file_format == NORMALIZER_FORMAT:
         return EightPoint(LearnedNormalizer.from_pretrained(name)).eval()
     return ESTIMATORS.get(weights_model(name), LearnedEightPoint).from_pretrained(name)
@@ -88,9 +79,6 @@ def export_layer(
             normaliser's ``max_points`` where there is one. With a mask, sets of eight and less fit in nine rows.
         gradients: keep what derivatives need, as for training the network before the layer. Without, the outputs
             carry no gradient.
-
-    Returns:
-        the program.
 
     Raises:
         TypeError: if ``layer`` is none of these layers.
@@ -136,16 +124,8 @@ def export_networks(layer: EightPoint | LearnedLayer) -> dict[str, Any]:
     ``points2`` (B, N, 2) in the base's coordinates, and ``null_matrix`` (B, 3, 3) where it needs one, to ``params1``
     and ``params2`` (B, P).
 
-    Args:
-        layer: a layer with learned parts.
-
-    Returns:
-        one ``torch.onnx.ONNXProgram`` for each network, by name: ``stage1`` and so on, or ``network``.
-
-    Raises:
-        ImportError: if onnx or onnxscript is not installed.
-        ValueError: if the layer has no network.
-
+    Returns one ``torch.onnx.ONNXProgram`` for each network, by name: ``stage1`` and so on, or ``network``. ImportError
+    if onnx or onnxscript is not installed, ValueError if the layer has no network.
     """
     import_extra("onnx", "onnx", "ONNX export")
     import_extra("onnxscript", "onnx", "ONNX export")

@@ -29,16 +29,13 @@ class EpipolarLoss(nn.Module):
     enter one by one, each through its own logarithm or mean.
 
     Args:
-        residual: maps ``(points1, points2, F_mat)`` to residuals :math:`(B, N)`;
-            :func:`~kornia_learnnorm.symmetric_epipolar_distance`, :func:`~kornia_learnnorm.sampson_distance` or
-            :func:`~kornia_learnnorm.algebraic_distance`.
+        residual: maps ``(points1, points2, F_mat)`` to residuals :math:`(B, N)`, such as
+            :func:`~kornia_learnnorm.symmetric_epipolar_distance` or :func:`~kornia_learnnorm.sampson_distance`.
         log: average the logarithm instead of the residual.
         heldout_weight: share of the held-out part, 0 to 1.
-        floor: added to the residuals under the logarithm, in their unit; own points fit far below a pixel, held-out
-            ones do not.
-        heldout_floor: the same for held-out residuals.
-        ceiling: residuals above this count as this much and send no gradient; it keeps infinite ones (points on an
-            epipole) out of the mean.
+        floor: added to the residuals under the logarithm, in their unit.
+        heldout_floor: the same for held-out residuals, which do not fit far below a pixel.
+        ceiling: residuals above this, also infinite ones, count as this much and send no gradient.
 
     Raises:
         ValueError: if ``heldout_weight`` is outside 0 to 1, or a floor or the ceiling is not positive.
@@ -66,12 +63,8 @@ class EpipolarLoss(nn.Module):
             raise ValueError(f"heldout_weight must be in [0, 1], got {heldout_weight}")
         if min(floor, heldout_floor, ceiling) <= 0:
             raise ValueError(f"floors and ceiling must be positive, got {floor}, {heldout_floor} and {ceiling}")
-        self.residual = residual
-        self.log = log
-        self.heldout_weight = heldout_weight
-        self.floor = floor
-        self.heldout_floor = heldout_floor
-        self.ceiling = ceiling
+        self.residual, self.log, self.heldout_weight = residual, log, heldout_weight
+        self.floor, self.heldout_floor, self.ceiling = floor, heldout_floor, ceiling
 
     def extra_repr(self) -> str:
         """Return the parameters."""
@@ -86,18 +79,9 @@ class EpipolarLoss(nn.Module):
         heldout1: Tensor | None = None,
         heldout2: Tensor | None = None,
     ) -> Tensor:
-        """Return the loss, a scalar.
+        """Return the loss, a scalar, of pixels (B, N, 2) and held-out ones (B, M, 2) under matrices (B, 3, 3).
 
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            F_mat: fundamental matrices with shape :math:`(B, 3, 3)`.
-            heldout1: held-out pixels in the first view with shape :math:`(B, M, 2)`.
-            heldout2: held-out pixels in the second view with shape :math:`(B, M, 2)`.
-
-        Raises:
-            ValueError: if ``heldout_weight`` is positive and there are no held-out correspondences.
-
+        ValueError if ``heldout_weight`` is positive and there are no held-out correspondences.
         """
         own = self._residuals(points1, points2, F_mat).mean(-1)
         loss = (own + self.floor).log().mean() if self.log else own.mean()
@@ -180,9 +164,8 @@ class LogEpipolarLoss(nn.Module):
 class LogEssentialLoss(nn.Module):
     r"""Logarithm of the chordal distance :math:`d` of essential matrices of unit norm, :math:`\log \sqrt{d^2 + f^2}`.
 
-    The sign of a matrix has no meaning: the nearer of both counts.
-
-    For small angles, in radians, the distance is that of the translations, or 0.7 to 1 times that of the rotations.
+    The nearer sign counts. For small angles, in radians, the distance is that of the translations, or 0.7 to 1 times
+    that of the rotations.
 
     Args:
         floor: distance :math:`f`, far below which nothing is gained.

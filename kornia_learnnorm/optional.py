@@ -11,14 +11,7 @@ from typing import Any
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Return a module of a package that the core does not need; without it, say which extra brings it and for what.
-
-    Example:
-        >>> import_extra("no_module", "hub", "it")
-        Traceback (most recent call last):
-        ImportError: it needs no_module: run pip install 'kornia-learnnorm[hub]', in a checkout pip install '.[hub]'
-
-    """
+    """Return a module of a package that the core does not need; without it, say which extra brings it and for what."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

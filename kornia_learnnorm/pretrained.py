@@ -51,11 +51,10 @@ def save_module(path: str | Path, module: nn.Module, file_format: str, architect
 
 
 def load_module(name: str | Path, file_format: str, build: Callable[[Path, str], Module]) -> Module:
-    """Load a module that :func:`save_module` wrote: one that ships with the package, by name, or a file.
+    """Load a module that :func:`save_module` wrote, by name or file, in evaluation mode and the dtype of its weights.
 
-    ``build`` makes the module of the path, for messages, and the architecture as JSON text, on the device ``meta``:
-    weights take no memory before their shapes are known to be those in the file. The module is in evaluation mode, in
-    the dtype of its weights. A FileNotFoundError names the weights that ship; a file that does not fit is a ValueError.
+    ``build`` makes it of the path and the architecture, JSON, on the device ``meta``: weights take no memory before
+    their shapes are known to be those in the file.
     """
     path = weights_path(name)
     if not path.is_file() and Path(name).is_file():
@@ -127,18 +126,13 @@ def weights_digest(name: str | Path) -> str:
 
 
 def weights_path(name: str | Path) -> Path:
-    """Return the file of shipped weights, or the path that ends in ``.safetensors`` as it is.
-
-    Of some weights the wheel has the model card only: a FileNotFoundError says where their file is.
-    """
+    """Return the file of shipped weights, of some of which the wheel has only the card, or a ``.safetensors`` path."""
     if Path(name).suffix == ".safetensors":
         return Path(name)
     path = WEIGHTS / f"{name}.safetensors"
     if not path.is_file() and str(name) in {card.stem for card in WEIGHTS.glob("*.md")}:
-        raise FileNotFoundError(
-            f"the weights {str(name)!r} are not in the wheel: take kornia_learnnorm/weights/{path.name} from the"
-            f" repository or the source distribution, and give its path or put it into {WEIGHTS}"
-        )
+        advice = f"take kornia_learnnorm/weights/{path.name} from the repository, and give its path or put it into"
+        raise FileNotFoundError(f"the weights {str(name)!r} are not in the wheel: {advice} {WEIGHTS}")
     return path
 
 
@@ -183,10 +177,7 @@ def describe_part(part: object, *modules: Any) -> dict[str, Any]:
 
 
 def find_part(name: str, own_modules: Collection[str], *modules: Any) -> Any:
-    """Return the class or function that a file names: a public one of ``modules``, or one that an own module defines.
-
-    Only ``own_modules`` are imported, from the Python path or the working folder.
-    """
+    """Return the class or function that a file names: a public one of ``modules``, or one of ``own_modules``."""
     for known in modules:
         if name in known.__all__:
             return getattr(known, name)
@@ -194,10 +185,8 @@ def find_part(name: str, own_modules: Collection[str], *modules: Any) -> Any:
     if not module:
         raise ValueError(f"unknown part {name!r}")
     if module not in own_modules:
-        raise ValueError(
-            f"{name} is not of this package; if you trust the module, import it by own_modules=[{module!r}], on the"
-            f" command line by {module}:FILE"
-        )
+        how = f"import it by own_modules=[{module!r}], on the command line by {module}:FILE"
+        raise ValueError(f"{name} is not of this package; if you trust the module, {how}")
     with working_folder_importable():
         try:
             found = getattr(importlib.import_module(module), attribute)

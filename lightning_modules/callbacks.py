@@ -127,17 +127,12 @@ class AgainstStart(Callback):
 
     Before it a new normaliser is its base, such as Hartley's normalisation, and other models are the weights that they
     start from. ``num_sanity_val_steps=-1`` of the trainer makes the sanity check the whole validation.
-
-    Attributes:
-        start: the errors before the first step, by the names of the metrics; empty where they were not measured.
-        last: the errors of the last validation.
-        step: number of steps before the last validation.
     """
 
     def __init__(self) -> None:
-        self.start: dict[str, float] = {}
-        self.last: dict[str, float] = {}
-        self.step = 0
+        self.start: dict[str, float] = {}  # errors before the first step; empty where they were not measured
+        self.last: dict[str, float] = {}  # errors of the last validation
+        self.step = 0  # steps before the last validation
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Keep the errors."""

@@ -37,10 +37,6 @@ class HeldOutLoss(nn.Module):
         ceiling: larger distances, pixels, count as this and send no gradient.
         scale_weight: weight of the likelihood.
 
-    Raises:
-        TypeError: if the estimator is none of both.
-        ValueError: if ``floor`` or ``ceiling`` is not positive.
-
     """
 
     def __init__(

@@ -221,11 +221,7 @@ class EstimatorTask(pl.LightningModule):
 
     @contextmanager
     def _limited_gradients(self, arrived: list[Tensor]) -> Iterator[None]:
-        """Attach the limit to the networks' outputs while the block runs.
-
-        Processes, accumulated batches and the scaler of half precision multiply the loss after it is computed. The
-        gradient of the loss, which arrives in a list, multiplies the limit too.
-        """
+        """Attach the limit, times the gradient of the loss that arrives in a list, to the networks' outputs."""
 
         def limit(gradient: Tensor) -> Tensor:
             most = self.sample_gradient * arrived[-1] / len(gradient)  # type: ignore[operator]

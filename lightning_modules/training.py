@@ -99,10 +99,8 @@ class TrainingCLI(LightningCLI):
                 stack.enter_context(full_disk_names(folder))
                 last = folder / "checkpoints" / "last.ckpt"
                 if last.exists() and self.config[subcommand].get("ckpt_path") is None:
-                    raise FileExistsError(
-                        f"{folder} holds a run already: go on with it by --ckpt_path {last}, or choose another folder"
-                        " by --trainer.default_root_dir"
-                    )
+                    advice = f"go on with it by --ckpt_path {last}, or choose another --trainer.default_root_dir"
+                    raise FileExistsError(f"{folder} holds a run already: {advice}")
             super()._run_subcommand(subcommand)
 
     def before_fit(self) -> None:
@@ -117,10 +115,8 @@ class TrainingCLI(LightningCLI):
             raise FileNotFoundError(f"no checkpoint at {path}")
         expected = {key: value.shape for key, value in self.model.state_dict().items()}
         if {key: value.shape for key, value in _state_dict(path).items()} != expected:
-            raise ValueError(
-                f"{path} holds another network than the one configured: repeat the options of its run, or use the"
-                " config.yaml that the run left in lightning_logs"
-            )
+            advice = "repeat the options of its run, or use the config.yaml that the run left in lightning_logs"
+            raise ValueError(f"{path} holds another network than the one configured: {advice}")
 
     before_validate = before_test = before_predict = before_fit
 
@@ -181,10 +177,8 @@ def run(args: list[str]) -> dict[str, float]:
         raise ValueError(f"an option expected, got {options[0]!r}; a configuration is given by --config {options[0]}")
     if not any(option.startswith(("--config", "-c", "--model", "--help")) for option in options):
         names = ", ".join(name for name in config_names() if "/" not in name)
-        raise ValueError(
-            f"no configuration: give one by --config, a file or one of {names} (learnnorm config lists all); for"
-            f" example learnnorm {command} --config crossview-synthetic{' --ckpt_path FILE' * (command != 'fit')}"
-        )
+        example = f"learnnorm {command} --config crossview-synthetic{' --ckpt_path FILE' * (command != 'fit')}"
+        raise ValueError(f"no configuration: give one by --config, a file or one of {names}, as in {example}")
     raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines
     try:
         with working_folder_importable():

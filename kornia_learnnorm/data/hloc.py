@@ -16,11 +16,9 @@ __all__ = ["read_hloc"]
 def read_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
     """Return a store of the pairs in hloc's file of matches, with the keypoints of its file of features.
 
-    A group of the features is an image with ``keypoints`` (N, 2), pixels, and ``image_size``. A group of the matches is
-    a pair, ``NAME0/NAME1`` with ``-`` for the slashes in names, with ``matches0`` (N,), an index or -1 for each
-    keypoint of image 0, and ``matching_scores0`` (N,). The ratio, K, R, t and F are NaN.
-
-    FileNotFoundError if a file is missing; ValueError if it is not HDF5, holds no pair, or lacks data of a pair.
+    The former has ``matches0``, an index or -1 for each keypoint of image 0, and ``matching_scores0``, the latter
+    ``keypoints`` (N, 2), pixels, and ``image_size``. The ratio, K, R, t and F are NaN. FileNotFoundError if a file is
+    missing; ValueError if it is not HDF5, holds no pair, or lacks data of a pair.
     """
 
     def values(group: Any, name: str) -> Any:

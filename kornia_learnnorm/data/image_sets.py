@@ -78,14 +78,11 @@ class ImageSets(StoreSets):
         chosen = able[torch.randint(len(able), (num_sets,), generator=generator)].tolist()
         points, images, cameras = zip(*(self._draw(i, num_points, ratio, generator) for i in chosen), strict=True)
         first, heldout = torch.stack(points).chunk(2, 1)
-        height, width = (max(image.shape[side] for pair in images for image in pair) for side in (0, 1))
-        stacked = [
-            torch.from_numpy(np.stack([_padded(pair[view], height, width) for pair in images]))[:, None]
-            for view in range(2)
-        ]
+        shape = [max(image.shape[side] for pair in images for image in pair) for side in (0, 1)]
+        image1, image2 = (torch.stack([_padded(image, shape) for image in view]) for view in zip(*images, strict=True))
         K1, K2, E_mat = (torch.stack(values) for values in zip(*cameras, strict=True))
         sets = MatchSets(first[..., :2], first[..., 2:], heldout[..., :2], heldout[..., 2:], torch.tensor(chosen))
-        return sets._replace(K1=K1, K2=K2, E_mat=E_mat, image1=stacked[0], image2=stacked[1])
+        return sets._replace(K1=K1, K2=K2, E_mat=E_mat, image1=image1, image2=image2)
 
     def _draw(
         self, index: int, num_points: int, ratio: float | None, generator: Generator
@@ -109,10 +106,7 @@ class ImageSets(StoreSets):
 
 
 def find_images(folders: Sequence[str]) -> Callable[[str, Size], Path | None]:
-    """Return a function that finds the file of an image by its name in a store and its size there, None for no file.
-
-    The file can be larger, and is then to be reduced; see :class:`ImageSets`. FileNotFoundError for a missing folder.
-    """
+    """Return a function that finds the file, of its size or larger, of an image by its name and size in a store."""
     roots = [Path(expand_path(folder)) for folder in folders]
     by_stem: dict[str, Path] = {}
     for root in roots:
@@ -145,6 +139,7 @@ def _mapped(image: NDArray[np.uint8], symmetry: int) -> tuple[NDArray[np.uint8],
     return image, A
 
 
-def _padded(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """Return an image with its last row and column repeated up to a size."""
-    return np.pad(image, ((0, height - image.shape[0]), (0, width - image.shape[1])), "edge")
+def _padded(image: NDArray[np.uint8], shape: Sequence[int]) -> Tensor:
+    """Return an image with its last row and column repeated up to a height and width, (1, H, W)."""
+    missing = [(0, wanted - side) for wanted, side in zip(shape, image.shape, strict=True)]
+    return torch.from_numpy(np.pad(image, missing, "edge"))[None]

@@ -90,11 +90,9 @@ def draw_samples(
         raise ValueError(f"no pair of the store has {size} correspondences{limit}, which a sample needs")
     sample_pair, passes = pair[rows[:, 0]], torch.from_numpy(passes_ratio_test(store.ratio, RATIO))
     passing = torch.bincount(pair[passes], minlength=len(store))[sample_pair]
-    if num_heldout and require_heldout and int(passing.min()) <= size:
-        raise ValueError(
-            f"held-out correspondences: a pair has only {int(passing.min())} with ratio below {RATIO}, expected more"
-            f" than the {size} of a sample"
-        )
+    if num_heldout and require_heldout and (few := int(passing.min())) <= size:
+        expected = f"more than the {size} of a sample expected"
+        raise ValueError(f"held-out correspondences: a pair has only {few} with ratio below {RATIO}, {expected}")
     cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
     drawable = passing > size
     rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]

@@ -45,7 +45,7 @@ class BlockSource(Protocol):
 
 
 def block_generator(*key: int) -> torch.Generator:
-    """Return a random generator for a key of integers from 0, for example the seed of a draw and a block's number."""
+    """Return a random generator for a key of integers, such as the seed of a draw and a block's number."""
     # torch's generator on the CPU uses 32 bits of its seed
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
 

@@ -34,10 +34,7 @@ def write_store(path: str | Path, store: CorrespondenceStore) -> None:
 
 
 def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provenance: dict[str, Any]) -> None:
-    """Write the pairs of one or more stores as :func:`write_store` does; one store is in memory at a time.
-
-    ``dataset``, ``pairs`` and ``detector`` are those of the first store.
-    """
+    """Write the pairs of one or more stores, described as the first one is; one store is in memory at a time."""
     h5py = import_extra("h5py", "images", "writing stores")
     with atomic_write(path) as temporary:
         try:
@@ -88,8 +85,7 @@ class StoreWriter:
 
     Each pair becomes a store of its own, a part, in the folder ``<path>.parts``, which a later run finds if this one is
     killed; :meth:`finish` joins the parts by their places. The ``options`` are all that the store depends on, values of
-    JSON's types; parts, or a complete store, of other options or of another program are a ValueError. ``skipped`` has
-    the pairs that are not in a complete store, and why.
+    JSON's types; parts, or a complete store, of other options or of another program are a ValueError.
     """
 
     def __init__(self, path: str | Path, options: dict[str, Any]) -> None:

@@ -35,15 +35,7 @@ class Diagnostics(NamedTuple):
 
 
 def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagnostics:
-    r"""Compute the diagnostics of a normaliser on samples.
-
-    Args:
-        points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
-        points2: pixels in the second view with shape :math:`(B, N, 2)`.
-        normalizer: maps ``(points1, points2, weights)`` to the transforms :math:`(B, 3, 3)` of both views.
-
-    Returns:
-        the diagnostics, float64 where the device has it.
+    r"""Compute the diagnostics of a normaliser on samples, pixels :math:`(B, N, 2)` with :math:`N \ge 8`, float64.
 
     Reference:
         Fan et al., sections 3 and 4, and their figures of normalised distances, condition numbers and :math:`\rho`.

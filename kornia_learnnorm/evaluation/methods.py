@@ -108,17 +108,15 @@ def _find_normalizer(name: str) -> Normalizer:
         return _own_normalizer(name)
     shipped, suffix = shipped_weights(FORMAT), Path(name).suffix
     if weights_format(name) == LAYER_FORMAT:
-        raise ValueError(
-            f"{name} holds the weights of a LearnedEightPoint, expected those of a LearnedNormalizer, such as"
-            f" {', '.join(shipped)}; learnnorm robust STORE --out RUN --estimators learned:{name} evaluates them"
-        )
+        expected = f"expected those of a LearnedNormalizer, such as {', '.join(shipped)}"
+        advice = f"learnnorm robust --estimators learned:{name} evaluates them"
+        raise ValueError(f"{name} holds the weights of a LearnedEightPoint, {expected}; {advice}")
     if suffix == ".ckpt":
         raise FileNotFoundError(f"{name} is a checkpoint: learnnorm fit writes weights.safetensors beside its folder")
     if name not in shipped and suffix != ".safetensors":
-        raise FileNotFoundError(
-            f"no weights {name!r} and no such normalisation: expected {', '.join([*CLOSED_FORMS, *shipped])}, a"
-            f" .safetensors file or module:Name, each without suffix or with {REFINED} or {OPTIMAL}"
-        )
+        expected = f"{', '.join([*CLOSED_FORMS, *shipped])}, a .safetensors file or module:Name"
+        suffixes = f"each without suffix or with {REFINED} or {OPTIMAL}"
+        raise FileNotFoundError(f"no weights {name!r} and no such normalisation: expected {expected}, {suffixes}")
     return LearnedNormalizer.from_pretrained(name)
 
 

@@ -25,12 +25,11 @@ class SearchedNormalizer(ProblemNormalizer):
     r"""Search each sample's transforms by gradient descent on its own symmetric epipolar distance.
 
     :math:`T_i = B(p_i)\, T_i^{base}` with five parameters :math:`p_i` of
-    :func:`~kornia_learnnorm.geometry.transforms.spd_transform` for every sample, which start at zero. Adam lowers the
-    logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters of all steps are kept, so that no sample
-    ends above its base. They stay within plus and minus 3: beyond, rounding errors of :math:`F` would pass for gains.
+    :func:`~kornia_learnnorm.geometry.transforms.spd_transform` for every sample, from zero and within plus and minus 3.
+    Adam lowers the logarithm of the mean distance (Fan et al., Eq. 7) and the best parameters of all steps are kept.
 
-    Use it as a limit to compare with, not as a method: it fits the sample's own points, noise included, costs a
-    hundred solutions and its result carries no gradient. It is a local search, so the true optimum may be lower still.
+    Use it as a limit to compare with, not as a method: it fits the sample's own points, noise included, and its result
+    carries no gradient. It is a local search, so the true optimum may be lower still.
 
     Args:
         base: normaliser to start from; :class:`~kornia_learnnorm.ReweightedWhitening` when not given.

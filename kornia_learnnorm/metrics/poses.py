@@ -48,20 +48,10 @@ def translation_error(t: Tensor, t_true: Tensor) -> Tensor:
 
 
 def pose_error(R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> Tensor:
-    r"""Return the larger of rotation and translation error, in degrees.
+    r"""Return the larger of rotation and translation error :math:`(*)`, degrees.
 
-    Args:
-        R: estimated rotations with shape :math:`(*, 3, 3)`.
-        t: estimated translations with shape :math:`(*, 3)`, any length.
-        R_true: true rotations with shape :math:`(*, 3, 3)`.
-        t_true: true translations with shape :math:`(*, 3)`, any length.
-
-    Returns:
-        errors with shape :math:`(*)`; infinite where the estimate is NaN or has no direction, NaN where the truth is or
-        has none.
-
-    Raises:
-        ShapeError: if a shape is wrong.
+    Rotations have shape :math:`(*, 3, 3)`, translations :math:`(*, 3)` and any length. The error is infinite where the
+    estimate is NaN or has no direction, NaN where the truth is or has none. ShapeError if a shape is wrong.
 
     Example:
         >>> R, t = torch.eye(3).repeat(2, 1, 1), torch.tensor([[0.0, 0.0, 1.0], [torch.nan, 0.0, 1.0]])

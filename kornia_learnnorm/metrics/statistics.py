@@ -33,20 +33,11 @@ class BetterRate(NamedTuple):
 
 
 def better_rate(residual: Tensor, baseline: Tensor) -> BetterRate:
-    """Compare two methods sample by sample (the better rate of Fan et al., Table 1).
+    """Compare residuals (S,) of two methods, strict ``<``, sample by sample (the better rate of Fan et al., Table 1).
 
-    Args:
-        residual: one residual per sample with shape (S,).
-        baseline: the baseline's residuals with shape (S,).
-
-    Returns:
-        the rate, strict ``<``, with ties and degenerate samples counted.
-
-    Raises:
-        ValueError: if the shapes differ or nothing can be compared.
+    ValueError if the shapes differ or nothing can be compared.
 
     Example:
-        >>> import torch
         >>> better_rate(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.0, 1.0]))
         BetterRate(rate=0.333..., ties=1, degenerate=0, compared=3)
 
@@ -77,12 +68,9 @@ def bootstrap_interval(
     Args:
         values: one value per sample with shape (S,).
         groups: index of each sample's group, its image pair, with shape (S,), integers.
-        level: share of the draws within the interval.
+        level: share of the draws within the interval, from lower to upper end.
         draws: number of draws.
         seed: seed of the draws.
-
-    Returns:
-        lower and upper end.
 
     Raises:
         ValueError: if the shapes differ, there are fewer than two groups, or ``level`` is not between 0 and 1.
@@ -144,8 +132,7 @@ def paired_bootstrap(
     if values.shape != baseline.shape or values.ndim != 1:
         raise ValueError(f"values must be two (S,) tensors, got {[*values.shape]} and {[*baseline.shape]}")
     difference = values.double() - baseline.double()
-    bad = int((~difference.isfinite()).sum())
-    if bad:
+    if bad := int((~difference.isfinite()).sum()):
         raise ValueError(f"differences must be finite, got {bad} NaN or infinite ones of {len(difference)}")
     means = _means(difference, groups, draws, seed)
     low, high = _middle(means, level)

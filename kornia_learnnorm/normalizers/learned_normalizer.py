@@ -112,10 +112,7 @@ class LearnedNormalizer(ProblemNormalizer):
         return f"transform={transform}, max_points={self.max_points}, trained_on={self.trained_on}"
 
     def save_pretrained(self, path: str | Path) -> None:
-        """Write weights and architecture to one safetensors file, beside the target and then renamed.
-
-        Args:
-            path: the file to write.
+        """Write weights and architecture to one ``.safetensors`` file, whole or not at all.
 
         Raises:
             TypeError: if the base, the network or the builder cannot be imported by its name, or its constructor does
@@ -134,7 +131,7 @@ class LearnedNormalizer(ProblemNormalizer):
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "crossview", own_modules: Collection[str] = ()) -> LearnedNormalizer:
-        """Load a trained normaliser: one that ships with the package, by name, or a safetensors file.
+        """Load a trained normaliser, in evaluation mode: one that ships, by name, or a safetensors file.
 
         Args:
             name: ``"crossview"`` or ``"crossview-synthetic"``, for up to twelve correspondences; ``"crossview-sets"``,
@@ -142,16 +139,10 @@ class LearnedNormalizer(ProblemNormalizer):
             own_modules: names of modules of your own that the file may name and that are then imported, from the Python
                 path or the working folder. Without, no code but this package's runs.
 
-        Returns:
-            the normaliser, in evaluation mode.
-
         Raises:
             FileNotFoundError: if there are no such weights; the message lists those that ship.
             ValueError: if the file is not a normaliser of this package, names a part of another module, or its tensors
                 do not fit.
-
-        Example:
-            >>> normalizer = LearnedNormalizer.from_pretrained("crossview-synthetic")
 
         """
         return load_module(name, FORMAT, lambda path, text: cls(**_build(path, text, own_modules)))

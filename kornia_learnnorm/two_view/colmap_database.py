@@ -110,7 +110,6 @@ def export_colmap(
         FileExistsError: if there is a file at ``path``.
         TypeError: if an argument is of a wrong type.
         ValueError: if an argument is out of range, or COLMAP cannot read an image or finds another size than the store.
-        ImportError: if pycolmap is not installed.
 
     """
     pycolmap = import_extra("pycolmap", "colmap", "writing a COLMAP database")
@@ -213,19 +212,14 @@ def _write_images(
             raise ValueError(f"{text} cannot read or, where all share one camera, of another size")
         for name, image in found.items():
             stored = file.read_camera(image.camera_id)
-            read = stored.width, stored.height
-            if sizes[name] != read:
+            if sizes[name] != (stored.width, stored.height):
                 text = "{} was matched at {} x {} pixels, COLMAP reads {} x {}: match images at full size"
-                raise ValueError(text.format(name, *sizes[name], *read))
+                raise ValueError(text.format(name, *sizes[name], stored.width, stored.height))
         return {name: image.image_id for name, image in found.items()}
 
 
 def _write_pairs(
-    pycolmap: Any,
-    database: Path,
-    ids: dict[str, int],
-    pairs: Sequence[_Pair],
-    geometries: Sequence[_Geometry | None],
+    pycolmap: Any, database: Path, ids: dict[str, int], pairs: list[_Pair], geometries: list[_Geometry | None]
 ) -> None:
     """Write keypoints, which are all matched points of an image, matches and geometries to a database."""
     seen: defaultdict[str, list[Array]] = defaultdict(list)

@@ -68,18 +68,14 @@ def draw_matches(
 
 
 def draw_pair(
-    image1: npt.NDArray[np.uint8],
-    image2: npt.NDArray[np.uint8],
-    estimate: PairEstimate,
-    path: str | Path,
+    image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8], estimate: PairEstimate, path: str | Path
 ) -> None:
     """Draw the matches in image 1 and what the matrix says in image 2, and write the picture whole or not at all.
 
     Image 1 shows the inliers in blue, each with its motion to image 2, and the outliers in red. Image 2 shows the
     epipolar lines of a random subset of the inliers, line and point in one colour (as Fan et al., Figure 10), or the
-    mean of it and image 1 as the homography moves it. The predicted error is written above, warnings below. The images
-    are grey or RGB, uint8, and may be reduced. Wide images and those of unequal shapes are stacked, others stand side
-    by side. The suffix of ``path`` decides the format.
+    mean of it and image 1 as the homography moves it. The images are grey or RGB, uint8, and may be reduced. The suffix
+    of ``path`` decides the format.
     """
     for image, size in ((image1, estimate.size1), (image2, estimate.size2)):
         if abs(image.shape[1] * size[1] - image.shape[0] * size[0]) > max(size) + max(image.shape[:2]):

@@ -68,7 +68,7 @@ def estimate_matches(
             than 1e6 median distances from the other points, are left out.
         points2: pixels in image 2 with shape (N, 2).
         scores: from 0 to 1 with shape (N,), 1 minus Lowe's ratio or a matcher's confidence; all equal when not given.
-        size1: width and height of image 1; as large as its points need when not given.
+        size1: width and height of image 1, pixels; as large as its points need when not given.
         size2: width and height of image 2.
         layer: estimates the fundamental matrix in the place of RANSAC.
         threshold: RANSAC's threshold, and the largest distance of an inlier, pixels: the symmetric epipolar distance,
@@ -76,9 +76,8 @@ def estimate_matches(
         seed: seed of RANSAC and of the parts of the matches.
         K1: camera of image 1, (3, 3), in pixels.
         K2: camera of image 2; both or none.
-        sampler: how the scores steer RANSAC, see :class:`~kornia_learnnorm.RANSAC`. A matcher's confidences, such as
-            LightGlue's, want :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`: samples of the highest alone
-            are worse.
+        sampler: how the scores steer RANSAC. A matcher's confidences, such as LightGlue's, want
+            :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`: samples of the highest alone are worse.
         model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
 
     Returns:

@@ -63,24 +63,18 @@ def estimate_pair(
 ) -> PairEstimate:
     """Return the fundamental matrix or homography of two images with its predicted error and the reasons to doubt it.
 
-    The answer is a homography where the matches do not determine a fundamental matrix, as on a plane or where the
-    camera only turns, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`.
-
     Matches are nearest neighbours in both directions that pass the ratio test in both, with 1 minus the larger ratio as
-    score, or LightGlue's with its scores. Of those that share a point, the one of highest score counts.
-    :class:`~kornia_learnnorm.RANSAC`, or a learned layer, reads the scores.
-    Features on a constant black frame around an image are dropped. Where texture repeats, matches that do not move like
-    those around them are left out. The predicted error is too small there.
+    score, or LightGlue's with its scores; :func:`~kornia_learnnorm.estimate_matches` estimates the matrix. Features on
+    a constant black frame around an image are dropped. Where texture repeats, matches that do not move like those
+    around them are left out. The predicted error is too small there.
 
     Args:
         image1: file of image 1, or its values: grey with shape (H, W) or RGB with shape (H, W, 3), uint8.
         image2: file of image 2, or its values.
         layer: estimates the fundamental matrix in the place of RANSAC.
         ratio: largest ratio of the nearest to the second-nearest descriptor distance, of the matcher ``nearest``.
-        threshold: RANSAC's threshold and the largest distance of an inlier, pixels of the images as they are matched,
-            see :func:`~kornia_learnnorm.estimate_matches`.
-        seed: seed of RANSAC and of the parts of the matches that tell how stable the matrix is; equal images and seeds
-            give equal estimates.
+        threshold: RANSAC's threshold and the largest distance of an inlier, pixels of the images as they are matched.
+        seed: seed of RANSAC and of the parts of the matches; equal images and seeds give equal estimates.
         K1: camera of image 1, (3, 3), pixels of the full image; with both, the result has an essential matrix and pose.
         K2: camera of image 2; both or none.
         mask1: true for the pixels of image 1 whose features count, (H, W) bool.
@@ -90,16 +84,12 @@ def estimate_pair(
         matcher: one of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
         model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
 
-    Returns:
-        the estimate; all its numbers are finite.
-
     Raises:
         FileNotFoundError: if a file does not exist.
         NoReliableMatrixError: if the images do not determine a matrix: a blank image, no motion, or fewer than nine
             matches or inliers.
         TypeError: if an argument is not of the kinds above.
-        ValueError: if a file is not an image, an argument is out of range, only one camera is given, or one is not a
-            finite and invertible (3, 3) matrix with a last row of (0, 0, w).
+        ValueError: if a file is not an image, or an argument is out of range.
         ImportError: if OpenCV is not installed.
 
     """

@@ -6,7 +6,6 @@ import csv
 import json
 import shlex
 import sys
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -112,10 +111,9 @@ def estimate_pairs(
     """Estimate the pairs that are not done yet, append a JSON line of each to ``pairs.jsonl`` and write ``pairs.csv``.
 
     A line has what :meth:`~kornia_learnnorm.two_view.result.PairEstimate.as_dict` returns, or
-    :func:`describe_failure` where there is no matrix or an image cannot be read. The folder, created where it does not
-    exist, keeps the options, and a later run must have the same; another process may not write it meanwhile. ``jobs``
-    is a number of processes, -1 for as many as there are cores; the workers of the Dask scheduler at the address
-    ``dask`` estimate instead. Returns the JSON objects of all pairs, in their order.
+    :func:`describe_failure` where there is no matrix or an image cannot be read. A later run in the folder must have
+    the same options. ``jobs`` is a number of processes, -1 for as many as there are cores; the workers of the Dask
+    scheduler at the address ``dask`` estimate instead. Returns the JSON objects of all pairs, in their order.
     """
     folder = Path(folder)
     cameras = [text if text == "exif" else read_camera(text).tolist() for text in options.K]
@@ -175,9 +173,7 @@ def describe_failure(code: str, text: str, image1: Path, image2: Path, options: 
     """Return the JSON object of a pair without a matrix: ``model`` is null, and the warning has a code and a text."""
 
     def describe(path: Path) -> Line:  # sizes are null where the file cannot be read
-        width = height = 0
-        with suppress(OSError):
-            width, height = image_size(path)
+        width, height = image_size(path) if path.is_file() else (0, 0)
         return {"file": str(path), "width": width or None, "height": height or None}
 
     return {

@@ -97,11 +97,10 @@ def parallax(points1: Tensor, points2: Tensor, H: Tensor) -> Tensor:
 def parallax_evidence(distance: Tensor, inliers: Tensor, threshold: float) -> float:
     r"""Return log10 of the expected number of epipoles with as many inliers off the plane among random matches.
 
-    The epipolar line of a match off the plane runs through :math:`H x_1` and the epipole. A random match at the
-    distance :math:`r` from :math:`H x_1` lies within :math:`\tau` of this line with probability
-    :math:`\frac{2}{\pi} \arcsin(\tau / r)`. Two matches determine an epipole; the others are evidence for it (as in
-    L. Moisan, B. Stival, IJCV 2004). Small is strong evidence; infinite is none, as where fewer than three matches off
-    the plane are inliers. ``distance`` (N,) is that of :func:`parallax`, ``threshold`` is :math:`\tau`.
+    A random match at the distance :math:`r` from :math:`H x_1` lies within :math:`\tau` of its epipolar line with
+    probability :math:`\frac{2}{\pi} \arcsin(\tau / r)`. Two matches determine an epipole; the others are evidence for
+    it (as in L. Moisan, B. Stival, IJCV 2004), infinite where fewer than three matches off the plane are inliers.
+    ``distance`` (N,) is that of :func:`parallax`, ``threshold`` is :math:`\tau`.
     """
     off = distance > OFF_PLANE * threshold
     number, agree = int(off.sum()), int((off & inliers).sum())
@@ -118,9 +117,8 @@ def parallax_evidence(distance: Tensor, inliers: Tensor, threshold: float) -> fl
 def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshold: float, seed: int) -> Tensor | None:
     """Return the fundamental matrix of a homography and an epipole that most matches agree with, refined on all.
 
-    None where fewer than three matches are off the plane. The threshold is the largest Sampson distance of an inlier;
-    the seed draws the pairs of matches off the plane (O. Chum, T. Werner, J. Matas, Two-view geometry estimation
-    unaffected by a dominant plane, CVPR 2005).
+    None where fewer than three matches are off the plane. The threshold is on the Sampson distance (O. Chum, T. Werner,
+    J. Matas, Two-view geometry estimation unaffected by a dominant plane, CVPR 2005).
     """
     off = (parallax(points1, points2, H) > OFF_PLANE * threshold).nonzero()[:, 0]
     if len(off) < MIN_PARALLAX_INLIERS:

@@ -44,9 +44,8 @@ class PlanePose(NamedTuple):
 def plane_poses(H_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor) -> list[PlanePose]:
     """Return the poses of a homography (3, 3) that matches (N, 2) allow: two or one of a plane, or the rotation.
 
-    A plane has two poses unless points of the image would be behind one of the cameras. Where the baseline is below 1 %
-    of the distance to the plane, the camera counts as one that only turned. There is no pose if the homography turns
-    the plane over. All are in float64, points in pixels.
+    A plane has two poses unless points would be behind a camera, none if the homography turns it over. With a baseline
+    below 1 % of the distance to the plane the camera only turned. All are in float64, points in pixels.
 
     Reference:
         E. Malis, M. Vargas, Deeper understanding of the homography decomposition for vision-based control, INRIA

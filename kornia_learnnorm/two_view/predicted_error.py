@@ -44,11 +44,7 @@ def random_parts(number: int, inliers: int, seed: int) -> Tensor:
 
 
 def drop_failed_parts(F_parts: Tensor, support: Tensor, inliers: int) -> Tensor:
-    """Return the matrices of parts (P, 3, 3) that most inliers agree with; all of them where these are few.
-
-    Among many outliers the search in a part can fail. Its matrix has little support (P,) among all matches then, and
-    says nothing about how well the inliers determine theirs.
-    """
+    """Return the matrices of parts (P, 3, 3) whose support (P,) is most inliers; all of them where these are few."""
     solved = support >= MIN_SUPPORT * inliers
     return F_parts[solved] if int(solved.sum()) >= MIN_SOLVED_PARTS else F_parts
 

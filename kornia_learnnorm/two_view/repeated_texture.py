@@ -35,11 +35,9 @@ MIN_AGREEING_SHARE = 0.8  # of the inliers of either matrix off the plane that f
 
 
 def mutual_share(points1: Tensor, points2: Tensor, mutual: Tensor, F_mat: Tensor, threshold: float) -> float:
-    """Return which share of the nearest neighbours that fit a matrix are nearest neighbours in both directions.
+    """Return which share of the neighbours off the main plane that fit are mutual; 1 where fewer than 16 are off.
 
-    Nearly all true matches are, and far fewer of the false ones. The reverse match has no part in which matches fit, so
-    a low share means false matches that agree with each other. Only matches off the plane that explains most count,
-    since they determine the epipole; the share is 1 where they are fewer than 16.
+    Nearly all true matches are, so a low share means false matches that agree with each other.
     """
     fits = symmetric_epipolar_distance(points1, points2, F_mat) < threshold
     H = find_main_plane(points1[fits], points2[fits], threshold) if int(fits.sum()) >= 8 else None
@@ -53,11 +51,8 @@ def resolve_ambiguity(
 ) -> PairEstimate:
     """Return the estimate of the coherent matches where false ones decided the first, with a warning where in doubt.
 
-    It replaces the first one if fewer false matches, which are not nearest neighbours in both directions, fit its
-    matrix for each coherent one that does. There is no doubt where both matrices say the same. On rendered walls of
-    repeated windows the predicted error of the answers without a warning is too small: 0.2 to 0.7 times the true one
-    (10 % and 90 % quantiles).
-    ``again`` maps a mask of the first one's matches to their estimate, or raises NoReliableMatrixError.
+    It replaces the first one if fewer false matches, not mutual, fit its matrix for each coherent one that does. There
+    is no doubt where both matrices say the same. ``again`` maps a mask of the first one's matches to their estimate.
     """
     inlying = first.points1[first.inliers], first.points2[first.inliers]
     H, coherent = find_main_plane(*inlying, first.threshold), torch.zeros_like(first.inliers)
@@ -105,13 +100,11 @@ def _with_doubt(estimate: PairEstimate, reason: str) -> PairEstimate:
 
 
 def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: float) -> Tensor:
-    """Return which matches have the parallax of most matches around them, in both images.
+    """Return which matches have the parallax, from where H moves points1, of most matches around them in both images.
 
-    A false match of repeated texture jumps to a copy, away from its neighbours in one image or in both. Where most
-    matches around a true one are false, these count little: in a second round the neighbours of a match are weighted by
-    the share of their own neighbours that agree with them. Parallax is measured from where H moves points1 (J. Bian et
-    al., GMS: grid-based motion statistics for fast, ultra-robust feature correspondence, CVPR 2017; J. Ma et al.,
-    Locality preserving matching, IJCV 2019).
+    In a second round neighbours are weighted by the share of their own neighbours that agree with them: where most
+    matches around a true one are false, these count little (J. Bian et al., GMS: grid-based motion statistics for fast,
+    ultra-robust feature correspondence, CVPR 2017; J. Ma et al., Locality preserving matching, IJCV 2019).
     """
     vectors = points2 - transform_points(H[None], points1[None])[0]
     views = [_neighbours(points, vectors, PARALLAX * threshold) for points in (points1, points2)]

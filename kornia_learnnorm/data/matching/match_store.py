@@ -205,8 +205,10 @@ def _match(
     pair: FramePair, features1: Features | str, features2: Features | str, options: MatchOptions, place: int
 ) -> CorrespondenceStore | str:
     """Return the store of a pair, or the reason why there is none."""
-    if isinstance(features1, str) or isinstance(features2, str):
-        return features1 if isinstance(features1, str) else str(features2)
+    if isinstance(features1, str):
+        return features1
+    if isinstance(features2, str):
+        return features2
     import_cv2().setNumThreads(1)
     try:
         return match_frames(pair, features1, features2, options, place)
@@ -238,12 +240,12 @@ class FeatureCache:
     def put(self, frame: Frame, features: Features | str) -> None:
         """Keep the features of a frame, or the reason why it has none; OSError on a full disk."""
         self.held[frame.name] = features if isinstance(features, str) else ""
-        if not isinstance(features, str):
-            try:
-                np.savez(self._path(frame), **{k: v for k, v in features._asdict().items() if v is not None})
-            except OSError as error:  # NumPy's message does not name the file
-                target = f"the features of {frame.name} to {self.folder}"
-                raise OSError(f"cannot write {target}, is the disk full? {error}") from error
+        if isinstance(features, str):
+            return
+        try:
+            np.savez(self._path(frame), **{k: v for k, v in features._asdict().items() if v is not None})
+        except OSError as error:  # NumPy's message does not name the file
+            raise OSError(f"cannot write the features of {frame.name}, is the disk full? {error}") from error
 
     def get(self, frame: Frame) -> Features | str:
         """Return the features of a frame, or the reason why there are none."""

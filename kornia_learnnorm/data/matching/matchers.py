@@ -128,11 +128,8 @@ def one_to_one(points1: Tensor, points2: Tensor, ratio: Tensor) -> Tensor:
 
 def _check(features1: Features, features2: Features) -> None:
     for number, features in enumerate((features1, features2), 1):
-        if len(features.points) < 2:
-            size = f"{features.size[0]} x {features.size[1]} pixels"
-            raise ValueError(
-                f"image {number} is blank or nearly so: {len(features.points)} features ({size}), expected 2 or more"
-            )
+        if (found := len(features.points)) < 2:
+            raise ValueError(f"image {number} is blank or nearly so: {found} features, expected 2 or more")
     columns1, columns2 = (features.descriptors.shape[1] for features in (features1, features2))
     if columns1 != columns2:
         raise ValueError(f"descriptors of the same length expected, got {columns1} and {columns2} columns")

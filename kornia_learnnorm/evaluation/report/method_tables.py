@@ -40,10 +40,8 @@ def with_baseline(run: Run) -> Run:
     cells = [cell for cell in run.cells if BASELINE in cell.predictions]
     if not cells:
         found = sorted({name for cell in run.cells for name in cell.predictions})
-        raise ValueError(
-            f"a report compares with {BASELINE}, the run has predictions of {', '.join(found) or 'no method'} so far:"
-            f" run learnnorm evaluate with {BASELINE} among --methods and the same --out"
-        )
+        has = f"the run has predictions of {', '.join(found) or 'no method'}: add it by learnnorm evaluate --methods"
+        raise ValueError(f"a report compares with {BASELINE}, {has}")
     left_out = [f"{cell.title}, without {BASELINE}" for cell in run.cells if BASELINE not in cell.predictions]
     return replace(run, cells=cells, missing=[*run.missing, *left_out])
 

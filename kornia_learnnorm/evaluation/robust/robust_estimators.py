@@ -114,10 +114,8 @@ def find_estimator(name: str) -> Estimator:
         rank2 = {"rank2": "optimal"} if method.endswith(OPTIMAL) else {}
         options = {"normalizer": find_method(method).normalizer, "max_samples": MAX_SAMPLES, **rank2}
         return partial(_ransac, options, False)
-    raise ValueError(
-        f"no estimator {name!r}: expected {', '.join(PEERS)}, learned:WEIGHTS, learned:WEIGHTS{REFINED} and {SCORED},"
-        f" guided:WEIGHTS, RANSAC, RANSAC{CALIBRATED}, RANSAC:METHOD or {TRUTH}"
-    )
+    own = f"learned:WEIGHTS, with {REFINED} or {SCORED}, guided:WEIGHTS, RANSAC, RANSAC{CALIBRATED}, RANSAC:METHOD"
+    raise ValueError(f"no estimator {name!r}: expected {', '.join(PEERS)}, {own} or {TRUTH}")
 
 
 def _peer(peer: Peer, calibrated: bool, pair: EvaluatedPair, seed: int, threshold: float) -> Found:

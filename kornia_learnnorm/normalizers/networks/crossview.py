@@ -21,11 +21,7 @@ __all__ = ["CrossViewNetwork", "SetNetwork"]
 
 
 def set_maximum(features: Tensor, absent: Tensor | None, dim: int, keepdim: bool = False) -> Tensor:
-    """Return the maximum over the present points along ``dim``, zero where all are absent.
-
-    ``absent`` marks the rows that are no points and broadcasts to the features. The gradient goes to one point for each
-    maximum.
-    """
+    """Return the maximum along ``dim`` over the points that are not ``absent``, zero where all are."""
     if absent is not None:
         features = torch.where(absent, -torch.inf, features)
     # Not `amax` with a gradient: torch.compile makes NaN of it under autocast to bfloat16, since it compares the
@@ -86,17 +82,13 @@ class CrossViewNetwork(nn.Module):
     def forward(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, null_matrix: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the parameters of both views.
+        """Return the parameters :math:`(B, P)` of both views, in the dtype of the points.
 
         Args:
             points1: points of the first view in base coordinates with shape :math:`(B, N, 2)`, :math:`N >= 8`.
-            points2: points of the second view in base coordinates with shape :math:`(B, N, 2)`.
+            points2: points of the second view.
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-            null_matrix: the DLT's unit null vectors in base coordinates with shape :math:`(B, 3, 3)`; solved from the
-                points when not given.
-
-        Returns:
-            parameters with shape :math:`(B, P)` of view 1 and view 2, in the dtype of the points.
+            null_matrix: the DLT's unit null vectors there with shape :math:`(B, 3, 3)`; solved for when not given.
 
         """
         views = self._views(points1, points2, weights, null_matrix)
