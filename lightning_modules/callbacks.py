@@ -221,19 +221,11 @@ def _names_of(source: Any) -> list[str]:
 class WritePredictions(Callback):
     """Write the tensors that ``predict`` returns to ``predictions.safetensors`` in the default root directory."""
 
-    def __init__(self) -> None:
-        self._batches: list[dict[str, Tensor]] = []
-
-    def on_predict_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, *args: Any, **kwargs: Any
-    ) -> None:
-        """Keep the predictions of a batch."""
-        self._batches.append({key: value.cpu() for key, value in outputs.items()})
-
     def on_predict_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Concatenate the batches of all processes and write them beside the target, then rename."""
-        batches = _gathered(self._batches) if trainer.world_size > 1 else self._batches
-        self._batches = []
+        """Concatenate the batches of all processes and write them whole or not at all."""
+        found: list[Any] = trainer.predict_loop.predictions
+        batches = [{key: value.cpu() for key, value in batch.items()} for batch in found]
+        batches = _gathered(batches) if trainer.world_size > 1 else batches
         if not trainer.is_global_zero:
             return
         path = Path(trainer.default_root_dir) / "predictions.safetensors"

@@ -34,7 +34,7 @@ class HeldOutLoss(nn.Module):
             :class:`~kornia_learnnorm.LearnedRelativePose`, which needs stores with cameras.
         teacher: take the matrices of the matches as they were found, without gradient, for comparisons.
         floor: distance :math:`f` in pixels, far below which nothing is gained.
-        ceiling: larger distances, pixels, count as this and send no gradient.
+        ceiling: larger distances, pixels, count as this and send no gradient. ValueError unless both are positive.
         scale_weight: weight of the likelihood.
 
     """

@@ -11,7 +11,7 @@ import torch
 from pytorch_lightning.utilities import rank_zero_warn
 from torch import Tensor, nn
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
+from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 from torchmetrics import CatMetric, MeanMetric, Metric, SumMetric
 
 from kornia_learnnorm.data.sets import MatchSets
@@ -24,7 +24,6 @@ from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolar
 from kornia_learnnorm.metrics.statistics import comparable
 from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
-from lightning_modules.schedule import one_cycle
 
 __all__ = ["EstimatorTask", "Median", "SetLoss", "adamw", "cameras_of"]
 
@@ -151,7 +150,12 @@ class EstimatorTask(pl.LightningModule):
         optimizer = self.optimizer(p for p in self.parameters() if p.requires_grad)
         if self.lr_scheduler is not None:
             return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self.lr_scheduler(optimizer)}}
-        schedule = one_cycle(optimizer, self.trainer, self.warm_up)
+        if self.trainer.estimated_stepping_batches == float("inf"):
+            expected = "give trainer.max_steps or trainer.max_epochs; trainer.max_time may end the training before"
+            raise ValueError(f"the learning rate follows one cycle over all steps: {expected}")
+        steps = max(2, int(self.trainer.estimated_stepping_batches))
+        share = max(self.warm_up, 1.5 / steps)  # the schedule divides by the warm-up's steps less one
+        schedule = OneCycle(optimizer, optimizer.param_groups[0]["lr"], total_steps=steps, pct_start=share)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def training_step(self, batch: MatchSets, batch_idx: int) -> Tensor:
@@ -282,6 +286,17 @@ def cameras_of(batch: MatchSets) -> tuple[Tensor, Tensor]:
     if batch.K1 is None or batch.K2 is None:
         raise ValueError("LearnedRelativePose needs sets with cameras, got none")
     return batch.K1.double(), batch.K2.double()
+
+
+class OneCycle(OneCycleLR):
+    """PyTorch's schedule, which goes on only in a training of as many steps: elsewhere it fails, or ends too early."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load the state of a checkpoint, which must be of a training of as many steps."""
+        if state_dict["total_steps"] != self.total_steps:
+            had = f"the checkpoint is of a training of {state_dict['total_steps']} steps, one cycle of learning rates"
+            raise ValueError(f"{had}; got {self.total_steps} steps: keep the number, or begin a new run elsewhere")
+        super().load_state_dict(state_dict)
 
 
 class Median(CatMetric):

@@ -89,7 +89,7 @@ def estimate_pair(
         NoReliableMatrixError: if the images do not determine a matrix: a blank image, no motion, or fewer than nine
             matches or inliers.
         TypeError: if an argument is not of the kinds above.
-        ValueError: if a file is not an image, or an argument is out of range.
+        ValueError: if a file is not an image, an argument is out of range, or there is no second camera.
         ImportError: if OpenCV is not installed.
 
     """
