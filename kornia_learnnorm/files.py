@@ -69,7 +69,9 @@ def exclusive(path: str | Path) -> Iterator[None]:
     file = path / ".lock" if path.is_dir() else path.with_name(f".{path.name}.lock")
     if not file.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {file.parent} does not exist")
-    lock, holder = FileLock(file), _holder(file)
+    lock, holder = FileLock(file), "another run"
+    with suppress(OSError, ValueError):
+        holder = file.read_text(encoding="utf-8") or holder
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
@@ -86,14 +88,6 @@ def exclusive(path: str | Path) -> Iterator[None]:
         with suppress(OSError):  # nor remove it
             file.unlink()
         lock.release()
-
-
-def _holder(file: Path) -> str:
-    """Return which process wrote a lock."""
-    try:
-        return file.read_text(encoding="utf-8") or "another run"
-    except (OSError, ValueError):
-        return "another run"
 
 
 def short_name(path: str | Path) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from itertools import pairwise
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
-from kornia_learnnorm.data.store import CorrespondenceStore, read_store
+from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.writer import check_target
 
 EXAMPLES = """\
@@ -97,9 +97,10 @@ def run(args: argparse.Namespace) -> int:
     store = read_store(args.out)
     known = int(np.isfinite(store.F).all((1, 2)).sum())
     print(f"{wrote}{args.out}: {len(store)} pairs, {known} with ground truth, {store.offsets[-1]} matches")
-    parts = _sequences(store)
+    folders = [name.rpartition("/")[0] for name, _ in store.names]
+    parts = [(name, [*places]) for name, places in groupby(range(len(store)), folders.__getitem__)]
     if 1 < len(parts) <= MAX_LISTED:
-        print("sequences: " + ", ".join(f"{name or '.'} @{first}:{stop}" for name, first, stop in parts))
+        print("sequences: " + ", ".join(f"{name or '.'} @{rows[0]}:{rows[-1] + 1}" for name, rows in parts))
     return 0
 
 
@@ -109,10 +110,3 @@ def print_skipped(skipped: dict[str, str]) -> None:
         print(f"skipped {pair}: {reason}", file=sys.stderr)
     if len(skipped) > MAX_LISTED:
         print(f"skipped {len(skipped)} pairs in all; the store lists them", file=sys.stderr)
-
-
-def _sequences(store: CorrespondenceStore) -> list[tuple[str, int, int]]:
-    """Return the folders of the images of consecutive pairs, with the first pair and the one after the last."""
-    folders = [name.rpartition("/")[0] for name, _ in store.names]
-    starts = [place for place in range(len(store)) if place == 0 or folders[place] != folders[place - 1]]
-    return [(folders[first], first, stop) for first, stop in pairwise([*starts, len(store)])]

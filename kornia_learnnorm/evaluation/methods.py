@@ -109,7 +109,7 @@ def _find_normalizer(name: str) -> Normalizer:
     shipped, suffix = shipped_weights(FORMAT), Path(name).suffix
     if weights_format(name) == LAYER_FORMAT:
         expected = f"expected those of a LearnedNormalizer, such as {', '.join(shipped)}"
-        advice = f"learnnorm robust --estimators learned:{name} evaluates them"
+        advice = f"learnnorm robust STORE --out RUN --estimators learned:{name} evaluates them"
         raise ValueError(f"{name} holds the weights of a LearnedEightPoint, {expected}; {advice}")
     if suffix == ".ckpt":
         raise FileNotFoundError(f"{name} is a checkpoint: learnnorm fit writes weights.safetensors beside its folder")

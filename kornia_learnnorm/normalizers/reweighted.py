@@ -59,8 +59,7 @@ class ReweightedWhitening(ProblemNormalizer):
         super().__init__()
         if iterations < 0 or damping <= 0:
             raise ValueError(f"iterations must be >= 0 and damping > 0, got {iterations} and {damping}")
-        self.iterations = iterations
-        self.damping = damping
+        self.iterations, self.damping = iterations, damping
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
         """Return the transforms :math:`(B, 3, 3)` of both views."""
@@ -94,9 +93,13 @@ class ReweightedWhitening(ProblemNormalizer):
         inverse = cofactors(F0).mT
         inverses = torch.stack([inverse, inverse.mT]).permute(2, 3, 0, 1).contiguous()
         determinant = (inverse[..., 0, :] * F0[..., :, 0]).sum(-1)
-        products = _products(points)
+        x, y = points.unbind(0)
+        products = torch.stack([x * x, x * y, x, y * y, y, torch.ones_like(x)], 1)
         indices = torch.tensor(MINORS, device=w.device), torch.tensor(ENTRIES, device=w.device)
-        b = _first_line(points, F0, w)
+        # View 1's line of the rank-2 correction in the coordinates whitened with w.
+        T = _whitening(points, w)
+        F_hat = transform_fundamental(F0, *cofactors(T).mT)
+        b = normalize((T[0].mT @ smallest_right_singular_vector_3x3(F_hat)[..., None]).squeeze(-1), dim=-1)
         a = _best_line(products[..., 1, :], w[:, 1], (inverse.mT @ b[..., None])[..., 0].mT, *indices)
         lines = torch.stack([b.mT, a], 1)
         for iteration in range(self.iterations):
@@ -127,30 +130,16 @@ def _whitening(points: Tensor, w: Tensor) -> Tensor:
     return whitening_from_moments(torch.stack([*mean], -1), covariance)
 
 
-def _first_line(points: Tensor, F0: Tensor, w: Tensor) -> Tensor:
-    """Return view 1's line of the rank-2 correction in the coordinates whitened with ``w``, ``(B, 3)``, unit norm."""
-    T = _whitening(points, w)
-    F_hat = transform_fundamental(F0, *cofactors(T).mT)
-    return normalize((T[0].mT @ smallest_right_singular_vector_3x3(F_hat)[..., None]).squeeze(-1), dim=-1)
-
-
 def _evaluate(lines: Tensor, points: Tensor) -> Tensor:
     """Return the products of lines ``(3, *, B)`` and homogeneous points, given as ``(2, N, *, B)``."""
     a, b, c = lines.unsqueeze(-3).unbind(0)
     return torch.addcmul(torch.addcmul(c, a, points[0]), b, points[1])
 
 
-def _products(points: Tensor) -> Tensor:
-    """Return the six different products of the homogeneous coordinates of points ``(2, N, 2, B)``."""
-    x, y = points.unbind(0)
-    return torch.stack([x * x, x * y, x, y * y, y, torch.ones_like(x)], 1)
-
-
 def _best_line(products: Tensor, w: Tensor, target: Tensor, minors: Tensor, entries: Tensor) -> Tensor:
     """Return the line :math:`S^{-1} t` of unit norm, ``(3, *)``, with the second moments :math:`S` of weighted points.
 
-    Of the points' products ``(N, 6, *)``, weights ``(N, *)`` and the other view's line by the inverse of ``F0``,
-    ``(3, *)``; the last two are the indices ``MINORS`` and ``ENTRIES`` on the device.
+    ``products`` are those of the points' homogeneous coordinates, six, ``(N, 6, *)``, and weights ``(N, *)``.
     """
     moments = (products * w[:, None]).sum(0)
     p, q, r, s = torch.unflatten(moments.index_select(0, minors), 0, (4, 6)).unbind(0)

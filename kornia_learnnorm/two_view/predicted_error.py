@@ -61,8 +61,11 @@ def predict_error(
     ``F_parts`` (P, 3, 3) are zeros where there is no matrix; a part has ``size`` of the matches (N, 2), of which
     ``inliers`` (N,) are those of ``F_mat`` (3, 3). The cameras (3, 3) may be guesses.
     """
-    x1 = points1[inliers].expand(len(F_parts), -1, -1)
-    x2 = _onto_lines(points1[inliers], points2[inliers], F_mat).expand(len(F_parts), -1, -1)
+    x1, x2 = points1[inliers], points2[inliers]
+    lines = convert_points_to_homogeneous(x1) @ F_mat.mT
+    normal = lines[:, :2]
+    x2 = x2 - (((normal * x2).sum(-1) + lines[:, 2]) / normal.square().sum(-1))[:, None] * normal  # onto their lines
+    x1, x2 = (x.expand(len(F_parts), -1, -1) for x in (x1, x2))
     distance = symmetric_epipolar_distance(x1, x2, F_parts).nan_to_num(nan=math.inf).median()
     cameras = K1.expand_as(F_parts), K2.expand_as(F_parts)
     R, t = relative_pose(F_mat[None], *(value[:1] for value in (*cameras, x1, x2)))
@@ -89,13 +92,6 @@ def _scale_to_all(distance: Tensor, angles: Tensor, size: int, number: int) -> P
     unit = math.sqrt(1 / min(number, COMMON_ERRORS) / (1 / size - 1 / number))
     angle = (math.sqrt(size / (number - size)) * angles).clamp(max=180.0).median()
     return PredictedError(unit * float(distance), float(angle))
-
-
-def _onto_lines(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    """Return points2 (N, 2) moved onto their epipolar lines."""
-    line = convert_points_to_homogeneous(points1) @ F_mat.mT
-    normal = line[:, :2]
-    return points2 - (((normal * points2).sum(-1) + line[:, 2]) / normal.square().sum(-1))[:, None] * normal
 
 
 def nominal_camera(size: Size) -> Tensor:

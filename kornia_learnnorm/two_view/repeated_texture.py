@@ -108,9 +108,10 @@ def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: flo
     """
     vectors = points2 - transform_points(H[None], points1[None])[0]
     views = [_neighbours(points, vectors, PARALLAX * threshold) for points in (points1, points2)]
-    share = torch.ones_like(points1[:, 0])
+    share, tiny = torch.ones_like(points1[:, 0]), torch.finfo(points1.dtype).tiny
     for _ in range(ROUNDS):
-        share = torch.minimum(*(_agreeing_share(share[indices], agrees) for indices, agrees in views))
+        weights = [(share[indices], agrees) for indices, agrees in views]
+        share = torch.minimum(*((w * agrees).sum(-1) / w.sum(-1).clamp(min=tiny) for w, agrees in weights))
     return share >= MIN_COHERENT
 
 
@@ -122,12 +123,6 @@ def _neighbours(points: Tensor, vectors: Tensor, least: float) -> tuple[Tensor, 
     nearest = apart.topk(number, largest=False)
     change = (vectors[nearest.indices] - vectors[:, None]).norm(dim=-1)
     return nearest.indices, change < (MAX_PARALLAX_CHANGE * nearest.values).clamp(min=least)
-
-
-def _agreeing_share(weights: Tensor, agrees: Tensor) -> Tensor:
-    """Return which share of the neighbours' weights (N, K) those that agree have, (N,); 0 where all weights are."""
-    share: Tensor = (weights * agrees).sum(-1) / weights.sum(-1).clamp(min=torch.finfo(weights.dtype).tiny)
-    return share
 
 
 def fitting_share(points1: Tensor, points2: Tensor, H: Tensor, F_mat: Tensor, threshold: float) -> float:

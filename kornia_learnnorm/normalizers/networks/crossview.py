@@ -111,7 +111,9 @@ class CrossViewNetwork(nn.Module):
         x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
         if null_matrix is None:
             null_matrix = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
-        F = null_matrix * _sign(null_matrix)
+        # The sign that makes the largest entry positive is equal for a matrix and its transpose.
+        entries = null_matrix.detach().flatten(-2)
+        F = null_matrix * entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
         u, v = smallest_singular_vectors(F)
         own, other, doubled = torch.stack([x1, x2]), torch.stack([x2, x1]), torch.stack([F, F.mT])
         features = _epipolar_features(own, other, doubled, torch.stack([v, u]), torch.stack([u, v]), weights)
@@ -122,12 +124,6 @@ class CrossViewNetwork(nn.Module):
     def dtype(self) -> torch.dtype:
         """The dtype of the network's own weights."""
         return next(self.parameters()).dtype
-
-
-def _sign(F: Tensor) -> Tensor:
-    """Return the sign that makes the largest entry of ``F`` positive, equal for ``F`` and its transpose."""
-    entries = F.detach().flatten(-2)
-    return entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
 
 
 def _epipolar_features(
