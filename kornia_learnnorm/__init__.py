@@ -6,7 +6,6 @@ Example:
     >>> F_mat = kln.find_fundamental(points1, points2, normalizer=kln.LearnedNormalizer.from_pretrained())
     >>> F_mat.shape
     torch.Size([4, 3, 3])
-
 """
 
 from kornia_learnnorm.estimators.learned import LearnedEightPoint

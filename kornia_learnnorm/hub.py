@@ -66,7 +66,6 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
         ...     layer = HubModel.from_pretrained(folder).layer
         >>> layer.trained_on
         ('synthetic scenes',)
-
     """
 
     def __init__(self, layer: LearnedLayer | LearnedNormalizer | MatchRefiner) -> None:

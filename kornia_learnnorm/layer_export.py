@@ -44,7 +44,6 @@ def load_layer(name: str | Path) -> EightPoint | LearnedLayer:
     Example:
         >>> load_layer("crossview").normalizer.max_points
         12
-
     """
     file_format = weights_format(name)
     if file_format is None:
@@ -89,7 +88,6 @@ def export_layer(
         >>> F_mat, determined = program.module()(torch.rand(3, 8, 2), torch.rand(3, 8, 2))
         >>> F_mat.shape
         torch.Size([3, 3, 3])
-
     """
     if not isinstance(layer, EightPoint | LearnedLayer):
         raise TypeError(f"layer must be an EightPoint or a learned layer, got {type(layer)}")

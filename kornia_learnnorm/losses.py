@@ -25,8 +25,7 @@ class EpipolarLoss(nn.Module):
     r"""Residuals on the sample's own points and on held-out ones, mixed and reduced.
 
     With ``log=False``, the mean residual of a sample is averaged over the batch (Fan et al., Eq. 7). With ``log=True``,
-    its logarithm is, so that a few bad samples do not outweigh the rest. Held-out correspondences hold outliers: they
-    enter one by one, each through its own logarithm or mean.
+    its logarithm is, so that a few bad samples do not outweigh the rest. Held-out correspondences enter one by one.
 
     Args:
         residual: maps ``(points1, points2, F_mat)`` to residuals :math:`(B, N)`, such as
@@ -46,7 +45,6 @@ class EpipolarLoss(nn.Module):
         >>> points1, points2 = torch.zeros(1, 8, 2), torch.ones(1, 8, 2)
         >>> EpipolarLoss(log=False)(points1, points2, F_mat)
         tensor(2.)
-
     """
 
     def __init__(
@@ -107,17 +105,13 @@ class BoundedEpipolarLoss(nn.Module):
     little, so that the matrix that explains most matches has the least loss.
 
     Args:
-        scale: distance :math:`s` in pixels at which a match costs one half.
+        scale: distance :math:`s` in pixels at which a match costs one half; ValueError unless positive.
         residual: another distance, such as :func:`~kornia_learnnorm.transfer_distance` of homographies.
-
-    Raises:
-        ValueError: if ``scale`` is not positive.
 
     Example:
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
         >>> BoundedEpipolarLoss(2.0)(torch.tensor([[[5.0, 1.0]]]), torch.tensor([[[9.0, 2.0]]]), F_mat)
         tensor([0.5000])
-
     """
 
     def __init__(self, scale: float = 2.0, residual: Residual = symmetric_epipolar_distance) -> None:
@@ -136,17 +130,13 @@ class LogEpipolarLoss(nn.Module):
     r"""Mean of :math:`\log(d + f)` over true inliers, with the symmetric epipolar distance :math:`d`.
 
     Args:
-        floor: distance :math:`f` in pixels, far below which nothing is gained.
+        floor: distance :math:`f` in pixels, far below which nothing is gained; ValueError unless positive.
         residual: another distance, such as :func:`~kornia_learnnorm.transfer_distance` of homographies.
-
-    Raises:
-        ValueError: if ``floor`` is not positive.
 
     Example:
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
         >>> LogEpipolarLoss(1.0)(torch.tensor([[[5.0, 1.0]]]), torch.tensor([[[9.0, 1.0]]]), F_mat)
         tensor([0.])
-
     """
 
     def __init__(self, floor: float = 0.1, residual: Residual = symmetric_epipolar_distance) -> None:
@@ -168,16 +158,12 @@ class LogEssentialLoss(nn.Module):
     that of the rotations.
 
     Args:
-        floor: distance :math:`f`, far below which nothing is gained.
-
-    Raises:
-        ValueError: if ``floor`` is not positive.
+        floor: distance :math:`f`, far below which nothing is gained; ValueError unless positive.
 
     Example:
         >>> E_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
         >>> LogEssentialLoss(1.0)(E_mat, -2 * E_mat)
         tensor([0.])
-
     """
 
     def __init__(self, floor: float = 0.003) -> None:
@@ -200,7 +186,6 @@ class InlierLoss(nn.Module):
     Example:
         >>> InlierLoss()(torch.tensor([[0.0, 9.0]]), torch.tensor([[1.0, torch.nan]]))
         tensor([0.6931])
-
     """
 
     def forward(self, logits: Tensor, inliers: Tensor) -> Tensor:

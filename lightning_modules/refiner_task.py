@@ -36,7 +36,6 @@ class HeldOutLoss(nn.Module):
         floor: distance :math:`f` in pixels, far below which nothing is gained.
         ceiling: larger distances, pixels, count as this and send no gradient. ValueError unless both are positive.
         scale_weight: weight of the likelihood.
-
     """
 
     def __init__(

@@ -38,13 +38,8 @@ class ImageSets(StoreSets):
         jitter: largest standard deviation of the displacement that is added, pixels.
         symmetries: flip and transpose.
 
-    Attributes:
-        left_out: number of pairs without images of their names and shapes.
-
-    Raises:
-        FileNotFoundError: if a store or a folder does not exist.
-        ValueError: if no pair is left, or an argument is out of its range.
-
+    The attribute ``left_out`` counts pairs without images of their names and shapes. FileNotFoundError if a store or a
+    folder does not exist; ValueError if no pair is left, or an argument is out of its range.
     """
 
     def __init__(

@@ -68,12 +68,8 @@ def draw_samples(
 
     The samples are float32, in the order of the pairs. ``max_ratio`` is exclusive; None keeps all. The ``num_heldout``
     correspondences of a sample are drawn with replacement from its pair; they are not in the sample and pass the ratio
-    test of 0.8, whatever ``max_ratio`` is.
-
-    Raises:
-        ValueError: if ``size`` is below 8, no pair fills a sample, or, with ``require_heldout``, a pair has no
-            correspondence to hold out; without, the held-out points of its samples are NaN.
-
+    test of 0.8, whatever ``max_ratio`` is. ValueError if ``size`` is below 8, no pair fills a sample, or, with
+    ``require_heldout``, a pair has no correspondence to hold out; without, the held-out points are NaN.
     """
     if size < 8:
         raise ValueError(f"a sample needs at least 8 correspondences, got size={size}")

@@ -1,11 +1,9 @@
 r"""Metrics of an estimated fundamental matrix, one number per image pair: share of inliers, F1 score, epipolar error.
 
 All distances are symmetric epipolar distances in pixels, the sum :math:`d_1 + d_2` of both points' distances to their
-epipolar lines. Other packages take the larger of the two or their mean, so their thresholds mean something else.
-
-A failed estimate (NaN or zero matrix) has no inliers and an infinite error. NaN is not a failure: the pair cannot be
-measured, and callers drop and count such pairs. The evaluation of NG-RANSAC drops a pair from all three
-metrics when the ground truth has no inliers at the threshold or none below 1 px.
+epipolar lines; other packages take the larger of the two or their mean. A failed estimate (NaN or zero matrix) has no
+inliers and an infinite error. NaN is not a failure: the pair cannot be measured. The evaluation of NG-RANSAC drops a
+pair from all three metrics when the ground truth has no inliers at the threshold or none below 1 px.
 
 Reference:
     R. Ranftl, V. Koltun, Deep Fundamental Matrix Estimation, ECCV 2018, as evaluated by E. Brachmann, C. Rother,
@@ -25,9 +23,7 @@ __all__ = ["epipolar_error", "f1_from_masks", "f1_score", "finite_distance", "in
 
 
 def inlier_share(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float) -> Tensor:
-    r"""Return the share of correspondences that agree with an estimate, "% inliers" over 100.
-
-    :math:`|\{i : d_i(F) < \tau\}| / N`, strict, with :math:`d` of Fan et al., Eq. 7.
+    r"""Return the share of correspondences that agree with an estimate: :math:`|\{i : d_i(F) < \tau\}| / N`, strict.
 
     Args:
         points1: pixels in the first images with shape :math:`(*, N, 2)`.
@@ -40,15 +36,13 @@ def inlier_share(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: flo
 
     Raises:
         TypeError: if a tensor is not floating-point or dtypes differ.
-        ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up or the threshold is not positive.
+        ValueError: if a shape is wrong (ShapeError), the points do not pair up, or the threshold is not positive.
 
     Example:
         >>> F_mat = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # lines are rows
         >>> points1, points2 = torch.tensor([[5.0, 1.0], [5.0, 2.0]]), torch.tensor([[9.0, 1.25], [9.0, 3.0]])
         >>> inlier_share(points1, points2, F_mat, threshold=1.0)  # distances 0.5 and 2
         tensor(0.5000)
-
     """
     return _inliers(points1, points2, F_mat, threshold).to(points1.dtype).mean(-1)
 
@@ -56,12 +50,9 @@ def inlier_share(points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: flo
 def f1_score(points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tensor, threshold: float) -> Tensor:
     r"""Return the harmonic mean of precision and recall between the inliers of an estimate and of the ground truth.
 
-    :math:`2 |A \cap B| / (|A| + |B|)` with :math:`A = \{i : d_i(F) < \tau\}` and the same :math:`B` of the true matrix.
-    The arguments and errors are those of :func:`inlier_share`, with true matrices ``F_true`` :math:`(*, 3, 3)`, NaN
-    where unknown.
-
-    Returns:
-        scores with shape :math:`(*)`; zero where the sets do not meet, NaN where the ground truth has no inliers.
+    :math:`2 |A \cap B| / (|A| + |B|)` with :math:`A = \{i : d_i(F) < \tau\}` and the same :math:`B` of the true matrix
+    ``F_true`` :math:`(*, 3, 3)`; NaN where the ground truth has no inliers. Other arguments and errors are those of
+    :func:`inlier_share`.
     """
     masks = (_inliers(points1, points2, matrix, threshold) for matrix in (F_mat, F_true))
     return f1_from_masks(*masks).to(points1.dtype)

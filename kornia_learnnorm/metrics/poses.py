@@ -1,8 +1,7 @@
 r"""Errors of relative poses and their summaries over image pairs: AUC and mean average accuracy.
 
-A pose is :math:`X_2 = R X_1 + t` for points in space; the length of :math:`t` is unknown. Errors are angles in degrees:
-infinite for a failed estimate, NaN where the ground truth is unknown, and callers drop and count such pairs. In the
-summaries a failure counts.
+A pose is :math:`X_2 = R X_1 + t`; the length of :math:`t` is unknown. Errors are angles in degrees: infinite for a
+failed estimate, which counts in the summaries, NaN where the ground truth is unknown.
 """
 
 from __future__ import annotations
@@ -57,7 +56,6 @@ def pose_error(R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> Tensor:
         >>> R, t = torch.eye(3).repeat(2, 1, 1), torch.tensor([[0.0, 0.0, 1.0], [torch.nan, 0.0, 1.0]])
         >>> pose_error(R, t, torch.eye(3), torch.tensor([0.0, 1.0, 1.0]))
         tensor([45., inf])
-
     """
     error = torch.maximum(rotation_error(R, R_true), translation_error(t, t_true))
     unknown = (rotation_error(R_true, R_true) + translation_error(t_true, t_true)).isnan()
@@ -96,7 +94,6 @@ def mean_average_accuracy(errors: Tensor, limit: int = 10) -> float:
 def _checked(errors: Tensor) -> Tensor:
     if errors.ndim != 1 or len(errors) == 0:
         raise ValueError(f"errors must be a (P,) tensor of at least one pair, got shape {[*errors.shape]}")
-    bad = int((~(errors >= 0)).sum())
-    if bad:
+    if bad := int((~(errors >= 0)).sum()):
         raise ValueError(f"errors must be zero or more, infinite for a failure, got {bad} NaN or negative ones")
     return errors.to(solve_dtype(errors.device))

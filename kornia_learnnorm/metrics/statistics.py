@@ -40,7 +40,6 @@ def better_rate(residual: Tensor, baseline: Tensor) -> BetterRate:
     Example:
         >>> better_rate(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.0, 1.0]))
         BetterRate(rate=0.333..., ties=1, degenerate=0, compared=3)
-
     """
     if residual.shape != baseline.shape or residual.ndim != 1:
         raise ValueError(f"residuals must be two (S,) tensors, got {[*residual.shape]} and {[*baseline.shape]}")
@@ -81,7 +80,6 @@ def bootstrap_interval(
     Example:
         >>> bootstrap_interval(torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([0, 0, 1, 1]))
         (0.0, 1.0)
-
     """
     return _middle(_means(values, groups, draws, seed), level)
 

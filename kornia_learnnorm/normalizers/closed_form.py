@@ -22,7 +22,6 @@ class Identity(ProblemNormalizer):
         tensor([[1., 0., 0.],
                 [0., 1., 0.],
                 [0., 0., 1.]])
-
     """
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
@@ -37,13 +36,11 @@ class Hartley(ProblemNormalizer):
     Coincident points keep their scale.
 
     Example:
-        >>> import torch
         >>> points = torch.tensor([[[0.0, 0.0], [4.0, 0.0], [0.0, 4.0], [4.0, 4.0]]])
         >>> Hartley()(points, points)[0]
         tensor([[[ 0.5000,  0.0000, -1.0000],
                  [ 0.0000,  0.5000, -1.0000],
                  [ 0.0000,  0.0000,  1.0000]]])
-
     """
 
     def transforms(self, problem: LinearProblem) -> tuple[Tensor, Tensor]:
@@ -58,17 +55,12 @@ class Whitening(ProblemNormalizer):
     smaller eigenvalue of :math:`\Sigma` is floored.
 
     Args:
-        floor: smallest ratio of the eigenvalues of :math:`\Sigma`.
-
-    Raises:
-        ValueError: if the floor is not positive.
+        floor: smallest ratio of the eigenvalues of :math:`\Sigma`; ValueError unless positive.
 
     Example:
-        >>> import torch
         >>> points = torch.tensor([[[0.0, 0.0], [4.0, 0.0], [0.0, 2.0], [4.0, 2.0]]])
         >>> Whitening()(points, points)[0][0].diagonal()
         tensor([0.5000, 1.0000, 1.0000])
-
     """
 
     def __init__(self, floor: float = 1e-6) -> None:

@@ -64,7 +64,6 @@ class LearnedNormalizer(ProblemNormalizer):
         >>> T1, T2 = normalizer(torch.rand(2, 8, 2) * 600, torch.rand(2, 8, 2) * 600)
         >>> T1.shape
         torch.Size([2, 3, 3])
-
     """
 
     min_points = 8
@@ -119,7 +118,6 @@ class LearnedNormalizer(ProblemNormalizer):
                 not keep its arguments, numbers and texts, as attributes: the file could not say how to build it.
             ValueError: if ``path`` does not end in ``.safetensors``.
             OSError: if it cannot be written.
-
         """
         architecture = {
             "base": describe_part(self.base, *BASES),
@@ -143,7 +141,6 @@ class LearnedNormalizer(ProblemNormalizer):
             FileNotFoundError: if there are no such weights; the message lists those that ship.
             ValueError: if the file is not a normaliser of this package, names a part of another module, or its tensors
                 do not fit.
-
         """
         return load_module(name, FORMAT, lambda path, text: cls(**_build(path, text, own_modules)))
 

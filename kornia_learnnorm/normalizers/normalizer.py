@@ -43,7 +43,6 @@ class ProblemNormalizer(nn.Module):
             TypeError: if the points are not float32 or float64 tensors of one dtype.
             ShapeError: if a shape is wrong.
             ValueError: if there are too few correspondences, a value is not finite, or a weight is negative.
-
         """
         check_correspondences(points1, points2, weights, self.min_points)
         T1, T2 = self.transforms(LinearProblem.from_points(points1, points2, weights, Fundamental()))
@@ -66,7 +65,6 @@ class PerView(nn.Module):
         >>> T1, T2 = PerView(normalize_points)(torch.rand(2, 8, 2), torch.rand(2, 8, 2))
         >>> T1.shape
         torch.Size([2, 3, 3])
-
     """
 
     def __init__(self, normalize: Callable[..., tuple[Tensor, Tensor]]) -> None:

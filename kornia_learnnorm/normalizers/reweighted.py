@@ -39,18 +39,14 @@ class ReweightedWhitening(ProblemNormalizer):
     swapping them swaps the transforms.
 
     Args:
-        iterations: number of reweightings; 0 whitens with :math:`w`.
-        damping: share of the mean residual added to each residual before it divides.
-
-    Raises:
-        ValueError: if ``iterations`` is negative or ``damping`` is not positive.
+        iterations: number of reweightings; 0 whitens with :math:`w`. ValueError for a negative number.
+        damping: share of the mean residual added to each residual before it divides; ValueError unless positive.
 
     Example:
         >>> _ = torch.manual_seed(0)
         >>> T1, T2 = ReweightedWhitening()(torch.rand(2, 8, 2), torch.rand(2, 8, 2))
         >>> T1.shape
         torch.Size([2, 3, 3])
-
     """
 
     min_points = 8

@@ -111,7 +111,6 @@ def export_colmap(
         TypeError: if an argument is of a wrong type.
         ValueError: if an argument is out of range, or COLMAP cannot read an image or finds another size than the store.
         ImportError: if pycolmap is not installed.
-
     """
     pycolmap = import_extra("pycolmap", "colmap", "writing a COLMAP database")
     tqdm = import_extra("tqdm", "images", "estimating many pairs").tqdm

@@ -90,7 +90,6 @@ def estimate_matches(
             of its type.
         ValueError: if shapes do not pair up, a value is out of range, only one camera is given, or one is not a finite
             and invertible (3, 3) matrix.
-
     """
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)

@@ -91,7 +91,6 @@ def estimate_pair(
         TypeError: if an argument is not of the kinds above.
         ValueError: if a file is not an image, an argument is out of range, or there is no second camera.
         ImportError: if OpenCV is not installed.
-
     """
     check_settings(threshold, seed, layer, model)
     read_cameras(K1, K2)  # before the work begins

@@ -84,7 +84,6 @@ def compute_gric(
     Reference:
         P. Torr, A. Fitzgibbon, A. Zisserman, The problem of degeneracy in structure and motion recovery from
         uncalibrated image sequences, IJCV 1999.
-
     """
     x1, x2 = (convert_points_to_homogeneous(points).mT[None] for points in (points1, points2))
     squares1, squares2 = (

@@ -19,10 +19,9 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
 
     ``root`` has ``dataset_train.txt`` and ``dataset_test.txt``, camera centres, approximately in metres, and
     quaternions from world to camera; ``split`` is ``train``, ``test`` or None for both. Focal lengths are those of
-    ``reconstruction.nvm`` (VisualSFM), whose radial distortion is not applied; the principal point is the centre of the
-    image. Cameras are NaN where image or reconstruction do not give them. FileNotFoundError if a list or one of its
-    images is missing; ValueError if the split is unknown, a line is malformed, or a list is empty or has an image
-    twice.
+    ``reconstruction.nvm`` (VisualSFM), NaN without, whose radial distortion is not applied; the principal point is the
+    centre of the image. FileNotFoundError if a list or one of its images is missing; ValueError if the split is
+    unknown, a line is malformed, or a list is empty or has an image twice.
     """
     root = Path(root)
     if split not in (None, "train", "test"):

@@ -28,11 +28,9 @@ def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
 
     ``model`` is the folder with cameras, images and points3D, as ``.bin`` or ``.txt``, of any unit of length; the
     images' names start from the folder ``images``. The centre of the top left pixel is (0.5, 0.5) in COLMAP and (0, 0)
-    in a frame. COLMAP ignores EXIF orientations, so an image that EXIF turns by a quarter does not have its camera's
-    size and is refused. Poses are NaN where the model has none.
-
-    FileNotFoundError if a file of the model or an image is missing; ValueError if the model is malformed or empty, a
-    camera has distortion other than k1, k2, p1, p2, or an image does not have its camera's size.
+    in a frame. Poses are NaN where the model has none. FileNotFoundError if a file of the model or an image is missing;
+    ValueError if the model is malformed or empty, a camera has distortion other than k1, k2, p1, p2, or an image does
+    not have its camera's size, as one that EXIF turns by a quarter.
     """
     images, reconstruction = Path(images), _reconstruction(Path(model))
     found = sorted(reconstruction.images.values(), key=lambda image: (image.name.rpartition("/")[0], image.name))

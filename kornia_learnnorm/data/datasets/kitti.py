@@ -22,9 +22,7 @@ def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera:
     """Return the frames of the KITTI odometry benchmark (A. Geiger et al., CVPR 2012; conventions of its devkit).
 
     ``root`` has ``sequences/SS/calib.txt``, ``sequences/SS/image_N/*.png`` and ``poses/SS.txt``, metres. ``sequences``
-    are names ``SS`` in the order to read, None for all; of the cameras ``image_0`` and ``image_1`` are grey,
-    ``image_2`` and ``image_3`` colour, left and right. Poses are NaN for a sequence without a file of poses (11 to 21).
-
+    are names ``SS`` in the order to read, None for all. Poses are NaN for a sequence without a file of poses.
     FileNotFoundError if a folder, an image or a ``calib.txt`` is missing; ValueError if a sequence or camera is
     unknown, a line is malformed, a frame lacks its pose, or the name of an image is not a number.
     """

@@ -33,10 +33,8 @@ def read_tum(root: str | Path, sequences: Sequence[str] | None = None, max_diffe
     ``root`` is a sequence's folder, with ``rgb.txt`` and ``groundtruth.txt``, metres, or a folder of sequences, of
     which ``sequences`` are names in the order to read, None for all. A frame gets the nearest pose, the earlier one of
     a tie, or NaN if there is none within ``max_difference`` seconds. Cameras are NaN unless the folder's name has
-    ``freiburg1`` to ``freiburg3`` or ``fr1`` to ``fr3`` in it.
-
-    FileNotFoundError if there is no sequence, or an image that ``rgb.txt`` lists is missing; ValueError if a sequence
-    is unknown, a line malformed, a file is empty or ``max_difference`` is negative.
+    ``freiburg1`` to ``freiburg3`` or ``fr1`` to ``fr3`` in it. FileNotFoundError if there is no sequence, or an image
+    is missing; ValueError if a sequence is unknown, a line malformed, a file empty or ``max_difference`` negative.
     """
     root = Path(root)
     if not max_difference >= 0:

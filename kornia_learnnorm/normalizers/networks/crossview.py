@@ -39,11 +39,10 @@ _POINT_FEATURES, _SET_FEATURES = {"own": 2, "both": 4, "epipolar": 13}, {"own": 
 class CrossViewNetwork(nn.Module):
     r"""Predict each view's parameters from the correspondences of both and from the null vector of the DLT.
 
-    One :class:`SetNetwork` serves both views. View 1 sees the problem as it is, view 2 its mirror image (views swapped,
-    :math:`F` transposed), so that swapping the views swaps the outputs exactly. A correspondence enters as its two
-    points, the directions and norms of its two epipolar lines, its distances from the lines of the rank-2 correction
-    and the epipolar distance that this correction leaves it; the set enters with the nine numbers of :math:`F` and the
-    size of the correction. The last layer starts at zero: an untrained network is the base.
+    View 1 sees the problem as it is, view 2 its mirror image (views swapped, :math:`F` transposed), so that swapping
+    the views swaps the outputs exactly. A correspondence enters as its two points, the directions and norms of its two
+    epipolar lines, its distances from the lines of the rank-2 correction and the epipolar distance that this leaves it;
+    the set enters with :math:`F` and the size of the correction. An untrained network is the base.
 
     Args:
         width: channels.
@@ -51,17 +50,13 @@ class CrossViewNetwork(nn.Module):
         num_parameters: parameters per view, as the transform builder wants them.
         bound: the parameters stay within plus and minus this.
         features: what a view's pass sees, to compare: ``"epipolar"`` all of the above, ``"both"`` only the points of
-            both views, ``"own"`` only its own points.
-
-    Raises:
-        ValueError: if ``features`` is not one of these names.
+            both views, ``"own"`` only its own points; ValueError for others.
 
     Example:
         >>> network = CrossViewNetwork(width=16, depth=2)
         >>> network(torch.rand(2, 8, 2), torch.rand(2, 8, 2))[0]
         tensor([[0., 0., 0., 0., 0.],
                 [0., 0., 0., 0., 0.]], grad_fn=...)
-
     """
 
     def __init__(
@@ -89,7 +84,6 @@ class CrossViewNetwork(nn.Module):
             points2: points of the second view.
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
             null_matrix: the DLT's unit null vectors there with shape :math:`(B, 3, 3)`; solved for when not given.
-
         """
         views = self._views(points1, points2, weights, null_matrix)
         point_features, set_features = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))

@@ -18,13 +18,11 @@ class PaperNetwork(nn.Module):
 
     A linear layer shared by the points, residual blocks with instance normalisation over the points, the maximum over
     the points before the first block and after each, a convolution over the stack of these maxima, and two fully
-    connected layers. Both views share all weights. Any number of points from two on goes in, and their order does not
-    matter.
+    connected layers. Both views share all weights. Any number of points from two on goes in, in any order.
 
     Where the text leaves a choice: the first layer has no activation; a block is twice a linear layer, instance
     normalisation and ReLU, plus the skip; no normalisation has parameters of its own; each maximum is normalised over
-    its channels; the convolution is not padded; the last layer starts at zero, so that an untrained network is the
-    base.
+    its channels; the convolution is not padded; the last layer starts at zero, so an untrained network is the base.
 
     Args:
         width: channels of a point, 128 in the paper.
@@ -44,7 +42,6 @@ class PaperNetwork(nn.Module):
         >>> network(torch.rand(2, 8, 2), torch.rand(2, 8, 2))[0]
         tensor([[0., 0., 0.],
                 [0., 0., 0.]], grad_fn=...)
-
     """
 
     def __init__(self, width: int = 128, depth: int = 12, num_parameters: int = 3) -> None:
@@ -64,13 +61,9 @@ class PaperNetwork(nn.Module):
         self.head = nn.Sequential(nn.Linear(features, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), last)
 
     def forward(self, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the parameters :math:`(B, P)` of both views, in the dtype of the points.
+        """Return the parameters :math:`(B, P)` of both views of points :math:`(B, N, 2)` in base coordinates.
 
-        Args:
-            points1: points of the first view in base coordinates with shape :math:`(B, N, 2)`.
-            points2: points of the second view.
-            weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
-
+        Optional weights :math:`(B, N)` are not negative; zero means absent.
         """
         dtype = self.stem.weight.dtype
         points = torch.cat([points1, points2]).to(dtype)
