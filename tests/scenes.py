@@ -10,6 +10,7 @@ from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import LearnedEightPoint, LearnedNormalizer
+from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.synthetic import TwoViewScene, forward_driving, handheld, orbit, random_scenes
 from kornia_learnnorm.geometry.transforms import paper_transform
 
@@ -35,6 +36,16 @@ def corner_error(M, H) -> float:
     corners = torch.tensor([[0.0, 0, 1], [600, 0, 1], [600, 600, 1], [0, 600, 1]], dtype=torch.float64).mT
     a, b = (X.detach() @ corners for X in (M, H))
     return float((a[..., :2, :] / a[..., 2:, :] - b[..., :2, :] / b[..., 2:, :]).norm(dim=-2).max())
+
+
+def store_of(points1, points2, offsets, names, size=(640, 480), ratio=0.5, **known) -> CorrespondenceStore:
+    """A store of matches whose cameras, motions and matrices are not known unless they are given."""
+    shapes = {"F": (3, 3), "K": (2, 3, 3), "R": (3, 3), "t": (3,)}
+    unknown = {name: np.full((len(names), *shape), np.nan) for name, shape in shapes.items()}
+    texts = dict.fromkeys(("dataset", "pairs", "detector"), "made by a test")
+    points = np.float32(points1), np.float32(points2), np.broadcast_to(np.float32(ratio), len(points1))
+    sizes = np.full((len(names), 2, 2), size, np.int32)
+    return CorrespondenceStore(*points, np.array(offsets), sizes, names, **unknown | texts | known)
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -112,25 +112,6 @@ class TestPairs:
         assert "oops" in crashed["crashed"]
         assert "room 0: ZeroDivisionError('oops')" in capsys.readouterr().err
 
-    @pytest.mark.parametrize(("seed", "share"), [(0, 0.1), (8, 0.9)])
-    def test_contaminated_matches(self, pairs, seed, share):
-        case, again = pairs.contaminated(seed), pairs.contaminated(seed)
-        assert all(map(torch.equal, case.read, again.read))
-        distance = kln.symmetric_epipolar_distance(*case.read, true_matrix(case))
-        # The distance, a sum of one in each image, has a standard deviation of about 1.4 px for noise of 0.5 px, and a
-        # random match comes within 6 px in about 1 % of the cases.
-        assert (distance > 6).double().mean().item() == pytest.approx(share, abs=0.03)
-        assert kln.symmetric_epipolar_distance(case.points1, case.points2, true_matrix(case)).max() < 1e-6
-        assert pairs.is_determined(case.points1, case.points2)
-
-    @pytest.mark.parametrize("share", [0.0, 0.75])
-    def test_random_matches_among_those_of_the_images(self, pairs, case, share):
-        mixed = pairs.mixed(case, share)
-        distance = kln.symmetric_epipolar_distance(*mixed.read[:2], true_matrix(case))
-        assert (distance > 6).double().mean().item() == pytest.approx(0.9 * share, abs=0.1)
-        assert mixed.read[2].min() >= 0.2
-        assert mixed.size == (160, 120)
-
     def test_tables(self, pairs):
         base = {"seed": 3, "refused": None, "crashed": None, "warnings": [], "matches": 20, "inliers": 9}
         base |= {"pose_error": 0.0, "predicted_error": 1.0, "true_error": 1.0, "right": True}
@@ -213,34 +194,6 @@ def test_every_method_is_timed(benchmark, backward, monkeypatch):
     assert lines[-1].rstrip("| ").endswith("-")
 
 
-def test_compiled_layers_are_timed(benchmark, monkeypatch):
-    speed = benchmark("speed")
-    monkeypatch.setattr(torch, "compile", lambda method, fullgraph: method)  # compiling takes a minute
-    args = argparse.Namespace(device="cpu", dtype="float64")
-    times = speed.measure_compiled(speed.solvers("cpu")["Hartley"], speed.Case(2, 8), args)
-    assert len(times) == 4
-    assert min(times.values()) >= 0
-    assert speed.COMPILED.keys() <= speed.solvers("cpu").keys() | speed.robust("cpu").keys()
-
-
-def test_shares_of_the_time(benchmark, monkeypatch):
-    profile = benchmark("profile_time")
-    monkeypatch.setattr(profile, "CALLS", 2)
-    found = profile.solver_shares("paper", benchmark("speed").Case(2, 8), backward=True)
-    assert tuple(found) == profile.COLUMNS
-    assert sum(found.values()) == pytest.approx(100)
-    assert min(found["layers"], found["factorisations"], found["arithmetic"]) > 0
-
-
-@pytest.mark.parametrize("suffix", ["", "+bfloat16+scores"])
-def test_learned_estimators_by_name(benchmark, case, suffix):
-    sizes, name = benchmark("sizes"), "learned:robust-tiny" + suffix
-    points = [p[:64].repeat(2, 1, 1) for p in (case.points1, case.points2)]
-    F_mat = sizes.find_method(name)(*points, torch.ones(2, 64).double())
-    assert sizes.shown(name) == name
-    assert kln.symmetric_epipolar_distance(*points, F_mat).median() < 0.5
-
-
 def test_poses_of_a_store(benchmark, tmp_path, capsys, monkeypatch):
     poses, store = benchmark("poses"), tmp_path / "pairs.h5"
     write_store(store, synthetic_store(2, points=80, scenes=["orbit"]))
@@ -285,11 +238,6 @@ def test_refined_matches_beside_found_and_tracked_ones(benchmark, tmp_path):
     assert header == ["store", "matches", "px", "fit", "ground-truth", "ms"]
     assert [row[:2] for row in rows] == [["store", name] for name in ("found", "moved", "Lucas-Kanade")]
     assert rows[0][2:5] == rows[1][2:5]  # untrained, it moves nothing
-    shift = np.roll(image, 1, axis=1)
-    points = torch.tensor([[200.0, 150], [300, 250]]).double()
-    pair = SimpleNamespace(points1=points, points2=points)
-    tracked = refined.track([image, shift], pair)[1] - points
-    torch.testing.assert_close(tracked, torch.tensor([[1.0, 0], [1, 0]]).double(), atol=0.02, rtol=0)
 
 
 def test_reconstruction(benchmark, real_data, tmp_path, monkeypatch, capsys):

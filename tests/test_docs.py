@@ -166,25 +166,6 @@ def test_the_model_zoo_lists_every_shipped_file_with_its_size():
         assert f"weights/{path.name}" in TEXTS[f"docs/models/{path.name}"]
 
 
-@pytest.fixture
-def check_site(monkeypatch):
-    pytest.importorskip("nbformat")
-    monkeypatch.syspath_prepend(DOCS)
-    return importlib.import_module("check_site")
-
-
-@pytest.mark.parametrize("link", ["missing.html", "sub/page.html#there"])
-def test_broken_links_of_the_built_site_are_found(check_site, link, tmp_path):
-    good = '<a href="sub/page.html#here">x</a><a href="#top">x</a><a href="https://example.org/none">x</a>'
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub/page.html").write_text('<h1 id="here">x</h1><a href="../index.html">x</a><img src="../a%20b.png">')
-    (tmp_path / "a b.png").touch()
-    (tmp_path / "index.html").write_text(good)
-    assert check_site.broken_links(tmp_path) == []
-    (tmp_path / "index.html").write_text(f'{good}<a href="{link}">x</a>')
-    assert check_site.broken_links(tmp_path) == [f"index.html: {link}"]
-
-
 def test_links_lead_to_files_that_read_well_without_the_site():
     """Those of the README to pages, those of pages to pages; a role that links to a page is lost without the site."""
     for page, text in TEXTS.items():

@@ -58,25 +58,6 @@ def test_a_layer_returns_from_a_downloaded_repository(folder, tmp_path):
         hub.HubModel.from_pretrained("someone/other", cache_dir=tmp_path / "cache", local_files_only=True)
 
 
-def test_an_upload_has_the_files_of_the_folder(folder, tmp_path, monkeypatch):
-    class Api:
-        def __init__(self, **kwargs):
-            self.token = None
-
-        def create_repo(self, repo_id, **kwargs):
-            self.repo_id = repo_id
-            return self
-
-        def upload_folder(self, *, repo_id, folder_path, **kwargs):
-            shutil.copytree(folder_path, tmp_path / repo_id)
-            return f"{repo_id} uploaded"
-
-    monkeypatch.setattr("huggingface_hub.hub_mixin.HfApi", Api)
-    assert hub.HubModel.from_pretrained(folder).push_to_hub("someone/tiny") == "someone/tiny uploaded"
-    uploaded, expected = hub.HubModel.from_pretrained(tmp_path / "someone/tiny"), hub.HubModel.from_pretrained(folder)
-    torch.testing.assert_close(uploaded.state_dict(), expected.state_dict(), rtol=0, atol=0)
-
-
 @pytest.mark.parametrize("config", [None, {}, {"class_name": "Linear"}])
 def test_a_folder_without_a_layer_of_this_package_is_refused(config, folder):
     (folder / "config.json").unlink()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import store_of
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.data.writer import StoreWriter, write_store
@@ -18,11 +19,7 @@ OPTIONS = {"detector": "sift", "num_features": 200, "max_matches": None}
 
 def pair(number: int) -> CorrespondenceStore:
     points = np.full((number + 1, 2), number, np.float32)
-    return CorrespondenceStore(
-        points, points + 1, np.full(number + 1, 0.5, np.float32), np.array([0, number + 1]),
-        np.full((1, 2, 2), 100, np.int32), [(f"{number}a", f"{number}b")], np.eye(3)[None],
-        np.stack([np.eye(3)] * 2)[None], np.eye(3)[None], np.ones((1, 3)), "test", "none", "none",
-    )  # fmt: skip
+    return store_of(points, points + 1, [0, number + 1], [(f"{number}a", f"{number}b")])
 
 
 @settings(max_examples=8)

@@ -1,7 +1,5 @@
 """Diagnostics of a normalisation against NumPy, and what does not change them."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -62,22 +60,6 @@ def test_gradcheck(function, shapes):
 def test_wrong_shapes(function, shapes, error, message):
     with pytest.raises(error, match=message):
         function(*map(torch.rand, shapes))
-
-
-NINE = torch.diag(torch.tensor([7.0, 3.0, 3.0, 9.0, 5.0, 5.0, 4.0, 2.0, 8.0]))
-
-
-@pytest.mark.parametrize(
-    ("function", "matrix", "expected"),
-    [
-        (condition_number, NINE, 3.0),  # 9 / 3: the ninth, 2, is left out
-        (condition_number, NINE[:8], 4.5),  # 9 / 2
-        (singularity_ratio, torch.diag(torch.tensor([100.0, 6.0, 2.0])), 3.0),  # the largest does not count
-        (singularity_ratio, torch.diag(torch.tensor([5.0, 2.0, 0.0])), math.inf),
-    ],
-)
-def test_of_a_diagonal(function, matrix, expected):
-    assert function(matrix).item() == expected
 
 
 class TestConditionNumber:

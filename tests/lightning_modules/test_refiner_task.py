@@ -5,13 +5,12 @@ import pytest
 import torch
 import yaml
 from PIL import Image
-from scenes import seeded
+from scenes import seeded, store_of
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.image_sets import ImageSets, find_images
 from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
-from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.data.writer import write_store
 from lightning_modules.refiner_task import HeldOutLoss, RefinerTask, all_matches
@@ -36,22 +35,12 @@ def folder(tmp_path_factory):
         points.append([pair.points1[rows], pair.points2[rows] + noise])
         names.append([f"place{seed}/s{seed}v1.png", "elsewhere/s1v2.extra.jpg" if seed else "place0/s0v2.png"])
         pairs.append(pair)
-    points1, points2 = (np.concatenate([views[k] for views in points]).astype(np.float32) for k in range(2))
-    store = CorrespondenceStore(
-        points1=points1,
-        points2=points2,
-        ratio=np.full(len(points1), 0.5, np.float32),
-        offsets=np.cumsum([0, *(len(views[0]) for views in points)]),
-        image_size=np.full((2, 2, 2), (WIDTH, HEIGHT), np.int32),
-        names=[(a, b) for a, b in names],
-        F=np.stack([pair.F_mat for pair in pairs]),
-        K=np.stack([np.stack([pair.K] * 2) for pair in pairs]),
-        R=np.stack([pair.R for pair in pairs]),
-        t=np.stack([pair.t for pair in pairs]),
-        dataset="rendered",
-        pairs="both",
-        detector="exact, with noise",
-    )
+    offsets = np.cumsum([0, *(len(views[0]) for views in points)])
+    known = {"F": "F_mat", "R": "R", "t": "t"}
+    known = {name: np.stack([getattr(pair, field) for pair in pairs]) for name, field in known.items()}
+    known["K"] = np.stack([np.stack([pair.K] * 2) for pair in pairs])
+    points1, points2 = (np.concatenate([views[k] for views in points]) for k in range(2))
+    store = store_of(points1, points2, offsets, [*map(tuple, names)], (WIDTH, HEIGHT), **known)
     write_store(folder / "matches.h5", store)
     return folder
 

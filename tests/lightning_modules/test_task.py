@@ -111,20 +111,6 @@ def test_a_loss_leaves_the_estimator_as_it_was():
     assert not any(network._forward_hooks for network in task.estimator.networks)
 
 
-def test_accumulated_batches_make_the_step_of_a_larger_one(tmp_path):
-    """Up to rounding, where the batches have the same number of samples; the limit of gradients is at work."""
-    source, states = SyntheticSamples(number=256, num_heldout=4, max_residual=None), []
-    for size, parts in ((64, 1), (16, 4)):
-        loss = kln.EpipolarLoss(log=True, heldout_weight=0.5)
-        task = normaliser_task(double=True, loss=loss, sample_gradient=0.1)
-        data = CorrespondenceDataModule(source, source, batch_size=size)
-        trainer = make_trainer(tmp_path, max_steps=6, enable_checkpointing=False, accumulate_grad_batches=parts)
-        trainer.fit(task, data)
-        assert trainer.global_step == 6
-        states.append(task.state_dict())
-    torch.testing.assert_close(*states, rtol=0, atol=1e-9)
-
-
 def test_sample_gradients_are_limited():
     batch, norms = next(iter(make_data().train_dataloader())), {}
     for limit in (None, 0.1):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scenes import store_of
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.images import read_image, stored_pixels
@@ -42,20 +43,9 @@ def make_store(kind="cloud", noise=0.05, names=NAMES) -> CorrespondenceStore:
     first, second = (np.concatenate([views[pair[side]] for pair in pairs]).astype(np.float32) for side in (0, 1))
     wrong = np.arange(len(second)) % 4 == 3
     second[wrong] = second[wrong][::-1]
-    shapes = {"F": (3, 3), "K": (2, 3, 3), "R": (3, 3), "t": (3,)}
-    unknown = {name: np.full((len(pairs), *shape), np.nan) for name, shape in shapes.items()}
-    return CorrespondenceStore(
-        points1=first,
-        points2=second,
-        ratio=np.where(wrong, 0.79, 0.5).astype(np.float32),
-        score=np.where(wrong, 0.21, 0.5).astype(np.float32),
-        offsets=MATCHES * np.arange(len(pairs) + 1),
-        image_size=np.full((len(pairs), 2, 2), SIZE, np.int32),
-        names=[(names[one], names[two]) for one, two in pairs],
-        dataset="",
-        pairs="",
-        detector="",
-        **unknown,
+    ratio = np.where(wrong, 0.79, 0.5)
+    return store_of(
+        first, second, MATCHES * np.arange(len(pairs) + 1), [(names[a], names[b]) for a, b in pairs], SIZE, ratio
     )
 
 

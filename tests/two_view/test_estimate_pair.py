@@ -1,7 +1,5 @@
 """The estimate of two images, against the true geometry of rendered ones, and its errors."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -105,19 +103,6 @@ class TestEstimatePair:
         assert found.front[found.inliers].double().mean() > 0.95
         E_mat = K.T @ found.F_mat.numpy() @ K
         assert np.allclose(abs((E_mat / np.linalg.norm(E_mat) * found.E_mat.numpy()).sum()), 1)
-
-    def test_json(self, result):
-        content = json.loads(json.dumps(result.as_dict(), allow_nan=False))
-        assert content["F"] == result.F_mat.tolist()
-        assert (content["E"], content["R"], content["t"], content["in_front"]) == (None, None, None, None)
-        assert (content["num_matches"], content["num_inliers"]) == (result.num_matches, result.num_inliers)
-        for name in ("points1", "points2", "scores", "weights", "inliers"):
-            assert content[name] == getattr(result, name).tolist()
-        assert content["image1"] == {"file": str(result.path1), "width": WIDTH, "height": HEIGHT}
-        assert (content["predicted_error_px"], content["warnings"]) == (result.predicted_error, [])
-        assert (content["estimator"], content["seed"]) == ("RANSAC", 0)
-        assert (content["ratio"], content["threshold_px"]) == (0.8, 1.0)
-        assert content["versions"]["torch"].partition("+")[0] == torch.__version__.partition("+")[0]
 
 
 def test_scores_of_lightglue_are_kept(planes, cached_weights):

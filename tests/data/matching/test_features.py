@@ -75,26 +75,6 @@ def test_keynet_leaves_out_what_fills_up(monkeypatch):
     assert found.descriptors.shape == (2, 128)
 
 
-def test_keynet_of_random_weights(monkeypatch):
-    import kornia.feature.affine_shape as affine
-    import kornia.feature.hardnet as hardnet
-    import kornia.feature.keynet as keynet
-    import kornia.feature.orientation as orientation
-
-    networks = {
-        keynet: keynet.KeyNet(False), orientation: orientation.OriNet(False),
-        affine: affine.LAFAffNetShapeEstimator(False), hardnet: hardnet.HardNet(False),
-    }  # fmt: skip
-    for place, network in networks.items():
-        weights = {"state_dict": network.state_dict()}
-        monkeypatch.setattr(place, "load_state_dict_from_url", lambda *_, w=weights, **__: w)
-    found = detect_keynet(texture(), 40)
-    assert len(found.points) <= 40
-    assert found.descriptors.shape == (len(found.points), 128)
-    assert (found.points.dtype, found.descriptors.dtype) == (np.float32, np.float32)
-    assert found.points.any(1).all()
-
-
 def test_lightglue_of_random_weights(monkeypatch):
     network = LightGlue(None, input_dim=128, filter_threshold=0.0).eval()
     monkeypatch.setattr(matching, "pretrained", lambda *_: network)

@@ -100,16 +100,6 @@ def test_share_of_gross_outliers(make, outliers, expected):
     assert torch.equal(scene.points1, exact.points1)
 
 
-def test_student_t_noise():
-    noise = draws.student_t((200_000, 2), seeded(4)).numpy()
-    # Quantiles of Student's t with three degrees of freedom, from its closed-form distribution function:
-    # F(x) = 1/2 + (x / (sqrt(3) (1 + x^2/3)) + atan(x / sqrt(3))) / pi.
-    for x in (-3.0, -1.0, 0.0, 0.5, 2.0, 6.0):
-        u = x / np.sqrt(3)
-        expected = 0.5 + (u / (1 + u * u) + np.arctan(u)) / np.pi
-        np.testing.assert_allclose((noise < x).mean(0), expected, atol=0.005)
-
-
 def test_random_scenes_have_the_breadth_promised():
     scene = random_scenes(4000, 20, seeded(7))
     width, height = scene.image_size.unbind(-1)
