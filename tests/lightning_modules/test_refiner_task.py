@@ -1,9 +1,10 @@
 """Refiners of matches: sets with images from stores, the loss, and a training on rendered pairs by the command line."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
-import yaml
 from PIL import Image
 from scenes import seeded, store_of
 
@@ -130,42 +131,15 @@ def test_gradients_pass_the_layer_and_leave_it(folder, calibrated):
         task.compute_loss(sets)
 
 
-def test_a_training_moves_matches_nearer_to_the_truth(folder, tmp_path, capsys):
+def test_a_training_moves_matches_nearer_to_the_truth(folder, tmp_path, monkeypatch, capsys):
     """By the command line, with checkpoints, weights, validation and predictions."""
+    monkeypatch.setenv("LEARNNORM_DATA", str(folder))
     images = {"paths": [f"{folder}/matches.h5"], "images": [f"{folder}/images"]}
-    data = {
-        "class_path": "kornia_learnnorm.data.random_sets.RandomSets",
-        "init_args": {
-            "sources": [{"class_path": "kornia_learnnorm.data.image_sets.ImageSets", "init_args": images}],
-            **{"sizes": [64, 64], "correspondences": 128, "augmented": 0.0, "batches": 30},
-        },
-    }
-    loss = {
-        "class_path": "lightning_modules.refiner_task.HeldOutLoss",
-        "init_args": {
-            "estimator": {
-                "class_path": "kornia_learnnorm.LearnedEightPoint.from_pretrained",
-                "init_args": {"name": "robust-tiny"},
-            }
-        },
-    }
-    config = {
-        "seed_everything": 0,
-        "trainer": {
-            "max_steps": 20,
-            "default_root_dir": str(tmp_path / "run"),
-            "enable_progress_bar": False,
-            "gradient_clip_val": 1.0,
-            "limit_val_batches": 2,
-        },
-        "model": {
-            "class_path": "lightning_modules.refiner_task.RefinerTask",
-            "init_args": {"refiner": {"class_path": "kornia_learnnorm.MatchRefiner"}, "loss": loss},
-        },
-        "data": {"batch_size": None, "train": data, "val": data, "test": data},
-    }
-    (tmp_path / "own.yaml").write_text(yaml.safe_dump(config))
-    options = ["--config", str(tmp_path / "own.yaml")]
+    sources = json.dumps([{"class_path": "kornia_learnnorm.data.image_sets.ImageSets", "init_args": images}])
+    data = {"sources": sources, "shares": "null", "sizes": "[64, 64]", "correspondences": 128, "batches": 30}
+    options = [f"--data.{stage}.init_args.{name}={value}" for stage in ("train", "val") for name, value in data.items()]
+    options = ["--config", "refiner", "--trainer.max_steps=20", "--trainer.enable_progress_bar=false", *options]
+    options += ["--trainer.limit_val_batches=2", f"--trainer.default_root_dir={tmp_path / 'run'}"]
     assert main(["fit", *options]) == 0
     refiner = kln.MatchRefiner.from_pretrained(tmp_path / "run/weights.safetensors")
     assert refiner.trained_on == ("matches",)
