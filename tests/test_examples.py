@@ -68,27 +68,6 @@ def test_weights_of_matches_learn_which_are_coarse_without_labels(example, monke
     assert weights[coarse[0]].mean() < 0.9 < 1.1 < weights[~coarse[0]].mean()
 
 
-def test_scores_of_lightglue_get_gradients(example, cached_weights):
-    cached_weights("xfeat.pt", "xfeat-lighterglue.pt")
-    module = example("finetune_lightglue")
-    layer, lightglue = module.pretrained()
-    room = render_pair(0, width=480, height=360)
-    sides = module.features([room.image1, room.image2])
-    found = lightglue(sides)
-    F_mat = layer.from_matches(sides["image0"], sides["image1"], found).F_mat
-    exact = [torch.from_numpy(points)[None].float() for points in (room.points1, room.points2)]
-    kln.symmetric_epipolar_distance(*exact, F_mat).median().backward()
-    assert all(p.grad.norm() > 0 for p in lightglue.log_assignment[-1].parameters())
-
-    pair, generator = module.match(lightglue, sides), torch.Generator().manual_seed(0)
-    weights = torch.ones(len(pair.points), dtype=torch.float64, requires_grad=True)
-    module.halves_loss(layer, lambda _: weights, [pair] * 16, generator).backward()
-    distance = kln.symmetric_epipolar_distance(
-        *(x[None] for x in pair.points.split(2, 1)), torch.from_numpy(room.F_mat)[None]
-    )[0]
-    assert weights.grad[distance < 1].sum() < 0 < weights.grad[distance > 1].sum()
-
-
 def test_folders_of_images_are_trained_on(example, cached_weights, tmp_path):
     cached_weights("xfeat.pt", "xfeat-lighterglue.pt")
     write_pair(tmp_path, render_pair(0, width=240, height=180))

@@ -44,14 +44,3 @@ def test_the_seed_determines_the_pair():
     first, again, other = (render_kind("repeated", seed, 96, 72) for seed in (1, 1, 2))
     np.testing.assert_equal(first, again)
     assert not np.array_equal(first.image1, other.image1)
-
-
-def test_borders_hide_their_correspondences():
-    frame, caption = rendered("borders", 0), rendered("borders", 1)
-    black = (frame.image1 == 0) & (frame.image2 == 0)
-    assert all(side.all() for side in (black[:, :8], black[:, -8:], black[:6], black[-6:]))
-    assert (caption.image1 == caption.image2)[-12:].all()
-    for view in ("points1", "points2"):
-        x, y = getattr(frame, view).round().astype(int).T
-        assert black[y, x].mean() < 0.01
-        assert getattr(caption, view)[:, 1].max() < SIZE[1] - 12

@@ -124,11 +124,6 @@ class TestOnePair:
             command(*(f"{planes}/left.png" if text == "IMAGE" else text for text in arguments))
         assert not list(Path().iterdir())
 
-    def test_seeds_are_checked_while_parsing(self, command, capsys):
-        with pytest.raises(SystemExit, match="2"):
-            command("--seed", str(2**63))
-        assert f"a whole number from 0 to 2^63 - 1 expected, got {2**63}" in capsys.readouterr().err
-
 
 class TestManyPairs:
     @pytest.fixture

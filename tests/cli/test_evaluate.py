@@ -161,20 +161,6 @@ def test_json_is_not_written_where_a_command_fails_or_over_its_input(folder, tmp
     assert [*tmp_path.iterdir()] == [store]
 
 
-def test_without_ground_truth_there_are_no_columns_of_it(folder, capsys):
-    assert main(["evaluate", str(folder / "known.h5"), str(folder / "unknown.h5"), "--methods", "none", "Hartley"]) == 0
-    known, unknown = capsys.readouterr().out.split("\nunknown: ")
-    assert "truth: median px" in known
-    assert "without ground truth" not in known
-    assert unknown.splitlines()[0].endswith("; without ground truth")
-    tables, legend = unknown.split("\nmean, median: ")
-    assert tables.count("truth") == 1
-    assert "truth: of the ground-truth inliers" in legend
-    for header, rows in read_tables(unknown).values():
-        assert header == ["method", "better than Hartley %", "mean px", "median px"]
-        assert rows["Hartley"][0] == "-"
-
-
 @pytest.mark.parametrize(
     ("stores", "weights", "message"),
     [

@@ -44,15 +44,6 @@ def test_readers(written, tmp_path, capsys, reader, args, pairs, known):
     assert len(read_store(tmp_path / "s.h5")) == pairs
 
 
-def test_the_pairs_of_each_sequence_are_printed(written, tmp_path, monkeypatch, capsys):
-    for place in ("desk", "street"):
-        shutil.copytree(written / "kitti/sequences/06/image_0", tmp_path / "photos" / place)
-    monkeypatch.chdir(tmp_path / "photos")
-    assert run("folder", Path(), tmp_path / "s.h5") == 0
-    assert "sequences: desk @0:3, street @3:6" in capsys.readouterr().out
-    assert read_store(tmp_path / "s.h5").dataset == "images of photos"
-
-
 @pytest.mark.parametrize("args", [[], ["--pairs"], ["--min-points", "5"]])
 def test_colmap(written, tmp_path, args):
     root = written / "colmap"

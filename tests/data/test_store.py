@@ -50,11 +50,6 @@ def test_matches_without_a_ratio_pass_every_ratio_test(uneven, tmp_path):
     assert StoreReader(tmp_path / "scored.h5").passing(0.8).tolist() == np.diff(store.offsets).tolist()
 
 
-def test_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no store at .*none\.h5"):
-        read_store(f"{tmp_path / 'none.h5'}@0:2")
-
-
 @pytest.mark.parametrize("change", [lambda data: b"not a store", lambda data: data[:3000]])
 def test_not_hdf5(path, change):
     path.write_bytes(change(path.read_bytes()))

@@ -278,14 +278,6 @@ class TestBackEnds:
         if gradients:
             torch.testing.assert_close(*gradients, rtol=1e-5, atol=1e-9)
 
-    @pytest.mark.slow
-    @pytest.mark.filterwarnings("ignore")  # Inductor's own
-    def test_inductor(self):
-        torch.compiler.reset()
-        layer, points = EightPoint(shaken()), correspondences("handheld", 4)
-        compiled = torch.compile(layer, fullgraph=True)
-        assert up_to_sign(compiled(*points).detach(), layer(*points).detach()) < 1e-6
-
     def test_functional_gradients(self, layer):
         layer, points = layer.double(), [p.requires_grad_() for p in correspondences("handheld", 3, 12)]
 

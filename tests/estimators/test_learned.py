@@ -1,7 +1,5 @@
 """The learned eight-point algorithm: invariances, small sets, scores, stages, files, errors."""
 
-import json
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -196,17 +194,6 @@ class TestFiles:
         assert not layer.training
         for key, value in expected.state_dict().items():
             assert torch.equal(layer.state_dict()[key], value)
-
-    def test_file_of_an_earlier_version(self, file):
-        """Before, there were no samples."""
-
-        def drop(_, metadata):
-            architecture = json.loads(metadata["architecture"])
-            del architecture["samples"]
-            metadata["architecture"] = json.dumps(architecture)
-
-        rewrite_weights(file, drop)
-        assert kln.LearnedEightPoint.from_pretrained(file).samples == 64
 
     @pytest.mark.parametrize(
         "architecture", ["", "[]", '{"widht": 3}', '{"width": 10000}', '{"stages": 0}', '{"rank2": "no"}']

@@ -10,10 +10,9 @@ from torch.autograd import gradcheck, gradgradcheck
 from kornia_learnnorm.geometry.dlt import design_matrix, nearest_null_vector, null_vector
 
 
-class TestDesignMatrix:
-    def test_shape(self):
-        with pytest.raises(ShapeError):
-            design_matrix(torch.rand(8, 2), torch.rand(8, 3))
+def test_shape():
+    with pytest.raises(ShapeError):
+        design_matrix(torch.rand(8, 2), torch.rand(8, 3))
 
 
 class TestNullVector:
@@ -25,12 +24,6 @@ class TestNullVector:
             rooted = A.numpy() if w is None else A.numpy() * np.sqrt(w.numpy())[..., None]
             expected = np.linalg.svd(rooted, full_matrices=True)[2][:, -1]
             np.testing.assert_allclose(h, np.sign((expected * h).sum(-1, keepdims=True)) * expected, atol=1e-11)
-
-    def test_is_exact_whatever_the_scales_of_eight_rows(self):
-        A = uniform(10, 8, 9, low=-1)
-        scaled = A * 10.0 ** uniform(10, 8, 1, low=-3, high=3, seed=1)
-        h, expected = null_vector(scaled), null_vector(A)
-        assert torch.minimum((h - expected).norm(dim=-1), (h + expected).norm(dim=-1)).max() < 1e-8
 
     @pytest.mark.parametrize("num_points", [8, 12])
     def test_gradients(self, num_points):

@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -94,13 +93,3 @@ def test_what_is_left_out_is_counted(alone):
     assert results(alone / "filtered")["samples"] == [20, 20, 1, 20, 20, 1]
     for folder in alone.iterdir():
         assert all(tensor.isfinite().all() for tensor in weights(folder).values())
-
-
-@pytest.mark.slow
-def test_killed_and_resumed(alone, tmp_path):
-    """A process that is killed outright after the third step leaves a checkpoint that leads to the same weights."""
-    ((code, _),) = start(tmp_path, 1, "killed")
-    assert code == -signal.SIGKILL
-    run("killed", 1, tmp_path)
-    torch.testing.assert_close(weights(tmp_path / "killed"), weights(alone / "plain"), rtol=0, atol=0)
-    assert results(tmp_path / "killed")["train/loss"] == results(alone / "plain")["train/loss"][2:]

@@ -70,21 +70,6 @@ class TestBootstrapInterval:
         low, high = bootstrap_interval(values, groups, level, draws=50)
         assert values.min() - 1e-9 <= low <= high <= values.max() + 1e-9
 
-    @pytest.mark.parametrize(
-        ("values", "groups", "level", "message"),
-        [
-            (torch.rand(3), torch.arange(4), 0.95, r"two \(S,\) tensors, got \[3\] and \[4\]"),
-            (torch.rand(2, 2), torch.ones(2, 2).long(), 0.95, r"two \(S,\) tensors, got \[2, 2\] and \[2, 2\]"),
-            (torch.tensor(1.0), torch.tensor(1), 0.95, r"two \(S,\) tensors, got \[\] and \[\]"),
-            *((torch.rand(3), torch.arange(3), n, f"between 0 and 1, got {n}") for n in (0.0, 1.0, 95, NAN)),
-            (torch.rand(3), torch.full((3,), 7), 0.95, "at least two groups are needed, got 1"),
-            (torch.rand(0), torch.arange(0), 0.95, "at least two groups are needed, got 0"),
-        ],
-    )
-    def test_exceptions(self, values, groups, level, message):
-        with pytest.raises(ValueError, match=message):
-            bootstrap_interval(values, groups, level)
-
 
 def uneven(effect=0.0, number=30, seed=1):
     """Differences that agree within pairs of very different sizes."""
@@ -126,15 +111,32 @@ class TestPairedBootstrap:
         for level in (0.1, 0.5):
             assert np.mean(np.array(found) < level) == pytest.approx(level, abs=0.07)
 
-    @pytest.mark.parametrize(
-        ("values", "baseline", "groups", "message"),
-        [
-            (torch.rand(3, 1), torch.rand(3, 1), torch.arange(3), r"two \(S,\) tensors, got \[3, 1\]"),
-            (torch.rand(3), torch.rand(3), torch.arange(4), r"got \[3\] and \[4\]"),
-            (torch.rand(3), torch.rand(3), torch.zeros(3).long(), "at least two groups are needed, got 1"),
-            (torch.tensor([1.0, NAN, INF]), torch.rand(3), torch.arange(3), "got 2 NaN or infinite ones of 3"),
-        ],
-    )
-    def test_exceptions(self, values, baseline, groups, message):
-        with pytest.raises(ValueError, match=message):
-            paired_bootstrap(values, baseline, groups)
+
+FEW = "at least two groups are needed, got"
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        (bootstrap_interval, (torch.rand(3), torch.arange(4)), r"two \(S,\) tensors, got \[3\] and \[4\]"),
+        (bootstrap_interval, (torch.rand(2, 2), torch.ones(2, 2).long()), r"got \[2, 2\] and \[2, 2\]"),
+        (bootstrap_interval, (torch.tensor(1.0), torch.tensor(1)), r"got \[\] and \[\]"),
+        *(
+            (bootstrap_interval, (torch.rand(3), torch.arange(3), n), f"between 0 and 1, got {n}")
+            for n in (0.0, 1.0, 95, NAN)
+        ),
+        (bootstrap_interval, (torch.rand(3), torch.full((3,), 7)), f"{FEW} 1"),
+        (bootstrap_interval, (torch.rand(0), torch.arange(0)), f"{FEW} 0"),
+        (paired_bootstrap, (torch.rand(3, 1), torch.rand(3, 1), torch.arange(3)), r"two \(S,\) tensors, got \[3, 1\]"),
+        (paired_bootstrap, (torch.rand(3), torch.rand(3), torch.arange(4)), r"got \[3\] and \[4\]"),
+        (paired_bootstrap, (torch.rand(3), torch.rand(3), torch.zeros(3).long()), f"{FEW} 1"),
+        (
+            paired_bootstrap,
+            (torch.tensor([1.0, NAN, INF]), torch.rand(3), torch.arange(3)),
+            "2 NaN or infinite ones of 3",
+        ),
+    ],
+)
+def test_exceptions(function, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        function(*arguments)

@@ -65,12 +65,6 @@ def test_draw_line_from_border_to_border(line, ends):
 
 
 class TestDrawPair:
-    @pytest.mark.parametrize(("width", "height", "ratio"), [(160, 120, 0.42), (300, 100, 0.75)])
-    def test_layout_follows_the_shape(self, draw, width, height, ratio):
-        picture = draw(*make_pair(width, height))
-        assert picture.shape[1] == 1200
-        assert picture.shape[0] / picture.shape[1] == pytest.approx(ratio, abs=0.05)
-
     def test_colours_of_inliers_and_outliers(self, picture):
         levels = (picture[70:, :590] * 255).round()
         blue = (np.abs(levels - [0x45, 0xA1, 0xFF]).max(2) < 8).sum()

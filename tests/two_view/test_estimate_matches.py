@@ -17,7 +17,6 @@ SCENE = handheld(1, 160, seeded(), noise=0.3)
 K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
 TINY = kln.LearnedEightPoint.from_pretrained("robust-tiny")
 SIZES = {"size1": (640, 480), "size2": (640, 480)}
-CAMERAS = {"K1": SCENE.K1[0], "K2": SCENE.K2[0]}
 
 
 def make_matches(outliers: int = 40):
@@ -115,14 +114,6 @@ class TestEstimateMatches:
             points1, points1 * torch.tensor([-1.0, 1]) + 400, **SIZES, K1=K, K2=K, model="homography"
         )
         assert (codes(mirrored), mirrored.R) == (["no_pose"], None)
-
-    def test_a_tie_between_poses(self, matches, monkeypatch):
-        nothing = torch.full((1, 3, 3), torch.nan).double()
-        monkeypatch.setattr(module, "relative_pose", lambda *_: (nothing, nothing[:, 0]))
-        found = kln.estimate_matches(*matches, **CAMERAS)
-        assert (found.R, found.t, found.front) == (None, None, None)
-        assert codes(found) == ["no_pose"]
-        json.dumps(found.as_dict(), allow_nan=False)
 
     def test_the_learned_layer(self, matches):
         found = kln.estimate_matches(*matches, layer=TINY)

@@ -191,11 +191,6 @@ class TestDask:
 
 
 class TestGoingOn:
-    def test_other_cameras_are_refused(self, images, expected):
-        moved = [FramePair(replace(pair.frame1, camera=np.eye(3)), pair.frame2) for pair in pairs_of(images)]
-        with pytest.raises(ValueError, match=r"other data.* the images, their cameras, their poses or the pairs"):
-            collect_matches(moved, expected, OPTIONS)
-
     @pytest.mark.parametrize(
         ("place", "error"),
         [

@@ -119,16 +119,6 @@ def test_the_rate_of_known_distributions():
     assert {row[2]: row[1] for row in as_text(table.rows[1:])} == printed
 
 
-def test_rates_have_no_row_of_the_baseline_or_of_a_method_without_predictions(run):
-    found = read_run(run)
-    for cell in found.cells:
-        cell.predictions.pop("crossview")
-    found.about["trained_on"]["crossview"] = ["scenes"]
-    others = {"none", "Hartley", "whitening", "Hartley+optimal", "Hartley+LM"}
-    names = [{row[0] for row in table.rows} for table in rate_tables(found)]
-    assert names == 2 * [others - {"Hartley"}] + 2 * [others - {"whitening"}]
-
-
 def test_numbers_of_robust_estimators(robust_run):
     found = read_robust(robust_run)
     tables = {table.title: table for table in robust_tables(found)}

@@ -13,7 +13,7 @@ from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import peers
 from kornia_learnnorm.evaluation.robust.robust_estimators import find_estimator, run_estimator
-from kornia_learnnorm.evaluation.robust.robust_run import estimate_path, even_pairs, measure, read_robust, shuffled_pair
+from kornia_learnnorm.evaluation.robust.robust_run import estimate_path, measure, read_robust, shuffled_pair
 from kornia_learnnorm.metrics.inliers import f1_score
 
 
@@ -131,8 +131,3 @@ def test_measure(matches):
     found = measure(unknown, drawn.F_mat, 1.0)
     assert found["inliers"] > 0.5
     assert all(math.isnan(found[key]) for key in ("f1", "error", "rotation_error", "translation_error"))
-
-
-def test_even_pairs():
-    assert even_pairs(51, 3) == [0, 25, 50]
-    assert even_pairs(2, 0) == even_pairs(2, 5) == [0, 1]

@@ -12,15 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.sets import plain_residual
-from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method
 from kornia_learnnorm.evaluation.runs import prediction_run
-from kornia_learnnorm.evaluation.runs.prediction_run import ERRORS, SampleOptions, read_run, temporary_run
+from kornia_learnnorm.evaluation.runs.prediction_run import ERRORS, read_run, temporary_run
 from kornia_learnnorm.evaluation.runs.results_store import file_name
 
 
@@ -32,21 +29,6 @@ def assert_same(one, other):
         for name, found in again.predictions.items():
             for key, values in found.items():
                 np.testing.assert_array_equal(cell.predictions[name][key], values)
-
-
-def test_predictions_are_those_of_the_functions(run, store):
-    cell = read_run(run).cells[0]
-    samples = SampleOptions().draw(read_store(store), 0.8)
-    assert cell.drawn == len(samples.pair)
-    samples = samples.select(plain_residual(samples.points1, samples.points2) < 60)
-    x1, x2 = samples.points1.double(), samples.points2.double()
-    with torch.no_grad():
-        F_mat = find_method("crossview").estimate(x1, x2)
-    found = cell.predictions["crossview"]
-    assert torch.equal(found["F_mat"], F_mat)
-    torch.testing.assert_close(found["own"], kln.symmetric_epipolar_distance(x1, x2, F_mat).mean(-1))
-    heldout = kln.symmetric_epipolar_distance(samples.heldout1.double(), samples.heldout2.double(), F_mat)
-    np.testing.assert_allclose(found["heldout"], np.median(heldout, axis=1))
 
 
 def test_a_temporary_run_of_methods_in_another_order_has_the_same_numbers(run, store, command):

@@ -5,14 +5,13 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from scenes import numpy_whitening, prepared, rewrite_weights, shaken, uniform
+from scenes import numpy_whitening, prepared, shaken, uniform
 from torch.autograd import gradcheck
 
 from kornia_learnnorm import CrossViewNetwork, LearnedNormalizer
 from kornia_learnnorm.estimators.set_network import AttentiveContextBlock
 from kornia_learnnorm.normalizers.networks.crossview import ContextLayer, SetNetwork
 
-FEATURES = ["epipolar", "both", "own"]
 whitened = partial(prepared, numpy_whitening)
 
 
@@ -99,14 +98,3 @@ class TestFeatures:
     def test_unknown(self, name):
         with pytest.raises(ValueError, match=f"features must be one of own, both, epipolar, got {name!r}"):
             CrossViewNetwork(features=name)
-
-    def test_files_from_before_them_have_epipolar_ones(self, tmp_path):
-        saved, file = LearnedNormalizer(network=CrossViewNetwork(width=8, depth=1)), tmp_path / "weights.safetensors"
-        saved.save_pretrained(file)
-
-        def change(_, metadata):
-            metadata["architecture"] = metadata["architecture"].replace(', "features": "epipolar"', "")
-            assert "features" not in metadata["architecture"]
-
-        rewrite_weights(file, change)
-        assert LearnedNormalizer.from_pretrained(file).network.features == "epipolar"
