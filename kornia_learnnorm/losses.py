@@ -147,8 +147,7 @@ class LogEpipolarLoss(nn.Module):
 
     def forward(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         """Return the loss of each set, (B,), of correspondences (B, M, 2) x 2 under matrices (B, 3, 3)."""
-        distance = self.residual(points1, points2, F_mat).clamp(max=MAX_DISTANCE)
-        return (distance + self.floor).log().mean(-1)
+        return (self.residual(points1, points2, F_mat).clamp(max=MAX_DISTANCE) + self.floor).log().mean(-1)
 
 
 class LogEssentialLoss(nn.Module):

@@ -43,8 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 with warnings"
     )
     parser.add_argument("images", metavar="IMG", type=Path, nargs="*", help=argparse.SUPPRESS)  # in the usage
-    picture = "picture of the matches; with --pairs, a folder"
-    parser.add_argument("--out", metavar="PATH", type=Path, help=picture)
+    parser.add_argument("--out", metavar="PATH", type=Path, help="picture of the matches; with --pairs, a folder")
     parser.add_argument("--json", metavar="FILE", help="write the result to this file; -: standard output")
     parser.add_argument("--matches", action="store_true", help="with the matches in the JSON")
     parser.add_argument("--strict", action="store_true", help="exit with 3 where there are warnings")
@@ -56,8 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     distance = f"largest distance of inliers {default}"
     add("--threshold", metavar="PX", type=float, default=options.threshold, help=distance)
     add("--seed", metavar="N", type=_seed, default=options.seed, help=default)
-    camera = "one or two: fx,fy,cx,cy, a file, exif; adds E, R, t"
-    add("--K", metavar="CAMERA", nargs="+", default=[], help=camera)
+    add("--K", metavar="CAMERA", nargs="+", default=[], help="one or two: fx,fy,cx,cy, a file, exif; adds E, R, t")
     add = parser.add_argument_group("matching").add_argument
     for name, known in (("detector", DETECTORS), ("matcher", MATCHERS)):
         text = f"{', '.join(known)} {default}"

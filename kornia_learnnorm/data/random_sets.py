@@ -278,8 +278,7 @@ class RandomSets:
         source = self.sources[int((shares < chance * shares[-1]).sum())]
         low, high = self.sizes
         num_points = round(low * math.exp(size * math.log(high / low)))
-        num_sets = max(1, min(self.max_sets, self.correspondences // num_points))
-        sets = source.draw(num_sets, num_points, generator)
+        sets = source.draw(max(1, min(self.max_sets, self.correspondences // num_points)), num_points, generator)
         if augmented < self.augmented:
             sets = augment(sets, generator)
         return sets if scored < self.scored else sets._replace(scores=None)

@@ -72,8 +72,7 @@ def epipolar_error(points1: Tensor, points2: Tensor, F_mat: Tensor, F_true: Tens
     infinite for a failed estimate and NaN where the ground truth has no inliers.
     """
     true = _inliers(points1, points2, F_true, threshold)
-    distance = finite_distance(points1, points2, F_mat)
-    return torch.where(true, distance, 0.0).sum(-1) / true.sum(-1)
+    return torch.where(true, finite_distance(points1, points2, F_mat), 0.0).sum(-1) / true.sum(-1)
 
 
 def finite_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:

@@ -87,8 +87,7 @@ def mean_average_accuracy(errors: Tensor, limit: int = 10) -> float:
     errors = _checked(errors)
     if limit < 1:
         raise ValueError(f"limit must be one degree or more, got {limit}")
-    degrees = torch.arange(1, limit + 1, device=errors.device)
-    return (errors[:, None] < degrees).to(errors.dtype).mean().item()
+    return (errors[:, None] < torch.arange(1, limit + 1, device=errors.device)).to(errors.dtype).mean().item()
 
 
 def _checked(errors: Tensor) -> Tensor:

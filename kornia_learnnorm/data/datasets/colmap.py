@@ -46,8 +46,7 @@ def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int 
     """Yield the pairs of frames that see at least ``min_points`` 3D points of a COLMAP model in common, by name."""
     if min_points < 1:
         raise ValueError(f"the frames of a pair must share at least 1 point, got min_points {min_points}")
-    reconstruction = _reconstruction(Path(model))
-    named = {image.name: image for image in reconstruction.images.values()}
+    named = {image.name: image for image in _reconstruction(Path(model)).images.values()}
     ordered = sorted(frames, key=lambda frame: frame.name)
     seen: list[set[int]] = []
     observers: defaultdict[int, list[int]] = defaultdict(list)

@@ -159,16 +159,17 @@ def _match_all(
 
     tqdm = import_extra("tqdm", "images", "matching many pairs").tqdm
     often = {} if sys.stderr.isatty() else {"mininterval": LOG_INTERVAL, "maxinterval": LOG_INTERVAL}
-    with tqdm(total=len(pairs), initial=len(done), unit="pair", **often) as bar:
-        log = partial(bar.write, file=sys.stderr)
-        with closing(restart_crashed(match_rest, log)) as results:
-            for place, result in results:
-                if isinstance(result, str):
-                    skipped[" ".join(frame.name for frame in pairs[place])] = result
-                else:
-                    writer.add(place, replace(result, **about))
-                done.add(place)
-                bar.update()
+    with (
+        tqdm(total=len(pairs), initial=len(done), unit="pair", **often) as bar,
+        closing(restart_crashed(match_rest, partial(bar.write, file=sys.stderr))) as results,
+    ):
+        for place, result in results:
+            if isinstance(result, str):
+                skipped[" ".join(frame.name for frame in pairs[place])] = result
+            else:
+                writer.add(place, replace(result, **about))
+            done.add(place)
+            bar.update()
     return skipped
 
 

@@ -160,8 +160,7 @@ def _corrupt(
     dirty = torch.where(learned, 0.1 + 0.6 * share, 0.2 + 0.7 * share)
     share = torch.where(clean, 0.2 * share, torch.where(common, 0.1 + 0.4 * share, dirty))
     outliers = _choose_outliers(points1, share, generator) | ~shown
-    wrong = _wrong_partners(points2, size, common, generator)
-    points2 = torch.where(outliers[..., None], wrong, points2)
+    points2 = torch.where(outliers[..., None], _wrong_partners(points2, size, common, generator), points2)
     inliers = shown & (distance(points1, points2) < 3 * scale[..., 0] + 0.5)
     scores = _scores(inliers, clean, generator)
     if coarse:
@@ -244,8 +243,7 @@ def _scores(inliers: Tensor, clean: Tensor, generator: Generator) -> Tensor:
     shape = tuple(inliers.shape)
     exponent = draws.log_uniform((shape[0], 1), 0.4, 1.2, generator)
     good = draws.uniform(shape, 0.02, 0.95, generator) ** exponent
-    bad = 1 - 0.3 * draws.uniform(shape, 0.0, 1.0, generator) ** 3
-    ratio = torch.where(inliers, good, bad)
+    ratio = torch.where(inliers, good, 1 - 0.3 * draws.uniform(shape, 0.0, 1.0, generator) ** 3)
     return 1 - torch.where(clean, 0.8 * ratio, ratio)
 
 
@@ -253,5 +251,4 @@ def _learned_scores(inliers: Tensor, quality: Tensor, clean: Tensor, generator: 
     """Return scores (B, N) as of LightGlue, in sets marked ``clean`` (B, 1), and of ratios, by the log of the noise."""
     chance = draws.normal(tuple(inliers.shape), generator)
     good = torch.where(clean, 3 - 1.7 * quality + 0.7 * chance, -0.7 - 0.6 * quality + 0.5 * chance)
-    bad = torch.where(clean, 1.5 * chance, chance - 2.2)
-    return torch.where(inliers, good, bad).sigmoid()
+    return torch.where(inliers, good, torch.where(clean, 1.5 * chance, chance - 2.2)).sigmoid()

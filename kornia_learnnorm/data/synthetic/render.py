@@ -66,8 +66,7 @@ def render_pair(seed: int = 0, width: int = 640, height: int = 480) -> RenderedP
     yaw, pitch, roll = np.deg2rad([rng.uniform(-5, -3), rng.uniform(-1, 1), rng.uniform(-1.5, 1.5)])
     R = rotation(yaw, pitch, roll)
     t = -R @ np.array([rng.uniform(0.5, 0.65), rng.uniform(-0.1, 0.05), rng.uniform(0.2, 0.4)])
-    planes = room(rng, cv2, texels=SUPERSAMPLING * width / 640)
-    return render_views(rng, cv2, planes, R, t, (width, height))
+    return render_views(rng, cv2, room(rng, cv2, texels=SUPERSAMPLING * width / 640), R, t, (width, height))
 
 
 def check_size(seed: int, width: int, height: int) -> None:

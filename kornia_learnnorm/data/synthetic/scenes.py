@@ -98,8 +98,7 @@ def forward_driving(
     axes = draws.normal((batch_size, 1, 3), generator) * size.new_tensor([0.2, 1.0, 0.2])
     baseline = draws.uniform((batch_size, 1), 0.6, 1.4, generator)
     R, t = draws.motions(axes, draws.log_uniform((batch_size, 1), 0.002, 0.05, generator), forward, baseline)
-    scene = two_views(points1, depths, K, R, t, size, num_points)
-    return _corrupt_evenly(scene, noise, outliers, generator)
+    return _corrupt_evenly(two_views(points1, depths, K, R, t, size, num_points), noise, outliers, generator)
 
 
 def handheld(
@@ -117,8 +116,7 @@ def handheld(
     baseline = draws.log_uniform((batch_size, 1), 0.03, 0.15, generator) * depths.median(dim=1, keepdim=True).values
     axes, direction = (draws.normal((batch_size, 1, 3), generator) for _ in range(2))
     R, t = draws.motions(axes, angle, direction, baseline)
-    scene = two_views(points1, depths, K, R, t, size, num_points)
-    return _corrupt_evenly(scene, noise, outliers, generator)
+    return _corrupt_evenly(two_views(points1, depths, K, R, t, size, num_points), noise, outliers, generator)
 
 
 def orbit(

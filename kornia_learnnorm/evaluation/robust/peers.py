@@ -109,8 +109,7 @@ PEERS = {
 
 def find_peer(name: str) -> Peer:
     """Return an estimator of another package by its name in ``PEERS``."""
-    module = import_extra(PEERS[name].module, PEERS[name].extra, f"the estimator {name}")
-    return partial(PEERS[name].estimate, module)
+    return partial(PEERS[name].estimate, import_extra(PEERS[name].module, PEERS[name].extra, f"the estimator {name}"))
 
 
 def peer_version(name: str) -> str:

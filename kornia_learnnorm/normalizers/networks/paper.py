@@ -67,8 +67,7 @@ class PaperNetwork(nn.Module):
         """
         dtype = self.stem.weight.dtype
         points = torch.cat([points1, points2]).to(dtype)
-        doubled = None if weights is None else torch.cat([weights, weights]).to(dtype)
-        maxima = self.global_features(points, doubled)
+        maxima = self.global_features(points, None if weights is None else torch.cat([weights, weights]).to(dtype))
         params = self.head(self.convolution(maxima[:, None]).flatten(1)).to(points1.dtype)
         # Not `chunk`, which torch.export cannot trace with a dynamic batch.
         params1, params2 = torch.unflatten(params, 0, (2, -1)).unbind(0)
