@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.datasets.frames import Frame
-from kornia_learnnorm.data.datasets.splits import choose_sequences
+from kornia_learnnorm.data.datasets.frames import Frame, choose_sequences
 from kornia_learnnorm.data.datasets.textfiles import rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 

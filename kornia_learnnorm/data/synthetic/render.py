@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kornia_learnnorm.data.datasets.frames import fundamental_from_motion
 from kornia_learnnorm.data.images import import_cv2
-from kornia_learnnorm.data.motion import fundamental_from_motion
 from kornia_learnnorm.files import atomic_write, write_text
 
 __all__ = ["Plane", "RenderedPair", "check_size", "circles", "framed", "letters", "masonry", "noise", "polygons"]

@@ -18,7 +18,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_p
 from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.data.motion import fundamental_from_motion
+from kornia_learnnorm.data.datasets.frames import fundamental_from_motion
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.synthetic import draws
 
