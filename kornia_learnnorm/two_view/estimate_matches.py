@@ -24,16 +24,17 @@ from kornia_learnnorm.two_view.inputs import Points, check_settings, read_camera
 from kornia_learnnorm.two_view.model_choice import choose_model
 from kornia_learnnorm.two_view.parallax import Parallax
 from kornia_learnnorm.two_view.plane_pose import PlanePose, angle_between, plane_poses
-from kornia_learnnorm.two_view.predicted_error import (
+from kornia_learnnorm.two_view.reliability import (
     CAMERA_ERROR,
+    PairWarning,
     PredictedError,
+    find_warnings,
     nominal_camera,
     predict_error,
     predict_transfer_error,
 )
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
-from kornia_learnnorm.two_view.warnings import PairWarning, find_warnings
 
 __all__ = ["estimate_matches"]
 

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.two_view.parallax import find_main_plane, parallax
+from kornia_learnnorm.two_view.reliability import MIN_INLIERS, PairWarning
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
-from kornia_learnnorm.two_view.warnings import MIN_INLIERS, PairWarning
 
 NUM_NEIGHBOURS = 48  # matches nearest to a match in an image
 ROUNDS = 2  # in the second, neighbours count by their own share in the first

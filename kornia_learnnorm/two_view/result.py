@@ -13,7 +13,7 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.statistics import median
 from kornia_learnnorm.two_view.parallax import Parallax, parallax
 from kornia_learnnorm.two_view.plane_pose import PlanePose
-from kornia_learnnorm.two_view.warnings import PairWarning
+from kornia_learnnorm.two_view.reliability import PairWarning
 
 __all__ = ["ModelChoice", "NoReliableMatrixError", "PairEstimate", "package_versions"]
 

@@ -31,9 +31,14 @@ from kornia_learnnorm.two_view.parallax import (
     parallax,
     parallax_evidence,
 )
-from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
+from kornia_learnnorm.two_view.reliability import (
+    MAX_LOG_FALSE_ALARMS,
+    drop_failed_parts,
+    log_false_alarms,
+    log_false_samples,
+    random_parts,
+)
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
-from kornia_learnnorm.two_view.warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
 
 MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
 MIN_SCORE_GAIN = 1.02  # of another hypothesis over the one found first, which otherwise stays

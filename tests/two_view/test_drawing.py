@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from kornia_learnnorm.two_view.drawing import draw_line, draw_pair, import_matplotlib
+from kornia_learnnorm.two_view.reliability import PairWarning
 from kornia_learnnorm.two_view.result import ModelChoice, PairEstimate
-from kornia_learnnorm.two_view.warnings import PairWarning
 
 image_module = pytest.importorskip("matplotlib.image")  # Matplotlib may not be installed
 

@@ -9,7 +9,7 @@ from scenes import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
-from kornia_learnnorm.two_view.predicted_error import predict_error, random_parts
+from kornia_learnnorm.two_view.reliability import predict_error, random_parts
 
 
 @pytest.mark.parametrize("number", [40, 200])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_learnnorm.two_view.warnings import find_warnings, log_false_alarms, log_false_samples
+from kornia_learnnorm.two_view.reliability import find_warnings, log_false_alarms, log_false_samples
 
 SIZE = (640, 480)
 ALL = torch.ones(100, dtype=torch.bool)
