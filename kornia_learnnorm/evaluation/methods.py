@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
@@ -152,11 +152,8 @@ def _explained(message: str) -> Iterator[None]:
 
 def _import(name: str) -> Any:
     """Import a class or function by its import path, from the current folder too, as ``python -m`` does."""
-    module, _, attribute = name.partition(":")
-    if not module or not attribute:
-        raise ValueError(f"no normaliser at {name!r}: expected module:Name")
     with _explained(f"no normaliser at {name!r}, looked for in {Path.cwd()} too"), working_folder_importable():
-        return getattr(importlib.import_module(module), attribute)
+        return resolve_name(name)
 
 
 def identify_method(name: str) -> str:

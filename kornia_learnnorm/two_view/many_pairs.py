@@ -16,6 +16,7 @@ import numpy as np
 from kornia_learnnorm.data.cameras import read_camera
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.datasets.reading import read_folder
+from kornia_learnnorm.data.datasets.textfiles import text_lines
 from kornia_learnnorm.data.images import image_size, import_cv2
 from kornia_learnnorm.data.matching.features import MissingWeightsError
 from kornia_learnnorm.data.matching.workers import open_workers
@@ -78,21 +79,14 @@ def read_pair_list(path: str | Path) -> list[FilePair]:
 
     Names with spaces stand in quotation marks; a # begins a comment.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no list of pairs at {path}")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a text file, a list of pairs expected") from error
-    pairs = []
-    for number, text in enumerate(lines, 1):
+    path, pairs = Path(path), []
+    for line in text_lines(path, "list of pairs"):
         try:
-            names = shlex.split(text, comments=True)
+            names = shlex.split(line.text, comments=True)
         except ValueError as error:
-            raise ValueError(f"{path}, line {number}: {error}") from error
+            raise ValueError(f"{path}, line {line.number}: {error}") from error
         if names and len(names) != 2:
-            raise ValueError(f"{path}, line {number}: two image files expected, got {len(names)} names")
+            raise line.error("two image files")
         pairs += [(path.parent / names[0], path.parent / names[1])] if names else []
     if not pairs:
         raise ValueError(f"{path} lists no pairs")

@@ -29,8 +29,7 @@ class PeerPackage(NamedTuple):
     """An estimator of another package."""
 
     estimate: Callable[..., Any]  # takes the imported module and the arguments of Peer
-    module: str  # name of the module to import
-    distribution: str  # name of the distribution, whose version a run keeps
+    module: str  # to import, of a distribution of the same name
     extra: str = "robust"  # the extra of this package that installs it
 
 
@@ -95,15 +94,15 @@ OPENCV = {
     "opencv-usac-magsac": "USAC_MAGSAC",
 }
 PEERS = {
-    **{name: PeerPackage(partial(_opencv, method), "cv2", "opencv", "images") for name, method in OPENCV.items()},
-    f"opencv-usac-magsac{CALIBRATED}": PeerPackage(_opencv_calibrated, "cv2", "opencv", "images"),
-    "poselib": PeerPackage(_poselib, "poselib", "poselib"),
-    f"poselib{CALIBRATED}": PeerPackage(_poselib_calibrated, "poselib", "poselib"),
-    "kornia": PeerPackage(partial(_kornia, "fundamental"), "kornia.geometry.ransac", "kornia"),
-    "kornia-8pt": PeerPackage(partial(_kornia, "fundamental_8pt"), "kornia.geometry.ransac", "kornia"),
-    "pydegensac": PeerPackage(_pydegensac, "pydegensac", "pydegensac"),
-    "pymagsac": PeerPackage(_pymagsac, "pymagsac", "pymagsac"),
-    "pysuperansac": PeerPackage(_pysuperansac, "pysuperansac", "pysuperansac"),
+    **{name: PeerPackage(partial(_opencv, method), "cv2", "images") for name, method in OPENCV.items()},
+    f"opencv-usac-magsac{CALIBRATED}": PeerPackage(_opencv_calibrated, "cv2", "images"),
+    "poselib": PeerPackage(_poselib, "poselib"),
+    f"poselib{CALIBRATED}": PeerPackage(_poselib_calibrated, "poselib"),
+    "kornia": PeerPackage(partial(_kornia, "fundamental"), "kornia.geometry.ransac"),
+    "kornia-8pt": PeerPackage(partial(_kornia, "fundamental_8pt"), "kornia.geometry.ransac"),
+    "pydegensac": PeerPackage(_pydegensac, "pydegensac"),
+    "pymagsac": PeerPackage(_pymagsac, "pymagsac"),
+    "pysuperansac": PeerPackage(_pysuperansac, "pysuperansac"),
 }
 
 
@@ -114,7 +113,7 @@ def find_peer(name: str) -> Peer:
 
 def peer_version(name: str) -> str:
     """Return the package of an estimator and its version."""
-    package = PEERS[name].distribution
-    if package == "opencv":  # several distributions provide the module
+    package = PEERS[name].module.partition(".")[0]
+    if package == "cv2":  # several distributions provide the module
         return f"opencv {importlib.import_module('cv2').__version__}"
     return f"{package} {importlib.metadata.version(package)}"

@@ -87,7 +87,7 @@ def test_the_seed_decides(matches):
 
 def test_what_fails_is_a_failure(monkeypatch, matches):
     for wrong in (None, np.zeros((9, 3))):
-        package = peers.PeerPackage(lambda *_, wrong=wrong: wrong, "math", "poselib")
+        package = peers.PeerPackage(lambda *_, wrong=wrong: wrong, "math")
         monkeypatch.setitem(peers.PEERS, "poselib", package)
         assert run_estimator(find_estimator("poselib"), matches(), 0, 1.0).F_mat.isnan().all()
     few = matches()._replace(points1=torch.rand(7, 2).double(), points2=torch.rand(7, 2).double())

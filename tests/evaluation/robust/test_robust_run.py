@@ -79,7 +79,7 @@ def test_estimators_and_stores_join(robust_copied, tmp_path):
 
 
 def test_a_package_that_is_not_installed(robust_copied, robust_store, monkeypatch):
-    monkeypatch.setitem(peers.PEERS, "poselib", peers.PeerPackage(pytest.fail, "no_such_module", "poselib"))
+    monkeypatch.setitem(peers.PEERS, "poselib", peers.PeerPackage(pytest.fail, "no_such_module"))
     options = ["--pairs", "2", "--seeds", "2", "--estimators", "poselib", "--out", str(robust_copied)]
     assert main(["robust", str(robust_store), *options]) == 0
     assert read_robust(robust_copied).about["estimators"]["poselib"] is None
