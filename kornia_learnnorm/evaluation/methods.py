@@ -152,7 +152,8 @@ def _explained(message: str) -> Iterator[None]:
 
 def _import(name: str) -> Any:
     """Import a class or function by its import path, from the current folder too, as ``python -m`` does."""
-    with _explained(f"no normaliser at {name!r}, looked for in {Path.cwd()} too"), working_folder_importable():
+    expected = f"no normaliser at {name!r}, expected module:Name, looked for in {Path.cwd()} too"
+    with _explained(expected), working_folder_importable():
         return resolve_name(name)
 
 
