@@ -219,14 +219,13 @@ def _jobs(
     folder: Path, stores: Stores, methods: Mapping[str, Method], options: SampleOptions, complete: bool
 ) -> Iterator[Job]:
     """Make the files of the stores' samples, and give those of the methods to make."""
-    keys = KEYS[complete]
     for name, store in stores.items():
         for protocol, max_ratio in PROTOCOLS.items():
             place = f"{name}, {protocol}"
             samples = _samples(_path(folder, name, protocol, "samples"), place, options, store, max_ratio)
             for label, method in methods.items():
                 compute = partial(predict, method, samples, store, max_ratio, complete)
-                yield Job(label, _path(folder, name, protocol, label), compute, keys, len(samples.pair))
+                yield Job(label, _path(folder, name, protocol, label), compute)
 
 
 def _path(folder: Path, *names: str) -> Path:

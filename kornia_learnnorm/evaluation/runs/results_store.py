@@ -1,7 +1,7 @@
 """The results of a run, kept in a folder, which is the only thing that recording and reporting share.
 
 ``run.json`` says what the run was computed from, in a section for ``evaluate`` and one for ``robust``; NumPy archives
-hold its arrays. A file that exists is read, to know that it is whole, and not computed again.
+hold its arrays. A file that exists is not computed again.
 """
 
 from __future__ import annotations
@@ -35,9 +35,7 @@ OPTIONS = {
 }
 # Where the files of methods are.
 PLACES = {"evaluate": ("*/filtered", "*/unfiltered"), "robust": ("robust/*/*/*",)}
-
 MAX_NAME = 80  # letters of a name in that of a file
-RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{device}{i}" for device in ("COM", "LPT") for i in range(10))}  # Windows
 
 About = dict[str, Any]
 Arrays = dict[str, NDArray[Any]]
@@ -50,8 +48,6 @@ class Job(NamedTuple):
     method: str
     path: Path
     compute: Callable[[], Arrays]
-    keys: Sequence[str] = ()  # arrays that a whole file has
-    rows: int | None = None  # of these arrays
 
 
 @contextmanager
@@ -71,9 +67,7 @@ def record(folder: Path, section: str, jobs: Iterable[Job], total: int, known: C
     with tqdm(total=total, unit="file", disable=None) as bar:
         for job in jobs:
             bar.set_postfix_str(f"{job.method}: {job.path.parent.relative_to(folder)}")
-            if job.path.is_file():
-                read_arrays(job.path, job.keys, job.rows)
-            elif job.method not in failed:
+            if not job.path.is_file() and job.method not in failed:
                 try:
                     write_arrays(job.path, job.compute())
                 except ValueError as error:
@@ -168,15 +162,8 @@ def _write(folder: Path, section: str, about: About) -> None:
 
 
 def file_name(name: str) -> str:
-    """Return the name of the file or folder of a store, a method or an estimator, without suffix.
-
-    It is the name itself, unless that is not a file's name on Linux, macOS and Windows alike, or longer than
-    ``MAX_NAME``: then it has a part of a hash of the name, so that no two names have one file.
-    """
-    safe = re.sub(r"[^A-Za-z0-9+_.-]", "_", name)[:MAX_NAME]
-    if name.partition(".")[0].upper() in RESERVED or name.startswith("."):
-        safe = f"_{safe}"
-    safe = safe.rstrip(".")
+    """Return the name of the file or folder of a store or method; one with odd letters gets a part of its hash."""
+    safe = re.sub(r"[^A-Za-z0-9+_.-]", "_", name)[:MAX_NAME].strip(".")
     return safe if safe and safe == name else f"{safe}-{sha256(name.encode()).hexdigest()[:8]}"
 
 
