@@ -33,7 +33,7 @@ NUMERICAL |= {"test_parallax.py", "test_repeated_texture.py"}
 # Tests that do not depend on the order of rounding: shapes, errors, files, random draws, and derivatives against
 # differences, whose tolerance is far above it.
 STEADY = r"smoke|wrong|exceptions|TestFiles|TestStrictness|gradcheck|::test_gradients(\[|$)"
-STEADY += r"|TestGradients::test_(first|second)|test_(bootstrap|call_counts|matches|samplers|threads)\.py"
+STEADY += r"|TestGradients::test_(first|second)|test_(statistics|call_counts|matches|samplers|threads)\.py"
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
 

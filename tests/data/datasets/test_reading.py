@@ -1,8 +1,10 @@
-"""Reading datasets by their names, and the ground truth of real and written ones."""
+"""Datasets by their names: ground truth, and what the readers say about wrong arguments and files."""
+
+import shutil
 
 import numpy as np
 import pytest
-from make_sequences import FR1, FR3, STEP
+from make_sequences import FR1, FR3, STEP, edit
 
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairing import pair_frames
@@ -59,3 +61,77 @@ def test_real_data(real_data, dataset, options, store, count):
             assert np.allclose(R, file["R"][row], rtol=0, atol=1e-6)
             assert np.allclose(t, file["t"][row], rtol=0, atol=1e-6)
             assert [pair.frame1.size, pair.frame2.size] == [tuple(size) for size in file["image_size"][row]]
+
+
+WHOLE = 0  # in place of the number of a line
+
+
+# File, line, its text, and the message. A line None is taken out, a file None is removed.
+MALFORMED = [
+    ("poses/00.txt", 2, "1 2 3", r"00\.txt, line 2: the 12 numbers of a pose expected, got '1 2 3'"),
+    ("poses/00.txt", 4, None, r"00\.txt has no line 4, the pose of .*000003\.png"),
+    ("sequences/00/calib.txt", 1, "P0: 1 2 3", r"calib\.txt, line 1: P0: and 12 numbers expected, got 'P0: 1 2 3'"),
+    ("sequences/00/calib.txt", 1, "P0: " + "0 " * 12, "line 1: a camera matrix and a fourth column expected"),
+    ("sequences/00/calib.txt", 1, None, r"calib\.txt has no line 'P0: 12 numbers'"),
+    ("sequences/00/calib.txt", WHOLE, b"\xff\xfe\x00", r"calib\.txt is not a text file in UTF-8"),
+    ("sequences/00/image_0/left3.png", WHOLE, b"", r"left3\.png: an image's name must be its frame's number"),
+    (f"{FR1}/rgb.txt", 3, "12.5", r"rgb\.txt, line 3: a timestamp and a file name expected, got '12\.5'"),
+    (f"{FR1}/rgb.txt", WHOLE, b"# nothing\n", r"rgb\.txt lists no images"),
+    (f"{FR1}/groundtruth.txt", 2, "1 2 3", r"groundtruth\.txt, line 2: timestamp tx ty tz qx qy qz qw expected"),
+    (f"{FR1}/groundtruth.txt", 3, "1 2 3 4 0 0 0 0", "line 3: a quaternion other than zero expected"),
+    ("dataset_train.txt", 5, "seq1/frame00002.png 1 2 3", r"train\.txt, line 5: ImageFile X Y Z W P Q R"),
+    ("dataset_train.txt", 5, "seq1/frame00001.png 0 0 0 1 0 0 0", "5: seq1/frame00001.png is listed twice"),
+    ("dataset_train.txt", WHOLE, b"a\nb\n\n", r"dataset_train\.txt lists no images"),
+    ("reconstruction.nvm", 1, "NVM_V3 FixedK 1 2 3 4 5", r"reconstruction\.nvm, line 1: NVM_V3 expected"),
+    ("reconstruction.nvm", 3, "many", "line 3: the number of images expected, got 'many'"),
+    ("reconstruction.nvm", 5, "a.jpg 0 1 0 0 0 0 0 0 0 0", "line 5: a positive focal length expected, got 0"),
+    ("reconstruction.nvm", WHOLE, b"NVM_V3\n\n3\n", r"reconstruction\.nvm announces 3 images and has 0"),
+]
+MISSING = [
+    ("sequences/00/calib.txt", WHOLE, None, r"no calibration at .*calib\.txt"),
+    ("sequences/00/image_0", WHOLE, None, r"no images \*\.png in .*image_0"),
+    ("sequences", WHOLE, None, r"no folder .*sequences"),
+    (f"{FR1}/rgb.txt", 3, "12.5 rgb/none.png", r"rgb\.txt, line 3: no image at .*none\.png"),
+    ("dataset_train.txt", WHOLE, None, r"no list of images at .*dataset_train\.txt"),
+]
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "text", "message", "error"),
+    [(*case, ValueError) for case in MALFORMED] + [(*case, FileNotFoundError) for case in MISSING],
+)
+def test_malformed(written, tmp_path, file, line, text, message, error):
+    dataset = "tum" if file.startswith(FR1) else "kitti" if file.startswith(("poses", "sequences")) else "cambridge"
+    root = shutil.copytree(written / dataset, tmp_path / dataset)
+    if line != WHOLE:
+        edit(root / file, line, text)
+    elif text is not None:
+        (root / file).write_bytes(text)
+    elif (root / file).is_dir():
+        shutil.rmtree(root / file)
+    else:
+        (root / file).unlink()
+    with pytest.raises(error, match=message):
+        read_dataset(dataset, root)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "root", "arguments", "error", "message"),
+    [
+        ("kitti", "kitti", {"sequences": ["07"]}, ValueError, r"no sequence '07' at .*, there are 00, 06, 11"),
+        ("kitti", "kitti", {"sequences": "00"}, TypeError, "a list of names, got the string '00'"),
+        ("kitti", "kitti", {"camera": "image_4"}, ValueError, "image_0 to image_3, got 'image_4'"),
+        ("tum", "tum", {"max_difference": -0.1}, ValueError, r"zero or more seconds, got -0\.1"),
+        ("tum", "kitti", {}, FileNotFoundError, r"no rgb\.txt in .*kitti, nor in a folder in it"),
+        ("cambridge", "cambridge", {"split": "val"}, ValueError, "'train', 'test' or None for both, got 'val'"),
+        ("folder", "none", {}, FileNotFoundError, r"no folder at .*none"),
+        ("kiti", "", {}, ValueError, "must be one of kitti, tum, cambridge, folder, colmap, got 'kiti'"),
+        ("kitti", "kitti", {"colour": True}, ValueError, "colour is for no dataset, got kitti"),
+        ("kitti", "kitti", {"split": "val"}, ValueError, "a split of kitti must be one of train, test, got 'val'"),
+        ("tum", f"tum/{FR3}", {"split": "train"}, FileNotFoundError, f"expected others than {FR3}, got {FR3}"),
+        ("tum", f"tum/{FR1}", {"split": "val"}, FileNotFoundError, f"no val sequence of tum .*: expected {FR3}, got"),
+    ],
+)
+def test_wrong_arguments(written, dataset, root, arguments, error, message):
+    with pytest.raises(error, match=message):
+        read_dataset(dataset, written / root, **arguments)

@@ -1,4 +1,6 @@
-"""The bootstrap against another one, alone and of paired differences."""
+"""The bootstrap against another one, the better rate against counting, the median against NumPy."""
+
+import warnings
 
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_learnnorm.metrics.statistics import bootstrap_interval, paired_bootstrap
+from kornia_learnnorm.metrics.statistics import better_rate, bootstrap_interval, median, paired_bootstrap
 
 INF, NAN = float("inf"), float("nan")
 
@@ -140,3 +142,57 @@ FEW = "at least two groups are needed, got"
 def test_exceptions(function, arguments, message):
     with pytest.raises(ValueError, match=message):
         function(*arguments)
+
+
+@pytest.mark.parametrize("number", [1, 2, 5, 8])
+@pytest.mark.parametrize("dim", [0, -1])
+def test_agrees_with_numpy(number, dim, device, dtype):
+    values = torch.randn(number, 3, number, dtype=dtype)
+    values[values < -0.5] = torch.nan
+    values[0, 0, 0] = 1.0
+    values[:, 1], values[:, 2] = torch.inf, torch.nan
+    found = median(values.to(device), dim)
+    assert found.dtype == dtype
+    with warnings.catch_warnings(action="ignore"):  # NumPy's of slices that are all NaN
+        np.testing.assert_array_equal(found.cpu().numpy(), np.nanmedian(values.numpy(), axis=dim))
+
+
+def test_of_nothing_is_nan():
+    assert median(torch.zeros(2, 0)).isnan().all()
+    assert median(torch.zeros(0)).isnan()
+
+
+NUMBERS = st.sampled_from([0.0, 0.5, 1.0, 2.0, INF, NAN])
+
+
+class TestBetterRate:
+    @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=30))
+    def test_counts(self, pairs):
+        """Ties are not better, one infinite residual is worse than any other, two and NaN are left out."""
+        finite = [(a, b) for a, b in pairs if a == a and b == b and not a == b == INF]
+        residual, baseline = torch.tensor(pairs).unbind(-1)
+        if not finite:
+            with pytest.raises(ValueError, match=f"none of {len(pairs)} samples can be compared"):
+                better_rate(residual, baseline)
+            return
+        found = better_rate(residual, baseline)
+        assert found.rate == sum(a < b for a, b in finite) / len(finite)
+        assert found.ties == sum(a == b for a, b in finite)
+        assert found.degenerate == len(pairs) - len(finite)
+        assert found.compared == len(finite)
+        reverse = better_rate(baseline, residual)
+        assert found.rate + reverse.rate + found.ties / found.compared == pytest.approx(1)
+
+    @pytest.mark.parametrize(
+        ("residual", "baseline", "message"),
+        [
+            (torch.rand(3), torch.rand(4), r"two \(S,\) tensors, got \[3\] and \[4\]"),
+            (torch.rand(3, 2), torch.rand(3, 2), r"two \(S,\) tensors, got \[3, 2\] and \[3, 2\]"),
+            (torch.tensor(1.0), torch.tensor(2.0), r"two \(S,\) tensors, got \[\] and \[\]"),
+            (torch.rand(0), torch.rand(0), "none of 0 samples can be compared"),
+            (torch.full((3,), NAN), torch.rand(3), "none of 3 samples can be compared"),
+        ],
+    )
+    def test_exceptions(self, residual, baseline, message):
+        with pytest.raises(ValueError, match=message):
+            better_rate(residual, baseline)
