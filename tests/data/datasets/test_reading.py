@@ -4,11 +4,11 @@ import shutil
 
 import numpy as np
 import pytest
-from make_sequences import FR1, FR3, STEP, edit
+from make_sequences import FR1, FR3, SIZE, STEP, edit, names
 
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairing import pair_frames
-from kornia_learnnorm.data.datasets.reading import read_dataset
+from kornia_learnnorm.data.datasets.reading import read_dataset, read_folder
 
 
 def epipoles_agree(pair: FramePair) -> bool:
@@ -135,3 +135,30 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
 def test_wrong_arguments(written, dataset, root, arguments, error, message):
     with pytest.raises(error, match=message):
         read_dataset(dataset, written / root, **arguments)
+
+
+def test_frames_of_a_folder(written):
+    frames = read_folder(written / "folder")
+    listed = ("a.png", "b.PNG", "left/1.jpg", "left/2.JPG", "left/deep/1.bmp", "right/1.tif", "right/2.webp")
+    assert [frame.name for frame in frames] == list(listed)
+    assert [frame.sequence for frame in frames] == [name.rpartition("/")[0] for name in listed]
+    for frame in frames:
+        assert frame.size == SIZE
+        assert np.isnan(frame.K).all()
+        assert np.isnan(frame.pose).all()
+
+
+def test_a_folder_within_does_not_part_its_sequence(tmp_path):
+    for name in ("s/1.png", "s/2/1.png", "s/3.png", "s-1/1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / name).touch()
+    pairs = pair_frames(read_folder(str(tmp_path)))
+    assert names(pairs) == [("s/1.png", "s/3.png")]
+
+
+def test_hidden_files(tmp_path):
+    for name in (".thumbs/1.png", "._1.png", "1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    frames = read_folder(tmp_path)
+    assert [(frame.name, frame.size) for frame in frames] == [("1.png", (0, 0))]
