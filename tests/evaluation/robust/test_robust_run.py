@@ -10,7 +10,6 @@ import torch
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
-from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import peers
 from kornia_learnnorm.evaluation.robust.robust_estimators import find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import estimate_path, measure, read_robust, shuffled_pair
@@ -65,17 +64,6 @@ def test_other_options_are_refused(robust_again, refused):
         refused([*robust_again, option, "3"], "is a run of other options")
     refused([*robust_again, "--seeds", "0"], "seeds must be 1 or more, got 0")
     refused([*robust_again, "--pairs", "-1"], "pairs must be 0 or more, got -1")
-
-
-def test_estimators_and_stores_join(robust_copied, tmp_path):
-    write_store(tmp_path / "other.h5", synthetic_store(pairs=1, points=40, seed=2, scenes=["orbit"]))
-    before = [*read_robust(robust_copied).about["estimators"]]
-    options = ["--pairs", "2", "--seeds", "2", "--estimators", "opencv-usac", "opencv-lmeds"]
-    assert main(["robust", str(tmp_path / "other.h5"), *options, "--out", str(robust_copied)]) == 0
-    found = read_robust(robust_copied)
-    assert [*found.about["stores"]] == ["kitti_06", "other"]
-    assert [*found.about["estimators"]] == [*before, "opencv-lmeds"]
-    assert [*found.cells[3].estimates] == ["opencv-usac", "opencv-lmeds"]
 
 
 def test_a_package_that_is_not_installed(robust_copied, robust_store, monkeypatch):
