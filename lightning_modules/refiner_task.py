@@ -32,7 +32,6 @@ class HeldOutLoss(nn.Module):
     Args:
         estimator: :class:`~kornia_learnnorm.LearnedEightPoint`, ``robust-synthetic`` when not given, or
             :class:`~kornia_learnnorm.LearnedRelativePose`, which needs stores with cameras.
-        teacher: take the matrices of the matches as they were found, without gradient, for comparisons.
         floor: distance :math:`f` in pixels, far below which nothing is gained.
         ceiling: larger distances, pixels, count as this and send no gradient. ValueError unless both are positive.
         scale_weight: weight of the likelihood.
@@ -41,7 +40,6 @@ class HeldOutLoss(nn.Module):
     def __init__(
         self,
         estimator: nn.Module | None = None,
-        teacher: bool = False,
         floor: float = 0.05,
         ceiling: float = 6.0,
         scale_weight: float = 0.2,
@@ -53,35 +51,22 @@ class HeldOutLoss(nn.Module):
         if not min(floor, ceiling) > 0:
             raise ValueError(f"floor and ceiling must be positive, got {floor} and {ceiling}")
         self.estimator = estimator.requires_grad_(False)
-        self.teacher, self.floor, self.ceiling, self.scale_weight = teacher, floor, ceiling, scale_weight
+        self.floor, self.ceiling, self.scale_weight = floor, ceiling, scale_weight
 
     def forward(self, sets: MatchSets, moved: RefinedMatches) -> Tensor:
         """Return the loss of each set, (B,), of the moved matches (B, 2 N), in the order of :func:`all_matches`."""
-        matrices = None
-        if self.teacher:
-            with torch.no_grad():
-                matrices = self.matrices(sets, *all_matches(sets))
-        distance = self.distances(sets, moved.points1, moved.points2, matrices).clamp(max=self.ceiling)
+        distance = self.distances(sets, moved.points1, moved.points2).clamp(max=self.ceiling)
         likelihood = moved.scale.log() + 2**0.5 * 0.5 * distance.detach() / moved.scale
         return ((distance + self.floor).log() + self.scale_weight * likelihood).mean(-1)
 
-    def distances(self, sets: MatchSets, points1: Tensor, points2: Tensor, F_mat: Tensor | None = None) -> Tensor:
+    def distances(self, sets: MatchSets, points1: Tensor, points2: Tensor) -> Tensor:
         """Return the distances (B, 2 N) of both halves of matches, each under the matrix of the other half."""
-        F_mat = self.matrices(sets, points1, points2) if F_mat is None else F_mat
-        distance = symmetric_epipolar_distance(_halves(points1), _halves(points2), F_mat.roll(len(points1), 0))
-        return torch.cat([*distance.chunk(2)], 1)
-
-    def matrices(self, sets: MatchSets, points1: Tensor, points2: Tensor) -> Tensor:
-        """Return the fundamental matrices (2 B, 3, 3) of the first halves of matches (B, 2 N), then of the second."""
+        halves1, halves2 = (torch.cat([*points.double().chunk(2, 1)]) for points in (points1, points2))  # (2 B, N, 2)
         calibrated = isinstance(self.estimator, LearnedRelativePose)
         cameras = [K.repeat(2, 1, 1) for K in cameras_of(sets)] if calibrated else []
-        F_mat: Tensor = self.estimator.estimate(_halves(points1), _halves(points2), *cameras).F_mat
-        return F_mat
-
-
-def _halves(points: Tensor) -> Tensor:
-    """Return the first halves of points (B, 2 N, 2), then the second ones, (2 B, N, 2) float64."""
-    return torch.cat([*points.double().chunk(2, 1)])
+        F_mat = self.estimator.estimate(halves1, halves2, *cameras).F_mat
+        distance = symmetric_epipolar_distance(halves1, halves2, F_mat.roll(len(points1), 0))
+        return torch.cat([*distance.chunk(2)], 1)
 
 
 def all_matches(sets: MatchSets) -> tuple[Tensor, Tensor]:
