@@ -197,7 +197,7 @@ class TestManyPairs:
         assert read_pair_list(path) == [(tmp_path / "a b.png", tmp_path / "c.png")]
         for text, message in (
             ("'a.png b.png\n", "line 1: No clos"),
-            ("a b c\n", "line 1: .* got 3"),
+            ("a b c\n", "line 1: .* got 'a b c'"),
             ("\n", "no pairs"),
         ):
             path.write_text(text)

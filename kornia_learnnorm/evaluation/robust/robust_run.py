@@ -80,16 +80,11 @@ def record_robust(
     read = {name: read_store(path) for name, path in stores.items()}
     identities = {names[name]: found[names[name]] and robust_estimators.identify_estimator(name) for name in estimators}
     about: About = {"estimators": identities, **options, "threads": torch.get_num_threads()}
-    redone = [names[name] for name in redo]
     installed = {name: estimator for name, estimator in found.items() if estimator is not None}
-    with results_store.run_folder(folder):
-        before = results_store.begin_section(folder, "robust", read, about, redone, command)
-        for path in results_store.result_files(folder, "robust", redone):
-            path.unlink()
-        total = len(read) * len(PROTOCOLS) * len(THRESHOLDS) * len(installed)
-        known = before.get("estimators", {}).keys() - {*redone}
-        failed = results_store.record(folder, "robust", _jobs(folder, read, installed, options), total, known)
-    if failed:
+    jobs = _jobs(folder, read, installed, options)
+    total = len(read) * len(PROTOCOLS) * len(THRESHOLDS) * len(installed)
+    redone = [names[name] for name in redo]
+    if failed := results_store.record(folder, "robust", read, about, jobs, total, redone, command):
         raise ValueError(f"{failed}. All others are in {folder}")
     return [name for name, estimator in found.items() if estimator is None]
 

@@ -206,12 +206,8 @@ def record_run(
         "methods": {names[name]: identify_method(name) for name in methods},
         "trained_on": {name: list(method.trained_on) for name, method in found.items()},
     }
-    with results_store.run_folder(folder):
-        before = results_store.begin_section(folder, "evaluate", read, about, command=command)
-        jobs = _jobs(folder, read, found, options, complete)
-        total = len(read) * len(PROTOCOLS) * len(found)
-        failed = results_store.record(folder, "evaluate", jobs, total, before.get("methods", ()))
-    if failed:
+    jobs, total = _jobs(folder, read, found, options, complete), len(read) * len(PROTOCOLS) * len(found)
+    if failed := results_store.record(folder, "evaluate", read, about, jobs, total, command=command):
         raise ValueError(failed + (f". All others are in {folder}" if complete else ""))
 
 

@@ -11,10 +11,10 @@ import json
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import datetime
 from hashlib import sha256
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,43 +50,54 @@ class Job(NamedTuple):
     compute: Callable[[], Arrays]
 
 
-@contextmanager
-def run_folder(folder: Path) -> Iterator[None]:
-    """Make the folder of a run if missing and keep other processes from writing it; raise ValueError for a file."""
+def record(
+    folder: Path,
+    section: str,
+    stores: Stores,
+    about: About,
+    jobs: Iterable[Job],
+    total: int,
+    redo: Collection[str] = (),
+    command: str = "",
+) -> str:
+    """Do the jobs, at most ``total``, whose files are missing, or refuse a folder of other options.
+
+    ``about`` has the options and, by the names in ``JOINED``, what each method or estimator is, None for one whose
+    package is not installed. Stores and methods may join; results and descriptions of ``redo`` are replaced. Returns
+    why methods failed, empty if none has; they leave the run unless it had them before.
+    """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: expected a folder for the run, or a new name")
     folder.mkdir(parents=True, exist_ok=True)
+    tqdm, failed = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm, dict[str, str]()
     with exclusive(folder):
-        yield
-
-
-def record(folder: Path, section: str, jobs: Iterable[Job], total: int, known: Collection[str]) -> str:
-    """Do the jobs whose files are missing; return why methods failed, which leave the run unless it had them before."""
-    tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
-    failed = dict[str, str]()
-    with tqdm(total=total, unit="file", disable=None) as bar:
-        for job in jobs:
-            bar.set_postfix_str(f"{job.method}: {job.path.parent.relative_to(folder)}")
-            if not job.path.is_file() and job.method not in failed:
-                try:
-                    write_arrays(job.path, job.compute())
-                except ValueError as error:
-                    failed[job.method] = str(error)
-            bar.update()
-    about, forgotten = read_section(folder, section) or {}, failed.keys() - {*known}
-    for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
-        about[key] = {name: value for name, value in about[key].items() if name not in forgotten}
-    _write(folder, section, about)
-    for path in result_files(folder, section, forgotten):
-        path.unlink()
+        before = _begin(folder, section, stores, about, redo, command)
+        _forget(folder, section, redo)
+        with tqdm(total=total, unit="file", disable=None) as bar:
+            for job in jobs:
+                bar.set_postfix_str(f"{job.method}: {job.path.parent.relative_to(folder)}")
+                if not job.path.is_file() and job.method not in failed:
+                    try:
+                        write_arrays(job.path, job.compute())
+                    except ValueError as error:
+                        failed[job.method] = str(error)
+                bar.update()
+        about = read_section(folder, section) or {}
+        forgotten = failed.keys() - (before.get(JOINED[section][1], {}).keys() - {*redo})
+        for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
+            about[key] = {name: value for name, value in about[key].items() if name not in forgotten}
+        _write(folder, section, about)
+        _forget(folder, section, forgotten)
     # A normaliser of the user's own is named in its message already.
     named = {text if text.startswith(name.partition("+")[0]) else f"{name}: {text}" for name, text in failed.items()}
     return "; ".join(sorted(named))
 
 
-def result_files(folder: Path, section: str, names: Iterable[str]) -> list[Path]:
-    """Return the files of methods or estimators."""
-    return [p for name in names for place in PLACES[section] for p in folder.glob(f"{place}/{file_name(name)}.npz")]
+def _forget(folder: Path, section: str, names: Iterable[str]) -> None:
+    """Remove the files of methods or estimators."""
+    for name, place in product(names, PLACES[section]):
+        for path in folder.glob(f"{place}/{file_name(name)}.npz"):
+            path.unlink()
 
 
 def read_section(folder: Path, section: str) -> About | None:
@@ -104,14 +115,8 @@ def read_section(folder: Path, section: str) -> About | None:
     return about
 
 
-def begin_section(
-    folder: Path, section: str, stores: Stores, about: About, redo: Collection[str] = (), command: str = ""
-) -> About:
-    """Write what a run is computed from, or refuse a folder of other options; return what the section was before.
-
-    ``about`` has the options and, by the names in ``JOINED``, what each method or estimator is, None for one whose
-    package is not installed. Stores and methods may join; the descriptions of ``redo`` may change.
-    """
+def _begin(folder: Path, section: str, stores: Stores, about: About, redo: Collection[str], command: str) -> About:
+    """Write what a run is computed from, or refuse a folder of other options; return what the section was before."""
     about = about | {
         "stores": {
             name: f"{store.dataset or 'no description'}, {len(store)} pairs, {store.offsets[-1]} matches"
