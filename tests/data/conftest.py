@@ -1,5 +1,6 @@
-"""Small stores, and where correspondences lie in one."""
+"""Small stores, where correspondences lie in one, and copies of the sequences on disk, to be changed."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -34,3 +35,14 @@ def rows_of(store):
         return rows, np.searchsorted(store.offsets, rows, side="right") - 1
 
     return find
+
+
+def copy_of(dataset):
+    @pytest.fixture(name=dataset)
+    def copy(written, tmp_path):
+        return shutil.copytree(written / dataset, tmp_path / dataset)
+
+    return copy
+
+
+kitti, tum, cambridge, colmap = map(copy_of, ("kitti", "tum", "cambridge", "colmap"))

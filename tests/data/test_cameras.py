@@ -8,75 +8,60 @@ from kornia_learnnorm.data.cameras import exif_camera, read_camera
 Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
 
-def test_numbers_and_files(tmp_path):
-    expected = [[700, 0, 320], [0, 710, 240], [0, 0, 1]]
-    (tmp_path / "four.txt").write_text("700 710\n320 240\n")
-    (tmp_path / "nine.txt").write_text("700 0 320\n0 710 240\n0 0 1\n")
-    for text in ("700,710,320,240", " 700, 710, 320, 240", str(tmp_path / "four.txt"), str(tmp_path / "nine.txt")):
-        assert read_camera(text).tolist() == expected
-
-
-def test_calibration_of_kitti(tmp_path):
-    """P0 counts, with the numbers of sequence 00."""
-    path = tmp_path / "calib.txt"
-    rows = "{0} 0 607.1928 {1} 0 {0} 185.2157 0 0 0 1 0"
-    path.write_text(f"P0: {rows.format(718.856, 0)}\nP1: {rows.format(700, -386.1448)}\n")
-    assert read_camera(str(path)).tolist() == [[718.856, 0, 607.1928], [0, 718.856, 185.2157], [0, 0, 1]]
-    path.write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match=r"expected .*codec can't decode"):
-        read_camera(str(path))
-    path.write_text("P0: 1 2 3\n")
-    with pytest.raises(ValueError, match=r"calib\.txt, line 1.*12 numbers"):
-        read_camera(str(path))
-    path.write_text(f"P2: {rows.format(718.856, 0)}\n")
-    with pytest.raises(ValueError, match=r"calib\.txt: expected .* KITTI's calib\.txt"):
-        read_camera(str(path))
-
-
+KITTI = "P{} 0 607.1928 0 0 718.856 185.2157 0 0 0 1 0\n"  # sequence 00; P0 counts
+STRECHA = "2700 0 1500\n0 2710 1000\n0 0 1\n{} 0 0\n1 0 0\n0 1 0\n0 0 1\n-14 -5 0.1\n3072 2048"
+COLMAP = {  # the centre of the top left pixel is (0.5, 0.5)
+    "1 PINHOLE 640 480 700 710 320 240": [700, 710, 319.5, 239.5],
+    "3 SIMPLE_PINHOLE 640 480 700 320 240": [700, 700, 319.5, 239.5],
+    "1 SIMPLE_RADIAL 640 480 700 320 240 0": [700, 700, 319.5, 239.5],
+    "1 OPENCV 640 480 700 710 320 240 0 0 0 0": [700, 710, 319.5, 239.5],
+    "1 SIMPLE_RADIAL 640 480 700 320 240 0.1": "a camera without distortion, as of colmap image_undistorter",
+    "1 PINHOLE 640 480 700 710 320": "a camera without distortion",
+    "1 PINHOLE 640 480 700 710 320 a": "line 3: numbers of a PINHOLE camera expected",
+    "PINHOLE 640 480": "line 3: an identifier and a camera model",
+    "1 PINHOLE 640 480 700 710 320 240\n2 PINHOLE 640 480 1 1 1 1": "one camera expected, got 2",
+    "1 FOV 640 480 700 710 320 240 1": "could not convert string to float: ",
+}
 HEADER = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
 
 
 @pytest.mark.parametrize(
-    ("line", "expected"),
+    ("name", "text", "expected"),
     [
-        ("1 PINHOLE 640 480 700 710 320 240", [700, 710, 319.5, 239.5]),
-        ("3 SIMPLE_PINHOLE 640 480 700 320 240", [700, 700, 319.5, 239.5]),
-        ("1 SIMPLE_RADIAL 640 480 700 320 240 0", [700, 700, 319.5, 239.5]),
-        ("1 OPENCV 640 480 700 710 320 240 0 0 0 0", [700, 710, 319.5, 239.5]),
-        ("1 SIMPLE_RADIAL 640 480 700 320 240 0.1", "a camera without distortion, as of colmap image_undistorter"),
-        ("1 PINHOLE 640 480 700 710 320", "a camera without distortion"),
-        ("1 PINHOLE 640 480 700 710 320 a", "line 3: numbers of a PINHOLE camera expected"),
-        ("PINHOLE 640 480", "line 3: an identifier and a camera model"),
-        ("1 PINHOLE 640 480 700 710 320 240\n2 PINHOLE 640 480 1 1 1 1", "one camera expected, got 2"),
-        ("1 FOV 640 480 700 710 320 240 1", "could not convert string to float: "),
+        ("four.txt", "700 710\n320 240\n", [700, 710, 320, 240]),
+        ("nine.txt", "700 0 320\n0 710 240\n0 0 1\n", [700, 710, 320, 240]),
+        ("calib.txt", KITTI.format("0: 718.856") + KITTI.format("1: 700"), [718.856, 718.856, 607.1928, 185.2157]),
+        ("calib.txt", "\x80\xff", r"expected .*codec can't decode"),
+        ("calib.txt", "P0: 1 2 3\n", r"calib\.txt, line 1.*12 numbers"),
+        ("calib.txt", KITTI.format("2: 718.856"), r"calib\.txt: expected .* KITTI's calib\.txt"),
+        ("0000.jpg.camera", STRECHA.format(0), [2700, 2710, 1500, 1000]),
+        ("0000.jpg.camera", STRECHA.format(0.1), r"no distortion expected, got \[0\.1, "),
+        *(("cameras.txt", f"{HEADER}{line}\n", expected) for line, expected in COLMAP.items()),
     ],
 )
-def test_cameras_of_colmap(tmp_path, line, expected):
-    """The centre of the top left pixel is (0.5, 0.5) in COLMAP."""
-    path = tmp_path / "cameras.txt"
-    path.write_text(f"{HEADER}{line}\n")
+def test_files(tmp_path, name, text, expected):
+    (tmp_path / name).write_bytes(text.encode("latin-1"))
     if isinstance(expected, str):
         with pytest.raises(ValueError, match=expected):
-            read_camera(str(path))
-        return
-    K = read_camera(str(path))
-    assert [K[0, 0], K[1, 1], K[0, 2], K[1, 2]] == expected
-    assert K[2].tolist() == [0, 0, 1]
+            read_camera(str(tmp_path / name))
+    else:
+        fx, fy, cx, cy = expected
+        assert read_camera(str(tmp_path / name)).tolist() == [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+
+
+@pytest.mark.parametrize("line", [line for line, expected in COLMAP.items() if isinstance(expected, list)])
+def test_cameras_of_colmap_are_pycolmaps(tmp_path, line):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    (tmp_path / "cameras.txt").write_text(line)
     _, model, width, height, *params = line.split()
     camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=[*map(float, params)])
-    assert np.array_equal(K, camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    expected = camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    assert np.array_equal(read_camera(str(tmp_path / "cameras.txt")), expected)
 
 
-def test_camera_of_strecha(tmp_path):
-    path = tmp_path / "0000.jpg.camera"
-    rows = ["2700 0 1500", "0 2710 1000", "0 0 1", "{} 0 0", *["1 0 0", "0 1 0", "0 0 1"], "-14 -5 0.1", "3072 2048"]
-    text = "\n".join(rows)
-    path.write_text(text.format(0))
-    assert read_camera(str(path)).tolist() == [[2700, 0, 1500], [0, 2710, 1000], [0, 0, 1]]
-    path.write_text(text.format(0.1))
-    with pytest.raises(ValueError, match=r"no distortion expected, got \[0\.1, "):
-        read_camera(str(path))
+@pytest.mark.parametrize("text", ["700,710,320,240", " 700, 710, 320, 240"])
+def test_numbers(text):
+    assert read_camera(text).tolist() == [[700, 0, 320], [0, 710, 240], [0, 0, 1]]
 
 
 @pytest.mark.parametrize(

@@ -42,17 +42,6 @@ class TestBest:
         counts = scorer.inliers(best.F_mat).sum(-1).numpy()
         assert np.abs(counts - (own <= 1.5).sum(-1)).max() <= 1  # a distance next to the threshold
 
-    def test_shortlist(self, pair, matrices, factor):
-        points, rows = [p.repeat(3, 1) for p in pair], torch.randperm(1500, generator=torch.Generator().manual_seed(2))
-        scorer = PairScorer(*points, 1.5, Fundamental(distance=factor), rows)
-        few = PairScorer(*(p[rows[:512]] for p in points), 1.5, Fundamental(distance=factor))
-        matrices = scorer.from_pixels(matrices)
-        kept = scorer.shortlist(matrices)
-        assert [len(kept), len(scorer.shortlist(matrices[:50])), len(few.shortlist(matrices))] == [64, 50, 200]
-        expected = few.best(few.from_pixels(scorer.to_pixels(matrices)), 64).score
-        assert torch.allclose(few.best(few.from_pixels(scorer.to_pixels(kept)), 64).score, expected, rtol=1e-3)
-        assert torch.equal(scorer.best(kept, 8).F_mat, scorer.best(matrices, 8).F_mat)
-
     def test_nothing_speaks_for_zero_or_nan(self, pair, factor):
         F = torch.tensor([0.0, torch.nan, torch.inf]).double()[:, None, None].expand(3, 3, 3)
         assert len(PairScorer(*pair, 1.0, Fundamental(distance=factor)).best(F, 3).F_mat) == 0

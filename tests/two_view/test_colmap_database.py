@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 from scenes import store_of
 
-import kornia_learnnorm as kln
 from kornia_learnnorm.data.images import read_image, stored_pixels
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.two_view.colmap_database import DatabaseCounts, export_colmap
@@ -133,11 +132,6 @@ def test_cameras_of_its_own(images):
         with pycolmap.Database.open(path) as file:
             assert [camera.model_name for camera in file.read_all_cameras()] == number * ["SIMPLE_RADIAL"]
         path.unlink()
-
-
-def test_a_learned_layer(images):
-    counts, _ = export(images, layer=kln.LearnedEightPoint.from_pretrained("robust-tiny"))
-    assert counts.verified == 6
 
 
 def test_images_that_do_not_match_have_no_geometry(images):
