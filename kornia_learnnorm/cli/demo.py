@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import webbrowser
 
-from kornia_learnnorm.data.matching.features import DETECTORS
-from kornia_learnnorm.data.matching.matchers import MATCHERS, check_methods
+from kornia_learnnorm.cli.match import add_feature_arguments
+from kornia_learnnorm.data.matching.matchers import check_methods
 from kornia_learnnorm.optional import import_extra
 
 PORT = 5006
@@ -19,9 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm demo`` to a parser."""
     parser.description = f"{parser.description};\nit is served to this computer alone, until Ctrl-C"
     parser.add_argument("--port", type=int, default=PORT, help="port of the page on 127.0.0.1 (default: %(default)s)")
-    for name, known, default in (("detector", DETECTORS, "sift"), ("matcher", MATCHERS, "nearest")):
-        text = f"{', '.join(known)} (default: %(default)s)"
-        parser.add_argument(f"--{name}", metavar="NAME", choices=known, default=default, help=text)
+    add_feature_arguments(parser)
     parser.add_argument("--no-browser", action="store_true", help="print the address, but open no browser")
 
 

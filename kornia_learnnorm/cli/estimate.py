@@ -9,9 +9,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from kornia_learnnorm.cli.match import add_feature_arguments
 from kornia_learnnorm.data.images import image_size, read_colour, read_mask
-from kornia_learnnorm.data.matching.features import DETECTORS
-from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
@@ -56,13 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--threshold", metavar="PX", type=float, default=options.threshold, help=distance)
     add("--seed", metavar="N", type=_seed, default=options.seed, help=default)
     add("--K", metavar="CAMERA", nargs="+", default=[], help="one or two: fx,fy,cx,cy, a file, exif; adds E, R, t")
-    add = parser.add_argument_group("matching").add_argument
-    for name, known in (("detector", DETECTORS), ("matcher", MATCHERS)):
-        text = f"{', '.join(known)} {default}"
-        add(f"--{name}", metavar="NAME", choices=known, default=getattr(options, name), help=text)
+    group = parser.add_argument_group("matching")
+    add_feature_arguments(group)
+    add = group.add_argument
     add("--ratio", type=float, default=options.ratio, help=f"ratio test of nearest neighbours {default}")
-    size = f"reduce images to this longer side {default}"
-    add("--max-size", metavar="PX", type=int, default=options.max_size, help=size)
+    add("--max-size", metavar="PX", type=int, default=options.max_size, help=f"longer side of the images {default}")
     mask = "one or two: features count where it is white"
     add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
     many = parser.add_argument_group("many pairs")
@@ -90,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
     names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher", "model", "matches")
     options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
     if args.pairs is not None:
-        found = estimate_pairs(_read_pairs(args), args.out, options, args.jobs, args.dask)
+        pairs = pairs_of_folder(args.pairs, args.gap) if args.pairs.is_dir() else read_pair_list(args.pairs)
+        found = estimate_pairs(pairs, args.out, options, args.jobs, args.dask)
         _print_pairs(found, args.out)
         _print_hint(args)
         if any(line["model"] is None for line in found):
@@ -116,10 +114,6 @@ def run(args: argparse.Namespace) -> int:
         print("\n".join([estimate.summary(), *(f"wrote    {path}" for path in (args.out, json_path) if path)]))
         _print_hint(args)
     return doubtful if estimate.warnings else 0
-
-
-def _read_pairs(args: argparse.Namespace) -> list[tuple[Path, Path]]:
-    return pairs_of_folder(args.pairs, args.gap) if args.pairs.is_dir() else read_pair_list(args.pairs)
 
 
 def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:

@@ -41,15 +41,11 @@ def run(args: argparse.Namespace) -> int:
             file = args.out if len(programs) == 1 else args.out.with_stem(f"{args.out.stem}-{name}")
             with atomic_write(file) as temporary:
                 temporary.write_bytes(program.model_proto.SerializeToString())
-            _report(file)
+            print(f"wrote {file}: {file.stat().st_size / 1e6:.1f} MB")
         return 0
     with atomic_write(args.out) as temporary:  # a path that cannot be written is refused before the work
         buffer = BytesIO()  # a file would give its temporary name to the archive
         torch.export.save(export_layer(load_layer(args.weights), args.inputs, args.points), buffer)
         temporary.write_bytes(buffer.getvalue())
-    _report(args.out)
+    print(f"wrote {args.out}: {args.out.stat().st_size / 1e6:.1f} MB")
     return 0
-
-
-def _report(path: Path) -> None:
-    print(f"wrote {path}: {path.stat().st_size / 1e6:.1f} MB")

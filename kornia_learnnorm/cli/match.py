@@ -55,11 +55,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         _add_number(match, option, text)
 
 
-def add_matching_arguments(match: argparse._ArgumentGroup) -> None:
-    """Add the arguments that say which features are matched, how, and where it is computed."""
+def add_feature_arguments(parser: argparse._ActionsContainer) -> None:
+    """Add the arguments that say which features are matched and how."""
     for option, names in (("detector", DETECTORS), ("matcher", MATCHERS)):
         text, default = f"{', '.join(names)} (default: %(default)s)", getattr(MatchOptions, option)
-        match.add_argument(f"--{option}", metavar="NAME", choices=names, default=default, help=text)
+        parser.add_argument(f"--{option}", metavar="NAME", choices=names, default=default, help=text)
+
+
+def add_matching_arguments(match: argparse._ArgumentGroup) -> None:
+    """Add the arguments that say which features are matched, how, and where it is computed."""
+    add_feature_arguments(match)
     _add_number(match, "num_features", "of an image")
     where = match.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=int, default=-1, help="processes here; -1 for all cores (default: %(default)s)")
