@@ -32,16 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "normalisers or weights, with +LM or +optimal or without; module:Name for your own (default: none, Hartley,"
     text += f" whitening, reweighted, {', '.join(SHIPPED)}, searched)"
     add("--methods", metavar="NAME", nargs="+", help=text)
-    text = "further weights; the methods or their default stay"
-    add("--weights", metavar="NAME_OR_PATH", nargs="+", help=text)
+    add("--weights", metavar="NAME_OR_PATH", nargs="+", help="further weights; the methods or their default stay")
     add("--seed", type=int, default=0, help="seed of the shuffle (default: %(default)s)")
     text = "leave out samples whose mean symmetric epipolar distance under the un-normalised eight-point algorithm is"
     text += " this or larger (default: %(default)g; inf: none)"
     add("--max-residual", type=float, metavar="PX", default=SampleOptions.max_residual, help=text)
     text = "at most so many samples of each store and protocol, at random (default: %(default)s; 0: all)"
     add("--max-samples", metavar="N", type=int, default=SampleOptions.max_samples, help=text)
-    text = "correspondences in a sample (default: %(default)s)"
-    add("--size", metavar="N", type=int, default=8, help=text)
+    add("--size", metavar="N", type=int, default=8, help="correspondences in a sample (default: %(default)s)")
     text = "folder to keep the predictions in, with everything that learnnorm report shows; the default methods are"
     add("--out", metavar="RUN", help=f"{text} then also {', '.join(KEPT_METHODS)}")
     add_json_argument(parser)
@@ -54,10 +52,7 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
 
 @contextmanager
 def json_tables(args: argparse.Namespace, inputs: Sequence[str] = ()) -> Iterator[list[Table]]:
-    """Give a list for the tables of a command, which are written when the block succeeds, if ``--json`` is given.
-
-    The arguments have ``json`` and ``command_line``. Inputs, also as FILE.h5@3:10, are not overwritten.
-    """
+    """Give a list for the tables of a command, written as ``--json`` says when the block ends; inputs stay."""
     tables: list[Table] = []
     with ExitStack() as stack:
         if args.json not in (None, "-"):

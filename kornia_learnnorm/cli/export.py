@@ -18,15 +18,13 @@ learnnorm export robust --format onnx --out robust.onnx"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm export`` to a parser."""
-    parser.add_argument("weights", metavar="NAME_OR_PATH", help="weights that ship with the package, or a file of them")
-    text = "pt2: the whole layer, for torch.export.load; onnx: its networks alone"
-    parser.add_argument("--format", choices=["pt2", "onnx"], required=True, help=text)
+    add = parser.add_argument
+    add("weights", metavar="NAME_OR_PATH", help="weights that ship with the package, or a file of them")
+    add("--format", choices=["pt2", "onnx"], required=True, help="pt2: the whole layer; onnx: its networks alone")
     text = "file to write, .pt2 or .onnx; of several networks, FILE-stage1.onnx and so on"
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help=text)
-    text = "further inputs of the program besides the points: weights, mask, scores"
-    parser.add_argument("--inputs", metavar="INPUT", nargs="+", default=[], help=text)
-    text = "fixed number of correspondences, as 8 for minimal samples; without it, any number from 9 on"
-    parser.add_argument("--points", metavar="N", type=int, help=text)
+    add("--out", metavar="FILE", type=Path, required=True, help=text)
+    add("--inputs", metavar="INPUT", nargs="+", default=[], help="besides the points: weights, mask, scores")
+    add("--points", metavar="N", type=int, help="fixed number of correspondences; without it, any from 9 on")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -38,8 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames.add_argument("--split", metavar="NAME", help="kitti, cambridge: train, test; tum: train, val")
     frames.add_argument("--camera", help="kitti: image_0 to image_3 (default: image_0)")
     frames.add_argument("--model", metavar="FOLDER", type=Path, help="colmap: cameras, images and points")
-    text = "tum: seconds from image to pose (default: 0.02)"
-    frames.add_argument("--max-difference", metavar="S", type=float, help=text)
+    frames.add_argument("--max-difference", metavar="S", type=float, help="tum: seconds to a pose (default: 0.02)")
     frames.add_argument("--resize", metavar=("WIDTH", "HEIGHT"), nargs=2, type=int, help="resize images and cameras")
     pairs = parser.add_argument_group("pairs").add_mutually_exclusive_group()
     pairs.add_argument("--gap", type=int, default=1, help="frames apart (default: %(default)s)")

@@ -16,12 +16,12 @@ learnnorm synthesize folder --pairs 5 --scenes orbit --points 200"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm synthesize`` to a parser."""
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="folder to write to; created if missing")
-    parser.add_argument("--pairs", type=int, default=20, help="pairs of each scene (default: %(default)s)")
-    text = f"which (default: {', '.join(SCENES)})"
-    parser.add_argument("--scenes", metavar="KIND", nargs="+", default=list(SCENES), help=text)
-    parser.add_argument("--points", type=int, default=800, help="correspondences of a pair (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of scenes and images (default: %(default)s)")
+    add = parser.add_argument
+    add("folder", metavar="FOLDER", type=Path, help="folder to write to; created if missing")
+    add("--pairs", type=int, default=20, help="pairs of each scene (default: %(default)s)")
+    add("--scenes", metavar="KIND", nargs="+", default=[*SCENES], help=f"which (default: {', '.join(SCENES)})")
+    add("--points", type=int, default=800, help="correspondences of a pair (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of scenes and images (default: %(default)s)")
 
 
 def run(args: argparse.Namespace) -> int:
