@@ -178,7 +178,7 @@ def run(args: list[str]) -> dict[str, float]:
     if not any(option.startswith(("--config", "-c", "--model", "--help")) for option in options):
         names = ", ".join(name for name in config_names() if "/" not in name)
         example = f"learnnorm {command} --config crossview-synthetic{' --ckpt_path FILE' * (command != 'fit')}"
-        raise ValueError(f"no configuration: give one by --config, a file or one of {names}, as in {example}")
+        raise ValueError(f"no configuration: give one by --config, a file or one of {names}, for example {example}")
     raises = {"exit_on_error": False}  # an exception instead of a usage of fifty lines
     try:
         with working_folder_importable():

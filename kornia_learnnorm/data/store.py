@@ -11,7 +11,7 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,17 +75,6 @@ class CorrespondenceStore:
         """Return the number of image pairs."""
         return len(self.offsets) - 1
 
-    def select(self, first: int, stop: int) -> CorrespondenceStore:
-        """Return a store of the pairs ``first`` to ``stop - 1``, one or more."""
-        _check_range(first, stop, len(self))
-        rows = slice(int(self.offsets[first]), int(self.offsets[stop]))
-        cut: dict[str, Any] = {
-            name: getattr(self, name)[rows if axis == "M" else slice(first, stop)]
-            for name, (_, _, axis) in LAYOUT.items()
-        }
-        offsets = self.offsets[first : stop + 1] - self.offsets[first]
-        return replace(self, offsets=offsets, names=self.names[first:stop], **cut)
-
     def rows(self, pair: int, max_ratio: float | None = None) -> NDArray[np.int64]:
         """Return the rows (N,) of the correspondences of :meth:`matches`, in increasing order."""
         rows = np.arange(self.offsets[pair], self.offsets[pair + 1])
@@ -102,11 +91,6 @@ class CorrespondenceStore:
 def passes_ratio_test(ratio: NDArray[np.float32], max_ratio: float | None) -> NDArray[np.bool_]:
     """Return which matches (N,) have a ratio below a limit, None for no limit, or no ratio, NaN."""
     return np.asarray(~(ratio >= (np.inf if max_ratio is None else max_ratio)))
-
-
-def _check_range(first: int, stop: int, number: int, path: str = "") -> None:
-    if not 0 <= first < stop <= number:
-        raise ValueError(f"{path}pairs {first}:{stop} were asked for, the store has 0:{number}")
 
 
 def read_store(path: str | Path) -> CorrespondenceStore:
@@ -139,7 +123,8 @@ class StoreReader:
         with open_hdf5(self.path) as file:
             offsets = _read_offsets(self.path, file)
         first, stop = (int(part[2]), int(part[3])) if part else (0, len(offsets) - 1)
-        _check_range(first, stop, len(offsets) - 1, f"{self.path}: ")
+        if not first < stop < len(offsets):
+            raise ValueError(f"{self.path}: pairs {first}:{stop} were asked for, the store has 0:{len(offsets) - 1}")
         self._first = first
         self.offsets = offsets[first : stop + 1]
 

@@ -127,14 +127,13 @@ def test_a_failed_write_leaves_the_old_file(uneven, path):
 
 @pytest.mark.parametrize(("first", "stop"), [(0, 1), (2, 5), (0, 6)])
 def test_some_pairs(uneven, path, first, stop):
-    part = uneven.select(first, stop)
+    part = read_store(f"{path}@{first}:0{stop}")
     assert part.names == uneven.names[first:stop]
     for new, old in enumerate(range(first, stop)):
         np.testing.assert_equal(part.matches(new), uneven.matches(old))
         for name in ("image_size", "F", "K", "R", "t"):
             np.testing.assert_array_equal(getattr(part, name)[new], getattr(uneven, name)[old])
     assert len(part.points1) == len(part.points2) == len(part.ratio) == part.offsets[-1]
-    same(read_store(f"{path}@{first}:0{stop}"), part)
 
 
 def test_matches_of_a_pair(uneven):
@@ -147,11 +146,7 @@ def test_matches_of_a_pair(uneven):
     assert [len(part) for part in uneven.matches(1)] == [0, 0, 0]
 
 
-@pytest.mark.parametrize(("first", "stop"), [(0, 0), (4, 2), (0, 7), (-1, 2)])
-def test_pairs_that_are_not_there(uneven, path, first, stop):
-    message = f"pairs {first}:{stop} were asked for, the store has 0:6"
-    with pytest.raises(ValueError, match=message):
-        uneven.select(first, stop)
-    if first >= 0:
-        with pytest.raises(ValueError, match=message):
-            read_store(f"{path}@{first}:{stop}")
+@pytest.mark.parametrize(("first", "stop"), [(0, 0), (4, 2), (0, 7)])
+def test_pairs_that_are_not_there(path, first, stop):
+    with pytest.raises(ValueError, match=f"pairs {first}:{stop} were asked for, the store has 0:6"):
+        read_store(f"{path}@{first}:{stop}")
