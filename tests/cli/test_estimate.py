@@ -39,12 +39,11 @@ class TestOnePair:
         lines = capsys.readouterr().out.splitlines()
         printed = [[float(value) for value in line.split()] for line in lines[1:4]]
         assert np.allclose(printed, result.F_mat.numpy(), rtol=1e-8)
-        assert re.match(r"model +fundamental: one homography explains", lines[4])
-        assert re.match(r"by +RANSAC, seed 0", lines[5])
-        assert re.match(rf"matches +{result.num_matches} \(ratio test 0\.8\)", lines[6])
-        assert re.match(rf"inliers +{result.num_inliers} ", lines[7])
-        assert f"predicted error of F: {result.predicted_error:.2f} px (typical error of epipolar lines" in lines[8]
-        assert len(lines) == 9
+        about = re.sub(" +", " ", "\n".join(lines[4:]))
+        for fact in ("model fundamental", "RANSAC, seed 0", "ratio test 0.8", f"{result.predicted_error:.2f} px"):
+            assert fact in about
+        assert f"\nmatches {result.num_matches} (" in about
+        assert f"\ninliers {result.num_inliers} " in about
         assert not list(Path().iterdir())
 
     def test_writes_picture_and_json(self, command, capsys):
