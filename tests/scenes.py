@@ -16,7 +16,6 @@ from kornia_learnnorm.geometry.transforms import paper_transform
 
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
 DTYPES = [torch.float32, torch.float64]
-WALL_SHIFT = np.array([4.0, 3.0])  # of the wall of `repeated_wall`, pixels
 
 
 def plane(batch_size: int = 3, number: int = 40, noise: float = 0.0, outliers: float = 0.0):
@@ -344,7 +343,7 @@ def repeated_wall(copies: int = 90, seed: int = 0) -> tuple[Tensor, Tensor, Tens
     wall = wall[((wall < 195) | (wall > 305)).any(-1)]
     points1 = np.concatenate([wall, board, false])
     label = np.repeat([0, 1, 2], [len(wall), len(board), len(false)])
-    points2 = points1 + WALL_SHIFT + rng.normal(0, 0.1, points1.shape)
+    points2 = points1 + (4.0, 3.0) + rng.normal(0, 0.1, points1.shape)
     points2[label == 1] += rng.uniform(8, 14, (len(board), 1)) * epipole
     points2[label == 2] += rng.integers(1, 4, (len(false), 1)) * cell
     return torch.from_numpy(points1), torch.from_numpy(points2), torch.from_numpy(label)

@@ -66,10 +66,6 @@ def sideways(case) -> Tensor:
     return true_matrix(case._replace(R=torch.eye(3).double(), t=torch.tensor([0.0, 1.0, 0.0]).double()))
 
 
-def table_rows(text: str) -> list[list[str]]:
-    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
-
-
 class TestPairs:
     def test_right_and_wrong_answers(self, pairs, case):
         record = pairs.score(case, lambda case: answer(case, true_matrix(case)))
@@ -111,24 +107,6 @@ class TestPairs:
         assert pairs.outcome(crashed) == "crashed"
         assert "oops" in crashed["crashed"]
         assert "room 0: ZeroDivisionError('oops')" in capsys.readouterr().err
-
-    def test_tables(self, pairs):
-        base = {"seed": 3, "refused": None, "crashed": None, "warnings": [], "matches": 20, "inliers": 9}
-        base |= {"pose_error": 0.0, "predicted_error": 1.0, "true_error": 1.0, "right": True}
-        base |= {"model": "fundamental", "gric": "homography"}
-        room, plane = base | {"kind": "room", "determined": True}, base | {"kind": "plane", "determined": False}
-        records = [room | {"predicted_error": 3.0, "true_error": 1.5}, room | {"warnings": ["planar"]}]
-        records += [room | {"refused": "blank"}, room | {"right": False}, plane | {"refused": "no_motion"}]
-        records += [plane | {"right": right, "warnings": ["planar"], "model": "homography"} for right in (False, True)]
-        # Pairs, determined, F, F by GRIC, right, wrong, refused, crashed, warned, silently wrong; right,
-        # flagged; determined, refused.
-        assert {kind: [*map(int, cells)] for kind, *cells in pairs.count_rows(records)} == {
-            "room": [4, 4, 4, 0, 2, 1, 1, 0, 1, 1, 1, 1],
-            "plane": [3, 0, 1, 0, 1, 1, 1, 0, 2, 0, 1, 0],
-            "all": [7, 4, 5, 0, 3, 2, 2, 0, 3, 1, 2, 1],
-        }
-        _, _, first, *_ = table_rows(pairs.calibration_table(records))
-        assert first == ["room", "2", "1.25", "2", "1.1", "1.5", "1.9"]  # ratios 2 and 1
 
     def test_runs(self, pairs, tmp_path, capsys):
         arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]

@@ -1,7 +1,6 @@
 """The wheel: the same bytes from the same files, configurations and weights in it, the version of the package."""
 
 import os
-import re
 import subprocess
 import sys
 import tomllib
@@ -10,12 +9,10 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-import yaml
 
 import kornia_learnnorm as kln
 
 ROOT = Path(__file__).parents[1]
-SERVICES = ("test", "pages", "release")  # workflows
 BUILD = "from hatchling.build import build_wheel; import sys; build_wheel(sys.argv[1])"
 
 
@@ -64,17 +61,3 @@ def test_every_extra_is_checked():
     checks = import_module("check_extras").CHECKS
     assert set(checks) == set(project["optional-dependencies"]) - {"dev", "docs", "all"} | {"core"}
     assert [extra for extra in checks if extra != "core" and f"\n| `{extra}` |" not in documented] == []
-
-
-@pytest.mark.parametrize("path", [*(f".github/workflows/{name}.yml" for name in SERVICES), ".readthedocs.yaml"])
-def test_services_call_targets_of_the_makefile(path):
-    content = yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
-    jobs = content.get("jobs", {}).values()
-    steps = [step.get("run", "") for job in jobs for step in job["steps"]]
-    commands = content["build"]["commands"] if "build" in content else steps
-    called = [command.removeprefix("make ") for command in commands if command.startswith("make ")]
-    matrix = [target for job in jobs for target in job.get("strategy", {}).get("matrix", {}).get("target", [])]
-    targets = [*matrix, *(target for target in called if "{" not in target)]
-    assert targets
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    assert [target for target in targets if not re.search(rf"^{target}:", makefile, flags=re.MULTILINE)] == []

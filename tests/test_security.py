@@ -5,7 +5,6 @@ import json
 import pickle
 import re
 import struct
-import subprocess
 import sys
 import zipfile
 import zlib
@@ -175,15 +174,3 @@ def test_actions_are_pinned():
     for path in (ROOT / ".github").glob("**/*.y*ml"):
         for action in re.findall(r"uses:\s*(\S+)", path.read_text()):
             assert action.startswith("./") or re.search(r"@[0-9a-f]{40}$", action), (path, action)
-
-
-@pytest.mark.parametrize("found", ["not done (offline?): no connection", "Found 1 known vulnerability"])
-def test_audit_never_fails(tmp_path, found):
-    """``make audit`` reports; where nothing can be reached it says so and goes on."""
-    (tmp_path / "bin").mkdir()
-    printed = found.rpartition("): ")[2]
-    (tmp_path / "bin/pip-audit").write_text(f"#!/bin/sh\necho '{printed}' >&2; exit 1\n")
-    (tmp_path / "bin/pip-audit").chmod(0o755)
-    command = ["make", "--no-print-directory", "audit", f"AUDIT={tmp_path}", "PYTHON=false"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout) == (0, f"audit: {found}\n")

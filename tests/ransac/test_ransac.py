@@ -67,11 +67,15 @@ class TestResult:
         inlying = epipolar_distances(points1, points2, F_true.numpy()) < 1
         assert np.median(epipolar_distances(points1, points2, F_mat.numpy())[inlying]) < 1
 
-    def test_estimate(self):
+    @pytest.mark.parametrize(
+        ("distance", "reference"), [("sampson", kln.sampson_distance), ("symmetric", kln.symmetric_epipolar_distance)]
+    )
+    def test_estimate(self, distance, reference):
         points1, points2 = pair()[:2]
-        result = RANSAC(seed=0).estimate(points1, points2)
-        distances = kln.sampson_distance(points1, points2, result.F_mat)
-        expected = (1 - distances.square()).clamp(min=0).sum()
+        result = RANSAC(seed=0, distance=distance, inl_th=1.5).estimate(points1, points2)
+        distances = reference(points1, points2, result.F_mat)
+        assert ((distances <= 1.5) != result.inliers).sum() <= 1  # a distance next to the threshold
+        expected = (1 - (distances / 1.5).square()).clamp(min=0).sum()
         assert result.score == pytest.approx(expected.item(), rel=1e-6)
         assert result.num_samples >= 64
         assert result.E_mat is None  # without cameras

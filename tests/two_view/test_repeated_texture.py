@@ -6,52 +6,16 @@ import numpy as np
 import pytest
 import torch
 from rendered import render_kind
-from scenes import WALL_SHIFT, epipolar_distances, repeated_wall, uniform
+from scenes import epipolar_distances, repeated_wall, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.metrics.poses import pose_error
-from kornia_learnnorm.two_view.repeated_texture import coherent_matches, resolve_ambiguity
+from kornia_learnnorm.two_view.repeated_texture import resolve_ambiguity
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 
 SIZE = (640, 480)
-
-
-def wall_homography() -> torch.Tensor:
-    H = torch.eye(3).double()
-    H[:2, 2] = torch.from_numpy(WALL_SHIFT)
-    return H
-
-
-def agreeing_share(points: np.ndarray, vectors: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The share of the weights of the 48 nearest points that those with a vector like a point's own have."""
-    shares = []
-    for row in range(len(points)):
-        apart = np.linalg.norm(points - points[row], axis=1)
-        nearest = np.argsort(apart)[1:49]
-        change = np.linalg.norm(vectors[nearest] - vectors[row], axis=1)
-        shares.append(weights[nearest] @ (change < np.maximum(0.3 * apart[nearest], 3.0)) / weights[nearest].sum())
-    return np.array(shares)
-
-
-def coherent_rows(points1: np.ndarray, points2: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Which points have a vector like most of those around them, weighted by their own share in a first round."""
-    share = np.ones(len(vectors))
-    for _ in range(2):
-        share = np.minimum(*(agreeing_share(points, vectors, share) for points in (points1, points2)))
-    return share >= 0.8
-
-
-class TestCoherentMatches:
-    @pytest.mark.parametrize("seed", [0, 1])
-    def test_true_matches_are_coherent(self, seed):
-        points1, points2, label = repeated_wall(seed=seed)
-        found = coherent_matches(points1, points2, wall_homography(), 1.0)
-        expected = coherent_rows(points1.numpy(), points2.numpy(), (points2 - points1).numpy() - WALL_SHIFT)
-        np.testing.assert_array_equal(found.numpy(), expected)
-        assert found[label < 2].double().mean() > 0.95
-        assert not found[label == 2].any()
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """Reports as Markdown and HTML."""
 
 import contextlib
-import dataclasses
 import io
 import json
 import re
@@ -13,10 +12,8 @@ from typing import NamedTuple
 import pytest
 
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.evaluation.report.figures import report_figures
 from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 from kornia_learnnorm.evaluation.robust.robust_run import read_robust
-from kornia_learnnorm.evaluation.runs.prediction_run import read_run
 from kornia_learnnorm.evaluation.tables import Table
 
 matplotlib = pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
@@ -57,32 +54,6 @@ def test_files(written):
     assert len(identifiers) == len(set(identifiers))
     for reference in re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', page):
         assert "".join(reference) in identifiers
-
-
-def test_pictures_show_what_the_run_has(run, written):
-    found = read_run(run)
-    assert " Dashed: with non-linear refinement.\n\n![Error by frame]" in written.text
-    assert " Dashed: learned.\n\n![Distribution of errors]" in written.text
-    (cell, *_), kept = found.cells, slice(99)
-    predictions = {name: {k: v[kept] for k, v in cell.predictions[name].items()} for name in ("Hartley", "whitening")}
-    few = dataclasses.replace(cell, pair=cell.pair[kept], predictions=predictions)
-    pictures = {picture.name: picture for picture in report_figures(dataclasses.replace(found, cells=[few]))}
-    assert "figure-12" in pictures
-    assert "figure-13" not in pictures  # its points are means of 100 samples
-    assert not [picture.name for picture in pictures.values() if "Dashed" in picture.text]
-
-
-def test_the_answer_comes_first_then_contents_date_and_command(written):
-    titles = re.findall(r"^## (.+)$", written.text, flags=re.MULTILINE)
-    assert titles[:3] == ["Summary", "Contents", "Data and methods"]
-    contents = re.findall(r"^- \[(.+)\]\(#(.+)\)$", written.text, flags=re.MULTILINE)
-    assert [title for title, _ in contents] == titles[2:]
-    for _, anchor in contents:
-        assert f'<h2 id="{anchor}">' in written.page
-    ((command, date),) = json.loads((written.folder / "run.json").read_text())["evaluate"]["commands"].items()
-    assert command.startswith("learnnorm evaluate ")
-    assert f"{date}: `{command}`" in written.text
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d", date)
 
 
 def test_not_a_run_or_without_the_baseline(tmp_path, copied, refused):

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from kornia_learnnorm.evaluation.report.method_tables import papers_data, rate_tables, report_tables
-from kornia_learnnorm.evaluation.report.numbers import mean_share, median_number, number, paired_change
 from kornia_learnnorm.evaluation.report.robust_tables import PRINTED, robust_tables
 from kornia_learnnorm.evaluation.robust.robust_run import read_robust
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell, read_run
@@ -27,22 +26,6 @@ def test_accuracy_and_tests(run):
     tests = {row[0]: row for row in as_text(tables["Paired tests: scenes, filtered"].rows)}
     assert tests["none"][1].startswith("+")
     assert tests["Hartley+LM"][1].startswith("-")
-
-
-def test_numbers():
-    assert [str(number(0.5)), number(float("nan"))] == ["0.500", ""]
-    assert str(median_number(torch.tensor([1.0, 4.0, torch.nan]))) == "2.500"
-    values = torch.tensor([1.5, 2.5])
-    assert str(paired_change(values, values - 0.5)) == "+0.500"  # too few pairs for an interval
-    assert paired_change(values, values * torch.nan) == ""
-    values = torch.arange(8) + 1.5
-    assert str(paired_change(values, values - 0.5)) == "+0.500 [+0.500, +0.500], < 0.001"
-    halved = paired_change(values, values + np.log(2), logarithms=True)
-    assert str(halved) == "-50.0 [-50.0, -50.0], < 0.001"
-    pair = torch.arange(8).repeat_interleave(2)
-    assert str(mean_share(torch.zeros(16), pair)) == "0.0 [0.0, 0.0]"
-    assert str(mean_share(torch.zeros(16).masked_fill(pair == 3, torch.nan), pair)) == "0.0"  # seven pairs
-    assert mean_share(torch.full((16,), torch.nan), pair) == ""
 
 
 def without_truth(run, robust):
