@@ -2,36 +2,13 @@
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scenes import scenes, uniform
 
 from kornia_learnnorm import RANSAC
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 
 
-def reference(points1, points2, weights=None) -> list[bool]:
-    """One match after another, from the best to the worst."""
-    order = sorted(range(len(points1)), key=lambda k: 0 if weights is None else -weights[k].item())
-    seen1, seen2, kept = set(), set(), [False] * len(points1)
-    for k in order:
-        a, b = tuple(points1[k].tolist()), tuple(points2[k].tolist())
-        if a not in seen1 and b not in seen2:
-            kept[k] = True
-            seen1.add(a)
-            seen2.add(b)
-    return kept
-
-
 class TestMask:
-    @given(seed=st.integers(0, 1000), number=st.integers(0, 40), values=st.integers(1, 6))
-    @pytest.mark.parametrize("weighted", [False, True])
-    @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
-    def test_against_a_loop(self, weighted, kind, seed, number, values):
-        points1, points2 = (uniform(2, number, 2, seed=seed) * values).floor().to(kind) - 2
-        weights = (uniform(number, seed=seed + 1) * 4).floor() if weighted else None
-        assert distinct_points(points1, points2, weights).tolist() == reference(points1, points2, weights)
-
     def test_by_hand(self):
         """Zeros of both signs are equal; equal coordinates in another order are not."""
         points1, points2 = torch.tensor([[[0.0, 1], [-0.0, 1], [1, 0]], [[2, 3], [4, 5], [5, 4]]])
