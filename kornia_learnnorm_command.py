@@ -1,7 +1,5 @@
 """The console script ``learnnorm``: outside the package, whose import loads torch and can be interrupted as well."""
 
-from __future__ import annotations
-
 import sys
 
 __all__ = ["main"]

@@ -1,7 +1,5 @@
 """Files that are written whole or not at all, by one process at a time, and their short names."""
 
-from __future__ import annotations
-
 import errno
 import os
 import platform

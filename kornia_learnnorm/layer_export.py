@@ -3,8 +3,6 @@ r"""Export of the layers as programs that run without this package, and of their
 ONNX has no operators for eigenvectors, singular values and LU factorisations, so only the networks are written in it.
 """
 
-from __future__ import annotations
-
 import copy
 import inspect
 import logging

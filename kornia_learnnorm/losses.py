@@ -4,8 +4,6 @@ r"""Losses of a fundamental matrix.
 :class:`BoundedEpipolarLoss` without labels, :class:`LogEpipolarLoss` and :class:`InlierLoss` with ground truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

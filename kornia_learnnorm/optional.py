@@ -1,7 +1,5 @@
 """Optional packages, which come with the extras of this package, and modules of the user."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ A file names the parts to build. Those of this package are found by their names;
 import path, and only a module that the caller names is imported.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import json

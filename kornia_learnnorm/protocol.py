@@ -1,7 +1,5 @@
 """Constants of the evaluation protocol of Fan et al., which is Ranftl and Koltun's (DFE) as NG-RANSAC evaluates it."""
 
-from __future__ import annotations
-
 RATIO = 0.8  # of the distances to the nearest and second-nearest descriptor; a filtered match lies below (Lowe's ratio)
 MAX_FILTERED = 1000  # filtered matches kept of an image pair
 MAX_RESIDUAL = 60.0  # pixels; samples with a larger residual under the un-normalised eight-point algorithm are dropped

@@ -1,7 +1,5 @@
 """Callbacks: checkpoints, expected time, export of the trained weights, and predictions to a file."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

@@ -1,7 +1,5 @@
 """The training configurations that ship with the package, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The datamodule and its loader: batches of sets of correspondences from any sources, in an order that can resume."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """The training task of a refiner of matches: image pairs and their matches in, no labels needed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The training task: sets of correspondences in, losses of the estimated matrices out, with labels or without."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, cast

@@ -1,7 +1,5 @@
 """The training commands: LightningCLI with the project's task and datamodule, and a look at the checkpoint first."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import sys

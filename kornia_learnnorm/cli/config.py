@@ -1,7 +1,5 @@
 """Print a training configuration, to edit: ``learnnorm config``."""
 
-from __future__ import annotations
-
 import argparse
 
 from lightning_modules.config_files import config_names, find_config

@@ -1,7 +1,5 @@
 """The command ``learnnorm demo``: a page in the browser to try two images on."""
 
-from __future__ import annotations
-
 import argparse
 import webbrowser
 

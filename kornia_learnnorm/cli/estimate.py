@@ -1,7 +1,5 @@
 """The command ``learnnorm estimate``: the fundamental matrix or homography of two image files, or of many pairs."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """Better rates and errors of methods on stores of correspondences: ``learnnorm evaluate``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator, Sequence

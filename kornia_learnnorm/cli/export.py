@@ -1,7 +1,5 @@
 """Write a layer as a program that runs without this package: ``learnnorm export``."""
 
-from __future__ import annotations
-
 import argparse
 from io import BytesIO
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Write a COLMAP database from a folder of images or their matches: ``learnnorm export-colmap``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

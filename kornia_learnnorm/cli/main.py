@@ -1,7 +1,5 @@
 """The command ``learnnorm``: training by LightningCLI, and the commands that need no training."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import math

@@ -1,7 +1,5 @@
 """Match folders of images into a store of correspondences: ``learnnorm match``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from itertools import groupby

@@ -1,7 +1,5 @@
 """The command ``learnnorm report``: tables and pictures of a run. No model is run."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command ``learnnorm robust``: robust estimators on stores."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

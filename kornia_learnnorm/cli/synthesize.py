@@ -1,7 +1,5 @@
 """Write a synthetic store and a rendered image pair: ``learnnorm synthesize``."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

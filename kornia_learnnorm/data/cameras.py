@@ -1,7 +1,5 @@
 """Camera matrices from what a person can give: four numbers, a file, or the EXIF data of a photograph."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Reading the features and matches of hloc (P.-E. Sarlin et al., From coarse to fine, CVPR 2019) into a store."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Random sets of matches together with the images that they were found in."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path

@@ -3,8 +3,6 @@
 Pillow, of the extra ``images``, is imported on use. The centre of the top left pixel is (0, 0), as in OpenCV.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

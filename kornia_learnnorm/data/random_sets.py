@@ -1,7 +1,5 @@
 """Random sets of matches with outliers, as many as wanted from each image pair, and their mix for training."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

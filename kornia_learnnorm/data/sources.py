@@ -4,8 +4,6 @@ The samples of an epoch, a draw, are made in blocks; one block is in memory at o
 the draw and its own number, so blocks can be drawn in any order, by any process.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 r"""Diagnostics of a normalisation: its effect on the design matrix, the rank-2 projection and the points."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

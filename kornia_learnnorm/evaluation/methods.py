@@ -1,7 +1,5 @@
 """The methods that an evaluation compares, by name."""
 
-from __future__ import annotations
-
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Sequence

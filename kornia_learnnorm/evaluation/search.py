@@ -1,7 +1,5 @@
 r"""The per-sample optimum of the normalisation: how far any normaliser could go on a sample's own points."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

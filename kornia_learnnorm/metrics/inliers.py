@@ -10,8 +10,6 @@ Reference:
     Neural-Guided RANSAC, ICCV 2019.
 """
 
-from __future__ import annotations
-
 from math import inf
 
 import torch

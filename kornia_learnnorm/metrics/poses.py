@@ -4,8 +4,6 @@ A pose is :math:`X_2 = R X_1 + t`; the length of :math:`t` is unknown. Errors ar
 failed estimate, which counts in the summaries, NaN where the ground truth is unknown.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import inf
 

@@ -1,7 +1,5 @@
 """Statistics of errors over samples: the median, better rates, and bootstraps over image pairs."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

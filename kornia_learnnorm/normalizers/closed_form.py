@@ -1,7 +1,5 @@
 r"""Closed forms: no normalisation, Hartley's, and whitening."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -6,8 +6,6 @@ and optional weights :math:`(B, N)` go in, two transforms :math:`(B, 3, 3)` come
 nothing is checked or solved twice. :class:`ProblemNormalizer` turns that method into the contract.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

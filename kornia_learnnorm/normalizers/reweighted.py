@@ -6,8 +6,6 @@ and :math:`b`, and nothing else. Given one, the best other one is weighted least
 are singular vectors in whitened coordinates. So alternating least squares is iterated whitening.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize

@@ -3,8 +3,6 @@
 Pixels are COLMAP's in all private functions: they begin at the corner of the first pixel, not at its centre.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import defaultdict
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The fundamental matrix or homography of matches, with its predicted error and the reasons to doubt it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple, cast

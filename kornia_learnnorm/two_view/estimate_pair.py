@@ -1,7 +1,5 @@
 """The fundamental matrix or homography of two images: features, one-to-one matches, and the estimate that they give."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

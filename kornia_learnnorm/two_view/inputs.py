@@ -1,7 +1,5 @@
 """Input checks of the estimates of matches and images, all made before the work begins."""
 
-from __future__ import annotations
-
 from numbers import Integral, Real
 from typing import Any
 

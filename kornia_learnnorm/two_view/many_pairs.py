@@ -1,7 +1,5 @@
 """Estimates of many image pairs, one JSON line each; a run that was stopped continues where it was."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shlex

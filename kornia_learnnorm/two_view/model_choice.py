@@ -1,7 +1,5 @@
 """Whether the matches determine a fundamental matrix, or a homography is the answer."""
 
-from __future__ import annotations
-
 import math
 
 from kornia.geometry.conversions import convert_points_to_homogeneous

@@ -4,8 +4,6 @@ In normalised coordinates the homography of the plane :math:`n^\top X_1 = d` is 
 :math:`R` where the camera only turned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple, cast
 

@@ -1,7 +1,5 @@
 """How far a matrix may be off, from those of random parts of the matches, and the reasons to doubt it."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

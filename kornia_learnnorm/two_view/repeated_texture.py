@@ -6,8 +6,6 @@ the false matches jump away from their neighbours, and are nearest neighbours in
 pixels (N, 2) in float64, matrices (3, 3), and thresholds pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace

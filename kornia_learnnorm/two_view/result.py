@@ -1,7 +1,5 @@
 """The estimate of an image pair: its fields, the JSON object and the printed text."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cambridge Landmarks as frames."""
 
-from __future__ import annotations
-
 from itertools import islice
 from pathlib import Path, PurePosixPath
 

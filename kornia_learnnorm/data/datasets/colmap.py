@@ -1,7 +1,5 @@
 """COLMAP models: their frames, and the pairs of frames that see the same points. pycolmap is imported on use."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from itertools import chain

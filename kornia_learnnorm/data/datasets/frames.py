@@ -3,8 +3,6 @@ r"""Frames and pairs of frames, which the readers of datasets return and matchin
 Pixels follow OpenCV: the centre of the top left pixel is (0, 0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """KITTI odometry as frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

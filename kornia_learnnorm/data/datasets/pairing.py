@@ -1,7 +1,5 @@
 """Pairs of frames: neighbours in a sequence, pairs that a file lists, or images of a COLMAP model."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations, groupby, starmap
 from pathlib import Path

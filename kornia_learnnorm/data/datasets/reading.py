@@ -1,7 +1,5 @@
 """Reading a dataset by its name, or a folder of images, and naming the ground truth that is missing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Parsing the text files of datasets: lines of names and numbers, with errors that name file and line."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """TUM RGB-D as frames."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath

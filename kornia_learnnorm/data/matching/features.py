@@ -3,8 +3,6 @@
 The latter load their weights through :mod:`torch.hub`, from its cache or from the internet.
 """
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Callable

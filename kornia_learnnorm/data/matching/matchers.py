@@ -1,7 +1,5 @@
 """Matching the features of two images: nearest neighbours with Lowe's ratio, or LightGlue."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Worker processes on this machine or on a Dask cluster, and what comes after one of them crashed."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

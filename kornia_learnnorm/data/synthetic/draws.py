@@ -1,7 +1,5 @@
 r"""Random draws for synthetic scenes: cameras, points, depths and motions, in float64 on the generator's device."""
 
-from __future__ import annotations
-
 import math
 
 import torch

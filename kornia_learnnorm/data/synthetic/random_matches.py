@@ -1,7 +1,5 @@
 """Synthetic matches as a matcher gives them: varied scenes, noise, scores, and outliers of several kinds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -4,8 +4,6 @@ For a first run without a data set; use real images to compare methods. A back w
 warped into each view by the homographies of their planes, from back to front. OpenCV is imported on use.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ and points lie in both images. Noise and gross outliers come last. All steps are
 on the generator's device, and depend only on the arguments and the generator's state.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Tables of a run of predictions: better rates, accuracy, inliers and paired tests."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """Numbers of a report's tables, with intervals and p-values; an empty text where a number is unknown."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -3,8 +3,6 @@
 It begins with what won, and has no table, column or row without a number.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import textwrap

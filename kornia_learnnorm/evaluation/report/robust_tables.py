@@ -1,7 +1,5 @@
 """Tables of robust estimators in a report."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.report import numbers

@@ -1,7 +1,5 @@
 """Summary of a run: which method or estimator won in each store and protocol, by how much, and on what."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple

@@ -5,8 +5,6 @@ threshold in pixels, and those with the suffix ``-calibrated`` also the finite m
 returns a fundamental matrix (3, 3), or None for a failure. Each package applies the threshold to a different distance.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.metadata
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Robust estimators by name, as ``learnnorm robust`` takes them."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

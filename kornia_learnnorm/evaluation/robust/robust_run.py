@@ -3,8 +3,6 @@
 The folder may also hold a run of ``learnnorm evaluate``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product

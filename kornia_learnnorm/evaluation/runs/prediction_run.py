@@ -3,8 +3,6 @@
 Each store has a folder with, for each protocol, the samples and a file per method.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial

@@ -4,8 +4,6 @@
 hold its arrays. A file that exists is not computed again.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import re

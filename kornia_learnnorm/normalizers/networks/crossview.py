@@ -6,8 +6,6 @@ whose attribute ``needs_null_matrix`` is true also gets the null matrix of the D
 ``null_matrix``.
 """
 
-from __future__ import annotations
-
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn

@@ -1,7 +1,5 @@
 r"""The network of Fan et al.: each view's transform from that view's points alone."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import batch_norm, layer_norm
