@@ -1,10 +1,8 @@
 """Trained layers in the form of the Hugging Face Hub: local folders, upload and download; needs the extra ``hub``."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from torch import nn
 
@@ -90,7 +88,7 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
         (save_directory / CONFIG_FILE).write_text(text + "\n", encoding="utf-8")
 
     @classmethod
-    def _from_pretrained(cls, *, model_id: str, config: dict[str, Any] | None = None, **download: Any) -> HubModel:
+    def _from_pretrained(cls, *, model_id: str, config: dict[str, Any] | None = None, **download: Any) -> Self:
         """Load the layer of a local folder or of a repository; ``download`` are options of ``hf_hub_download``."""
         local = Path(model_id)
         path = local / WEIGHTS_FILE if local.is_dir() else Path(hf_hub_download(model_id, WEIGHTS_FILE, **download))

@@ -1,8 +1,6 @@
 """Sets of correspondences of image pairs: samples of eight, or matches with outliers, and what supervises them."""
 
-from __future__ import annotations
-
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -35,11 +33,12 @@ class MatchSets(NamedTuple):
     image1: Tensor | None = None  # grey values, (B, 1, H, W), uint8
     image2: Tensor | None = None
 
-    def select(self, rows: Tensor) -> MatchSets:
+    def select(self, rows: Tensor) -> Self:
         """Return the sets of the given rows (indices or mask)."""
-        return MatchSets(*(None if field is None else field[rows] for field in self))  # type: ignore[arg-type]
+        parts: dict[str, Any] = {k: None if part is None else part[rows] for k, part in self._asdict().items()}
+        return self._replace(**parts)
 
-    def with_residual_below(self, max_residual: float | None) -> MatchSets:
+    def with_residual_below(self, max_residual: float | None) -> Self:
         """Return the sets whose :func:`plain_residual` is below a limit in pixels; None keeps all."""
         return self if max_residual is None else self.select(plain_residual(self.points1, self.points2) < max_residual)
 

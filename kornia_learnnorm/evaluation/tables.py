@@ -1,12 +1,10 @@
 """Tables of numbers, which are rounded where they are shown: in Markdown, in the terminal and in JSON."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from kornia_learnnorm.files import short_name
 from kornia_learnnorm.optional import import_extra
@@ -58,7 +56,7 @@ class Table(NamedTuple):
     header: list[str]
     rows: list[list[Cell]]
 
-    def known_parts(self) -> Table | None:
+    def known_parts(self) -> Self | None:
         """Return the table without rows, and columns after the first, that have no number; None if none is left."""
         known = [row for row in self.rows if any(map(_is_known, row[1:]))]
         places = [0, *(i for i in range(1, len(self.header)) if any(_is_known(row[i]) for row in known))]

@@ -1,11 +1,9 @@
 r"""The learned normaliser: a base normaliser, a network, and a builder that turns its output into transforms."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -128,7 +126,7 @@ class LearnedNormalizer(ProblemNormalizer):
         save_module(path, self, FORMAT, architecture)
 
     @classmethod
-    def from_pretrained(cls, name: str | Path = "crossview", own_modules: Collection[str] = ()) -> LearnedNormalizer:
+    def from_pretrained(cls, name: str | Path = "crossview", own_modules: Collection[str] = ()) -> Self:
         """Load a trained normaliser, in evaluation mode: one that ships, by name, or a safetensors file.
 
         Args:

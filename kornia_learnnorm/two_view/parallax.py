@@ -6,10 +6,8 @@ distortion of both images explains is no parallax. Points are pixels (N, 2) in f
 pixels.
 """
 
-from __future__ import annotations
-
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -167,8 +165,8 @@ class _Parameters(NamedTuple):
     def matrix(self) -> Tensor:
         return self.values
 
-    def retract(self, step: Tensor) -> _Parameters:
-        return _Parameters(self.values + step)
+    def retract(self, step: Tensor) -> Self:
+        return self._replace(values=self.values + step)
 
     def tangents(self) -> Tensor:
         return torch.eye(10).to(self.values)[None]

@@ -1,11 +1,9 @@
 """The matrices of matches by RANSAC or a learned layer, plane and parallax, and parts of the matches."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -153,7 +151,7 @@ class TwoViewSolver:
         points1, points2 = (points.expand(len(F_mat), -1, -1) for points in (self.points1, self.points2))
         return (symmetric_epipolar_distance(points1, points2, F_mat) < self.threshold).sum(-1)
 
-    def part(self, rows: Tensor) -> TwoViewSolver:
+    def part(self, rows: Tensor) -> Self:
         """Return the solver of some matches, from their rows or a mask."""
         return replace(self, points1=self.points1[rows], points2=self.points2[rows], scores=self.scores[rows])
 

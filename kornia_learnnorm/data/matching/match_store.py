@@ -3,8 +3,6 @@
 The features of a frame stay on disk until its last pair is matched, so memory does not grow with the number of pairs.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections import Counter
@@ -15,7 +13,7 @@ from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -225,7 +223,7 @@ class FeatureCache:
         self.uses = Counter(frame.name for pair in pairs for frame in pair)
         self.held: dict[str, str] = {}  # name -> reason why there are none; empty where there are some
 
-    def __enter__(self) -> FeatureCache:
+    def __enter__(self) -> Self:
         self.__exit__()
         self.folder.mkdir()
         return self
