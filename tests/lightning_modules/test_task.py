@@ -19,30 +19,21 @@ def make_data(**arguments):
     return CorrespondenceDataModule(source, source, source, **{"batch_size": 32, **arguments})
 
 
-def layer_task(**arguments):
+SMALL = {"width": 16, "depth": 1, "stages": 2}
+FASTER = {"optimizer": lambda params: torch.optim.AdamW(params, lr=1e-2)}
+TRANSFER = SetLoss(labelled=kln.LogEpipolarLoss(residual=kln.transfer_distance))
+OF_SETS = {  # estimators, and how they are trained on sets of matches
+    "layer": lambda: (kln.LearnedEightPoint(**SMALL), {}),
+    "normaliser": lambda: (kln.EightPoint(kln.LearnedNormalizer(kln.Hartley(), kln.CrossViewNetwork(16, 1))), FASTER),
+    "pose": lambda: (kln.LearnedRelativePose(**SMALL, samples=4), {"loss": SetLoss(pose_weight=0.5), **FASTER}),
+    "homography": lambda: (kln.LearnedHomography(**SMALL), {"loss": TRANSFER, **FASTER}),
+}
+
+
+def set_task(kind="layer"):
     torch.manual_seed(0)
-    return EstimatorTask(kln.LearnedEightPoint(width=16, depth=1, stages=2), **arguments)
-
-
-def pose_task():
-    torch.manual_seed(0)
-    layer = kln.LearnedRelativePose(width=16, depth=1, stages=2, samples=4)
-    return EstimatorTask(layer, SetLoss(pose_weight=0.5), lambda params: torch.optim.AdamW(params, lr=1e-2))
-
-
-def homography_task():
-    torch.manual_seed(0)
-    loss = SetLoss(labelled=kln.LogEpipolarLoss(residual=kln.transfer_distance))
-    layer = kln.LearnedHomography(width=16, depth=1, stages=2)
-    return EstimatorTask(layer, loss, lambda params: torch.optim.AdamW(params, lr=1e-2))
-
-
-def sets_task():
-    """A normaliser that is trained on sets of matches."""
-    torch.manual_seed(0)
-    network = kln.CrossViewNetwork(width=16, depth=1)
-    layer = kln.EightPoint(kln.LearnedNormalizer(kln.Hartley(), network))
-    return EstimatorTask(layer, optimizer=lambda params: torch.optim.AdamW(params, lr=1e-2))
+    estimator, arguments = OF_SETS[kind]()
+    return EstimatorTask(estimator, **arguments)
 
 
 def make_sets(labels=True, matches=random_matches, **arguments):
@@ -68,18 +59,13 @@ def test_samples_lower_the_loss(tmp_path, precision):
 
 
 @pytest.mark.parametrize(
-    ("make", "labels", "steps", "least"),
-    [
-        (layer_task, True, 40, 0.05),
-        (layer_task, False, 50, 0.01),
-        (sets_task, True, 60, 0.02),
-        (pose_task, True, 60, 0.05),
-        (homography_task, True, 60, 0.05),
-    ],
+    ("kind", "labels", "steps", "least"),
+    [("layer", True, 40, 0.05), ("layer", False, 50, 0.01), ("normaliser", True, 60, 0.02)]
+    + [(kind, True, 60, 0.05) for kind in ("pose", "homography")],
 )
-def test_sets_lower_the_loss(make, labels, steps, least, tmp_path):
-    matches = random_planes if make is homography_task else random_matches
-    task, data = make(), make_sets(labels, matches)
+def test_sets_lower_the_loss(kind, labels, steps, least, tmp_path):
+    matches = random_planes if kind == "homography" else random_matches
+    task, data = set_task(kind), make_sets(labels, matches)
     batch = SyntheticSets(32, matches, labels).draw(64, 32, block_generator(9))
     before = task.compute_loss(batch).item()
     options = {"enable_checkpointing": False, "gradient_clip_val": 1.0, "limit_val_batches": 4}
@@ -103,7 +89,7 @@ def test_pose_loss_counts_sets_with_cameras_alone():
 
 
 def test_a_loss_leaves_the_estimator_as_it_was():
-    task, batch = layer_task(), SyntheticSets(8).draw(4, 20, block_generator(1))
+    task, batch = set_task(), SyntheticSets(8).draw(4, 20, block_generator(1))
     task.compute_loss(batch)
     with pytest.raises(ValueError, match="must be finite"):
         task.compute_loss(batch._replace(points1=batch.points1 * torch.nan))
@@ -138,7 +124,7 @@ def test_metrics_of_an_untrained_network_are_whitening_s(tmp_path):
     assert got["test/log_sed"] == pytest.approx((whitening + 1e-3).log().mean().item(), abs=1e-5)
 
 
-@pytest.mark.parametrize("make", [normaliser_task, layer_task])
+@pytest.mark.parametrize("make", [normaliser_task, set_task])
 def test_export_and_predictions(make, tmp_path):
     task, data = make(), make_data()
     trainer = make_trainer(tmp_path, [ExportWeights(), WritePredictions()], max_steps=3, enable_checkpointing=False)
@@ -176,14 +162,14 @@ def test_heldout_loss_and_epoch_schedule(tmp_path):
 @pytest.mark.parametrize("steps", [1, 2])
 def test_every_number_of_steps_has_a_schedule(tmp_path, steps):
     trainer = make_trainer(tmp_path, max_steps=steps, limit_val_batches=0, enable_checkpointing=False)
-    trainer.fit(layer_task(), make_sets(correspondences=32))
+    trainer.fit(set_task(), make_sets(correspondences=32))
     assert trainer.global_step == steps
 
 
 def test_a_training_without_an_end_has_no_cycle(tmp_path):
     trainer = make_trainer(tmp_path, max_steps=-1, max_time="00:00:01:00", limit_val_batches=0)
     with pytest.raises(ValueError, match=r"give trainer.max_steps or trainer.max_epochs"):
-        trainer.fit(layer_task(), make_sets())
+        trainer.fit(set_task(), make_sets())
 
 
 @pytest.mark.parametrize(
