@@ -370,7 +370,24 @@ def test_help_fits_a_screen_and_ends_with_examples_that_parse(command, monkeypat
         assert parser.parse_args(words[1:]).command == words[1]
 
 
+def test_help_lists_all_options():
+    assert "--trainer.gradient_clip_val" in help_of("fit", "--help-all")
+
+
 def test_help_of_a_training_needs_no_extra(monkeypatch):
     for module in ("lightning_modules.training", "pytorch_lightning", "jsonargparse", "yaml"):
         monkeypatch.setitem(sys.modules, module, None)
     assert "--help-all" in help_of("fit", "--config", "crossview", "-h")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("config crossview --unheard of", "learnnorm config: error: unrecognized arguments: --unheard of"),
+        (f"estimate a.png b.png --seed {2**63}", f"a whole number from 0 to 2^63 - 1 expected, got {2**63}"),
+    ],
+)
+def test_bad_usage_exits_with_2(words, message, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split())
+    assert message in capsys.readouterr().err

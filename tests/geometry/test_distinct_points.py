@@ -1,4 +1,4 @@
-"""Matches that share a point: the mask against a loop, and what they do to RANSAC."""
+"""Matches that share a point: the mask by hand, and what they do to RANSAC."""
 
 import pytest
 import torch
@@ -11,8 +11,10 @@ from kornia_learnnorm.geometry.distinct_points import distinct_points
 class TestMask:
     def test_by_hand(self):
         """Zeros of both signs are equal; equal coordinates in another order are not."""
-        points1, points2 = torch.tensor([[[0.0, 1], [-0.0, 1], [1, 0]], [[2, 3], [4, 5], [5, 4]]])
-        assert distinct_points(points1, points2).tolist() == [True, False, True]
+        points1 = torch.tensor([[0.0, 1], [-0.0, 1], [1, 0], [7, 7], [8, 8]])
+        points2 = torch.tensor([[2.0, 3], [4, 5], [5, 4], [5, 4], [7, 7]])
+        assert distinct_points(points1, points2).tolist() == [True, False, True, False, True]
+        assert distinct_points(points1, points2, torch.arange(5)).tolist() == [False, True, False, True, True]
 
 
 class TestRansac:

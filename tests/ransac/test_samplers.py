@@ -111,6 +111,10 @@ class TestHitRate:
         sampler = ProsacSampler(torch.linspace(1, 0.1, 100))
         assert sampler.hit_rate(best > self.ROWS, self.ROWS) == pytest.approx(share**8)
 
+    def test_prosac_does_not_see_what_it_never_draws(self):
+        sampler, inliers = ProsacSampler(torch.cat([torch.ones(100), torch.zeros(2000)])), torch.arange(2100) < 100
+        assert [sampler.hit_rate(inliers[rows], rows) for rows in (slice(None), slice(100, None))] == [1, 0]
+
     def test_weighted(self):
         weights = torch.where(self.ROWS < 10, 9.0, 1.0)
         assert WeightedSampler(weights).hit_rate(self.ROWS < 10, self.ROWS) == pytest.approx(0.5**8)

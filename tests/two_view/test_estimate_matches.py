@@ -115,6 +115,12 @@ class TestEstimateMatches:
         )
         assert (codes(mirrored), mirrored.R) == (["no_pose"], None)
 
+    def test_a_tie_between_poses(self, matches, monkeypatch):
+        nothing = torch.full((1, 3, 3), torch.nan).double()
+        monkeypatch.setattr(module, "relative_pose", lambda *_: (nothing, nothing[:, 0]))
+        found = kln.estimate_matches(*matches, K1=SCENE.K1[0], K2=SCENE.K2[0])
+        assert (found.R, found.t, found.front, codes(found)) == (None, None, None, ["no_pose"])
+
     def test_the_learned_layer(self, matches):
         found = kln.estimate_matches(*matches, layer=TINY)
         assert found.estimator == "LearnedEightPoint"

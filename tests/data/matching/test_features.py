@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.feature import DISK, LightGlue
+from kornia.feature import DISK, LightGlue, LightGlueMatcher, scale_laf
 from make_sequences import texture
 
 from kornia_learnnorm.data.matching import features as module
@@ -88,6 +88,32 @@ def test_lightglue_of_random_weights(monkeypatch):
     assert ((score >= 0) & (score <= 1)).all()
     with pytest.raises(ValueError, match=r"LightGlue of disk needs .* 128 columns, got float32 with 64 columns"):
         matching.match_lightglue(*(side._replace(descriptors=side.descriptors[:, :64]) for side in sides))
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "used"), [("sift", 6.0, ("scales", "oris")), ("keynet_affnet_hardnet", 1.0, ("lafs",))]
+)
+def test_lightglue_gets_the_frames_that_kornia_gives_it(monkeypatch, name, scale, used):
+    """Kornia's LightGlueMatcher makes the same input of local affine frames, SIFT's of six standard deviations."""
+    given = {}
+
+    class Spy(torch.nn.Module):
+        def __init__(self, *_, **__):
+            super().__init__()
+
+        def forward(self, data):
+            given.update(data)
+            return {"matches0": torch.full((1, 2), -1), "matching_scores0": torch.zeros(1, 2)}
+
+    monkeypatch.setattr("kornia.feature.integrated.LightGlue", Spy)
+    found = [detect_rootsift(texture(seed, 200), 50) for seed in range(2)]
+    rows, lafs = ([torch.from_numpy(getattr(side, part)) for side in found] for part in ("descriptors", "lafs"))
+    frames = [scale_laf(side[None], scale) for side in lafs]
+    LightGlueMatcher(name)(*rows, *frames, *(side.size[::-1] for side in found))
+    for number, side in enumerate(found):
+        ours, expected = matching._lightglue_input(side), given[f"image{number}"]
+        for part in ("keypoints", "descriptors", "image_size", *used):
+            torch.testing.assert_close(ours[part], expected[part].to(ours[part].dtype), rtol=1e-5, atol=1e-4)
 
 
 KEYNET_FILES = ["keynet_pytorch.pth", "AffNet.pth", "OriNet.pth", "checkpoint_liberty_with_aug.pth"]
