@@ -181,46 +181,25 @@ def test_whole_weights_are_repetitions(name, bound, seed, counts):
     assert hartley_difference(found, expected, *repeated, name == "homography") < bound
 
 
-def degenerate(kind: str) -> list[torch.Tensor]:
-    """Matrices, points and weights of which little is determined."""
+@pairwise(kind=["on the epipoles", "all zero"], correction=["optimal", *LOSSES], distance=["sampson", "symmetric"])
+def test_points_on_the_epipoles_are_finite_in_value_and_gradient(kind, correction, distance):
+    """Of given matrices; other degenerate points are in test_finite.py."""
     points1, points2 = correspondences("handheld", 5, 12)
-    weights, F_mat = torch.ones(5, 12, dtype=torch.float64), rank_three(points1, points2)
-    if kind == "coincident":
-        points1, points2 = points1[:, :1].repeat(1, 12, 1), points2[:, :1].repeat(1, 12, 1)
-    elif kind == "collinear":
-        points1 = torch.linspace(0, 500, 12, dtype=torch.float64)[None, :, None].repeat(5, 1, 2)
-    elif kind == "planar":
-        points2 = 0.9 * points1 + 20
-    elif kind == "absent":
-        weights = torch.zeros_like(weights)
-    elif kind == "same":
-        points2 = points1.clone()
-    elif kind == "on the epipoles":
-        F_mat = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=torch.float64).repeat(5, 1, 1)
-        points1[:, 0] = points2[:, 1] = points1[:, 2] = points2[:, 2] = 0.0
-    else:
+    F_mat = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=torch.float64).repeat(5, 1, 1)
+    points1[:, 0] = points2[:, 1] = points1[:, 2] = points2[:, 2] = 0.0
+    if kind == "all zero":
         F_mat = torch.tensor([[1e-3, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64).repeat(5, 1, 1)
         points1, points2 = torch.zeros_like(points1), torch.zeros_like(points2)
-    return [value.clone().requires_grad_() for value in (F_mat, points1, points2, weights)]
-
-
-@pairwise(
-    kind=["coincident", "collinear", "planar", "absent", "same", "on the epipoles", "all zero"],
-    correction=["optimal", *LOSSES],
-    distance=["sampson", "symmetric"],
-)
-def test_degenerate_points_are_finite_in_value_and_gradient(kind, correction, distance):
-    values = degenerate(kind)
+    start, *values = (v.requires_grad_() for v in (F_mat, points1, points2, torch.ones(5, 12, dtype=torch.float64)))
     if correction == "optimal":
-        F_mat = optimal_rank2(*values)
+        found = optimal_rank2(start, *values)
     else:
-        start, points1, points2, weights = values
-        found = refine_fundamental(points1, points2, start.detach(), weights, distance, LOSSES[correction])
-        assert (found.cost <= found.cost_before).all()
-        F_mat = found.F_mat
-    assert torch.isfinite(F_mat).all()
-    assert (torch.linalg.svdvals(F_mat)[:, 2] < 1e-10).all()
-    for gradient in torch.autograd.grad(signless(F_mat).sum(), values, allow_unused=True):
+        refinement = refine_fundamental(*values[:2], start.detach(), values[2], distance, LOSSES[correction])
+        assert (refinement.cost <= refinement.cost_before).all()
+        found = refinement.F_mat
+    assert torch.isfinite(found).all()
+    assert (torch.linalg.svdvals(found)[:, 2] < 1e-10).all()
+    for gradient in torch.autograd.grad(signless(found).sum(), [start, *values], allow_unused=True):
         assert gradient is None or torch.isfinite(gradient).all()
 
 

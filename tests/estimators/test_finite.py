@@ -83,13 +83,27 @@ def check(solve, parameters, points1, points2, weights=None):
         assert gradient is None or torch.isfinite(gradient).all()
 
 
+def refined(points1, points2, weights=None, **options):
+    start = kln.find_fundamental(points1, points2, weights).detach()
+    return kln.refine_fundamental(points1, points2, start, weights, max_iterations=20, **options).F_mat
+
+
+SOLVERS = {  # without a normaliser
+    "homography": kln.find_homography,
+    "optimal": partial(kln.find_fundamental, rank2="optimal"),
+    "refined": refined,
+    "refined, symmetric": partial(refined, distance="symmetric", loss=kln.Cauchy(0.5)),
+    "refined, truncated": partial(refined, loss=kln.Truncated(3.0)),
+}
+
+
 def check_function(name, points1, points2, weights=None):
-    normalizer = None if name == "homography" else NORMALIZERS[name]()
-    solve = kln.find_homography if normalizer is None else partial(kln.find_fundamental, normalizer=normalizer)
+    normalizer = None if name in SOLVERS else NORMALIZERS[name]()
+    solve = SOLVERS[name] if name in SOLVERS else partial(kln.find_fundamental, normalizer=normalizer)
     check(solve, [] if normalizer is None else normalizer.parameters(), points1, points2, weights)
 
 
-@pairwise(name=[*NORMALIZERS, "homography"], sample=SAMPLES, num_points=[8, 12], dtype=DTYPES)
+@pairwise(name=[*NORMALIZERS, *SOLVERS], sample=SAMPLES, num_points=[8, 12], dtype=DTYPES)
 def test_degenerate_and_extreme_samples(name, sample, num_points, dtype):
     points1, points2 = (points.to(dtype) for points in SAMPLES[sample](num_points))
     check_function(name, points1, points2)
