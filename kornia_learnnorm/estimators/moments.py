@@ -16,7 +16,16 @@ from torch import Tensor
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.geometry.checks import safe_divisor
 
-__all__ = ["Evidence", "descend", "draw_samples", "evenly_ranked", "geometric_scale", "least_cost", "pick"]
+__all__ = [
+    "Evidence",
+    "descend",
+    "draw_samples",
+    "evenly_ranked",
+    "geometric_scale",
+    "least_cost",
+    "normal_equations",
+    "pick",
+]
 
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
 MIN_PIVOT = 1e-6  # of the largest one, of a minimal sample that is not degenerate, such as by drawing a match twice
@@ -60,6 +69,19 @@ class Evidence(NamedTuple):
         """Return Geman and McClure's loss (B, S, N) under matrices (B, S, 3, 3), of a squared scale (B, S or 1, 1)."""
         return UNROLLED_LOSS(self.squares(F_mat)[0] / square_scale.to(F_mat))[0]
 
+    def forms(self, share: Tensor, squares: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the matrices M and X of a step (:func:`descend`) over the trace of M, each (B S, 9, 9).
+
+        Of weights times gradient factors, and of squared distances, both (B, S, N).
+        """
+        M = self.moments(share).flatten(0, 1)
+        trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+        points1, points2 = ((share * squares) @ self.products.mT).view(-1, 2, 3, 3).unbind(1)
+        flat = _FLAT.to(M)
+        # Kronecker products: the normal of x1's line is the first two rows of F x1, that of x2's the first columns.
+        X = points1[:, :, None, :, None] * flat[:, None] + flat[:, None, :, None] * points2[:, None, :, None]
+        return M / (trace + (trace == 0)), X.view(-1, 9, 9) / (trace + (trace == 0))
+
     def moments(self, weights: Tensor) -> Tensor:
         """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9)."""
         return (self.rows[:, None] * weights[:, :, None]) @ self.rows.mT[:, None]
@@ -92,10 +114,7 @@ def descend(
     for _ in range(steps):
         squares, factor = evidence.squares(torch.unflatten(F_mat, 0, (-1, weights.shape[1])))
         share = weights * UNROLLED_LOSS(squares / square_scale(squares))[1] * factor
-        points = (share * squares) @ evidence.products.mT
-        state, F_mat = _gauss_newton(
-            evidence.moments(share).flatten(0, 1), points.flatten(0, 1), state, F_mat, relaxation
-        )
+        state, F_mat = _gauss_newton(*evidence.forms(share, squares), state, F_mat, relaxation)
     return state
 
 
@@ -161,24 +180,12 @@ def evenly_ranked(order: Tensor, most: int) -> Tensor:
 EVEN_ROOTS = {5: 1.1347241384015194, 7: 1.0969815577985598}
 
 
-def _gauss_newton(M: Tensor, points: Tensor, state: Any, F_mat: Tensor, relaxation: float) -> tuple[Any, Tensor]:
-    """Return the states and matrices after a step that lowers the cost of M - X (B, 9, 9), or unchanged.
-
-    ``points`` (B, 18) are the second moments of the points of both views that X is made of.
-    """
-    trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
-    points1, points2 = points.view(-1, 2, 3, 3).unbind(1)
-    flat = _FLAT.to(M)
-    # Kronecker products: the normal of x1's line is the first two rows of F x1, that of x2's the first columns of F.
-    X = points1[:, :, None, :, None] * flat[:, None] + flat[:, None, :, None] * points2[:, None, :, None]
-    M, difference = M / (trace + (trace == 0)), (M - X.view(-1, 9, 9)) / (trace + (trace == 0))
-    tangents, e = state.tangents(), F_mat.mT.reshape(-1, 9, 1)
-    normal = tangents.mT @ M @ tangents
-    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
-    damped = normal + damping * torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
-    step = torch.linalg.solve_ex(damped, tangents.mT @ (difference @ e))[0]
-    moved = state.retract(-relaxation * step[..., 0])
-    moved_F = moved.matrix()
+def _gauss_newton(M: Tensor, X: Tensor, state: Any, F_mat: Tensor, relaxation: float) -> tuple[Any, Tensor]:
+    """Return the states and matrices after a step that lowers the cost of M - X (B, 9, 9), or unchanged."""
+    difference = M - X
+    normal, gradient = normal_equations(M, difference, state.tangents(), F_mat)
+    moved = state.retract(-relaxation * torch.linalg.solve_ex(normal, gradient)[0][..., 0])
+    moved_F, e = moved.matrix(), F_mat.mT.reshape(-1, 9, 1)
     new = moved_F.mT.reshape(-1, 9, 1)
     # A step at the optimum, whose derivative is the optimum's, may raise the cost by rounding.
     lower = new.mT @ difference @ new <= e.mT @ difference @ e + torch.finfo(M.dtype).eps
@@ -186,6 +193,14 @@ def _gauss_newton(M: Tensor, points: Tensor, state: Any, F_mat: Tensor, relaxati
     for value, old in zip(moved, state, strict=True):
         found.append(torch.where(lower.view(-1, *[1] * (value.ndim - 1)), value, old))
     return type(state)(*found), torch.where(lower, moved_F, F_mat)
+
+
+def normal_equations(M: Tensor, difference: Tensor, tangents: Tensor, F_mat: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal matrices (B, P, P) of steps along tangents, a little damped, and the gradients (B, P, 1)."""
+    normal = tangents.mT @ M @ tangents
+    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
+    eye = torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
+    return normal + damping * eye, tangents.mT @ (difference @ F_mat.mT.reshape(-1, 9, 1))
 
 
 _FLAT = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))

@@ -21,6 +21,7 @@ __all__ = [
     "Optimum",
     "RobustCost",
     "attach_gradient",
+    "differentiable_state",
     "minimize",
     "refine_unrolled",
 ]
@@ -183,7 +184,7 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
     """
     total_weight = weights.sum(1, keepdim=True)
     share = weights / (total_weight + (total_weight == 0))
-    state = _differentiable_state(model, M / torch.linalg.matrix_norm(M, keepdim=True))
+    state = differentiable_state(model, M / torch.linalg.matrix_norm(M, keepdim=True))
     distance, J = model.linearise(state.matrix(), x1, x2, share)
     squares = distance.square() if model.components == 1 else model.squares(distance)
     geometric_mean = (share * (squares + DISTANCE_FLOOR**2).log() / 2).sum(1, keepdim=True).exp()
@@ -214,7 +215,7 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
     return refined
 
 
-def _differentiable_state(model: TwoViewModel, M: Tensor) -> Any:
+def differentiable_state(model: TwoViewModel, M: Tensor) -> Any:
     """Return the states of matrices of unit norm, with the derivatives that a step on the manifold has."""
     with torch.no_grad():
         state = model.state(M)

@@ -2,10 +2,14 @@ r"""The stages of the learned relative pose: features, logits, moment matrix, es
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras
 from kornia_learnnorm.estimators.match_features import (
     POINT_FEATURES,
     RESIDUAL_FEATURES,
@@ -22,9 +26,11 @@ from kornia_learnnorm.estimators.moments import (
     least_cost,
     pick,
 )
+from kornia_learnnorm.estimators.optimize import differentiable_state
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
+from kornia_learnnorm.models.fundamental import Fundamental
 
 __all__ = ["POSE_OUTPUTS", "POSE_POINT_FEATURES", "POSE_RESIDUAL_FEATURES", "run_pose_stages"]
 
@@ -88,6 +94,8 @@ def run_pose_stages(
                 state, front = _most_consistent(evidence, model, unit, weights, factor, states[-1:], drawn)
             share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
             state = _reweight(evidence, state, share, weights, LAST_SCALE * scale, unit, refine_steps)
+            if drawn:
+                state = _leave_cameras(evidence, model, state, share, weights, LAST_SCALE * scale, unit, refine_steps)
         states.append(state)
         found.append(logits)
     return states, found
@@ -209,15 +217,38 @@ def _span_moments(evidence: Evidence, model: Essential, weights: Tensor) -> tupl
 
 
 def _reweight(
-    evidence: Evidence, state: Calibrated, weights: Tensor, inliers: Tensor, scale: Tensor, unit: Tensor, steps: int
-) -> Calibrated:
-    """Return states after steps of reweighted least squares, differentiable.
+    evidence: Evidence, state: Any, weights: Tensor, inliers: Tensor, scale: Tensor, unit: Tensor, steps: int
+) -> Any:
+    """Return states after steps of reweighted least squares, differentiable."""
+    square_scale = _square_scale(inliers, scale, unit)
+    return descend(evidence, state, weights[:, None], square_scale, steps, RELAXATION)
 
-    The loss has a scale (B, 1) in geometric means of the distances, weighted by the probabilities of inliers.
+
+def _square_scale(inliers: Tensor, scale: Tensor, unit: Tensor) -> Callable[[Tensor], Tensor]:
+    """Return the function from squared distances (B, S, N) to the squared scale (B, S, 1) of the loss.
+
+    The scale (B, 1) is in geometric means of the distances, weighted by the probabilities of inliers.
     """
     mean = geometric_scale(inliers, Essential.dof, (PIXEL_FLOOR / unit).square()[:, None])
-    square = scale.square()[:, None]
-    found: Calibrated = descend(
-        evidence, state, weights[:, None], lambda squares: square * mean(squares), steps, RELAXATION
-    )
-    return found
+    return lambda squares: scale.square()[:, None] * mean(squares)
+
+
+def _leave_cameras(
+    evidence: Evidence,
+    model: Essential,
+    state: Calibrated,
+    weights: Tensor,
+    inliers: Tensor,
+    scale: Tensor,
+    unit: Tensor,
+    steps: int,
+) -> Calibrated:
+    """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras."""
+    with torch.no_grad():
+        square_scale = _square_scale(inliers, scale, unit)(evidence.squares(state.matrix()[:, None])[0])
+        left = contradict_cameras(evidence, state, weights, square_scale[:, 0])
+    if not torch.compiler.is_compiling() and not left.any():
+        return state
+    free = _reweight(evidence, Fundamental().state(state.matrix()), weights, inliers, scale, unit, steps)
+    found = differentiable_state(model, free.matrix())
+    return Calibrated(*(torch.where(left[:, None, None], new, old) for new, old in zip(found, state, strict=True)))
