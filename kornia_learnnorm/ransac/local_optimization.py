@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras
+from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
 from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
@@ -23,9 +24,6 @@ MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
 MANIFOLD_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages by Levenberg-Marquardt
 MANIFOLD_STEPS = 2  # steps of Levenberg-Marquardt in a stage
-SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
-MIN_EFFECT = 0.1  # share of the noise that two more parameters must explain: errors of matches are not independent
-MIN_NOISE = 0.01  # thresholds; smaller distances don't speak against cameras
 
 
 def optimize_locally(scorer: PairScorer, M: Tensor, number: int) -> Hypotheses:
@@ -80,33 +78,11 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     relaxed = model.relaxed()
     if relaxed is None:
         return state
-    before, free = minimize(last, relaxed.state(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)
-    contradicts = _contradicts(last, free.state.matrix(), float(before - free.cost), scorer.threshold)
-    return free.state if contradicts else state
-
-
-def _contradicts(cost: RobustCost, free: Tensor, gain: float, threshold: float) -> bool:
-    r"""Return whether two more parameters lower the cost of Geman and McClure's loss by more than noise would.
-
-    The :math:`\tau` test: the gain over the mean of :math:`\psi^2` and times that of :math:`\psi'`, where
-    :math:`\psi(d)` is half of the loss's derivative, is twice an F-distributed number of 2 and :math:`m` degrees of
-    freedom, which is above :math:`x` with probability :math:`(1 + 2x / m)^{-m / 2}`. It takes the errors of matches to
-    be independent. Those of neighbours are not, and a thousand matches find the cameras of photographs significantly
-    wrong where they are right, so the parameters must also explain a tenth of the noise.
-
-    Reference:
-        F. Hampel, E. Ronchetti, P. Rousseeuw, W. Stahel, Robust Statistics, 1986, section 7.2.
-
-    """
-    squares = cost.squares(free)
-    weights = cost.weights * cost.loss(squares)[1]
-    freedom = float(weights.sum()) - 7
-    if freedom < 1:
-        return False
-    noise = (squares + (MIN_NOISE * threshold) ** 2) * weights.square()
-    slope = weights * (4 * weights.sqrt() - 3)  # of Geman and McClure's psi
-    statistic = gain * float(slope.sum() / noise.sum())
-    return statistic > freedom * max(math.pow(SIGNIFICANCE, -2 / freedom) - 1, MIN_EFFECT)
+    square_scale = weights.new_full((1, 1), loss.scale**2)
+    evidence = Evidence.from_points(scorer.x1[None], scorer.x2[None])
+    if not bool(contradict_cameras(evidence, state, weights, square_scale)):
+        return state
+    return minimize(last, relaxed.state(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)[1].state
 
 
 def _cost(
