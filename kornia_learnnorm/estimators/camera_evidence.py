@@ -45,7 +45,7 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     scale = cost / safe_divisor((e.mT @ M @ e)[:, 0, 0])
     gains, variances = [], []
     for D, steps in ((tangents, torch.eye(Essential.dof).to(pose)), (free, pose)):
-        normal, gradient = normal_equations(M, M - X, D, F_mat)
+        normal, gradient = normal_equations(M, M - X, D, e)
         inverse = torch.linalg.inv_ex(normal)[0]
         gains.append((gradient.mT @ inverse @ gradient)[:, 0, 0] * scale)
         variances.append((steps @ inverse @ steps.mT).diagonal(dim1=-2, dim2=-1).sum(-1))

@@ -15,7 +15,8 @@ from kornia_learnnorm.estimators.moments import (
     least_cost,
     pick,
 )
-from kornia_learnnorm.estimators.stages import Refinement
+from kornia_learnnorm.estimators.stages import Refinement, few_outliers
+from kornia_learnnorm.geometry.checks import is_known_true
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.contract import TwoViewModel
@@ -26,7 +27,10 @@ __all__ = ["FundamentalRefinement"]
 COMPARED_SCALE, LAST_SCALE = 1.5, 2.0  # of comparisons and of the last fit, in geometric means of the distances
 LAST_FLOOR = 0.002  # of the frame's unit, about half a pixel, added to the last scale
 LAST_POWER = 0.2  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
-LOCAL_STEPS = 4  # reweightings of candidates
+FIRST_SCALE = 3.0  # of the first fit of settled sets, in geometric means of the distances
+FIRST_STEPS, LOCAL_STEPS = 2, 3  # reweightings of the first fit of settled sets, and of candidates
+SEARCH_STEPS = 5  # of the last stage's steps that a search takes the place of
+RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
 SAMPLE_SIZE = 7
 MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
@@ -43,21 +47,41 @@ class FundamentalRefinement(Refinement):
     their probabilities, is fitted to them by reweighted least squares.
     """
 
-    def __init__(self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, samples: int) -> None:
+    def __init__(
+        self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, samples: int, training: bool
+    ) -> None:
         super().__init__(model, problem, frame)
+        self.training = training
+        self.easy: Tensor | None = None
         # A traced program serves sets of any size.
         self.samples = samples if torch.compiler.is_compiling() or self.x1.shape[-1] >= MIN_MATCHES else 0
 
+    def settled(self, logits: Tensor) -> Tensor | None:
+        """Return which sets of enough matches have few outliers, (B,) bool; None in training, or if none is searched.
+
+        There minimal samples find what the other stages would.
+        """
+        if not self.training and self.samples:
+            self.easy = few_outliers(logits, None if self.weights is None else self.weights > 0)
+        return self.easy
+
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
-        """Return the matrices after so many steps; in the last stage, searched sets take as many from their best one.
+        """Return the matrices after so many steps; in the last stage, searched sets take some from their best one.
 
         The choice among matrices has no derivative; through a zero, the transforms still get a gradient of zero.
         """
-        own = super().optimize(M, probability, steps, last)
         if not (last and steps and self.samples):
-            return own
+            return super().optimize(M, probability, steps, last)
         weights = probability if self.weights is None else probability * self.weights
         evidence, mean = Evidence.from_points(self.x1, self.x2), geometric_scale(weights, self.model.dof, SQUARE_FLOOR)
+        own = M
+        if self.easy is not None and not is_known_true(~self.easy.any()):
+            with torch.no_grad():
+                state, square = self.model.state(M), FIRST_SCALE**2
+                own = descend(evidence, state, weights[:, None], lambda s: square * mean(s), FIRST_STEPS).matrix()
+        if self.easy is None or not is_known_true(self.easy.all()):
+            damped = super().optimize(M, probability, steps, last)
+            own = damped if self.easy is None else torch.where(self.easy[:, None, None], own, damped)
         with torch.no_grad():
             square_mean = mean(evidence.squares(own[:, None])[0])
             best = self._most_consistent(evidence, torch.stack([own, M], 1), weights, COMPARED_SCALE**2 * square_mean)
@@ -69,8 +93,8 @@ class FundamentalRefinement(Refinement):
             """Return a scale that moves along, so that derivatives don't depend on where the fit began."""
             return LAST_SCALE**2 * mean(squares) + LAST_FLOOR**2
 
-        steps = max(1, steps - LOCAL_STEPS)
-        fitted = descend(evidence, state, power[:, None], square_scale, steps).matrix()
+        steps = max(1, steps - SEARCH_STEPS)
+        fitted = descend(evidence, state, power[:, None], square_scale, steps, RELAXATION).matrix()
         present = weights > 0
         few = (present.sum(1) < MIN_MATCHES) | ((probability * present).sum(1) < MIN_INLIERS)
         return torch.where(few[:, None, None], own, fitted)
@@ -88,7 +112,9 @@ class FundamentalRefinement(Refinement):
         losses = evidence.single().select(some).losses(drawn.float(), square_scale)
         M = torch.cat([M, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
         state, number = self.model.state(M.flatten(0, 1)), M.shape[1]
-        state = descend(evidence, state, present[:, None].expand(-1, number, -1), lambda _: square_scale, LOCAL_STEPS)
+        state = descend(
+            evidence, state, present[:, None].expand(-1, number, -1), lambda _: square_scale, LOCAL_STEPS, RELAXATION
+        )
         losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square_scale)
         best: Rank2 = pick(state, (losses @ present[..., None])[..., 0].argmin(1), number)
         return best

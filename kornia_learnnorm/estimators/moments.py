@@ -74,7 +74,7 @@ class Evidence(NamedTuple):
 
         Of weights times gradient factors, and of squared distances, both (B, S, N).
         """
-        M = self.moments(share).flatten(0, 1)
+        M = ((self.rows[:, None] * share[:, :, None]) @ self.rows.mT[:, None]).flatten(0, 1)
         trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
         points1, points2 = ((share * squares) @ self.products.mT).view(-1, 2, 3, 3).unbind(1)
         flat = _FLAT.to(M)
@@ -113,9 +113,27 @@ def descend(
     F_mat = state.matrix()
     for _ in range(steps):
         squares, factor = evidence.squares(torch.unflatten(F_mat, 0, (-1, weights.shape[1])))
-        share = weights * UNROLLED_LOSS(squares / square_scale(squares))[1] * factor
-        state, F_mat = _gauss_newton(*evidence.forms(share, squares), state, F_mat, relaxation)
+        M, X = evidence.forms(weights * UNROLLED_LOSS(squares / square_scale(squares))[1] * factor, squares)
+        difference, e = M - X, F_mat.mT.reshape(-1, 9, 1)
+        normal, gradient = normal_equations(M, difference, state.tangents(), e)
+        moved = state.retract(-relaxation * torch.linalg.solve_ex(normal, gradient)[0][..., 0])
+        moved_F = moved.matrix()
+        new = moved_F.mT.reshape(-1, 9, 1)
+        # A step at the optimum, whose derivative is the optimum's, may raise the cost by rounding.
+        lower = new.mT @ difference @ new <= e.mT @ difference @ e + torch.finfo(M.dtype).eps
+        tensors = []
+        for value, old in zip(moved, state, strict=True):
+            tensors.append(torch.where(lower.view(-1, *[1] * (value.ndim - 1)), value, old))
+        state, F_mat = type(state)(*tensors), torch.where(lower, moved_F, F_mat)
     return state
+
+
+def normal_equations(M: Tensor, difference: Tensor, tangents: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal matrices (B, P, P) of steps along tangents, a little damped, and the gradients (B, P, 1)."""
+    normal = tangents.mT @ M @ tangents
+    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
+    eye = torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
+    return normal + damping * eye, tangents.mT @ (difference @ e)
 
 
 def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float) -> Callable[[Tensor], Tensor]:
@@ -161,7 +179,7 @@ def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int
     shares = shares / shares[:, -1:]
     steps = EVEN_ROOTS[size] ** -torch.arange(1, size + 1, dtype=shares.dtype, device=shares.device)
     chances = (torch.arange(1, number + 1, device=shares.device)[:, None] * steps).frac().flatten()
-    ranks = (shares[:, None, :-1] < chances[:, None]).sum(-1)
+    ranks = torch.searchsorted(shares[:, :-1].contiguous(), chances + 0.0 * shares[:, :1])
     rows = evidence.select(order.gather(1, ranks)).rows
     rows = torch.unflatten(rows, 2, (number, size)).transpose(1, 2).flatten(0, 1)  # (B S, 9, size)
     Q, R = torch.linalg.qr(rows, mode="complete")
@@ -178,29 +196,6 @@ def evenly_ranked(order: Tensor, most: int) -> Tensor:
 
 
 EVEN_ROOTS = {5: 1.1347241384015194, 7: 1.0969815577985598}
-
-
-def _gauss_newton(M: Tensor, X: Tensor, state: Any, F_mat: Tensor, relaxation: float) -> tuple[Any, Tensor]:
-    """Return the states and matrices after a step that lowers the cost of M - X (B, 9, 9), or unchanged."""
-    difference = M - X
-    normal, gradient = normal_equations(M, difference, state.tangents(), F_mat)
-    moved = state.retract(-relaxation * torch.linalg.solve_ex(normal, gradient)[0][..., 0])
-    moved_F, e = moved.matrix(), F_mat.mT.reshape(-1, 9, 1)
-    new = moved_F.mT.reshape(-1, 9, 1)
-    # A step at the optimum, whose derivative is the optimum's, may raise the cost by rounding.
-    lower = new.mT @ difference @ new <= e.mT @ difference @ e + torch.finfo(M.dtype).eps
-    found = []
-    for value, old in zip(moved, state, strict=True):
-        found.append(torch.where(lower.view(-1, *[1] * (value.ndim - 1)), value, old))
-    return type(state)(*found), torch.where(lower, moved_F, F_mat)
-
-
-def normal_equations(M: Tensor, difference: Tensor, tangents: Tensor, F_mat: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal matrices (B, P, P) of steps along tangents, a little damped, and the gradients (B, P, 1)."""
-    normal = tangents.mT @ M @ tangents
-    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
-    eye = torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
-    return normal + damping * eye, tangents.mT @ (difference @ F_mat.mT.reshape(-1, 9, 1))
 
 
 _FLAT = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))

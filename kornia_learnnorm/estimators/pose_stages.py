@@ -27,6 +27,8 @@ from kornia_learnnorm.estimators.moments import (
     pick,
 )
 from kornia_learnnorm.estimators.optimize import differentiable_state
+from kornia_learnnorm.estimators.stages import few_outliers
+from kornia_learnnorm.geometry.checks import is_known_true
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
@@ -36,9 +38,9 @@ __all__ = ["POSE_OUTPUTS", "POSE_POINT_FEATURES", "POSE_RESIDUAL_FEATURES", "run
 
 POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
-EARLY_STEPS, LOCAL_STEPS = 2, 6  # reweightings in all stages but the last, and of the last stage's candidates
-# Scales of the robust loss in geometric means of the distances, times the network's factor.
-EARLY_SCALE, LAST_SCALE = 3.0, 0.7
+EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of candidates, twice if not settled
+# Scales of the robust loss in geometric means of the distances, the first two times the network's factor.
+EARLY_SCALE, LAST_SCALE, SETTLED_SCALE = 3.0, 0.7, 3.1
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
@@ -47,6 +49,8 @@ PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
 SHORTLIST = 4  # matrices of minimal samples that are compared on all matches
+
+Candidates = tuple[Tensor, Tensor]  # essential matrices (B, S, 3, 3), and which of them are real
 
 
 def run_pose_stages(
@@ -58,8 +62,12 @@ def run_pose_stages(
     refine_steps: int,
     samples: int,
     detach_stages: bool,
+    settle: bool,
 ) -> tuple[list[Calibrated], list[Tensor]]:
-    """Return the states of the stages and their logits (B, N), for sets that determine their matrix."""
+    """Return the states of the stages and their logits (B, N), for sets that determine their matrix.
+
+    With ``settle``, sets of few outliers leave out the stages between the first network and the last fit.
+    """
     present = problem.present
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
     x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
@@ -68,9 +76,10 @@ def run_pose_stages(
     features = torch.cat([match_features(frame, scores, present), _rays(frame, model, x1, x2)], -1)
     states: list[Calibrated] = []
     found: list[Tensor] = []
+    settled = torch.zeros_like(problem.x1[:, 0, 0], dtype=torch.bool)
     dtype, tiny = next(networks.parameters()).dtype, torch.finfo(problem.x1.dtype).tiny
-    for number, network in enumerate(networks, 1):
-        seen, factor = features, None
+    for network in networks:
+        seen, factor, before = features, None, None
         if states:
             with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
                 F_mat = states[-1].matrix()
@@ -78,27 +87,37 @@ def run_pose_stages(
                 squares, factor = (value[:, 0] for value in evidence.squares(F_mat[:, None]))
                 pixels = unit * (squares + torch.finfo(squares.dtype).tiny).sqrt()
             seen = torch.cat([features, residuals, (pixels + PIXEL_FLOOR).log()[..., None] / 2], -1)
+            factor = torch.where(settled[:, None], 1.0, factor)
+            before = states[-1].essential()[:, None], ~settled[:, None]
         logits, outputs = network(seen.to(dtype), None if present is None else present == 0)
         logits, outputs = logits.to(problem.x1), outputs.to(problem.x1)
+        if states:
+            logits = torch.where(settled[:, None], found[-1], logits)
+        scale = (SCALE_BOUND * torch.tanh(outputs / SCALE_BOUND)).exp()
+        if settle and not states:
+            settled = few_outliers(logits, None if problem.weights is None else problem.weights > 0)
         weights = logits.sigmoid()
         weights = weights / weights.detach().amax(1, keepdim=True) + MIN_WEIGHT
         weights = weights if problem.weights is None else weights * problem.weights
-        scale = (SCALE_BOUND * torch.tanh(outputs / SCALE_BOUND)).exp()
-        if number < len(networks):
-            with torch.no_grad():
-                state = _likeliest(evidence, model, unit, weights, factor, states[-1:])
-            state = _reweight(evidence, state, weights, weights, EARLY_SCALE * scale, unit, EARLY_STEPS)
-        else:
-            with torch.no_grad():
-                drawn = 0 if detach_stages else samples
-                state, front = _most_consistent(evidence, model, unit, weights, factor, states[-1:], drawn)
-            share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
-            state = _reweight(evidence, state, share, weights, LAST_SCALE * scale, unit, refine_steps)
-            if drawn:
-                state = _leave_cameras(evidence, model, state, share, weights, LAST_SCALE * scale, unit, refine_steps)
-        states.append(state)
+        suggested = weights if factor is None else weights * factor
         found.append(logits)
-    return states, found
+        if len(found) == len(networks) or is_known_true(settled.all()):
+            break
+        with torch.no_grad():
+            state = _likeliest(evidence, model, unit, weights, suggested, before)
+        states.append(_reweight(evidence, state, weights, weights, EARLY_SCALE * scale, unit, EARLY_STEPS))
+    drawn = 0 if detach_stages else samples
+    with torch.no_grad():
+        state, front = _most_consistent(evidence, model, unit, weights, suggested, before, drawn, settled)
+    share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
+    options = weights, torch.where(settled[:, None], SETTLED_SCALE, LAST_SCALE * scale), unit, refine_steps
+    state = _reweight(evidence, state, share, *options)
+    if drawn:
+        state = _leave_cameras(evidence, model, state, share, *options)
+    # A settled set has gone to the last stage at once.
+    states = [state.where(settled, other) for other in states]
+    left = len(networks) - len(states)
+    return states + left * [state], found + (len(networks) - len(found)) * found[-1:]
 
 
 def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tensor:
@@ -110,14 +129,12 @@ def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tenso
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
 
 
-def _suggested(
-    evidence: Evidence, model: Essential, weights: Tensor, before: list[Calibrated]
-) -> tuple[Tensor, Tensor]:
-    """Return the matrices of moments under weights (B, S, N) and of the stage before, and which of them are real."""
-    E_mat, real = _span_moments(evidence, model, weights)
-    if before:
-        E_mat = torch.cat([E_mat, before[0].essential()[:, None]], 1)
-        real = torch.cat([real, torch.ones_like(real[:, :1])], 1)
+def _suggested(evidence: Evidence, model: Essential, weights: Tensor, before: Candidates | None) -> Candidates:
+    """Return the matrices of moments under weights (B, S, N) and those of the stage before."""
+    found = _span_moments(evidence, model, weights)
+    if before is None:
+        return found
+    E_mat, real = (torch.cat(pair, 1) for pair in zip(found, before, strict=True))
     return E_mat, real
 
 
@@ -132,11 +149,10 @@ def _likeliest(
     model: Essential,
     unit: Tensor,
     weights: Tensor,
-    factor: Tensor | None,
-    before: list[Calibrated],
+    suggested: Tensor,
+    before: Candidates | None,
 ) -> Calibrated:
     """Return the states of least weighted cost among those that the weights suggest."""
-    suggested = weights if factor is None else weights * factor
     E_mat, real = _suggested(evidence, model, suggested[:, None], before)
     losses = _losses(evidence, model, E_mat, EARLY_PIXELS / unit)
     return model.calibrated(least_cost(E_mat, real, losses, weights, 1)[:, 0])
@@ -147,9 +163,10 @@ def _most_consistent(
     model: Essential,
     unit: Tensor,
     weights: Tensor,
-    factor: Tensor | None,
-    before: list[Calibrated],
+    suggested: Tensor,
+    before: Candidates | None,
     samples: int,
+    settled: Tensor,
 ) -> tuple[Calibrated, Tensor]:
     """Return the states of least cost of all matches, whatever their weights, and which matches are in front.
 
@@ -157,7 +174,6 @@ def _most_consistent(
     are fitted to all matches. A match behind a camera, (B, N) bool, costs as much as one far away.
     """
     present, scale = (weights > 0).to(weights), LAST_PIXELS / unit
-    suggested = weights if factor is None else weights * factor
     E_mat, real = _suggested(evidence, model, torch.stack([suggested, present], 1), before)
     E_mat = least_cost(E_mat, real, _losses(evidence, model, E_mat, scale), present, 2)
     if samples:
@@ -176,7 +192,10 @@ def _most_consistent(
     repeated = Essential(*(C.repeat_interleave(number, 0) for C in (model.C1, model.C2)))
     state, square = repeated.calibrated(E_mat.flatten(0, 1)), scale.square()[:, None]
     front = _in_front(evidence, state, present, number)
-    state = descend(evidence, state, present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION)
+    options = present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION
+    state = descend(evidence, state, *options)
+    if not is_known_true(settled.all()):
+        state = state.where(settled.repeat_interleave(number, 0), descend(evidence, state, *options))
     losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square)
     cost = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0]
     best = cost.argmin(1)
@@ -202,7 +221,7 @@ def _in_front(evidence: Evidence, state: Calibrated, weights: Tensor, number: in
     return front.gather(2, best.expand(-1, -1, 1, front.shape[-1]))[:, :, 0]
 
 
-def _span_moments(evidence: Evidence, model: Essential, weights: Tensor) -> tuple[Tensor, Tensor]:
+def _span_moments(evidence: Evidence, model: Essential, weights: Tensor) -> Candidates:
     """Return the matrices (B, 11 S, 3, 3) that moments under weights (B, S, N) suggest, and which of them are real."""
     carry = torch.einsum("bik,bjl->bklij", model.C1, model.C2)  # of the entries of E to those of F
     carry = carry.flatten(3, 4).flatten(1, 2)[:, None]
@@ -247,8 +266,7 @@ def _leave_cameras(
     with torch.no_grad():
         square_scale = _square_scale(inliers, scale, unit)(evidence.squares(state.matrix()[:, None])[0])
         left = contradict_cameras(evidence, state, weights, square_scale[:, 0])
-    if not torch.compiler.is_compiling() and not left.any():
+    if is_known_true(~left.any()):
         return state
     free = _reweight(evidence, Fundamental().state(state.matrix()), weights, inliers, scale, unit, steps)
-    found = differentiable_state(model, free.matrix())
-    return Calibrated(*(torch.where(left[:, None, None], new, old) for new, old in zip(found, state, strict=True)))
+    return differentiable_state(model, free.matrix()).where(left, state)

@@ -229,7 +229,7 @@ class LearnedRelativePose(LearnedLayer):
         solved = LinearProblem.from_points(p1, p2, given, self.model)
         eye = torch.eye(3).to(K1)
         C1, C2 = (torch.where(rows[..., None], K, eye) for K in (K1, K2))
-        options = self.refine_steps, self.samples, self.detach_stages
+        options = self.refine_steps, self.samples, self.detach_stages, not (self.training or self.detach_stages)
         states, logits = run_pose_stages(self.networks, solved, C1, C2, scores, *options)
         sideways = Essential(eye[None], eye[None]).calibrated(
             p1.new_tensor(self.model.preferred).view(1, 3, 3).expand(p1.shape[0], -1, -1)

@@ -11,18 +11,19 @@ from torch import Tensor, nn
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
 from kornia_learnnorm.estimators.match_features import CommonFrame, match_features, residual_features
 from kornia_learnnorm.estimators.optimize import refine_unrolled
-from kornia_learnnorm.geometry.checks import weighted_mean
+from kornia_learnnorm.geometry.checks import is_known_true, weighted_mean
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform
 from kornia_learnnorm.models.contract import TwoViewModel
 
-__all__ = ["TRANSFORM_PARAMS", "Refinement", "run_stages"]
+__all__ = ["TRANSFORM_PARAMS", "Refinement", "few_outliers", "run_stages"]
 
 EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
 MAX_MINIMAL_DISTANCE = 0.01  # of the frame's unit; quadratic mean that the best fit of `min_points` inliers leaves
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
+MIN_SETTLED, SETTLED = 16, 0.7  # matches, and their mean probability, from which on the first stage is enough
 TRANSFORM_PARAMS = 5  # of each view's SPD transform
 
 
@@ -38,8 +39,8 @@ def run_stages(
 ) -> tuple[Tensor, Tensor]:
     """Return matrices (B, S, 3, 3) and logits (B, S, N) of the stages, for sets that determine their matrix.
 
-    Unless stages are detached, the refined matrices of the last stage follow. All but the last change of coordinates is
-    the common frame's.
+    Unless stages are detached, the refined matrices of the last stage follow. Sets that are settled after the first
+    stage keep what it gives in the others. All but the last change of coordinates is the common frame's.
     """
     present = problem.present
     frame = CommonFrame.from_points(problem.points1, problem.points2, present)
@@ -48,7 +49,11 @@ def run_stages(
     with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
         refine = refinement(problem, frame)
     dtype = next(networks.parameters()).dtype
+    settled: Tensor | None = None
     for network in networks:
+        if settled is not None and is_known_true(settled.all()):
+            found.append(found[0])
+            continue
         seen = features
         if found:
             with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_stages):
@@ -59,7 +64,13 @@ def run_stages(
         logits, params = logits.to(problem.x1), params.to(problem.x1)
         weights = logits.sigmoid() if factor is None else logits.sigmoid() * factor
         weights = weights if problem.weights is None else weights * problem.weights
-        found.append((_solve_weighted(model, frame, weights, present, params if learn_transforms else None), logits))
+        M = _solve_weighted(model, frame, weights, present, params if learn_transforms else None)
+        if settled is not None:
+            M = torch.where(settled[:, None, None], found[0][0], M)
+            logits = torch.where(settled[:, None], found[0][1], logits)
+        found.append((M, logits))
+        if len(found) == 1 and not detach_stages:
+            settled = refine.settled(logits)
     if not detach_stages:
         found.append(refine(*found[-1], refine_steps, last=True))
     matrices, all_logits = zip(*found, strict=True)
@@ -80,6 +91,13 @@ def _solve_weighted(
     params = torch.where(frame.swapped[:, None, None], params.flip(1), params)
     T1, T2 = (spd_transform(params) @ torch.stack([weighted.T1, weighted.T2], 1)).unbind(1)
     return solve_in_coordinates(weighted, T1, T2)
+
+
+def few_outliers(logits: Tensor, present: Tensor | None) -> Tensor:
+    """Return which sets of enough correspondences have few outliers by their logits (B, N), (B,) bool."""
+    present = torch.ones_like(logits) if present is None else present.to(logits)
+    number = present.sum(1)
+    return (number >= MIN_SETTLED) & ((logits.sigmoid() * present).sum(1) > SETTLED * number)
 
 
 class Refinement:
@@ -105,6 +123,10 @@ class Refinement:
         if self.minimal is not None and self.is_minimal is not None:
             refined = torch.where(self.is_minimal, self.minimal, refined)
         return refined, logits
+
+    def settled(self, logits: Tensor) -> Tensor | None:
+        """Return which sets need no stage but the first and its refinement, (B,) bool; None if all stages are run."""
+        return None
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
         """Return the matrices after so many steps, with the probabilities of inliers; ``last`` in the last stage."""

@@ -18,6 +18,7 @@ __all__ = [
     "check_pairs",
     "check_tensor",
     "check_whole_number",
+    "is_known_true",
     "needs_gradient",
     "read_condition",
     "safe_divisor",
@@ -149,6 +150,11 @@ def read_condition(condition: Tensor) -> bool | None:
         return bool(condition)
     except RuntimeError:
         return None
+
+
+def is_known_true(condition: Tensor) -> bool:
+    """Return whether a boolean scalar is true, and known to be without waiting for a device."""
+    return condition.device.type == "cpu" and read_condition(condition) is True
 
 
 def check_whole_number(name: str, value: object, least: int) -> None:
