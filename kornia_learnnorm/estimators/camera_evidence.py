@@ -53,4 +53,5 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     freedom = (inner.sum(1) - Fundamental.dof).clamp(min=1.0)
     effect = (gains[1] - gains[0]) * inner.sum(1) / safe_divisor(noise) / freedom
     least = (SIGNIFICANCE ** (-2 / freedom) - 1).clamp(min=MIN_EFFECT)
-    return (effect > least) & (variances[0] > MIN_PRECISION * variances[1])
+    contradicted: Tensor = (effect > least) & (variances[0] > MIN_PRECISION * variances[1])
+    return contradicted

@@ -185,7 +185,8 @@ class LearnedEightPoint(LearnedLayer):
 
     In the last stage of sets of 16 correspondences and more, with :math:`\sum_i \sigma(l_i) \ge 8`, minimal samples of
     seven are drawn by :math:`\sigma(l_i)`. Of their matrices and the network's, the one of least robust cost over all
-    correspondences is fitted to all of them, weighted by :math:`\sigma(l_i)^{0.2}`.
+    correspondences is fitted to all of them, weighted by :math:`\sigma(l_i)^{0.2}`. In evaluation, those of them with a
+    mean :math:`\sigma(l_i)` above 0.7 in the first stage leave the other stages out: they hold what the first gives.
 
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
     their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the

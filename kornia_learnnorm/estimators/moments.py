@@ -179,7 +179,7 @@ def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int
     shares = shares / shares[:, -1:]
     steps = EVEN_ROOTS[size] ** -torch.arange(1, size + 1, dtype=shares.dtype, device=shares.device)
     chances = (torch.arange(1, number + 1, device=shares.device)[:, None] * steps).frac().flatten()
-    ranks = torch.searchsorted(shares[:, :-1].contiguous(), chances + 0.0 * shares[:, :1])
+    ranks = torch.searchsorted(shares, chances + 0.0 * shares[:, :1]).clamp(max=shares.shape[1] - 1)
     rows = evidence.select(order.gather(1, ranks)).rows
     rows = torch.unflatten(rows, 2, (number, size)).transpose(1, 2).flatten(0, 1)  # (B S, 9, size)
     Q, R = torch.linalg.qr(rows, mode="complete")

@@ -269,4 +269,5 @@ def _leave_cameras(
     if is_known_true(~left.any()):
         return state
     free = _reweight(evidence, Fundamental().state(state.matrix()), weights, inliers, scale, unit, steps)
-    return differentiable_state(model, free.matrix()).where(left, state)
+    nearest: Calibrated = differentiable_state(model, free.matrix())
+    return nearest.where(left, state)

@@ -78,7 +78,7 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     relaxed = model.relaxed()
     if relaxed is None:
         return state
-    square_scale = weights.new_full((1, 1), loss.scale**2)
+    square_scale = weights.new_full((1, 1), (FINAL_LOSS_SCALE * scorer.threshold) ** 2)
     evidence = Evidence.from_points(scorer.x1[None], scorer.x2[None])
     if not bool(contradict_cameras(evidence, state, weights, square_scale)):
         return state

@@ -61,8 +61,9 @@ class RANSAC(nn.Module):
 
     With both cameras, minimal samples of five run through Kornia's five-point solver, and local optimisation and the
     final fit are Levenberg-Marquardt on essential matrices; distances stay in pixels. Where a fundamental matrix then
-    fits so much better that chance explains it with a probability below 0.001, the cameras are inexact, or a lens or a
-    shutter is not that of a pinhole, and the result is this matrix. ``normalizer`` and ``rank2`` have no effect.
+    fits so much better that chance explains it with a probability below 0.001, and its pose has at most twice the
+    standard error, the cameras are inexact, or a lens or a shutter is not that of a pinhole: the result is this matrix.
+    ``normalizer`` and ``rank2`` have no effect.
 
     Matches that share a point exactly, in either view, with a match of higher weight, or of the same weight and before
     them, are treated as absent: many matches on one point agree with every epipolar line through it.

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import essential_from_Rt
 from pairwise import pairwise
 from scenes import (
@@ -25,11 +26,12 @@ from scenes import (
 from torch.nn.functional import normalize
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators import moments, pose_stages
+from kornia_learnnorm.estimators import camera_evidence, moments, pose_stages
 from kornia_learnnorm.estimators.match_features import CommonFrame
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
@@ -224,6 +226,86 @@ DEGENERATE = {
     "unrelated": lambda p: (p, p.flip(1)),
 }
 DETERMINED = {"pose": ["no motion", "unrelated"], "homography": ["four places", "no motion", "unrelated"]}
+
+
+@pytest.mark.parametrize("kind", ["fundamental", "pose"])
+def test_sets_of_few_outliers_leave_stages_out(kind):
+    """A set that needs its stages, in the same batch, changes nothing but the time."""
+    cls = {"fundamental": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose}[kind]
+    layer, calls = cls.from_pretrained(), []
+    for network in layer.networks:
+        network.register_forward_hook(lambda *_: calls.append(1))
+    scene = scenes("handheld", 3, 200, noise=0.5)
+    points = (scene.points1, scene.points2) + ((scene.K1, scene.K2) if kind == "pose" else ())
+    points[1][2, :120] = uniform(120, 2, high=400.0)
+    layer(*points)
+    alone, numbers = [], [len(calls)]
+    for row in range(3):
+        calls.clear()
+        alone.append(layer(*(p[row : row + 1] for p in points)))
+        numbers.append(len(calls))
+    assert numbers == [len(layer.networks), 1, 1, len(layer.networks)]
+    assert up_to_sign(layer(*points).detach(), torch.cat(alone).detach()) < 1e-6
+    calls.clear()
+    layer.train()(*(p[:2] for p in points))
+    assert len(calls) == len(layer.networks)
+
+
+def turned_in(points, K, share):
+    """Points moved towards the principal point, in the corners by a share of their distance."""
+    offsets = points - K[:, None, :2, 2]
+    squares = offsets.square().sum(-1, keepdim=True)
+    return K[:, None, :2, 2] + offsets * (1 - share * squares / squares.amax(1, keepdim=True))
+
+
+def test_cameras_are_left_where_matches_contradict_them():
+    """The matrix is essential still, the pose better than that of the cameras; right cameras and planes keep theirs."""
+    layer, errors = kln.LearnedRelativePose.from_pretrained(), []
+    scene = scenes("handheld", 8, 400, noise=0.3)
+    cameras = scene.K1, scene.K2
+    moved = [turned_in(p, K, 0.1) for p, K in zip((scene.points1, scene.points2), cameras, strict=True)]
+    for least in (0.0, torch.inf):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(camera_evidence, "MIN_EFFECT", max(least, camera_evidence.MIN_EFFECT))
+            found = layer.estimate(*moved, *cameras)
+            errors.append(pose_error(found.R, found.t, scene.R, scene.t))
+            values = torch.linalg.svdvals(found.E_mat.detach())
+            assert torch.allclose(values[:, 0], values[:, 1], rtol=1e-9)
+    assert errors[0].median() < 0.8 * errors[1].median()
+    points = scene.points1.requires_grad_(), scene.points2
+    kept = layer(*points, *cameras)
+    assert torch.isfinite(torch.autograd.grad(kept.square().sum() + kept[:, 0, 0].sum(), points[0])[0]).all()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(camera_evidence, "MIN_EFFECT", torch.inf)
+        assert torch.equal(kept, layer(*points, *cameras))
+
+
+def test_contradiction_is_that_of_an_f_test():
+    """The gain of two more parameters is that of least squares, computed from the distances' derivatives."""
+    scene = scenes("handheld", 1, 300, noise=0.3)
+    points = [convert_points_to_homogeneous(p / 200).mT for p in (scene.points1, scene.points2)]
+    T = torch.diag(torch.tensor([1 / 200, 1 / 200, 1.0], dtype=torch.float64))[None]
+    model = Essential.of_cameras(scene.K1, scene.K2, T, T)
+    evidence, weights = Evidence.from_points(*points), torch.ones(1, 300, dtype=torch.float64)
+    start = model.calibrated(true_essential(scene))
+    scale = torch.full((1, 1), 0.02, dtype=torch.float64)
+    state = minimize(RobustCost(model, *points, weights, GemanMcClure(0.02)), start, 50, 1e-9)[1].state
+    F_mat = state.matrix()
+    distance, J = Fundamental().linearise(F_mat, *points)
+    inner = (1 + (distance / scale).square()) ** -2
+    rows, right = J[0].mT * inner[0, :, None].sqrt(), distance[0] * inner[0].sqrt()
+    costs = []
+    for tangents in (state.tangents()[0], Fundamental().state(F_mat).tangents()[0]):
+        A = rows @ tangents
+        costs.append((right - A @ torch.linalg.lstsq(A, right[:, None]).solution[:, 0]).square().sum())
+    gain = (costs[0] - costs[1]) * inner.sum() / (inner.square() * distance.square()).sum() / (inner.sum() - 7)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(camera_evidence, "SIGNIFICANCE", 1.0)
+        patch.setattr(camera_evidence, "MIN_PRECISION", 0.0)
+        for factor in (0.97, 1.03):
+            patch.setattr(camera_evidence, "MIN_EFFECT", float(factor * gain))
+            found = camera_evidence.contradict_cameras(evidence, state, weights, scale.square())
+            assert found.tolist() == [factor < 1]
 
 
 @both
