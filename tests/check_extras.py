@@ -34,7 +34,7 @@ command = ['learnnorm', 'demo', '--no-browser', '--port', '5107']
 with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
     try:
         address = server.stdout.readline().split()[4].rstrip(',')
-        assert b'bokeh' in urllib.request.urlopen(address, timeout=60).read()
+        assert b'gradio' in urllib.request.urlopen(address, timeout=60).read()
     finally:
         server.terminate()
         server.communicate(timeout=60)"""

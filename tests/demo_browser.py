@@ -3,8 +3,6 @@
 python tests/demo_browser.py docs/images/demo.jpg
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -28,20 +26,14 @@ def find_browser() -> str | None:
     return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
-def free_port() -> int:
-    """Return a port of this computer that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
 @contextmanager
 def served() -> Iterator[tuple[str, subprocess.Popen]]:
     """Run ``learnnorm demo`` and give the address of its page and the process; end it by Ctrl-C if it runs still."""
-    command = [sys.executable, "-c", PROGRAM, "demo", "--no-browser", "--port", str(port := free_port())]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]  # nobody listens there
+    command = [sys.executable, "-c", PROGRAM, "demo", "--no-browser", "--port", str(port)]
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, **options) as process:
         try:
             line = process.stdout.readline()
             if f"127.0.0.1:{port}" not in line:
@@ -54,7 +46,7 @@ def served() -> Iterator[tuple[str, subprocess.Popen]]:
 
 @contextmanager
 def opened(address: str, width: int, height: int) -> Iterator[tuple[Any, list[str]]]:
-    """Give the loaded page with the result of the first example, and the requests to other computers, all refused."""
+    """Give the loaded page with the result of the example, and the requests to other computers, all refused."""
     from playwright.sync_api import sync_playwright
 
     foreign: list[str] = []
@@ -74,35 +66,30 @@ def opened(address: str, width: int, height: int) -> Iterator[tuple[Any, list[st
         page.set_default_timeout(TIMEOUT)
         page.route("**/*", judge)
         page.goto(address)
-        wait_for_status(page, "Point at a spot")
+        wait_for_status(page, "matches are inliers")
         yield page, foreign
         browser.close()
 
 
 def wait_for_status(page: Any, text: str) -> None:
-    """Wait until the line above the images has a text."""
-    page.locator(".status", has_text=text).wait_for()
+    """Wait until the line above the picture has a text."""
+    page.wait_for_function("text => document.querySelector('#status textarea')?.value.includes(text)", arg=text)
 
 
-def point_at(page: Any, image: str, x: float, y: float, size: tuple[int, int] = (640, 480)) -> None:
-    """Move the mouse to a pixel of an image, ``Image 1`` or ``Image 2``."""
-    box = page.locator(".bk-Figure").nth(int(image[-1]) - 1).bounding_box()
-    left, top = ((value + 0.5) / side for value, side in zip((x, y), size, strict=True))
-    page.mouse.move(box["x"] + left * box["width"], box["y"] + top * box["height"])
-
-
-def line(page: Any, name: str) -> list[list[float]]:
-    """Wait for the epipolar line of a method, as ``Image 2, RANSAC``, and return its ends, [[x, x], [y, y]]."""
-    data = "Bokeh.documents[0].get_model_by_name(name).data"
-    page.wait_for_function(f"name => {data}.x.length == 2", arg=name)
-    return page.evaluate(f"name => [Array.from({data}.x), Array.from({data}.y)]", name)
+def click_picture(page: Any, x: float, y: float) -> bytes:
+    """Click at shares of the picture's width and height, and return the file of the picture that follows."""
+    image = page.locator("#picture img")
+    before, box = image.get_attribute("src"), image.bounding_box()
+    image.click(position={"x": x * box["width"], "y": y * box["height"]})
+    changed = "before => document.querySelector('#picture img').getAttribute('src') != before"
+    page.wait_for_function(changed, arg=before)
+    return page.request.get(image.get_attribute("src")).body()
 
 
 def main(path: Path) -> None:
-    """Take a screenshot of the first example with the mouse on a corner of a picture."""
+    """Take a screenshot of the example with a click on a corner of a picture."""
     with served() as (address, _), opened(address, 1100, 900) as (page, _):
-        point_at(page, "Image 1", 261, 156)
-        line(page, "Image 2, RANSAC")
+        click_picture(page, 0.2, 0.33)
         page.wait_for_timeout(1000)  # until the line is drawn
         page.screenshot(path=path, type="jpeg", quality=70, full_page=True)
     print(f"wrote {path} ({path.stat().st_size / 1000:.0f} kB)")

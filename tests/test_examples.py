@@ -1,5 +1,6 @@
 """The scripts in examples/, cut short: they run, what they train gets better."""
 
+import asyncio
 import importlib
 import sys
 from pathlib import Path
@@ -80,6 +81,16 @@ def test_one_line_changes_nothing_but_the_solver(example):
     kornia, same, whitening, learned = errors.values()
     assert same == pytest.approx(kornia, rel=1e-3)
     assert learned < whitening < kornia
+
+
+def test_the_page_of_a_hosted_space_is_built(example):
+    pytest.importorskip("gradio", reason="Gradio is not installed")
+
+    async def build():  # outside of a running loop, Gradio leaves loops open
+        return example("app").app
+
+    labels = [block["props"].get("label") for block in asyncio.run(build()).get_config_file()["components"]]
+    assert {"Detector", "Matcher", "Model", "Threshold, px", "Cameras"} <= {*labels}
 
 
 @pytest.fixture

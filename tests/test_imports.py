@@ -21,7 +21,7 @@ FLOORS = [
     {"data", "layer_export", "hub"},
     {"two_view"},
     {"evaluation", "lightning_modules"},
-    {"demo"},
+    {"browser_demo"},
     {"kornia_learnnorm"},  # the package's __init__, with the public names
     {"cli"},
 ]
@@ -31,7 +31,7 @@ CORE_NEEDS = {"filelock", "kornia", "kornia_learnnorm", "numpy", "safetensors", 
 # cli/main.py names Lightning only to say which extra brings it.
 PLACES = {"argparse": {"cli"}, "pytorch_lightning": {"lightning_modules", "cli"}}
 HEAVY = ["pytorch_lightning", "lightning", "cv2", "h5py", "matplotlib", "jsonargparse", "torchmetrics", "tabulate"]
-HEAVY += ["bokeh", "huggingface_hub"]
+HEAVY += ["gradio", "huggingface_hub"]
 
 
 def room_of(name: str) -> str:

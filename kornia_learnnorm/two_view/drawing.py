@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-__all__ = ["INLIER", "OUTLIER", "WIDE", "draw_line", "draw_matches", "draw_pair", "import_matplotlib"]
+__all__ = ["INLIER", "blend_images", "draw_line", "draw_matches", "draw_pair", "import_matplotlib", "stacked"]
 
 BACKGROUND = "#11161d"  # dark, to fit light and dark pages
 TEXT = "#e8edf2"
@@ -81,7 +81,8 @@ def draw_pair(
         if abs(image.shape[1] * size[1] - image.shape[0] * size[0]) > max(size) + max(image.shape[:2]):
             raise ValueError(f"the estimate is of an image of {size[0]} x {size[1]} pixels, got shape {image.shape}")
     if moved := estimate.model == "homography":
-        image2, shown = _blend(image1, image2, estimate), "image 1 as H moves it, over image 2; predicted error of H"
+        image2 = blend_images(image1, image2, estimate)
+        shown = "image 1 as H moves it, over image 2; predicted error of H"
     else:
         shown = f"{min(NUM_LINES, estimate.num_inliers)} epipolar lines; predicted error of F"
     outliers = estimate.num_matches - estimate.num_inliers
@@ -102,12 +103,18 @@ def draw_pair(
         figure.savefig(temporary, facecolor=figure.get_facecolor())
 
 
+def stacked(sizes: Sequence[tuple[int, int]]) -> bool:
+    """Return whether images of these widths and heights are shown one above the other, not side by side."""
+    aspects = [width / height for width, height in sizes]
+    return min(aspects) > WIDE or max(aspects) > UNEQUAL * min(aspects)
+
+
 def _panels(
     images: Sequence[npt.NDArray[np.uint8]], sizes: Sequence[tuple[int, int]], margin: float
 ) -> tuple[Figure, npt.NDArray[Any]]:
     """Return a figure that shows each image in its own axes, in pixels of its full size, with a margin for texts."""
     aspects = [width / height for width, height in sizes]
-    if min(aspects) > WIDE or max(aspects) > UNEQUAL * min(aspects):
+    if stacked(sizes):
         heights = [min(WIDTH / aspect, MAX_HEIGHT) for aspect in aspects]
         height, grid = sum(heights), {"nrows": 2, "height_ratios": heights}
     else:
@@ -123,7 +130,7 @@ def _panels(
     return figure, panels
 
 
-def _blend(
+def blend_images(
     image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8], estimate: PairEstimate
 ) -> npt.NDArray[np.uint8]:
     """Return the mean of image 2 and image 1 moved by the homography, RGB; image 2 alone where image 1 ends."""

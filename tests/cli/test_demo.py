@@ -1,7 +1,5 @@
 """The command ``learnnorm demo`` where it cannot serve its page."""
 
-from __future__ import annotations
-
 import socket
 
 import pytest
@@ -16,9 +14,8 @@ def test_a_matcher_without_its_detector(refused):
     refused(["demo", "--matcher", "lightglue"], "keynet, got sift")
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Tornado leaves its socket open
 def test_a_port_in_use(refused):
-    pytest.importorskip("bokeh", reason="Bokeh is not installed")
+    pytest.importorskip("gradio", reason="Gradio is not installed")
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         refused(["demo", "--no-browser", f"--port={port}"], f"--port {port}: cannot listen there")

@@ -254,7 +254,7 @@ def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, 
         ("completion bash", "shtab", "completion"),
         ("export paper --format onnx --out a.onnx", "onnx", "onnx"),
         ("export-colmap . --out a.db", "pycolmap", "colmap"),
-        *(("demo --no-browser", package, "demo") for package in ("bokeh", "cv2", "PIL")),
+        *(("demo --no-browser", package, "demo") for package in ("gradio", "cv2", "PIL")),
     ],
 )
 def test_a_missing_package_is_one_line(command, blocked, extra, tmp_path, monkeypatch, refused):
