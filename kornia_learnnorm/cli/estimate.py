@@ -11,15 +11,9 @@ from kornia_learnnorm.cli.match import add_feature_arguments
 from kornia_learnnorm.data.images import image_size, read_colour, read_mask
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.files import atomic_write, write_text
+from kornia_learnnorm.two_view import many_pairs
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
 from kornia_learnnorm.two_view.inputs import MODELS
-from kornia_learnnorm.two_view.many_pairs import (
-    PairOptions,
-    describe_failure,
-    estimate_pairs,
-    pairs_of_folder,
-    read_pair_list,
-)
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf", ".svg")
@@ -34,7 +28,7 @@ HINT = "more accurate, but slower: --detector aliked --matcher lightglue, whose 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm estimate`` to a parser."""
-    options = PairOptions()
+    options = many_pairs.PairOptions()
     parser.usage = "%(prog)s IMG1 IMG2 [options]\n       %(prog)s --pairs LIST --out FOLDER [options]"
     parser.description = (
         f"{parser.description}\nexit codes: 0 solved, 2 wrong use or input, 3 no matrix, 4 with warnings"
@@ -83,10 +77,11 @@ def run(args: argparse.Namespace) -> int:
     doubtful = NO_MATRIX if args.strict else DOUBTFUL
     weights = (args.weights or "robust-synthetic") if args.estimator == "learned" else None
     names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher", "model", "matches")
-    options = PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
+    options = many_pairs.PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
     if args.pairs is not None:
-        pairs = pairs_of_folder(args.pairs, args.gap) if args.pairs.is_dir() else read_pair_list(args.pairs)
-        found = estimate_pairs(pairs, args.out, options, args.jobs, args.dask)
+        listed = not args.pairs.is_dir()
+        pairs = many_pairs.read_pair_list(args.pairs) if listed else many_pairs.pairs_of_folder(args.pairs, args.gap)
+        found = many_pairs.estimate_pairs(pairs, args.out, options, args.jobs, args.dask)
         _print_pairs(found, args.out)
         _print_hint(args)
         if any(line["model"] is None for line in found):
@@ -96,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         estimate = _estimate(args, options)
     except NoReliableMatrixError as error:
-        failure = _to_json(describe_failure(error.code, str(error), image1, image2, options))
+        failure = _to_json(many_pairs.describe_failure(error.code, str(error), image1, image2, options))
         if json_path is not None:
             write_text(json_path, failure)
             print(f"wrote    {json_path}")
@@ -114,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
     return doubtful if estimate.warnings else 0
 
 
-def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
+def _estimate(args: argparse.Namespace, options: many_pairs.PairOptions) -> PairEstimate:
     """Return the estimate of one pair after its picture and its JSON file are written, both or neither."""
     with ExitStack() as stack:
         picture, report = (path and stack.enter_context(atomic_write(path)) for path in (args.out, _json_path(args)))
@@ -136,7 +131,7 @@ def _estimate(args: argparse.Namespace, options: PairOptions) -> PairEstimate:
 
 def _print_hint(args: argparse.Namespace) -> None:
     """Print, to standard error, what is more accurate than the default."""
-    if args.detector == PairOptions.detector:
+    if args.detector == many_pairs.PairOptions.detector:
         print(f"matched SIFT features; {HINT}", file=sys.stderr)
 
 

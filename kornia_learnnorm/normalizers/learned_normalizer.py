@@ -8,6 +8,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from kornia_learnnorm import pretrained
 from kornia_learnnorm.geometry import transforms
 from kornia_learnnorm.geometry.checks import read_condition
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -17,14 +18,6 @@ from kornia_learnnorm.normalizers.networks import crossview, paper
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
-from kornia_learnnorm.pretrained import (
-    check_architecture,
-    describe_part,
-    find_part,
-    load_module,
-    name_part,
-    save_module,
-)
 
 __all__ = ["LearnedNormalizer"]
 
@@ -118,12 +111,12 @@ class LearnedNormalizer(ProblemNormalizer):
             OSError: if it cannot be written.
         """
         architecture = {
-            "base": describe_part(self.base, *BASES),
-            "network": describe_part(self.network, crossview, paper),
-            "transform": name_part(self.transform, transforms),
+            "base": pretrained.describe_part(self.base, *BASES),
+            "network": pretrained.describe_part(self.network, crossview, paper),
+            "transform": pretrained.name_part(self.transform, transforms),
             "max_points": self.max_points,
         }
-        save_module(path, self, FORMAT, architecture)
+        pretrained.save_module(path, self, FORMAT, architecture)
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "crossview", own_modules: Collection[str] = ()) -> Self:
@@ -140,7 +133,7 @@ class LearnedNormalizer(ProblemNormalizer):
             ValueError: if the file is not a normaliser of this package, names a part of another module, or its tensors
                 do not fit.
         """
-        return load_module(name, FORMAT, lambda path, text: cls(**_build(path, text, own_modules)))
+        return pretrained.load_module(name, FORMAT, lambda path, text: cls(**_build(path, text, own_modules)))
 
 
 def _build(path: Path, architecture: str, own_modules: Collection[str]) -> dict[str, Any]:
@@ -148,14 +141,14 @@ def _build(path: Path, architecture: str, own_modules: Collection[str]) -> dict[
     try:
         parts = json.loads(architecture)
         base, network = dict(parts["base"]), dict(parts["network"])
-        check_architecture(base, network)
+        pretrained.check_architecture(base, network)
         max_points = parts.get("max_points")  # files of older versions have none
         if not isinstance(max_points, int | None):
             raise ValueError(f"max_points must be a whole number or null, got {max_points!r}")
         return {
-            "base": find_part(base.pop("name"), own_modules, *BASES)(**base),
-            "network": find_part(network.pop("name"), own_modules, crossview, paper)(**network),
-            "transform": find_part(parts["transform"], own_modules, transforms),
+            "base": pretrained.find_part(base.pop("name"), own_modules, *BASES)(**base),
+            "network": pretrained.find_part(network.pop("name"), own_modules, crossview, paper)(**network),
+            "transform": pretrained.find_part(parts["transform"], own_modules, transforms),
             "max_points": max_points,
         }
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:

@@ -18,19 +18,12 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
+from kornia_learnnorm.two_view import reliability
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.model_choice import choose_model
 from kornia_learnnorm.two_view.parallax import Parallax
 from kornia_learnnorm.two_view.plane_pose import PlanePose, angle_between, plane_poses
-from kornia_learnnorm.two_view.reliability import (
-    CAMERA_ERROR,
-    PairWarning,
-    PredictedError,
-    find_warnings,
-    nominal_camera,
-    predict_error,
-    predict_transfer_error,
-)
+from kornia_learnnorm.two_view.reliability import CAMERA_ERROR, PairWarning, PredictedError
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
@@ -100,7 +93,7 @@ def estimate_matches(
         answer = _answer_homography(solver, cast(Tensor, H_mat), None if found is None else found.matrix)
     else:
         answer = _answer_fundamental(solver, cast(Solution, found), cast(Parallax, choice.parallax), size1, size2)
-    doubts = find_warnings(points1, points2, answer.inliers, threshold, size2, answer.error.angle)
+    doubts = reliability.find_warnings(points1, points2, answer.inliers, threshold, size2, answer.error.angle)
     return PairEstimate(
         choice=choice,
         F_mat=answer.F_mat,
@@ -162,8 +155,8 @@ def _answer_fundamental(
     solver: TwoViewSolver, found: Solution, parallax: Parallax, size1: Size, size2: Size
 ) -> _Answer:
     F_mat, inliers, matches = found.matrix, solver.inliers(found.matrix), (solver.points1, solver.points2)
-    cameras = solver.cameras or (nominal_camera(size1), nominal_camera(size2))
-    error = predict_error(found.parts, found.part_size, *matches, F_mat, inliers, *cameras)
+    cameras = solver.cameras or (reliability.nominal_camera(size1), reliability.nominal_camera(size2))
+    error = reliability.predict_error(found.parts, found.part_size, *matches, F_mat, inliers, *cameras)
     answer = _Answer(F_mat, inliers, inliers.double() if solver.layer is None else found.weights, error)
     if solver.cameras is None:
         if not parallax.planar:
@@ -182,7 +175,7 @@ def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | Non
     found, cameras, matches = solver.check_homography(H_mat), solver.cameras, (solver.points1, solver.points2)
     inliers = found.weights > 0
     about = found.parts, found.part_size, solver.points1, H_mat, inliers
-    answer = _Answer(F_mat, inliers, found.weights, predict_transfer_error(*about))
+    answer = _Answer(F_mat, inliers, found.weights, reliability.predict_transfer_error(*about))
     if cameras is None:
         return answer
     seen = (*cameras, *(points[inliers] for points in matches))
@@ -195,7 +188,7 @@ def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | Non
         poses = [poses[row] for row in support.argsort(descending=True, stable=True).tolist()]
     (R, t, n), *others = poses
     angles = torch.tensor([angle_between(poses[0], plane_poses(part, *seen)) for part in found.parts]).double()
-    answer = answer._replace(error=predict_transfer_error(*about, angles))
+    answer = answer._replace(error=reliability.predict_transfer_error(*about, angles))
     if t is None:
         return answer._replace(pose=_Pose(R=R))
     front = in_front(R[None], t[None], *(value[None] for value in (*cameras, *matches)))[0]

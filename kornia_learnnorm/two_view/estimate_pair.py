@@ -8,17 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.data.images import (
-    Size,
-    check_grey,
-    content_mask,
-    image_size,
-    import_cv2,
-    read_colour,
-    read_image,
-    resize_image,
-    scaling,
-)
+from kornia_learnnorm.data import images
 from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Features, check_mask, keep_features
 from kornia_learnnorm.data.matching.matchers import check_methods, match_both_ways, match_lightglue
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
@@ -104,10 +94,10 @@ class MatchedPair:
     points2: Tensor  # pixels of image 2 as it was matched, (N, 2), float64
     scores: Tensor  # 1 minus the larger ratio of the two directions, or LightGlue's score, (N,), float64
     mutual: Tensor  # mask of the matches that pass the ratio test also from image 2 to image 1, (N,), bool
-    size1: Size  # of image 1 as it was matched
-    size2: Size  # of image 2 as it was matched
-    full_size1: Size  # of image 1
-    full_size2: Size  # of image 2
+    size1: images.Size  # of image 1 as it was matched
+    size2: images.Size  # of image 2 as it was matched
+    full_size1: images.Size  # of image 1
+    full_size2: images.Size  # of image 2
     ratio: float | None  # largest ratio of the nearest to the second-nearest descriptor distance
     path1: Path | None = None
     path2: Path | None = None
@@ -122,7 +112,7 @@ class MatchedPair:
         model: str = "auto",
     ) -> PairEstimate:
         """Return the estimate of the matches; arguments and errors are those of :func:`estimate_pair`."""
-        S1, S2 = scaling(self.full_size1, self.size1), scaling(self.full_size2, self.size2)
+        S1, S2 = images.scaling(self.full_size1, self.size1), images.scaling(self.full_size2, self.size2)
         sampler = WeightedSampler if self.ratio is None else ProsacSampler  # LightGlue's highest scores mislead PROSAC
         cameras = read_cameras(K1, K2)
         K1, K2 = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
@@ -209,32 +199,33 @@ def _named(error: NoReliableMatrixError, paths: tuple[Path | None, Path | None])
     return NoReliableMatrixError(error.code, f"{names}: {error}")
 
 
-def _features(image: Image, mask: Mask | None, max_size: int, detector: str) -> tuple[Features, Size]:
+def _features(image: Image, mask: Mask | None, max_size: int, detector: str) -> tuple[Features, images.Size]:
     """Return the features of an image at the size at which it is matched, and its full size."""
     pixels, size = _pixels(image, max_size, detector in READS_COLOUR)
-    frame = content_mask(_grey(pixels))
+    frame = images.content_mask(_grey(pixels))
     if mask is not None:
         mask = mask.cpu().numpy() if isinstance(mask, Tensor) else mask
         check_mask(mask, size)
-        small = import_cv2().resize(mask.astype(np.uint8), pixels.shape[1::-1], interpolation=0) > 0
+        small = images.import_cv2().resize(mask.astype(np.uint8), pixels.shape[1::-1], interpolation=0) > 0
         frame = small if frame is None else small & frame
     features = DETECTORS[detector](pixels, NUM_FEATURES)
     return (features if frame is None else keep_features(features, frame)), size
 
 
-def _pixels(image: Image, max_size: int, colour: bool) -> tuple[NDArray[np.uint8], Size]:
+def _pixels(image: Image, max_size: int, colour: bool) -> tuple[NDArray[np.uint8], images.Size]:
     """Return the grey values, or colours where there are some, of an image of at most a size, and its full size."""
     if isinstance(image, str | Path):
-        return (read_colour if colour else read_image)(image, max_size), image_size(image)
+        return (images.read_colour if colour else images.read_image)(image, max_size), images.image_size(image)
     values = image.cpu().numpy() if isinstance(image, Tensor) else image
     if not isinstance(values, np.ndarray) or values.dtype != np.uint8:
         raise TypeError(f"an image must be a path or an array of uint8, got {getattr(values, 'dtype', type(values))}")
-    check_grey(values, colour=True)
+    images.check_grey(values, colour=True)
     values = np.ascontiguousarray(values if colour else _grey(values))
-    return resize_image(values, max_size), (values.shape[1], values.shape[0])
+    return images.resize_image(values, max_size), (values.shape[1], values.shape[0])
 
 
 def _grey(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if pixels.ndim == 2:
         return pixels
-    return np.asarray(import_cv2().cvtColor(np.ascontiguousarray(pixels), import_cv2().COLOR_RGB2GRAY), np.uint8)
+    cv2 = images.import_cv2()
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2GRAY), np.uint8)

@@ -149,7 +149,7 @@ class TestErrors:
         ],
     )
     def test_options_are_checked_before_the_work(self, options, error, message, monkeypatch):
-        monkeypatch.setattr(pair_module, "read_image", lambda *_: pytest.fail("an image was read"))
+        monkeypatch.setattr(pair_module.images, "read_image", lambda *_: pytest.fail("an image was read"))
         with pytest.raises(error, match=message):
             estimate_pair("left.png", "right.png", **options)
 

@@ -10,15 +10,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_p
 from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.data.synthetic import draws
-from kornia_learnnorm.data.synthetic.scenes import (
-    TwoViewScene,
-    forward_driving,
-    handheld,
-    orbit,
-    random_views,
-    two_views,
-)
+from kornia_learnnorm.data.synthetic import draws, scenes
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, transfer_distance
 
 __all__ = ["SyntheticMatches", "random_matches", "random_planes", "wide_baseline"]
@@ -65,11 +57,12 @@ def random_matches(
     kind = int(torch.randint(KINDS, (), generator=generator, device=generator.device))
     total = num_points + num_exact
     if kind == 0:
-        scene = random_views(batch_size, total, generator)
+        scene = scenes.random_views(batch_size, total, generator)
     elif kind == 4:
         scene = wide_baseline(batch_size, total, generator)
     else:
-        scene = (forward_driving, handheld, orbit)[kind - 1](batch_size, total, generator, noise=0.0)
+        draw = (scenes.forward_driving, scenes.handheld, scenes.orbit)[kind - 1]
+        scene = draw(batch_size, total, generator, noise=0.0)
     scene = _distort(scene, generator)
     points1, exact1 = torch.split(scene.points1, [num_points, num_exact], 1)
     points2, exact2 = torch.split(scene.points2, [num_points, num_exact], 1)
@@ -166,7 +159,7 @@ def _corrupt(
     return points1, points2, scores, inliers
 
 
-def wide_baseline(batch_size: int, num_points: int, generator: Generator) -> TwoViewScene:
+def wide_baseline(batch_size: int, num_points: int, generator: Generator) -> scenes.TwoViewScene:
     """Draw scenes that two photographers take of one object or facade, 5-45 degrees apart, without noise.
 
     Half of the scenes are a slanted plane with a relief of up to 20 % of its distance.
@@ -190,10 +183,10 @@ def wide_baseline(batch_size: int, num_points: int, generator: Generator) -> Two
     centre = torch.stack([torch.zeros_like(median), torch.zeros_like(median), median], -1)
     distance = draws.log_uniform((*shape, 1), 0.7, 1.4, generator)
     t = distance * centre - (R @ centre[..., None]).squeeze(-1)
-    return two_views(points1, depths, K, aside @ R, (aside @ t[..., None]).squeeze(-1), size, num_points)
+    return scenes.two_views(points1, depths, K, aside @ R, (aside @ t[..., None]).squeeze(-1), size, num_points)
 
 
-def _distort(scene: TwoViewScene, generator: Generator) -> TwoViewScene:
+def _distort(scene: scenes.TwoViewScene, generator: Generator) -> scenes.TwoViewScene:
     """Return the scenes with some radial distortion in both images, in a quarter of them."""
     batch_size = len(scene.F_mat)
     some = draws.uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.25
