@@ -5,8 +5,6 @@ without scores, as of earlier versions, has 1 minus the ratio. Where a command o
 ``file.h5@3:10`` means the pairs 3 to 9 of the file.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -14,15 +12,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.optional import import_extra
-
-if TYPE_CHECKING:
-    import h5py
 
 __all__ = ["FORMAT", "LAYOUT", "VERSION", "CorrespondenceStore", "StoreReader"]
 __all__ += ["open_hdf5", "own_dataset", "passes_ratio_test", "read_store"]
@@ -177,7 +172,7 @@ class StoreReader:
 
 
 @contextmanager
-def open_hdf5(path: Path) -> Iterator[h5py.File]:
+def open_hdf5(path: Path) -> Iterator[Any]:
     """Open an HDF5 file to read; its errors, also those of the block, become a ValueError that names the file."""
     h5py = import_extra("h5py", "images", READING)
     try:
@@ -187,7 +182,7 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
         raise ValueError(f"{path} is not a readable HDF5 file (truncated or of another kind): {error}") from error
 
 
-def own_dataset(group: h5py.Group, name: str) -> h5py.Dataset | None:
+def own_dataset(group: Any, name: str) -> Any:
     """Return a dataset that the file itself holds; None for none, a group, a link, or data in other files."""
     h5py = import_extra("h5py", "images", READING)
     if group.get(name, getclass=True, getlink=True) is not h5py.HardLink:
@@ -196,12 +191,12 @@ def own_dataset(group: h5py.Group, name: str) -> h5py.Dataset | None:
     return None if not hasattr(data, "shape") or data.external or data.is_virtual else data
 
 
-def _layout(file: h5py.File) -> dict[str, tuple[tuple[int, ...], str, str]]:
+def _layout(file: Any) -> dict[str, tuple[tuple[int, ...], str, str]]:
     """Return the layout without the scores, where a file has none."""
     return {name: entry for name, entry in LAYOUT.items() if name != "score" or name in file}
 
 
-def _read_offsets(path: Path, file: h5py.File) -> NDArray[np.int64]:
+def _read_offsets(path: Path, file: Any) -> NDArray[np.int64]:
     """Return the offsets of a store, after checking its version and the shapes and types of its arrays."""
     if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
         got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')}"

@@ -1,14 +1,12 @@
 """Writing stores: at once, or pair by pair with the pairs on disk after a crash."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +14,6 @@ from numpy.typing import NDArray
 from kornia_learnnorm.data.store import FORMAT, LAYOUT, VERSION, CorrespondenceStore, read_store
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.optional import import_extra
-
-if TYPE_CHECKING:
-    import h5py
 
 __all__ = ["StoreWriter", "check_target", "join_stores", "write_store"]
 
@@ -54,7 +49,7 @@ def join_stores(path: str | Path, stores: Iterable[CorrespondenceStore], provena
             raise OSError(f"cannot write {path}: {os.strerror(number) if number else error}") from error
 
 
-def _create(h5py: Any, file: h5py.File, store: CorrespondenceStore) -> None:
+def _create(h5py: Any, file: Any, store: CorrespondenceStore) -> None:
     file.attrs.update({key: getattr(store, key) for key in ("dataset", "pairs", "detector")})
     file.create_dataset("offsets", (1,), np.int64, maxshape=(None,), chunks=(128,))
     file.create_dataset("names", (0, 2), h5py.string_dtype(), maxshape=(None, 2), chunks=(64, 2))
@@ -63,7 +58,7 @@ def _create(h5py: Any, file: h5py.File, store: CorrespondenceStore) -> None:
         file.create_dataset(name, (0, *tail), dtype, maxshape=(None, *tail), chunks=(rows, *tail))
 
 
-def _append(dataset: h5py.Dataset, rows: NDArray[Any]) -> None:
+def _append(dataset: Any, rows: NDArray[Any]) -> None:
     if len(rows):
         dataset.resize(len(dataset) + len(rows), axis=0)
         dataset[-len(rows) :] = rows
