@@ -159,7 +159,6 @@ class AgainstStart(Callback):
 
 
 def _print_above_bar(text: str) -> None:
-    """Print a line of a training, above its progress bar where there is one."""
     with tqdm.external_write_mode():
         rank_zero_info(text)
 

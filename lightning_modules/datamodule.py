@@ -51,7 +51,6 @@ class BatchLoader:
         self._length = len(source.blocks(seed)) if batch_size is None else self._count(batch_size)
 
     def _count(self, batch_size: int) -> int:
-        """Return the number of batches in an epoch."""
         unit = "image pair" if self.by_pair else "sample"
         if batch_size < self.world_size:
             raise ValueError(f"a batch must hold at least one {unit} for each process, got {batch_size}")
@@ -62,7 +61,6 @@ class BatchLoader:
         return -(-number // batch_size)
 
     def __len__(self) -> int:
-        """Return the number of batches in an epoch."""
         return self._length
 
     def __iter__(self) -> Iterator[MatchSets]:

@@ -186,7 +186,6 @@ def _print_completion(args: argparse.Namespace) -> int:
 
 
 def _parsers_of_commands(parser: argparse.ArgumentParser) -> dict[str, Any]:
-    """Return the parser of each command by its name."""
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
     return dict(commands.choices)
 

@@ -241,7 +241,6 @@ def content_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
 
 
 def _black_rows(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return which rows are black and constant."""
     black = np.asarray(image.max(1) <= MAX_BLACK)
     rows = image[black]
     black[black] = (rows != np.median(rows, 1, keepdims=True)).mean(1) <= MAX_UNEVEN if len(rows) else False

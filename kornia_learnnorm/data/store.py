@@ -62,12 +62,10 @@ class CorrespondenceStore:
     score: NDArray[np.float32] = field(default_factory=lambda: np.full(1, np.nan, np.float32))
 
     def __post_init__(self) -> None:
-        """Compute the scores of matches with ratios."""
         score = np.where(np.isnan(self.ratio), self.score, (1 - self.ratio).clip(0, 1))
         object.__setattr__(self, "score", score)
 
     def __len__(self) -> int:
-        """Return the number of image pairs."""
         return len(self.offsets) - 1
 
     def rows(self, pair: int, max_ratio: float | None = None) -> NDArray[np.int64]:
@@ -124,7 +122,6 @@ class StoreReader:
         self.offsets = offsets[first : stop + 1]
 
     def __len__(self) -> int:
-        """Return the number of image pairs."""
         return len(self.offsets) - 1
 
     def read(self, pairs: Sequence[int]) -> CorrespondenceStore:

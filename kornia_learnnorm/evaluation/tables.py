@@ -23,7 +23,6 @@ class Number(NamedTuple):
     trained_on: bool = False  # whether the method was trained on the store
 
     def __str__(self) -> str:
-        """Return the number as tables show it."""
         text = format(self.value, self.spec)
         if self.interval is not None:
             text += " [{:{spec}}, {:{spec}}]".format(*self.interval, spec=self.spec)

@@ -55,7 +55,6 @@ class PairOptions:
     matches: bool = False  # results hold the matches
 
     def __post_init__(self) -> None:
-        """Raise a clear error for options that are out of range or do not go together."""
         check_settings(self.threshold, self.seed, model=self.model)
         check_matching(self.ratio, self.max_size, self.detector, self.matcher)
 

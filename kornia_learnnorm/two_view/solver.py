@@ -208,7 +208,6 @@ class TwoViewSolver:
         return unit_matrix(scorer.to_pixels(fit_final(scorer, start).matrix()))[0]
 
     def _refine_at(self, scale: float, F_mat: Tensor) -> Tensor:
-        """Return the matrix refined on a loss of a scale, pixels."""
         loss = GemanMcClure(scale)
         return refine_fundamental(self.points1[None], self.points2[None], F_mat[None], loss=loss).F_mat[0]
 

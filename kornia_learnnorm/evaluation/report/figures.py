@@ -161,7 +161,6 @@ def _line_style(name: str) -> str:
 
 
 def _make_figure(columns: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with axes side by side."""
     figure = import_matplotlib().figure.Figure(figsize=SIZE, layout="constrained")
     return figure, figure.subplots(1, columns, squeeze=False).flatten().tolist()
 

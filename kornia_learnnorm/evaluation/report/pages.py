@@ -94,7 +94,6 @@ def _about_run(run: Run) -> list[str]:
 
 
 def _about_robust(run: RobustRun) -> list[str]:
-    """Return the same of a run of robust estimators."""
     about = run.about
     identities: dict[str, str | None] = about["estimators"]
     absent = [name for name, identity in identities.items() if identity is None]

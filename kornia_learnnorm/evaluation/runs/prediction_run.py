@@ -223,7 +223,6 @@ def _jobs(
 
 
 def _path(folder: Path, *names: str) -> Path:
-    """Return a file of a run."""
     *parents, last = map(file_name, names)
     return folder.joinpath(*parents, f"{last}.npz")
 

@@ -92,7 +92,6 @@ def record(
 
 
 def _forget(folder: Path, section: str, names: Iterable[str]) -> None:
-    """Remove the files of methods or estimators."""
     for name, place in product(names, PLACES[section]):
         for path in folder.glob(f"{place}/{file_name(name)}.npz"):
             path.unlink()
