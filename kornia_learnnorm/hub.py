@@ -47,7 +47,6 @@ layer = HubModel.from_pretrained("OWNER/NAME").layer
 class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm", model_card_template=CARD):
     r"""Save, upload and download a learned layer by the methods of ``PyTorchModelHubMixin``.
 
-    ``save_pretrained(folder)``, ``push_to_hub(repo_id)`` and ``from_pretrained(folder_or_repo_id)`` are the mixin's.
     A folder or repository holds ``model.safetensors``, the file that the layer's own ``save_pretrained`` writes,
     ``config.json``, which names the class of the layer, and a model card, ``README.md``, unless there is one already.
 

@@ -60,13 +60,12 @@ def export_layer(
 ) -> ExportedProgram:
     r"""Return the program of a layer, which ``torch.export.save`` writes and any PyTorch process runs.
 
-    The program takes ``points1`` and ``points2`` with shape :math:`(B, N, 2)`, float32, and by name the tensors of
-    ``inputs``. It returns a tuple of the matrices ``F_mat`` (B, 3, 3), ``determined`` (B,) and, of a
+    The program takes ``points1`` and ``points2`` with shape :math:`(B, N, 2)`, float32, any batch size, and by name the
+    tensors of ``inputs``. It returns a tuple of the matrices ``F_mat`` (B, 3, 3), ``determined`` (B,) and, of a
     :class:`~kornia_learnnorm.LearnedEightPoint`, ``weights`` (B, N), as the layer's ``estimate``. That of a
     :class:`~kornia_learnnorm.LearnedRelativePose` takes the cameras ``K1`` and ``K2`` (B, 3, 3) after the points, and
     returns ``E_mat``, ``R`` and ``t`` in the place of ``F_mat``; that of a :class:`~kornia_learnnorm.LearnedHomography`
-    returns ``H_mat``. The batch size :math:`B` is any from one on. Values are not checked: points must be finite but
-    where masked, weights not negative.
+    returns ``H_mat``. Values are not checked: points must be finite but where masked, weights not negative.
 
     Args:
         layer: the layer; the program runs on its device.
@@ -77,9 +76,7 @@ def export_layer(
         gradients: keep what derivatives need, as for training the network before the layer. Without, the outputs
             carry no gradient.
 
-    Raises:
-        TypeError: if ``layer`` is none of these layers.
-        ValueError: if the layer has no such input, or ``num_points`` is less than eight.
+    TypeError for another layer; ValueError if it has no such input, or ``num_points`` is less than eight.
 
     Example:
         >>> program = export_layer(EightPoint(), num_points=8)

@@ -34,8 +34,7 @@ class EpipolarLoss(nn.Module):
         heldout_floor: the same for held-out residuals, which do not fit far below a pixel.
         ceiling: residuals above this, also infinite ones, count as this much and send no gradient.
 
-    Raises:
-        ValueError: if ``heldout_weight`` is outside 0 to 1, or a floor or the ceiling is not positive.
+    ValueError if ``heldout_weight`` is outside 0 to 1, or a floor or the ceiling is not positive.
 
     Example:
         >>> import torch

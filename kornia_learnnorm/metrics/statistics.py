@@ -59,8 +59,8 @@ def bootstrap_interval(
 ) -> tuple[float, float]:
     """Return the percentile bootstrap interval of a mean whose samples come in groups.
 
-    Samples of one image pair share its motion and scene, so the groups are drawn with replacement, each with all its
-    samples (the cluster bootstrap). The interval of few groups is too narrow; reports have none for fewer than eight.
+    The groups are drawn with replacement, each with all its samples (the cluster bootstrap). The interval of few groups
+    is too narrow; reports have none for fewer than eight.
 
     Args:
         values: one value per sample with shape (S,).
@@ -69,8 +69,7 @@ def bootstrap_interval(
         draws: number of draws.
         seed: seed of the draws.
 
-    Raises:
-        ValueError: if the shapes differ, there are fewer than two groups, or ``level`` is not between 0 and 1.
+    ValueError if the shapes differ, there are fewer than two groups, or ``level`` is not between 0 and 1.
 
     Reference:
         A. Davison, D. Hinkley, Bootstrap Methods and their Application, 1997, sections 3.8 and 5.3.

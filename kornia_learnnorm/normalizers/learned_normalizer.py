@@ -38,16 +38,14 @@ class LearnedNormalizer(ProblemNormalizer):
         network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates; an untrained
             :class:`~kornia_learnnorm.CrossViewNetwork` of their size when not given.
         transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
-        max_points: sets of more correspondences get Hartley's transforms; None for no limit. It is 12 in the shipped
-            weights ``crossview``, which were trained on eights and don't help above that.
+        max_points: sets of more correspondences get Hartley's transforms; None for no limit. It is 12 in ``crossview``.
 
     Attributes:
         trained_on: names of the stores that the weights were trained on, ``STORE@FIRST:STOP`` for some pairs of one, or
             ``synthetic scenes``; empty where that is not known. It is saved with the weights.
 
     Reference:
-        Fan et al., section 4: normalisation matrices predicted from the correspondences by a network that is
-        invariant to their order.
+        Fan et al., section 4.
 
     Example:
         >>> import torch

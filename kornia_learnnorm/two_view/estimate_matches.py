@@ -49,11 +49,9 @@ def estimate_matches(
     """Return the fundamental matrix or homography of matches with its predicted error and the reasons to doubt it.
 
     The answer is a homography where the matches do not determine a fundamental matrix, as on a plane or where the
-    camera only turns, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`.
-
-    Where less than half of the matches are inliers, RANSAC searches again among those near its matrix. Where one
-    homography explains most inliers, the matrix of this homography and the parallax of the other matches is tried too,
-    and the better one is refined at the scale of the noise if all parallax is below the threshold.
+    camera only turns, see :func:`~kornia_learnnorm.two_view.model_choice.choose_model`. Where less than half of the
+    matches are inliers, RANSAC searches again among those near its matrix. Where one homography explains most inliers,
+    the matrix of this homography and the parallax of the other matches is tried too.
 
     Args:
         points1: pixels in image 1 with shape (N, 2), an array or a tensor of numbers. Rows that are not finite, or more
@@ -78,10 +76,8 @@ def estimate_matches(
 
     Raises:
         NoReliableMatrixError: if there are fewer than nine matches or inliers, or no motion.
-        TypeError: if points, scores or cameras are neither arrays nor tensors of numbers, or another argument is not
-            of its type.
-        ValueError: if shapes do not pair up, a value is out of range, only one camera is given, or one is not a finite
-            and invertible (3, 3) matrix.
+        TypeError: if an argument is not of its type.
+        ValueError: if shapes do not pair up, a value is out of range, or a camera is missing or not invertible.
     """
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)

@@ -24,16 +24,11 @@ class PaperNetwork(nn.Module):
 
     Args:
         width: channels of a point, 128 in the paper.
-        depth: residual blocks, 12 in the paper.
+        depth: residual blocks, 12 in the paper. ValueError if the stack of maxima is smaller than the kernel, 3x3.
         num_parameters: parameters per view; in the paper the three of
             :func:`~kornia_learnnorm.geometry.transforms.paper_transform`.
 
-    Raises:
-        ValueError: if the stack of maxima is smaller than the convolution's kernel, 3x3.
-
-    Reference:
-        Fan et al., section 4 and its figure of the network; the points enter in the coordinates of
-        :class:`~kornia_learnnorm.Hartley`.
+    The points enter in the coordinates of :class:`~kornia_learnnorm.Hartley`.
 
     Example:
         >>> network = PaperNetwork()
