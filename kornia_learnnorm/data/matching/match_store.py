@@ -3,7 +3,6 @@
 The features of a frame stay on disk until its last pair is matched, so memory does not grow with the number of pairs.
 """
 
-import shutil
 import sys
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
@@ -13,7 +12,8 @@ from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Self
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -176,13 +176,14 @@ def _match_some(
 ) -> Generator[tuple[int, CorrespondenceStore | str], None, None]:
     """Yield each place of ``todo`` with the store of its pair, or the reason why there is none."""
     window = WINDOW * workers.number
-    with FeatureCache(folder / "features", [pairs[place] for place in todo]) as cache:
+    with TemporaryDirectory(prefix="features-", dir=folder) as features:
+        cache = FeatureCache(Path(features), [pairs[place] for place in todo])
         for first in range(0, len(todo), window):
             places = todo[first : first + window]
             missing = cache.missing([pairs[place] for place in places])
             with workers.results(_detect, ((frame, options) for frame in missing)) as found:
-                for frame, features in zip(missing, found, strict=True):
-                    cache.put(frame, features)
+                for frame, detected in zip(missing, found, strict=True):
+                    cache.put(frame, detected)
             tasks = ((pair, *map(cache.get, pair), options, place) for place in places for pair in [pairs[place]])
             with workers.results(_match, tasks) as results:
                 for place, result in zip(places, results, strict=True):
@@ -222,14 +223,6 @@ class FeatureCache:
         self.folder = folder
         self.uses = Counter(frame.name for pair in pairs for frame in pair)
         self.held: dict[str, str] = {}  # name -> reason why there are none; empty where there are some
-
-    def __enter__(self) -> Self:
-        self.__exit__()
-        self.folder.mkdir()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)
 
     def missing(self, pairs: Sequence[FramePair]) -> list[Frame]:
         """Return the frames of the pairs that have not been put, each once."""
