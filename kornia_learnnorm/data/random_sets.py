@@ -23,6 +23,9 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
 __all__ = ["RandomSets", "SetSource", "StoreSets", "SyntheticSets", "augment"]
 
+MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
+LABEL_THRESHOLD = 2.0  # pixels from the true epipolar lines up to which a match counts as an inlier
+
 
 def augment(sets: MatchSets, generator: Generator) -> MatchSets:
     """Return sets with image planes rotated, scaled and flipped, views swapped, and outliers added.
@@ -80,10 +83,6 @@ def _wrong_partners(points2: Tensor, generator: Generator) -> Tensor:
     length = log_uniform(shape, 5.0, 150.0, generator)
     shifted = points2 + (length * torch.cat([angle.cos(), angle.sin()], -1)).to(points2)
     return torch.where(uniform(shape, 0.0, 1.0, generator) < 0.5, points2.gather(1, index), shifted)
-
-
-MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
-LABEL_THRESHOLD = 2.0  # pixels from the true epipolar lines up to which a match counts as an inlier
 
 
 class SetSource(Protocol):

@@ -16,6 +16,15 @@ from torch import Tensor
 
 from kornia_learnnorm.data.images import Size, import_cv2, read_colour, read_image, scaling
 
+# Sequences by dataset and split, as B. Fan et al. choose them (A revisit of the normalized eight-point algorithm and a
+# self-supervised deep solution, section 5.1); None for all sequences that no other split names. StMarysChurch of
+# Cambridge Landmarks has its own lists of training and test images, which `read_cambridge` reads.
+SPLITS: dict[str, dict[str, tuple[str, ...] | None]] = {
+    "kitti": {"train": ("00", "01", "02", "03", "04", "05"), "test": ("06", "07", "08", "09", "10")},
+    "tum": {"train": None, "val": ("rgbd_dataset_freiburg3_long_office_household",)},
+}
+MARKER = "rgb.txt"  # file that makes a folder a sequence of TUM
+
 
 def fundamental_from_motion(K1: Tensor, K2: Tensor, R: Tensor, t: Tensor) -> Tensor:
     r"""Return :math:`F = K_2^{-\top} [t]_\times R K_1^{-1}` of unit norm, (*, 3, 3); NaN where t is zero or NaN."""
@@ -101,16 +110,6 @@ def read_frame(frame: Frame, colour: bool = False) -> NDArray[np.uint8]:
     if frame.matched_size != frame.size:
         image = cv2.resize(image, frame.matched_size, interpolation=cv2.INTER_AREA)
     return np.asarray(image, np.uint8)
-
-
-# Sequences by dataset and split, as B. Fan et al. choose them (A revisit of the normalized eight-point algorithm and a
-# self-supervised deep solution, section 5.1); None for all sequences that no other split names. StMarysChurch of
-# Cambridge Landmarks has its own lists of training and test images, which `read_cambridge` reads.
-SPLITS: dict[str, dict[str, tuple[str, ...] | None]] = {
-    "kitti": {"train": ("00", "01", "02", "03", "04", "05"), "test": ("06", "07", "08", "09", "10")},
-    "tum": {"train": None, "val": ("rgbd_dataset_freiburg3_long_office_household",)},
-}
-MARKER = "rgb.txt"  # file that makes a folder a sequence of TUM
 
 
 def split_sequences(dataset: str, split: str, root: str | Path) -> list[str]:

@@ -34,6 +34,8 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD, MAX_RESIDUAL, PROTOCOLS,
 DIAGNOSTICS = ("condition_number", "rho", "distance1", "distance2", "rank2_share")  # in the order of Diagnostics
 ERRORS = ("F_mat", "own", "heldout", "truth", "rotation_error", "translation_error", *DIAGNOSTICS)
 AGREEMENT = ("inliers", "f1")  # takes longer than all others together
+SAMPLES = ("pair", "plain_residual")  # arrays in the file of samples
+KEYS = (ERRORS, (*ERRORS, *AGREEMENT))  # arrays in the file of a method's predictions, without and with agreement
 NUM_HELDOUT = 16  # held-out matches of a sample
 BATCH_SIZE = 2048  # samples solved at once
 MIN_INLIERS = 16  # a pair with fewer has no ground-truth inliers to measure with
@@ -144,10 +146,6 @@ def median_distance(points: Tensor, F_mat: Tensor) -> Tensor:
     distance = symmetric_epipolar_distance(known[..., :2], known[..., 2:], F_mat)
     distance[points.isnan().any(-1)] = torch.nan
     return median(distance)
-
-
-SAMPLES = ("pair", "plain_residual")  # arrays in the file of samples
-KEYS = (ERRORS, (*ERRORS, *AGREEMENT))  # arrays in the file of a method's predictions, without and with agreement
 
 
 @dataclass(frozen=True)
