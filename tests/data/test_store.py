@@ -57,8 +57,9 @@ def test_not_hdf5(path, change):
         read_store(path)
 
 
-def of_integers(file):
-    file.create_dataset("names", (6, 2), h5py.vlen_dtype(np.int32))
+LINKS = r"lacks the datasets ratio \(links"
+LAYOUT_OF_RATIO = h5py.VirtualLayout((180,), "float32")
+LAYOUT_OF_RATIO[:] = h5py.VirtualSource("other.h5", "ratio", (180,))
 
 
 @pytest.mark.parametrize(
@@ -72,11 +73,21 @@ def of_integers(file):
         ("score", np.full(180, np.nan), "score must be from 0 to 1"),
         ("score", np.zeros(179), r"score must have shape \(180,\), got \(179,\)"),
         ("points1", np.zeros((180, 2), int), "points1 must be float32, got int64"),
-        ("names", of_integers, "names must be strings"),
+        ("names", lambda file: file.create_dataset("names", (6, 2), h5py.vlen_dtype(np.int32)), "must be strings"),
+        ("ratio", lambda file: file.create_group("ratio"), LINKS),
+        ("ratio", h5py.SoftLink("/offsets"), LINKS),
+        ("ratio", h5py.ExternalLink("other.h5", "ratio"), LINKS),
+        (
+            "ratio",
+            lambda file: file.create_dataset("ratio", 180, "f4", external=[(f"{file.filename}.raw", 0, 720)]),
+            LINKS,
+        ),
+        ("ratio", lambda file: file.create_virtual_dataset("ratio", LAYOUT_OF_RATIO), LINKS),
         ("version", 2, r"expected format='correspondences', version=1, got .*version=.*2"),
     ],
 )
-def test_inconsistent_arrays(path, name, value, message):
+def test_inconsistent_arrays_and_links_to_others(path, name, value, message):
+    path.with_name("other.h5").write_bytes(path.read_bytes())
     with h5py.File(path, "r+") as file:
         if name == "version":
             file.attrs[name] = value
@@ -87,32 +98,6 @@ def test_inconsistent_arrays(path, name, value, message):
         elif value is not None:
             file[name] = value
     with pytest.raises(ValueError, match=message):
-        read_store(path)
-
-
-def virtual(path):
-    layout = h5py.VirtualLayout((180,), "float32")
-    layout[:] = h5py.VirtualSource(path, "ratio", (180,))
-    return layout
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda file, other: file.create_group("ratio"),
-        lambda file, other: file.update(ratio=h5py.ExternalLink(other, "ratio")),
-        lambda file, other: file.update(ratio=h5py.SoftLink("/offsets")),
-        lambda file, other: file.create_dataset("ratio", (180,), "float32", external=[(str(other), 0, 720)]),
-        lambda file, other: file.create_virtual_dataset("ratio", virtual(other)),
-    ],
-)
-def test_a_group_or_a_link_in_place_of_a_dataset(path, change):
-    other = path.with_name("other.h5")
-    other.write_bytes(path.read_bytes())
-    with h5py.File(path, "r+") as file:
-        del file["ratio"]
-        change(file, other)
-    with pytest.raises(ValueError, match=r"lacks the datasets ratio \(links"):
         read_store(path)
 
 
