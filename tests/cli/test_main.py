@@ -31,15 +31,7 @@ from lightning_modules.config_files import find_config
 pytestmark = pytest.mark.usefixtures("program")
 
 FOLDER = Path(__file__).parents[2] / "configs"
-OF_SETS = (
-    "crossview-sets",
-    "robust",
-    "robust-pose",
-    "robust-synthetic",
-    "robust-pose-synthetic",
-    "robust-homography",
-    "refiner",
-)
+OF_SETS = ("crossview-sets", "refiner", *(path.stem for path in sorted(FOLDER.glob("robust*.yaml"))))
 SMALL = ["--trainer.max_steps=3", "--trainer.enable_progress_bar=false", "--data.batch_size=16"]
 SMALL += ["--trainer.num_sanity_val_steps=0"]
 NETWORK = "model.estimator.init_args.normalizer.init_args.network.init_args"

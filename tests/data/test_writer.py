@@ -90,30 +90,24 @@ class TestParts:
             writer.finish({})
 
 
+NO_PROC = pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
+
+
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "name", "error", "message"),
     [
-        (lambda path: path.write_bytes(b"\x89HDF"), r"store\.h5 is not a readable HDF5 file"),
-        (lambda path: write_store(path, pair(0)), r"store\.h5 exists, but was not made by this command"),
-        (lambda path: path.mkdir(), "not a regular file"),
-        (lambda path: path.with_name("store.h5.parts").touch(), r"store\.h5\.parts, which is not a folder"),
+        (lambda path: path.write_bytes(b"\x89HDF"), "store.h5", ValueError, r"store\.h5 is not a readable HDF5 file"),
+        (lambda path: write_store(path, pair(0)), "store.h5", ValueError, "exists, but was not made by this command"),
+        (lambda path: path.mkdir(), "store.h5", ValueError, "not a regular file"),
+        (lambda path: path.with_name("store.h5.parts").touch(), "store.h5", ValueError, "parts, which is not a folder"),
+        (id, "nothing/store.h5", FileNotFoundError, r"the folder .*nothing does not exist"),
+        pytest.param(id, "/proc/out.h5", OSError, r"^cannot write /proc/out\.h5: ", marks=NO_PROC),
     ],
 )
-def test_what_is_there_is_refused(path, make, message):
-    make(path)
-    with pytest.raises(ValueError, match=message):
-        StoreWriter(path, OPTIONS)
-
-
-def test_missing_folder(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"the folder .*nothing does not exist"):
-        StoreWriter(tmp_path / "nothing" / "store.h5", OPTIONS)
-
-
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
-def test_folder_that_takes_no_files():
-    with pytest.raises(OSError, match=r"^cannot write /proc/out\.h5: "):
-        StoreWriter("/proc/out.h5", OPTIONS)
+def test_places_that_are_refused(tmp_path, make, name, error, message):
+    make(tmp_path / name)
+    with pytest.raises(error, match=message):
+        StoreWriter(tmp_path / name, OPTIONS)
 
 
 FULL_DISK = """
