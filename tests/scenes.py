@@ -343,7 +343,7 @@ def repeated_wall(copies: int = 90, seed: int = 0) -> tuple[Tensor, Tensor, Tens
     wall = wall[((wall < 195) | (wall > 305)).any(-1)]
     points1 = np.concatenate([wall, board, false])
     label = np.repeat([0, 1, 2], [len(wall), len(board), len(false)])
-    points2 = points1 + (4.0, 3.0) + rng.normal(0, 0.1, points1.shape)
+    points2 = points1 + np.array([4.0, 3.0]) + rng.normal(0, 0.1, points1.shape)
     points2[label == 1] += rng.uniform(8, 14, (len(board), 1)) * epipole
     points2[label == 2] += rng.integers(1, 4, (len(false), 1)) * cell
     return torch.from_numpy(points1), torch.from_numpy(points2), torch.from_numpy(label)
