@@ -2,19 +2,20 @@
 
 import pickle
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from make_sequences import texture
 from pairwise import pairwise
 from scenes import DTYPES, check_gradients, rewrite_weights, seeded, uniform
 from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators.match_refiner import local_frames
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+from make_sequences import texture  # noqa: E402 (needs Pillow, which comes with OpenCV's extra)
 
 pytestmark = pytest.mark.numerical
 WIDTH, HEIGHT = 120, 90
