@@ -19,6 +19,7 @@ from kornia_learnnorm.optional import import_extra
 __all__ = ["check_grey", "content_mask", "image_size", "read_colour", "read_image", "read_mask", "scaling"]
 
 Size = tuple[int, int]  # width and height, pixels
+Array = NDArray[Any]
 
 # Weights of red, green and blue, and an offset that turns Pillow's rounding into rounding down: the integer arithmetic
 # of libpng, so that a PNG has the grey values that OpenCV reads.
@@ -125,9 +126,7 @@ def _orientation(image: Any) -> int:
     return int(image.getexif().get(ORIENTATION) or 1)
 
 
-def stored_pixels(
-    path: Path, points: NDArray[Any], size: Sequence[int], turned: bool = True
-) -> tuple[NDArray[np.float64], Size]:
+def stored_pixels(path: Path, points: Array, size: Sequence[int], turned: bool = True) -> tuple[Array, Size]:
     """Return pixels (N, 2) and the (width, height) of an image, ``turned`` by EXIF or not, in the file as stored."""
     turn = 1
     if turned:

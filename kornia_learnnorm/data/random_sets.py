@@ -151,11 +151,9 @@ class _Pair(NamedTuple):
         passing = self.passing(RATIO)
         return passing[self.distance[passing] < INLIER_THRESHOLD]
 
-    def draw(
-        self, num_points: int, num_heldout: int, max_ratio: float | None, generator: Generator
-    ) -> Sequence[Tensor]:
+    def draw(self, num_points: int, num_heldout: int, ratio: float | None, generator: Generator) -> Sequence[Tensor]:
         """Return the fields of a :class:`MatchSets` of one set, without the index of the pair."""
-        passing, heldout = self.passing(max_ratio), self.heldout
+        passing, heldout = self.passing(ratio), self.heldout
         rows = passing[torch.randperm(len(passing), generator=generator)]
         rows = rows[torch.arange(num_points) % len(rows)]
         held = self.points[heldout[torch.randint(len(heldout), (num_heldout,), generator=generator)]]

@@ -22,6 +22,7 @@ from kornia_learnnorm.optional import import_extra
 __all__ = ["FORMAT", "LAYOUT", "VERSION", "CorrespondenceStore", "StoreReader"]
 __all__ += ["open_hdf5", "own_dataset", "passes_ratio_test", "read_store"]
 
+Array = NDArray[np.float32]
 FORMAT = "correspondences"  # attribute of the file
 VERSION = 1  # attribute of the file
 READING = "reading HDF5 files"  # what needs h5py, in messages
@@ -44,9 +45,9 @@ LAYOUT: dict[str, tuple[tuple[int, ...], str, str]] = {
 class CorrespondenceStore:
     """Correspondences of many image pairs, in memory."""
 
-    points1: NDArray[np.float32]  # pixels (x, y) in the first images, (M, 2)
-    points2: NDArray[np.float32]  # pixels (x, y) in the second images, (M, 2)
-    ratio: NDArray[np.float32]  # nearest over second-nearest descriptor distance (Lowe's ratio), NaN without one, (M,)
+    points1: Array  # pixels (x, y) in the first images, (M, 2)
+    points2: Array  # pixels (x, y) in the second images, (M, 2)
+    ratio: Array  # nearest over second-nearest descriptor distance (Lowe's ratio), NaN without one, (M,)
     offsets: NDArray[np.int64]  # pair i owns rows offsets[i]:offsets[i + 1], (P + 1,)
     image_size: NDArray[np.int32]  # (width, height) of both images, (P, 2, 2)
     names: list[tuple[str, str]]  # file names of both images, P pairs
@@ -59,7 +60,7 @@ class CorrespondenceStore:
     detector: str  # detector and matcher
     provenance: dict[str, Any] = field(default_factory=dict)  # options, versions, skipped pairs; values of JSON's types
     # from 0 to 1, (M,): 1 - ratio, and the matcher's score, to be given, of matches without a ratio
-    score: NDArray[np.float32] = field(default_factory=lambda: np.full(1, np.nan, np.float32))
+    score: Array = field(default_factory=lambda: np.full(1, np.nan, np.float32))
 
     def __post_init__(self) -> None:
         score = np.where(np.isnan(self.ratio), self.score, (1 - self.ratio).clip(0, 1))
@@ -73,15 +74,13 @@ class CorrespondenceStore:
         rows = np.arange(self.offsets[pair], self.offsets[pair + 1])
         return rows[passes_ratio_test(self.ratio[rows], max_ratio)]
 
-    def matches(
-        self, pair: int, max_ratio: float | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    def matches(self, pair: int, max_ratio: float | None = None) -> tuple[Array, Array, Array]:
         """Return points1 (N, 2), points2 (N, 2) and ratio (N,) of a pair: those that pass the ratio test, or all."""
         rows = self.rows(pair, max_ratio)
         return self.points1[rows], self.points2[rows], self.ratio[rows]
 
 
-def passes_ratio_test(ratio: NDArray[np.float32], max_ratio: float | None) -> NDArray[np.bool_]:
+def passes_ratio_test(ratio: Array, max_ratio: float | None) -> NDArray[np.bool_]:
     """Return which matches (N,) have a ratio below a limit, None for no limit, or no ratio, NaN."""
     return np.asarray(~(ratio >= (np.inf if max_ratio is None else max_ratio)))
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
+from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2, scaling
 from kornia_learnnorm.files import atomic_write
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["INLIER", "blend_images", "draw_line", "draw_matches", "draw_pair", "import_matplotlib", "stacked"]
 
+Pixels = NDArray[np.uint8]
+Array = NDArray[np.float64]
 BACKGROUND = "#11161d"  # dark, to fit light and dark pages
 TEXT = "#e8edf2"
 INLIER = "#45a1ff"
@@ -47,7 +49,7 @@ def import_matplotlib() -> Any:
     return matplotlib
 
 
-def draw_line(axes: Axes, line: npt.NDArray[np.float64], **style: Any) -> Line2D | None:
+def draw_line(axes: Axes, line: Array, **style: Any) -> Line2D | None:
     """Draw the line a x + b y + c = 0 across axes, at any scale of (a, b, c); nothing for the line at infinity."""
     norm = np.linalg.norm(line[:2])
     if not norm > 0:
@@ -56,9 +58,7 @@ def draw_line(axes: Axes, line: npt.NDArray[np.float64], **style: Any) -> Line2D
     return axes.axline((-a * c, -b * c), slope=-a / b if b else math.inf, **style)
 
 
-def draw_matches(
-    axes: Axes, points1: npt.NDArray[np.float64], points2: npt.NDArray[np.float64], inliers: npt.NDArray[np.bool_]
-) -> None:
+def draw_matches(axes: Axes, points1: Array, points2: Array, inliers: NDArray[np.bool_]) -> None:
     """Draw the matches (N, 2) in image 1: inliers as dots with their motion to image 2, outliers as crosses."""
     motion = np.stack([points1, points2], 1)[inliers]
     lines = import_matplotlib().collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8)
@@ -67,9 +67,7 @@ def draw_matches(
     axes.plot(*points1[~inliers].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8, label="outliers")
 
 
-def draw_pair(
-    image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8], estimate: PairEstimate, path: str | Path
-) -> None:
+def draw_pair(image1: Pixels, image2: Pixels, estimate: PairEstimate, path: str | Path) -> None:
     """Draw the matches in image 1 and what the matrix says in image 2, and write the picture whole or not at all.
 
     Image 1 shows the inliers in blue, each with its motion to image 2, and the outliers in red. Image 2 shows the
@@ -109,9 +107,7 @@ def stacked(sizes: Sequence[tuple[int, int]]) -> bool:
     return min(aspects) > WIDE or max(aspects) > UNEQUAL * min(aspects)
 
 
-def _panels(
-    images: Sequence[npt.NDArray[np.uint8]], sizes: Sequence[tuple[int, int]], margin: float
-) -> tuple[Figure, npt.NDArray[Any]]:
+def _panels(images: Sequence[Pixels], sizes: Sequence[tuple[int, int]], margin: float) -> tuple[Figure, NDArray[Any]]:
     """Return a figure that shows each image in its own axes, in pixels of its full size, with a margin for texts."""
     aspects = [width / height for width, height in sizes]
     if stacked(sizes):
@@ -130,9 +126,7 @@ def _panels(
     return figure, panels
 
 
-def blend_images(
-    image1: npt.NDArray[np.uint8], image2: npt.NDArray[np.uint8], estimate: PairEstimate
-) -> npt.NDArray[np.uint8]:
+def blend_images(image1: Pixels, image2: Pixels, estimate: PairEstimate) -> Pixels:
     """Return the mean of image 2 and image 1 moved by the homography, RGB; image 2 alone where image 1 ends."""
     colours = [np.broadcast_to(np.atleast_3d(image), (*image.shape[:2], 3)) for image in (image1, image2)]
     S1, S2 = (

@@ -81,7 +81,7 @@ def estimate_matches(
     """
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)
-    points1, points2, scores = _usable_matches(*read_matches(points1, points2, scores), threshold)
+    points1, points2, scores = _usable(*read_matches(points1, points2, scores), threshold)
     size1, size2 = read_size("size1", size1, points1), read_size("size2", size2, points2)
     solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras, sampler)
     choice, found, H_mat = choose_model(solver, model, size1, size2)
@@ -111,9 +111,7 @@ def estimate_matches(
     )
 
 
-def _usable_matches(
-    points1: Tensor, points2: Tensor, scores: Tensor, threshold: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def _usable(points1: Tensor, points2: Tensor, scores: Tensor, threshold: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return the matches that move and share no point, best first; raise NoReliableMatrixError for too few."""
     given, finite = len(scores), finite_and_bounded(points1, points2, threshold)
     points1, points2, scores = points1[finite], points2[finite], scores[finite]

@@ -34,6 +34,8 @@ __all__ = ["MatchOptions", "collect_matches", "match_frames"]
 # one of the options of a store: those of earlier versions have matches that share points, and are not continued
 METHOD = {"matches": "one-to-one"}
 WINDOW = 8  # pairs per process that are matched before unneeded features are deleted
+Found = Features | str  # or the reason why there are none
+Result = CorrespondenceStore | str  # of a pair, or the reason why there is none
 LOG_INTERVAL = 30.0  # seconds between lines of progress where stderr is not a terminal
 
 
@@ -151,7 +153,7 @@ def _match_all(
     done = writer.done()
     skipped: dict[str, str] = {}
 
-    def match_rest() -> Generator[tuple[int, CorrespondenceStore | str], None, None]:
+    def match_rest() -> Generator[tuple[int, Result], None, None]:
         todo = [place for place in range(len(pairs)) if place not in done]
         return _match_some(pairs, todo, writer.folder, options, workers)
 
@@ -173,7 +175,7 @@ def _match_all(
 
 def _match_some(
     pairs: Sequence[FramePair], todo: Sequence[int], folder: Path, options: MatchOptions, workers: Workers
-) -> Generator[tuple[int, CorrespondenceStore | str], None, None]:
+) -> Generator[tuple[int, Result], None, None]:
     """Yield each place of ``todo`` with the store of its pair, or the reason why there is none."""
     window = WINDOW * workers.number
     with TemporaryDirectory(prefix="features-", dir=folder) as features:
@@ -191,7 +193,7 @@ def _match_some(
                     cache.release(pairs[place])
 
 
-def _detect(frame: Frame, options: MatchOptions) -> Features | str:
+def _detect(frame: Frame, options: MatchOptions) -> Found:
     """Return the features of a frame, or the reason why it cannot be read."""
     import_cv2().setNumThreads(1)
     try:
@@ -201,9 +203,7 @@ def _detect(frame: Frame, options: MatchOptions) -> Features | str:
     return DETECTORS[options.detector](image, options.num_features)
 
 
-def _match(
-    pair: FramePair, features1: Features | str, features2: Features | str, options: MatchOptions, place: int
-) -> CorrespondenceStore | str:
+def _match(pair: FramePair, features1: Found, features2: Found, options: MatchOptions, place: int) -> Result:
     """Return the store of a pair, or the reason why there is none."""
     if isinstance(features1, str):
         return features1
@@ -229,7 +229,7 @@ class FeatureCache:
         frames = {frame.name: frame for pair in pairs for frame in pair}
         return [frame for name, frame in frames.items() if name not in self.held]
 
-    def put(self, frame: Frame, features: Features | str) -> None:
+    def put(self, frame: Frame, features: Found) -> None:
         """Keep the features of a frame, or the reason why it has none; OSError on a full disk."""
         self.held[frame.name] = features if isinstance(features, str) else ""
         if isinstance(features, str):
@@ -239,7 +239,7 @@ class FeatureCache:
         except OSError as error:  # NumPy's message does not name the file
             raise OSError(f"cannot write the features of {frame.name}, is the disk full? {error}") from error
 
-    def get(self, frame: Frame) -> Features | str:
+    def get(self, frame: Frame) -> Found:
         """Return the features of a frame, or the reason why there are none."""
         if reason := self.held[frame.name]:
             return reason

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import fundamental_from_motion
-from kornia_learnnorm.data.images import import_cv2
+from kornia_learnnorm.data.images import Size, import_cv2
 from kornia_learnnorm.files import atomic_write, write_text
 
 __all__ = ["Plane", "RenderedPair", "check_size", "circles", "framed", "letters", "masonry", "noise", "polygons"]
@@ -130,9 +130,7 @@ def _darken_floor(cv2: Any, floor: Plane, foot: Array, right: Array) -> None:
     floor.texture[...] *= 1 - cv2.blur(shadow, (int(0.3 * density), int(0.3 * density)))
 
 
-def render_views(
-    rng: Random, cv2: Any, planes: Sequence[Plane], R: Array, t: Array, size: tuple[int, int]
-) -> RenderedPair:
+def render_views(rng: Random, cv2: Any, planes: Sequence[Plane], R: Array, t: Array, size: Size) -> RenderedPair:
     """Render planes, given from back to front, from the origin and from a camera with :math:`X_2 = R X_1 + t`."""
     width, height = size
     K = np.array([[0.9 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]])
@@ -152,7 +150,7 @@ def rotation(yaw: float, pitch: float, roll: float) -> Array:
     return np.asarray(Rz @ Rx @ Ry)
 
 
-def render_planes(cv2: Any, planes: Sequence[Plane], K: Array, R: Array, t: Array, size: tuple[int, int]) -> Texture:
+def render_planes(cv2: Any, planes: Sequence[Plane], K: Array, R: Array, t: Array, size: Size) -> Texture:
     """Render the planes from back to front on a finer grid and average it."""
     fine = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
     centre = (SUPERSAMPLING - 1) / 2
@@ -176,9 +174,7 @@ def expose(image: Texture, rng: Random) -> NDArray[np.uint8]:
     return levels.round().clip(0, 255).astype(np.uint8)
 
 
-def correspondences(
-    planes: Sequence[Plane], K: Array, R: Array, t: Array, size: tuple[int, int]
-) -> tuple[Array, Array]:
+def correspondences(planes: Sequence[Plane], K: Array, R: Array, t: Array, size: Size) -> tuple[Array, Array]:
     """Return exact correspondences, pixels ``(M, 2)``, of a grid of image 1: those that image 2 shows unhidden."""
     step = max(1, size[0] // GRID)
     x, y = np.meshgrid(np.arange(step // 2, size[0], step), np.arange(step // 2, size[1], step))
