@@ -52,11 +52,9 @@ class Checkpoints(ModelCheckpoint):
         if trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
             self._previous_handler = signal.signal(signal.SIGINT, self._interrupt)
 
-    def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
         """Save a checkpoint where one is due, or where the training was interrupted, which ends here."""
-        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        super().on_train_batch_end(trainer, pl_module, *args)
         terminated = trainer.received_sigterm and trainer.world_size == 1
         if self._interrupted or terminated:
             self._save_last(trainer)
