@@ -62,6 +62,6 @@ def exif_camera(path: str | Path) -> NDArray[np.float64]:
         raise ValueError(f"camera exif: {path} is not an image")
     focal = focal_length_35mm(Path(path))
     if not 0 < focal < math.inf:
-        raise ValueError(f"camera exif: {path} has no focal length on 35 mm film; give --K fx,fy,cx,cy")
+        raise ValueError(f"camera exif: {path} has no focal length on 35 mm film; give fx,fy,cx,cy")
     pixels = focal * math.hypot(*size) / FILM_DIAGONAL
     return camera_matrix(pixels, pixels, (size[0] - 1) / 2, (size[1] - 1) / 2)
