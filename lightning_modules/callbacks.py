@@ -23,8 +23,6 @@ from kornia_learnnorm.files import atomic_write, short_name
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from lightning_modules.task import EstimatorTask
 
-__all__ = ["AgainstStart", "Checkpoints", "ExpectedTime", "ExportWeights", "WritePredictions"]
-
 MEASURED_STEPS = 10  # steps whose mean time is multiplied, after one that does not count
 
 

@@ -14,8 +14,6 @@ from torch.utils.data import DataLoader
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.sources import SEEDS_PER_RUN, BlockSource, block_generator
 
-__all__ = ["BatchLoader", "CorrespondenceDataModule"]
-
 EVALUATION_SEED = 4_000_000_007  # far from the seeds of training epochs, below 2^32 as the generator needs it
 
 

@@ -15,8 +15,6 @@ from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from lightning_modules.task import EstimatorTask, Median, adamw, cameras_of
 
-__all__ = ["HeldOutLoss", "RefinerTask", "all_matches"]
-
 TRUE_MATCH = 4.0  # pixels, the largest distance of the found matches that the validation's medians are of
 
 

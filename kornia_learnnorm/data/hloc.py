@@ -8,8 +8,6 @@ import numpy as np
 
 from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, open_hdf5, own_dataset
 
-__all__ = ["read_hloc"]
-
 
 def read_hloc(features: str | Path, matches: str | Path) -> CorrespondenceStore:
     """Return a store of the pairs in hloc's file of matches, with the keypoints of its file of features.

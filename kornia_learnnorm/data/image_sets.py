@@ -15,8 +15,6 @@ from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.sources import expand_path
 from kornia_learnnorm.geometry.transforms import transform_points
 
-__all__ = ["ImageSets", "find_images"]
-
 CACHED_IMAGES = 512  # in memory, in the size of the store
 SYMMETRIES = 8  # of a square: flips and transposition
 

@@ -21,8 +21,6 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.transforms import affine_transform, transform_points
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 
-__all__ = ["RandomSets", "SetSource", "StoreSets", "SyntheticSets", "augment"]
-
 MIN_HELDOUT = 32  # true inliers of a pair that is used, or matches where they are not known
 LABEL_THRESHOLD = 2.0  # pixels from the true epipolar lines up to which a match counts as an inlier
 

@@ -11,8 +11,6 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.normalizers.closed_form import Identity
 from kornia_learnnorm.protocol import RATIO
 
-__all__ = ["MatchSets", "draw_samples", "plain_residual"]
-
 RESIDUAL_BATCH = 8192  # samples solved at once, which bounds the memory
 
 

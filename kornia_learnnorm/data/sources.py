@@ -18,9 +18,6 @@ from kornia_learnnorm.data.store import StoreReader
 from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
 from kornia_learnnorm.protocol import MAX_RESIDUAL, RATIO
 
-__all__ = ["SEEDS_PER_RUN", "Block", "BlockSource", "StoreSamples", "SyntheticSamples", "block_generator"]
-__all__ += ["check_draws", "expand_path"]
-
 SCENES_PER_BLOCK = 8192
 SEEDS_PER_RUN = 1_000_003  # seeds that a run can draw from: one for each epoch
 

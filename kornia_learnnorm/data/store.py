@@ -19,9 +19,6 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["FORMAT", "LAYOUT", "VERSION", "CorrespondenceStore", "StoreReader"]
-__all__ += ["open_hdf5", "own_dataset", "passes_ratio_test", "read_store"]
-
 Array = NDArray[np.float32]
 FORMAT = "correspondences"  # attribute of the file
 VERSION = 1  # attribute of the file

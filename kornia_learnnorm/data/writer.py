@@ -15,8 +15,6 @@ from kornia_learnnorm.data.store import FORMAT, LAYOUT, VERSION, CorrespondenceS
 from kornia_learnnorm.files import atomic_write, write_text
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["StoreWriter", "check_target", "join_stores", "write_store"]
-
 OPTIONS = "options.json"  # file in the folder of the parts
 DIGEST = "frames"  # option that is a hash, which messages do not quote
 ROWS_PER_CHUNK = 2048  # correspondences in a chunk of HDF5

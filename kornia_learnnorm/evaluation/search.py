@@ -12,8 +12,6 @@ from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
-__all__ = ["SearchedNormalizer"]
-
 NUM_PARAMETERS = 5  # of each view, as spd_transform takes them
 MAX_PARAMETER = 3.0  # beyond it rounding errors of F would pass for gains
 LEARNING_RATE = 0.1  # length of the first step; it falls to zero as half a cosine

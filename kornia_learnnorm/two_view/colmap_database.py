@@ -30,8 +30,6 @@ from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.two_view.inputs import check_settings, read_cameras
 from kornia_learnnorm.two_view.reliability import MAX_LOG_FALSE_ALARMS, log_false_alarms
 
-__all__ = ["THRESHOLD", "DatabaseCounts", "check_database", "export_colmap"]
-
 CORNER = 0.5  # pixels from the corner of the first pixel to its centre
 THRESHOLD = 2.0  # pixels, of RANSAC
 INLIER_FACTOR = 2.0  # thresholds within which a match is an inlier: a few coarse ones are better than broken tracks

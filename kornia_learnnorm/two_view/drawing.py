@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-__all__ = ["INLIER", "blend_images", "draw_line", "draw_matches", "draw_pair", "import_matplotlib", "stacked"]
-
 Pixels = NDArray[np.uint8]
 Array = NDArray[np.float64]
 BACKGROUND = "#11161d"  # dark, to fit light and dark pages

@@ -27,8 +27,6 @@ from kornia_learnnorm.two_view.reliability import CAMERA_ERROR, PairWarning, Pre
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
-__all__ = ["estimate_matches"]
-
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
 
 

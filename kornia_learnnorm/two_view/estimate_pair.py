@@ -22,8 +22,6 @@ from kornia_learnnorm.two_view.inputs import Points, check_number, check_setting
 from kornia_learnnorm.two_view.repeated_texture import mutual_share, resolve_ambiguity
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
-__all__ = ["MAX_SIZE", "MatchedPair", "check_matching", "estimate_pair", "match_two_images"]
-
 MAX_SIZE = 2000  # pixels of the longer side at which images are matched: SIFT then takes up to 0.5 GB and seconds
 MIN_SIZE = 64  # pixels of the longer side; smaller ones have too few features
 NUM_FEATURES = 4000  # of an image

@@ -27,8 +27,6 @@ from kornia_learnnorm.two_view.estimate_pair import MAX_SIZE, check_matching, es
 from kornia_learnnorm.two_view.inputs import check_settings
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, package_versions
 
-__all__ = ["PairOptions", "describe_failure", "estimate_pairs", "pairs_of_folder", "read_pair_list"]
-
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
 TABLE = "pairs.csv"  # the same without the matches, in the order of the pairs
 COLUMNS = ("model", "num_matches", "num_inliers", "predicted_error_px", "F", "H", "E", "R", "t", "n")  # of the table

@@ -14,8 +14,6 @@ from kornia_learnnorm.two_view.reliability import MIN_SUPPORT
 from kornia_learnnorm.two_view.result import ModelChoice, NoReliableMatrixError
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
-__all__ = ["choose_model", "compute_gric"]
-
 ASKED = "asked for"
 MIN_NOISE = 1e-6  # thresholds; of matches without noise
 MEDIAN_SQUARE = 0.455  # of a standard normal variable

@@ -17,8 +17,6 @@ from kornia_learnnorm.geometry.matrices import determinant, unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.poses import pose_error, rotation_error
 
-__all__ = ["PlanePose", "angle_between", "plane_poses"]
-
 MIN_BASELINE = 0.01  # of the distance to the plane; inexact cameras explain less
 MIN_IN_FRONT = 0.95  # of the points, under a pose that they allow
 

@@ -13,8 +13,6 @@ from kornia_learnnorm.two_view.parallax import Parallax, parallax
 from kornia_learnnorm.two_view.plane_pose import PlanePose
 from kornia_learnnorm.two_view.reliability import PairWarning
 
-__all__ = ["ModelChoice", "NoReliableMatrixError", "PairEstimate", "package_versions"]
-
 CONVENTION = "x2^T F x1 = 0, x2 ~ H x1, x = (column, row, 1) in pixels, X2 = R X1 + t; F, H and E have unit norm"
 
 

@@ -9,8 +9,6 @@ from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.textfiles import TextLine, camera_matrix, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 
-__all__ = ["read_cambridge"]
-
 
 def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
     """Return the frames of a scene of Cambridge Landmarks (A. Kendall et al., ICCV 2015), each folder a sequence.

@@ -14,8 +14,6 @@ from kornia_learnnorm.data.datasets.textfiles import camera_matrix, text_lines
 from kornia_learnnorm.data.images import image_size
 from kornia_learnnorm.optional import import_extra
 
-__all__ = ["FIRST_DISTORTION", "covisible_pairs", "read_colmap", "read_pinhole"]
-
 # Index of the first distortion parameter of a camera model (COLMAP's source, sensor/models.h). These parameters are the
 # first of OpenCV's k1, k2, p1, p2.
 FIRST_DISTORTION = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4}

@@ -10,8 +10,6 @@ from kornia_learnnorm.data.datasets.frames import Frame, choose_sequences
 from kornia_learnnorm.data.datasets.textfiles import rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 
-__all__ = ["read_calibration", "read_kitti"]
-
 Array = NDArray[np.float64]
 
 

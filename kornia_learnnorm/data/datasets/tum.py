@@ -11,8 +11,6 @@ from kornia_learnnorm.data.datasets.frames import Frame, choose_sequences
 from kornia_learnnorm.data.datasets.textfiles import camera_matrix, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 
-__all__ = ["read_tum"]
-
 Array = NDArray[np.float64]
 
 # fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3 of the three Kinects; https://cvg.cit.tum.de/data/datasets/rgbd-dataset,

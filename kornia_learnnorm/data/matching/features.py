@@ -19,9 +19,6 @@ from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import check_grey, import_cv2
 
-__all__ = ["DETECTORS", "READS_COLOUR", "Features", "MissingWeightsError", "check_mask", "detect_aliked", "detect_disk"]
-__all__ += ["detect_keynet", "detect_rootsift", "detect_sift", "detect_xfeat", "keep_features", "pretrained"]
-
 MASK_MARGIN = 8  # pixels along each axis; a feature nearer to a masked pixel is of the mask's edge
 
 

@@ -13,8 +13,6 @@ from torch.nn.functional import normalize
 from kornia_learnnorm.data.synthetic import draws, scenes
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, transfer_distance
 
-__all__ = ["SyntheticMatches", "random_matches", "random_planes", "wide_baseline"]
-
 ORBIT_CANDIDATES = 6  # motions per scene
 PLANE_CANDIDATES = 6  # planes and motions per scene
 MIN_DEPTH = 0.15  # of a point of a plane, over its depth in the other view
