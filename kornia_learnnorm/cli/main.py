@@ -158,13 +158,15 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=32, width=min(shutil.get_terminal_size().columns, 120) - 2)
 
-    def add_usage(self, usage: str | None, actions: Iterable[Any], groups: Iterable[Any], *prefix: str | None) -> None:
+    def add_usage(
+        self, usage: str | None, actions: Iterable[argparse.Action], groups: Iterable[Any], prefix: str | None = None
+    ) -> None:
         """Name optional arguments by one word: they are listed below."""
         required = [group for group in groups if group.required]
         members = {id(action) for group in required for action in group._group_actions}  # noqa: SLF001
         shown = [a for a in actions if a.required or id(a) in members or (not a.option_strings and a.nargs == "?")]
         rest = argparse.Action([], "options", metavar="[options]")
-        super().add_usage(usage, [*shown, rest], required, *prefix)
+        super().add_usage(usage, [*shown, rest], required, prefix)
 
 
 def _print_completion(args: argparse.Namespace) -> int:
