@@ -129,6 +129,11 @@ def test_homography():
         check(program, layer, *points, scores=torch.rand(batch_size, num_points))
 
 
+def test_gradients_of_sets():
+    layer = EightPoint(Whitening())
+    check_gradients_of_program(export_layer(layer, gradients=True).module(), layer, *sets(3, 20))
+
+
 def test_eights_with_weights_mask_and_gradients():
     network = CrossViewNetwork(width=8, depth=1)
     layer, points = EightPoint(shaken(LearnedNormalizer(Whitening(), network))), sets(4, 8)

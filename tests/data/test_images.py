@@ -61,6 +61,11 @@ class TestPixels:
         Image.fromarray(np.array([[7, 9]], np.uint8)).save(tmp_path / "a.png", transparency=7)
         assert read_image(tmp_path / "a.png").tolist() == [[0, 9]]
 
+    def test_first_frame_of_several(self, tmp_path):
+        first, second = (Image.fromarray(texture(seed)) for seed in (0, 1))
+        first.save(tmp_path / "a.gif", save_all=True, append_images=[second])
+        assert np.array_equal(read_image(tmp_path / "a.gif"), texture(0))
+
 
 class TestBroken:
     @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from scenes import (
 )
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.estimators.match_features import masked_median
 
 
 def shaken_double(**options) -> kln.LearnedEightPoint:
@@ -198,3 +199,13 @@ class TestFiles:
     def test_weights_of_a_normaliser(self):
         with pytest.raises(ValueError, match=r"crossview: .* LearnedEightPoint.* LearnedNormalizer"):
             kln.LearnedEightPoint.from_pretrained("crossview")
+
+
+def test_median_of_the_present_rows():
+    values, present = uniform(6, 11, 3, low=-1), (uniform(6, 11, seed=1) < 0.6).double()
+    found = masked_median(values, present)
+    for k in range(6):
+        held = values[k][present[k] > 0].sort(0).values
+        assert torch.equal(found[k, 0], held[(len(held) - 1) // 2])
+    assert torch.equal(masked_median(values, torch.ones(6, 11)), masked_median(values, None))
+    assert not masked_median(values, torch.zeros(6, 11)).any()

@@ -72,6 +72,16 @@ class TestDrawPair:
         assert blue > 200
         assert red > 20
 
+    def test_images_of_different_shapes_and_no_outliers(self, draw):
+        """Image 1 is three times as wide as high and fills the width, image 2 stands below in its own shape."""
+        image1, _, estimate = make_pair(300, 100)
+        estimate = dataclasses.replace(estimate, size2=(70, 100), inliers=torch.ones(30, dtype=torch.bool))
+        green = np.tile(np.uint8([0, 255, 0]), (100, 70, 1))
+        picture = draw(image1, green, estimate)
+        height, width = (np.ptp(places) for places in (picture == [0, 1, 0]).all(2).nonzero())
+        assert width / height == pytest.approx(0.7, abs=0.02)
+        assert picture.shape[0] > 1200 / 3 + height
+
     def test_a_homography_moves_image_1(self, draw):
         """A shift by half of image 1, which is green, over a magenta image 2: grey where both are."""
         image1, image2 = (np.tile(np.uint8(colour), (120, 160, 1)) for colour in ([0, 255, 0], [255, 0, 255]))

@@ -13,6 +13,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.two_view import parallax as parallax_module
 from kornia_learnnorm.two_view.parallax import (
     distances_from_plane,
+    find_main_plane,
     fit_plane_and_parallax,
     measure_parallax,
     parallax,
@@ -68,6 +69,19 @@ class TestEvidence:
         mean = 2 / math.pi * math.asin(1 / 20) * 8
         expected = math.log10(45) + (4 - mean - 4 * math.log(4 / mean)) / math.log(10)
         assert parallax_evidence(torch.full((10,), 20.0), inliers, 1.0) == pytest.approx(expected)
+
+    @given(st.integers(3, 40), st.integers(0, 40))
+    def test_more_inliers_are_stronger_evidence(self, inliers, outliers):
+        distance = torch.full((inliers + outliers + 1,), 30.0)
+        less, more = (torch.arange(len(distance)) < number for number in (inliers, inliers + 1))
+        assert parallax_evidence(distance, more, 1.0) <= parallax_evidence(distance, less, 1.0)
+
+
+def test_main_plane():
+    pytest.importorskip("cv2", reason="OpenCV is not installed")
+    points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (40, 2)))
+    found = find_main_plane(points, points + 7.0, 1.0)
+    assert np.allclose(found / found[2, 2], [[1, 0, 7], [0, 1, 7], [0, 0, 1]], atol=1e-6)
 
 
 SIZE = (1600, 1200)

@@ -65,3 +65,11 @@ def test_no_pose():
     H_mat, *cameras, x1, _ = seen(SIDEWAYS)
     mirror = torch.diag(torch.tensor([-1.0, 1, 1])).double()
     assert plane_poses(mirror @ H_mat, *cameras, x1, x1) == []
+
+
+def test_angle_to_the_nearest_pose():
+    turned = torch.from_numpy(cv2.Rodrigues(np.array([0, 0, np.deg2rad(30)]))[0]) @ R
+    pose = PlanePose(R, SIDEWAYS, N)
+    assert angle_between(pose, [PlanePose(turned, SIDEWAYS, N), PlanePose(R)]) == pytest.approx(30)
+    assert angle_between(PlanePose(R), [PlanePose(turned)]) == pytest.approx(30)
+    assert angle_between(pose, []) == angle_between(pose, [PlanePose(R)]) == 180

@@ -9,11 +9,13 @@ from scenes import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
+from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.two_view.reliability import (
     find_warnings,
     log_false_alarms,
     log_false_samples,
     predict_error,
+    predict_transfer_error,
     random_parts,
 )
 
@@ -104,3 +106,32 @@ def test_false_samples():
         value, exact = log_false_samples(300, inliers, 1.0, (640, 480)), math.log10(50_000 * sum(terms))
         assert exact < value < exact + 1
     assert log_false_samples(5, 0, 1.0, (640, 480)) > 0
+
+
+@pytest.mark.parametrize("number", [40, 200])
+def test_of_homographies(number):
+    """The medians of exact points that are moved agree within a factor of two; no pose has a zero angle."""
+    generator = torch.Generator().manual_seed(number)
+    exact = random_planes(24, 1, 2 * number, generator)
+    truth, H_true = exact.exact1, kln.find_homography(exact.exact1, exact.exact2)
+    noise = 0.5 * torch.randn(24, number, 4, generator=generator, dtype=torch.float64)
+    x1, x2 = exact.exact1[:, :number] + noise[..., :2], exact.exact2[:, :number] + noise[..., 2:]
+    rows = random_parts(number, number, 0)
+    H_mat = kln.find_homography(x1, x2)
+    H_parts = kln.find_homography(x1[:, rows].flatten(0, 1), x2[:, rows].flatten(0, 1)).unflatten(0, (24, -1))
+    inliers = torch.ones(number, dtype=torch.bool)
+    found = [
+        predict_transfer_error(parts, rows.shape[1], points1, H, inliers)
+        for parts, points1, H in zip(H_parts, x1, H_mat, strict=True)
+    ]
+    moved = [np.dstack([truth, np.ones(truth.shape[:2])]) @ H.mT.numpy() for H in (H_mat, H_true)]
+    error = np.linalg.norm(moved[0][..., :2] / moved[0][..., 2:] - moved[1][..., :2] / moved[1][..., 2:], axis=-1)
+    assert 0.5 < np.median([one.distance for one in found]) / np.median(error[:, :number]) < 2
+    assert {one.angle for one in found} == {0.0}
+
+
+def test_angles_of_homographies():
+    """Half of the matches have as large an error as what they differ by from all."""
+    points, inliers = torch.rand(100, 2).double(), torch.ones(100, dtype=torch.bool)
+    about = torch.eye(3).double().repeat(3, 1, 1), 50, points, torch.eye(3).double(), inliers
+    assert predict_transfer_error(*about, torch.tensor([1.0, 2.0, 180.0])) == (0.0, 2.0)

@@ -100,6 +100,35 @@ def test_share_of_gross_outliers(make, outliers, expected):
     assert torch.equal(scene.points1, exact.points1)
 
 
+def test_student_t_noise():
+    noise = draws.student_t((200_000, 2), seeded(4)).numpy()
+    # Quantiles of Student's t with three degrees of freedom, from its closed-form distribution function:
+    # F(x) = 1/2 + (x / (sqrt(3) (1 + x^2/3)) + atan(x / sqrt(3))) / pi.
+    for x in (-3.0, -1.0, 0.0, 0.5, 2.0, 6.0):
+        u = x / np.sqrt(3)
+        expected = 0.5 + (u / (1 + u * u) + np.arctan(u)) / np.pi
+        np.testing.assert_allclose((noise < x).mean(0), expected, atol=0.005)
+
+
+def test_random_scenes_have_the_breadth_promised():
+    scene = random_scenes(4000, 20, seeded(7))
+    width, height = scene.image_size.unbind(-1)
+    focal = scene.K1[:, 0, 0] / width
+    for values, low, high in ((width / 1000, 0.4, 1.4), (height / width, 0.3, 0.8), (focal, 0.5, 1.3)):
+        assert [values.min(), values.max()] == pytest.approx([low, high], abs=0.02)
+    angle = torch.linalg.matrix_norm(scene.R - torch.eye(3).double()).div(8**0.5).asin() * 2
+    assert 0.002 <= angle.min() < 0.0025
+    assert 0.3 < angle.max() <= 0.48
+    # The scenes that drive: one in three, and of the others those that happen to go ahead (a cap of 8 % at 0.84).
+    centre = -(scene.R.mT @ scene.t[..., None]).squeeze(-1)
+    ahead = (centre[:, 2] / centre.norm(dim=-1) > 0.84).double().mean()
+    assert ahead == pytest.approx(1 / 3 + 2 / 3 * 0.08, abs=0.04)
+    outliers = (~scene.inliers).double().mean(-1)
+    # Half of the scenes, and of the others those with less than half a point in 20: 1 in 12.
+    assert (outliers == 0).double().mean() == pytest.approx(0.5 + 0.5 / 12, abs=0.04)
+    assert outliers.mean() == pytest.approx(0.075, abs=0.005)
+
+
 def test_motions_of_the_named_scenes():
     driving, orbiting = forward_driving(50, 8, seeded()), orbit(50, 8, seeded())
     assert driving.image_size[0].tolist() == [1241.0, 376.0]
