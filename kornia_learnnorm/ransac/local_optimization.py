@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras
-from kornia_learnnorm.estimators.moments import Evidence
+from kornia_learnnorm.estimators.moments import Evidence, descend
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
+from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
 
 __all__ = ["fit_final", "optimize_locally"]
@@ -22,8 +24,8 @@ FINAL_STEPS = 3  # steps of least squares on that loss
 FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
-MANIFOLD_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages by Levenberg-Marquardt
-MANIFOLD_STEPS = 2  # steps of Levenberg-Marquardt in a stage
+MANIFOLD_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages on the manifold
+MANIFOLD_STEPS = 2  # steps in a stage
 
 
 def optimize_locally(scorer: PairScorer, M: Tensor, number: int) -> Hypotheses:
@@ -38,6 +40,12 @@ def optimize_locally(scorer: PairScorer, M: Tensor, number: int) -> Hypotheses:
     if fit is not None:
         return scorer.best(fit.F_mat, number)
     state = scorer.model.state(M)
+    if isinstance(scorer.model, Essential):
+        x1, x2 = (x[None, :, scorer.rows] for x in (scorer.x1, scorer.x2))
+        evidence, weights = Evidence.from_points(x1, x2), torch.ones_like(x1[:, :1]).expand(-1, len(M), -1)
+        for scale in MANIFOLD_SCALES:
+            state = descend(evidence, state, weights, _fixed(scale * scorer.threshold), MANIFOLD_STEPS)
+        return scorer.best(state.matrix(), number)
     for scale in MANIFOLD_SCALES:
         cost = _cost(scorer, Truncated(scale * scorer.threshold), scorer.rows)
         state = minimize(cost, state, MANIFOLD_STEPS, LM_TOLERANCE)[1].state
@@ -83,6 +91,11 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     if not bool(contradict_cameras(evidence, state, weights, square_scale)):
         return state
     return minimize(last, relaxed.state(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)[1].state
+
+
+def _fixed(scale: float) -> Callable[[Tensor], Tensor]:
+    """Return the function that gives a scale's square, whatever the squared distances."""
+    return lambda squares: squares.new_full((1, 1, 1), scale**2)
 
 
 def _cost(

@@ -60,7 +60,7 @@ class RANSAC(nn.Module):
     to Levenberg-Marquardt where least squares have not converged.
 
     With both cameras, minimal samples of five run through Kornia's five-point solver, and local optimisation and the
-    final fit are Levenberg-Marquardt on essential matrices; distances stay in pixels. Where a fundamental matrix then
+    final fit are least squares on essential matrices; distances stay in pixels. Where a fundamental matrix then
     fits so much better that chance explains it with a probability below 0.001, and its pose has at most twice the
     standard error, the cameras are inexact, or a lens or a shutter is not that of a pinhole: the result is this matrix.
     ``normalizer`` and ``rank2`` have no effect.
