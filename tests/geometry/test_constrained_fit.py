@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scenes import scenes, uniform
+from scenes import epipolar_distances, scenes, uniform
 
 from kornia_learnnorm import find_fundamental
 from kornia_learnnorm.estimators.refinement import refine_fundamental
@@ -56,6 +56,19 @@ class TestSteps:
 
 
 class TestResults:
+    @pytest.mark.parametrize("factor", [sampson_scale, symmetric_scale])
+    def test_a_point_on_the_epipole_does_not_outweigh_the_others(self, factor):
+        epipole = torch.full((2,), 300.0, dtype=torch.float64)
+        points1 = uniform(200, 2, high=600)
+        points2 = epipole + (points1 - epipole) * uniform(200, 1, low=1.1, high=1.4, seed=1)
+        points1[0] = points2[0] = epipole
+        F_true = torch.tensor([[[0.0, -1, 300], [1, 0, -300], [-300, 300, 0]]], dtype=torch.float64)
+        scorer = PairScorer(points1, points2, 1.0, Fundamental())
+        F0 = scorer.from_pixels(torch.cat([F_true, F_true + 1e-4 * uniform(3, 3, 3, seed=3)]))
+        fitted = constrained_fit(scorer.x1, scorer.x2, F0, 8 * [Truncated(3.0)], factor).F_mat
+        for F in scorer.to_pixels(fitted):
+            assert epipolar_distances(points1[None, 1:], points2[None, 1:], F[None]).max() < 1e-6
+
     def test_what_cannot_be_fitted_stays(self):
         """Without inliers a step has no equations, and another matrix in the batch must not notice."""
         scorer, F0 = begin(scenes("handheld", 1, 200, noise=0.5))

@@ -11,6 +11,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.two_view.reliability import (
+    drop_failed_parts,
     find_warnings,
     log_false_alarms,
     log_false_samples,
@@ -18,6 +19,15 @@ from kornia_learnnorm.two_view.reliability import (
     predict_transfer_error,
     random_parts,
 )
+
+
+def test_failed_searches_do_not_count():
+    """Of 100 inliers, a matrix of a part must have 75; with fewer than four such matrices all count."""
+    F_parts = torch.eye(3).double() * torch.arange(1.0, 7.0)[:, None, None]
+    support = torch.tensor([110, 75, 74, 20, 90, 80])
+    assert drop_failed_parts(F_parts, support, 100)[:, 0, 0].tolist() == [1, 2, 5, 6]
+    assert len(drop_failed_parts(F_parts, support, 101)) == 6
+    assert torch.equal(drop_failed_parts(F_parts, support, 10), F_parts)
 
 
 @pytest.mark.parametrize("number", [40, 200])
