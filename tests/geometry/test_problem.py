@@ -4,7 +4,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import correspondences, null_matrices, uniform, up_to_sign
+from scenes import correspondences, null_matrices, signless, uniform, up_to_sign
 
 from kornia_learnnorm import Whitening, find_fundamental
 from kornia_learnnorm.geometry.matrices import unit_matrix
@@ -52,6 +52,19 @@ class TestLinearProblem:
                     find_fundamental(*(p[:, i] for p in points), normalizer=normalizer) for i in (rows, rows[order])
                 )
                 assert (F_mat - shuffled).abs().max() < 1e-6
+
+    def test_select_and_detach(self):
+        points = [p.requires_grad_() for p in correspondences("handheld", 4, 10)]
+        problem = problem_of(*points, uniform(4, 10, low=0.1))
+        with torch.no_grad():
+            assert not problem.null_matrix.requires_grad
+        assert problem.null_matrix.requires_grad  # a solution without gradient is not kept
+        part = problem.select(torch.tensor([2, 0]))
+        assert torch.equal(part.null_matrix, problem.null_matrix[[2, 0]])
+        assert torch.equal(part.weights, problem.weights[[2, 0]])
+        held = problem.detach(torch.tensor([True, False, False, True]))
+        gradient = torch.autograd.grad(signless(held.null_matrix).sum(), points[0])[0]
+        assert gradient.flatten(1).any(1).tolist() == [False, True, True, False]
 
 
 @given(seed=st.integers(0, 2**20), size=st.floats(-1e-13, 1e-13))
