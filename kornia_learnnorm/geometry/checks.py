@@ -6,6 +6,7 @@ from collections.abc import Collection, Sequence
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
@@ -43,10 +44,11 @@ def check_tensor(name: str, value: object, shape: Sequence[str] | None = None, p
         raise TypeError(f"{name} must be {kind}, got {type(value)}{hint}")
     if not (value.dtype in (torch.float32, torch.float64) if precise else value.is_floating_point()):
         raise TypeError(f"{name} must be {kind}, got {value.dtype}")
-    if shape is not None:
+    if shape is not None and not KORNIA_CHECK_SHAPE(value, [*shape], raises=False):
         hint = f"; for one pair write {name}[None]" if shape[0] == "B" and value.ndim == len(shape) - 1 else ""
         hint = f"; this takes one pair, {name}[0]" if shape[0] == "N" and value.ndim == len(shape) + 1 else hint
-        KORNIA_CHECK_SHAPE(value, [*shape], f"Argument: {name}{hint}")
+        message = f"{name} must have shape ({', '.join(shape)}), got {[*value.shape]}{hint}"
+        raise ShapeError(message, actual_shape=[*value.shape], expected_shape=[*shape])
 
 
 def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None = None) -> None:

@@ -22,8 +22,10 @@ def read_matches(points1: Points, points2: Points, scores: Points | None) -> tup
     x1, x2 = _as_float64("points1", points1), _as_float64("points2", points2)
     score = torch.ones(len(x1), dtype=torch.float64) if scores is None else _as_float64("scores", scores)
     if x1.shape != x2.shape or x1.shape[1:] != (2,) or score.shape != x1.shape[:1]:
-        shapes = " and ".join(str([*value.shape]) for value in (x1, x2, score))
-        raise ValueError(f"points of shape (N, 2) and scores of shape (N,) expected, got {shapes}")
+        given = (x1, x2) if scores is None else (x1, x2, score)
+        shapes = " and ".join(str([*value.shape]) for value in given)
+        hint = "; this takes one pair, points1[0]" if x1.ndim == 3 else ""
+        raise ValueError(f"points of shape (N, 2) and scores of shape (N,) expected, got {shapes}{hint}")
     known = score[(x1.isfinite() & x2.isfinite()).all(-1)]
     wrong = known[~((known >= 0) & (known <= 1))]
     if len(wrong):
