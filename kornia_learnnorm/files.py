@@ -43,7 +43,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             raise
         raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # of a file that is not there, also in a read-only file system
+            temporary.unlink()
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -61,6 +61,17 @@ def test_a_failed_write_keeps_the_old_file(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["F.json"]
 
 
+def test_a_read_only_place_names_the_file(tmp_path, monkeypatch):
+    def refuse(path, *_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    for name in ("touch", "unlink"):  # such a file system also refuses to remove what is not there
+        monkeypatch.setattr(files.Path, name, refuse)
+    with pytest.raises(OSError, match=r"F\.json") as caught, atomic_write(tmp_path / "F.json"):
+        pass
+    assert caught.value.filename == str(tmp_path / "F.json")
+
+
 @pytest.mark.parametrize(("error", "named"), [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, False)])
 def test_a_full_disk_names_the_file(tmp_path, error, named):
     """The file that was written, not those around it."""
