@@ -47,8 +47,11 @@ def names_task(args: Sequence[str]) -> bool:
     paths += [arg.removeprefix("--config=") for arg in args if arg.startswith("--config=")]
     for path in paths:
         try:
-            model = yaml.safe_load(Path(path).read_text(encoding="utf-8"))["model"]
-        except (UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError):  # an error of jsonargparse, or no model
+            with Path(path).open(encoding="utf-8") as file:  # whose name is in the messages of yaml
+                model = yaml.safe_load(file)["model"]
+        except yaml.YAMLError as error:
+            raise ValueError(f"{path} is not a configuration: {' '.join(str(error).split())}") from error
+        except (UnicodeDecodeError, LookupError, TypeError):  # an error of jsonargparse, or no model
             continue
         if isinstance(model, dict) and "class_path" in model:
             return True

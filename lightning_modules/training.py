@@ -33,6 +33,7 @@ LOGGERS = (
     "pytorch_lightning.utilities.rank_zero",
 )
 UNWANTED_WARNINGS = (
+    "LightningCLI.s args parameter.*",  # the options come from the command line all the same
     ".*treespec, LeafSpec.*",  # Lightning's own call of torch
     ".*smaller than the logging interval.*",  # the interval counts the steps of all epochs
     "Checkpoint directory .* exists and is not empty.*",  # it is that of the run that goes on

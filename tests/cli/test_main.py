@@ -225,17 +225,20 @@ DATA = "data: {{{}: {{class_path: kornia_learnnorm.data.sources.StoreSamples, in
         ([*FIT, "--trainer.default_root_dir", "bad.yaml"], "", "bad.yaml is a file: expected a folder for the run"),
         ([*FIT, "--config", "unknown"], "", "no configuration unknown: expected a file, or one of crossview, "),
         (WITH_BAD, "model: {nomalizer: 3}", "model.nomalizer"),
-        *((WITH_BAD, bad, "") for bad in ("", "- 1", "a: [1", "\xff\xfe")),
+        *((WITH_BAD, bad, "") for bad in ("", "- 1", "\xff\xfe")),
+        (WITH_BAD, "a: [1", "bad.yaml is not a configuration: "),
         (WITH_BAD, DATA.format("train", "{paths: [none.h5]}"), "no store at none.h5\n"),
         (WITH_BAD, DATA.format("val", "{paths: [none.h5], max_ratios: 7}"), "max_ratios"),
     ],
 )
-def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, monkeypatch, refused):
+def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, monkeypatch, refused, recwarn):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["learnnorm", *arguments])
     monkeypatch.delenv("LEARNNORM_DATA", raising=False)
     Path("bad.yaml").write_bytes(bad.encode("latin-1"))
     refused(arguments, message)
     assert [path.name for path in tmp_path.iterdir()] == ["bad.yaml"]
+    assert not [w for w in recwarn if "LightningCLI" in str(w.message)]
 
 
 @pytest.mark.parametrize(
