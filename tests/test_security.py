@@ -5,7 +5,6 @@ import json
 import pickle
 import re
 import struct
-import sys
 import zipfile
 import zlib
 from pathlib import Path
@@ -89,17 +88,6 @@ class TestCheckpoints:
                 packed.writestr(entry.filename, stored.read(entry))
         assert path.stat().st_size < 10**5
         rejected(path)
-
-    def test_without_lightning(self, last, monkeypatch):
-        """The lines of docs/training.md, where Lightning cannot be imported, give the weights that were exported."""
-        text = (ROOT / "docs/training.md").read_text()
-        (lines,) = re.findall(r"## A checkpoint without Lightning.*?```python\n(.*?)```", text, flags=re.DOTALL)
-        lines = lines.replace("runs/crossview/checkpoints/last.ckpt", str(last))
-        for module in ("pytorch_lightning", "lightning"):
-            monkeypatch.setitem(sys.modules, module, None)
-        exec(lines.replace("kln.CrossViewNetwork()", "kln.CrossViewNetwork(width=8, depth=1)"), found := {})
-        exported = kln.LearnedNormalizer.from_pretrained(last.parents[1] / "weights.safetensors").state_dict()
-        torch.testing.assert_close(dict(found["normalizer"].state_dict()), dict(exported), rtol=0, atol=0)
 
 
 class TestWeights:

@@ -15,7 +15,7 @@ __all__ = ["contradict_cameras"]
 
 SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
 MIN_EFFECT = 0.05  # share of the noise that two more parameters must explain: errors of matches are not independent
-MIN_PRECISION = 0.25  # of the pose of a fundamental matrix over that with cameras: twice the standard error at most
+MIN_PRECISION = 1 / 9  # of a pose without cameras over that with them: at most three times the standard error
 
 
 @torch.no_grad()

@@ -61,7 +61,7 @@ class RANSAC(nn.Module):
 
     With both cameras, minimal samples of five run through Kornia's five-point solver, and local optimisation and the
     final fit are least squares on essential matrices; distances stay in pixels. Where a fundamental matrix then
-    fits so much better that chance explains it with a probability below 0.001, and its pose has at most twice the
+    fits so much better that chance explains it with a probability below 0.001, and its pose has at most three times the
     standard error, the cameras are inexact, or a lens or a shutter is not that of a pinhole: the result is this matrix.
     ``normalizer`` and ``rank2`` have no effect.
 
