@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from math import inf
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.metrics import auc_from_errors
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import solve_dtype
+from kornia_learnnorm.geometry.checks import check_tensor, solve_dtype
 
 __all__ = ["mean_average_accuracy", "pose_auc", "pose_error", "rotation_error", "translation_error"]
 
@@ -23,8 +22,8 @@ def rotation_error(R: Tensor, R_true: Tensor) -> Tensor:
     :math:`\operatorname{atan2}(\|\Delta - \Delta^\top\|_F / \sqrt 2, \operatorname{tr} \Delta - 1)` of
     :math:`\Delta = R R_{true}^\top`; an arc cosine of the trace would lose half of the digits near 0 and 180.
     """
-    KORNIA_CHECK_SHAPE(R, ["*", "3", "3"])
-    KORNIA_CHECK_SHAPE(R_true, ["*", "3", "3"])
+    check_tensor("R", R, ["*", "3", "3"])
+    check_tensor("R_true", R_true, ["*", "3", "3"])
     delta = R @ R_true.mT
     sine = torch.linalg.matrix_norm(delta - delta.mT) / 2**0.5
     cosine = delta.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
@@ -38,8 +37,8 @@ def translation_error(t: Tensor, t_true: Tensor) -> Tensor:
     degrees apart, as in NG-RANSAC: the points in front of the cameras decide the sign. SuperGlue's evaluation and the
     Image Matching Benchmark leave the sign open, which is ``torch.minimum(error, 180 - error)``.
     """
-    KORNIA_CHECK_SHAPE(t, ["*", "3"])
-    KORNIA_CHECK_SHAPE(t_true, ["*", "3"])
+    check_tensor("t", t, ["*", "3"])
+    check_tensor("t_true", t_true, ["*", "3"])
     t, t_true = t / t.norm(dim=-1, keepdim=True), t_true / t_true.norm(dim=-1, keepdim=True)
     return torch.rad2deg(2 * torch.atan2((t - t_true).norm(dim=-1), (t + t_true).norm(dim=-1)))
 
