@@ -192,6 +192,9 @@ class EstimatorTask(pl.LightningModule):
         of_sets = isinstance(self.loss, SetLoss)
         for number, (F_mat, logits) in enumerate(stages, 1):
             loss = self.loss(batch, F_mat, logits) if of_sets else self.loss(*points, F_mat, *heldout)
+            if not of_sets and (not isinstance(loss, Tensor) or loss.shape not in ((), F_mat.shape[:1])):
+                got = [*loss.shape] if isinstance(loss, Tensor) else type(loss)
+                raise ValueError(f"a loss must return a scalar or one number for each of {len(F_mat)} sets, got {got}")
             total = total + (1.0 if number == len(stages) else EARLY_STAGE) * loss.mean()
         if total.requires_grad:
             total.register_hook(arrived.append)  # type: ignore[no-untyped-call]

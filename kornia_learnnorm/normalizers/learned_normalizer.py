@@ -89,10 +89,13 @@ class LearnedNormalizer(ProblemNormalizer):
         T1, T2 = (T.to(problem.x1) for T in transforms_of(self.base, problem))
         x1, x2 = transform_points(problem.points1, T1), transform_points(problem.points2, T2)
         if getattr(self.network, "needs_null_matrix", False):
-            params1, params2 = self.network(x1, x2, problem.weights, null_matrix=problem.solve_in(T1, T2)[0])
+            params = self.network(x1, x2, problem.weights, null_matrix=problem.solve_in(T1, T2)[0])
         else:
-            params1, params2 = self.network(x1, x2, problem.weights)
-        return self.transform(params1) @ T1, self.transform(params2) @ T2
+            params = self.network(x1, x2, problem.weights)
+        if not isinstance(params, (tuple, list)) or len(params) != 2:
+            got = f"{len(params)} values" if isinstance(params, (tuple, list)) else type(params)
+            raise ValueError(f"a network must return (params1, params2), got {got}")
+        return self.transform(params[0]) @ T1, self.transform(params[1]) @ T2
 
     def extra_repr(self) -> str:
         """Return the parameters."""

@@ -33,6 +33,12 @@ class Constant(PointNetwork):
     def __init__(self):
         super().__init__()
         self.register_buffer("grid", torch.ones(2), persistent=False)
+class Single(PointNetwork):
+    def forward(self, points1, points2, weights=None):
+        return self.view(points1, points2, weights)
+class ThreeSets(MedianLoss):
+    def forward(self, *points):
+        return super().forward(*points)[:3]
 def make(width: int = 8) -> PointNetwork:
     class Local(PointNetwork):
         pass
@@ -122,3 +128,16 @@ def test_what_cannot_be_saved_is_refused_before_the_first_step(network, message,
     options = [*SMALL, f"--trainer.default_root_dir={tmp_path}", f"{NETWORK}={network}"]
     refused(["fit", "--config", "own", *options], message)
     assert not [*tmp_path.rglob("*.safetensors"), *tmp_path.rglob("*.ckpt")]
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (f"{NETWORK}=broken_modules.Single", "must return (params1, params2), got <class 'torch.Tensor'>"),
+        ("--model.loss=broken_modules.ThreeSets", "sets, got [3]"),
+    ],
+)
+def test_what_returns_another_shape_is_named(option, message, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(run)
+    assert main(["fit", "--config", "own", *SMALL, f"--trainer.default_root_dir={tmp_path}", option]) == 2
+    assert message in capsys.readouterr().err
