@@ -1,70 +1,159 @@
-r"""Refinement of the learned homography by reweighted least squares.
+r"""Refinement of the learned homography by reweighted least squares, and the search among minimal samples before it.
 
 Correspondences enter a step through the :math:`9 \times 9` matrix of the second moments of their design rows alone,
-which four weighted moments of view 1's points make: a step costs little for ten matches and for thousands.
+which weighted moments of view 1's points make: a step costs little for ten matches and for thousands.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.match_features import CommonFrame
+from kornia_learnnorm.estimators.moments import (
+    draw_matches,
+    evenly_ranked,
+    geometric_scale,
+    least_cost,
+    normal_equations,
+)
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.checks import safe_divisor
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.models.homography import Homography, UnitMatrix
+from kornia_learnnorm.models.homography import Homography, UnitMatrix, solve_four_points
 
 __all__ = ["HomographyRefinement"]
 
-EARLY_SCALE, LAST_SCALE = 3.0, 6.0  # of the robust loss, in geometric means of the inliers' distances
-LAST_POWER = 0.1  # of the probabilities in the last stage: most matches are to count, and a robust loss drops outliers
+# Of the robust loss, in geometric means of the inliers' distances: of early stages, comparisons and the last fit.
+EARLY_SCALE, COMPARED_SCALE, LAST_SCALE = 3.0, 1.5, 6.0
+LAST_POWER = 0.05  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
-DAMPING = 1e-12  # of the mean diagonal of the normal matrix, added to it
+LOCAL_STEPS = 2  # reweightings of candidates
+MAX_SCORED = 128  # matches by which candidates are compared
+SHORTLIST = 2  # matrices of minimal samples that are refined
+MIN_MARGIN = 1e-3  # of the frame's unit, by which a minimal sample has to miss being degenerate
+MIN_MATCHES = 8  # from which samples are drawn: among few, some fit most of them by chance
 
 
 class HomographyRefinement(Refinement):
-    r"""Reweighted least squares of a stage's homographies.
+    r"""Reweighted least squares of a stage's homographies, and in the last stage a search among minimal samples.
 
-    With the scale :math:`s`, the weights of the rows are those of Geman and McClure's loss of :math:`d_i / s`, times
-    the probabilities of inliers, in the last stage to the power of 0.1, times the factor from squared algebraic
-    residuals to squared Sampson distances.
+    Matches are weighted by the probabilities of inliers and the derivative of Geman and McClure's loss of squared
+    distances :math:`r` over a squared scale, :math:`(1 + r)^{-2}`. In the last stage these are probabilities to the
+    power of 0.05 and :math:`(1 + r^2)^{-2}`, which leaves inliers nearly equal weights; sets of at least eight matches
+    start from their refined matrix or one of minimal samples that are drawn by the probabilities of inliers, whichever
+    has the least cost of all matches, whatever their probabilities.
     """
 
     model: Homography
 
-    def __init__(self, model: Homography, problem: LinearProblem, frame: CommonFrame) -> None:
+    def __init__(self, model: Homography, problem: LinearProblem, frame: CommonFrame, samples: int) -> None:
         super().__init__(model, problem, frame)
-        self.products = (self.x1[:, :, None] * self.x1[:, None]).flatten(1, 2)  # of the points of view 1, (B, 9, N)
-        self.terms = model.sampson_terms(self.x1, self.x2)
+        products = (self.x1[:, :, None] * self.x1[:, None]).flatten(1, 2)
+        self.evidence = model.sampson_terms(self.x1, self.x2), products
+        # A traced program serves sets of any size.
+        self.samples = samples if torch.compiler.is_compiling() or self.x1.shape[-1] >= MIN_MATCHES else 0
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
-        """Return the matrices after so many steps."""
-        share = probability if self.weights is None else probability * self.weights
-        share = share / safe_divisor(share.sum(1, keepdim=True))
-        number = (1 / safe_divisor(share.square().sum(1, keepdim=True))).clamp(min=self.model.dof + 1.0)
-        scale, power = (LAST_SCALE, LAST_POWER) if last else (EARLY_SCALE, 1.0)
-        square_scale = scale**2 * number / (number - self.model.dof)
-        weights = probability.clamp(min=torch.finfo(M.dtype).tiny) ** power
-        weights = weights if self.weights is None else weights * self.weights
-        M = M / torch.linalg.matrix_norm(M, keepdim=True)
+        """Return the matrices after so many steps.
+
+        The choice among matrices has no derivative; through a zero, the transforms still get a gradient of zero.
+        """
+        inliers = probability if self.weights is None else probability * self.weights
+        mean, weights = geometric_scale(inliers, self.model.dof, SQUARE_FLOOR), inliers
+        if last:
+            weights = probability.clamp(min=torch.finfo(M.dtype).tiny) ** LAST_POWER
+            weights = weights if self.weights is None else weights * self.weights
+        M = (M / torch.linalg.matrix_norm(M, keepdim=True))[:, None]
+
+        def weigh(squares: Tensor) -> Tensor:
+            if last:
+                return weights[:, None] * UNROLLED_LOSS((squares / (LAST_SCALE**2 * mean(squares))).square())[1]
+            return weights[:, None] * UNROLLED_LOSS(squares / (EARLY_SCALE**2 * mean(squares)))[1]
+
+        if last and steps and self.samples:
+            with torch.no_grad():
+                own = self._descend(M, self.evidence, weigh, LOCAL_STEPS)
+                squares = self.model.sampson_squares(own, self.evidence[0])[0]
+                best = self._most_consistent(own, inliers, COMPARED_SCALE**2 * mean(squares))
+            few = (inliers > 0).sum(1) < MIN_MATCHES
+            M = torch.where(few[:, None, None, None], M, best + 0.0 * M)
+        return self._descend(M, self.evidence, weigh, steps)[:, 0]
+
+    def _most_consistent(self, own: Tensor, inliers: Tensor, square_scale: Tensor) -> Tensor:
+        """Return the matrices of least cost, (B, 1, 3, 3), among own ones and those of minimal samples."""
+        # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
+        order = inliers.argsort(dim=1, descending=True, stable=True)
+        drawn = draw_matches(inliers, order, self.samples, self.model.sample_size)
+        x1, x2 = (
+            torch.unflatten(x.gather(2, drawn[:, None].expand(-1, 3, -1)), 2, (self.samples, -1)).permute(0, 2, 3, 1)
+            for x in (self.x1, self.x2)
+        )
+        M, margin = (
+            torch.unflatten(value, 0, (-1, self.samples))
+            for value in solve_four_points(x1.flatten(0, 1), x2.flatten(0, 1))
+        )
+        present, some = (inliers > 0).to(inliers), evenly_ranked(order, MAX_SCORED)
+        few = present.gather(1, some)
+        terms, products = (value.gather(2, some[:, None].expand(-1, value.shape[1], -1)) for value in self.evidence)
+
+        def losses(M: Tensor, terms: Tensor) -> Tensor:
+            return UNROLLED_LOSS(self.model.sampson_squares(M, terms)[0] / square_scale.to(M))[0]
+
+        def weigh(squares: Tensor) -> Tensor:
+            return few[:, None] * UNROLLED_LOSS(squares / square_scale)[1]
+
+        M = least_cost(M, margin > MIN_MARGIN, losses(M.float(), terms.float()), few, SHORTLIST)
+        M = torch.cat([own, self._descend(M, (terms, products), weigh, LOCAL_STEPS)], 1)
+        return least_cost(M, M.isfinite().all((2, 3)), losses(M, self.evidence[0]), present, 1)
+
+    def _descend(
+        self, M: Tensor, evidence: tuple[Tensor, Tensor], weigh: Callable[[Tensor], Tensor], steps: int
+    ) -> Tensor:
+        r"""Return the matrices (B, K, 3, 3) after steps of reweighted least squares; differentiable.
+
+        Each is a Gauss-Newton step of new weights, with the gradient of :math:`\sum_i w_i \epsilon_i^\top C_i^{-1}
+        \epsilon_i`: with :math:`\lambda = C^{-1} \epsilon` it is that of :math:`\sum_i w_i (\epsilon_i^\top C_i^{-1}
+        \epsilon_i - \lambda_i^\top C_i \lambda_i)` where :math:`C_i^{-1}` and :math:`\lambda_i` are held.
+        """
+        terms, products = evidence
         for _ in range(steps):
-            squares, factor = (value[:, 0] for value in self.model.sampson_squares(M[:, None], self.terms))
-            mean = (share * (squares + SQUARE_FLOOR).log()).sum(1, keepdim=True).exp()
-            M = self._step(M, weights * factor * UNROLLED_LOSS(squares / (square_scale * mean))[1])
+            p, q, a, b, c, volume = self.model.sampson_parts(M, terms)
+            first, second = (c * p - b * q) / volume, (a * q - b * p) / volume
+            weights = weigh(p * first + q * second)
+            weights = weights / safe_divisor(weights.sum(2, keepdim=True))
+            M = self._step(M, terms, products, weights, (first, second), (a, b, c, volume))
         return M
 
-    def _step(self, M: Tensor, weights: Tensor) -> Tensor:
-        """Return the matrices after a step of least squares with weights (B, N) of the rows."""
-        weights = weights / safe_divisor(weights.sum(1, keepdim=True))
-        u, v, _ = self.x2.unbind(1)
-        weighted = torch.stack([weights, -weights * u, -weights * v, weights * (u * u + v * v)], 1)
-        S, Su, Sv, Suv = torch.unflatten(weighted @ self.products.mT, 2, (3, 3)).unbind(1)
-        zero = torch.zeros_like(S)
-        moments = torch.cat([torch.cat(row, 2) for row in ([S, zero, Su], [zero, S, Sv], [Su, Sv, Suv])], 1)
-        state = UnitMatrix(M.mT)  # moments are those of row-major entries
-        D, h = state.tangents(), M.flatten(1)[..., None]
-        normal, eye = D.mT @ moments @ D, torch.eye(self.model.dof, dtype=M.dtype, device=M.device)
-        damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
-        return state.retract(-torch.linalg.solve_ex(normal + damping * eye, D.mT @ moments @ h)[0][..., 0]).M.mT
+    def _step(
+        self,
+        M: Tensor,
+        terms: Tensor,
+        products: Tensor,
+        weights: Tensor,
+        multipliers: tuple[Tensor, Tensor],
+        covariance: tuple[Tensor, ...],
+    ) -> Tensor:
+        """Return the matrices after a step with weights (B, K, N)."""
+        u, v = terms[:, None, 3], terms[:, None, 4]
+        (first, second), (a, b, c, volume) = multipliers, covariance
+        share = weights / volume
+        w11, w12, w22 = share * c, -share * b, share * a
+        w1, w2 = w11 * u + w12 * v, w12 * u + w22 * v
+        depth = weights * (first.square() + second.square())
+        rows = torch.stack([w11, w12, w22, -w1, -w2, w1 * u + w2 * v, depth], 2)
+        S11, S12, S22, S1, S2, S3, depths = torch.unflatten(rows @ products.mT[:, None], 3, (3, 3)).unbind(2)
+        moments = torch.cat([torch.cat(row, 3) for row in ([S11, S12, S1], [S12, S22, S2], [S1, S2, S3])], 2)
+        L = torch.stack([first, second, -(u * first + v * second)], 2)
+        L = (L * weights[:, :, None]) @ L.mT
+        flat, last = torch.diag(M.new_tensor([1.0, 1.0, 0.0])), torch.diag(M.new_tensor([0.0, 0.0, 1.0]))
+        held = L[..., :, None, :, None] * flat[:, None] + last[:, None, :, None] * depths[..., None, :, None, :]
+        difference = moments - held.flatten(4, 5).flatten(2, 3)
+        state = UnitMatrix(M.flatten(0, 1).mT)  # moments are those of row-major entries
+        h = M.flatten(0, 1).flatten(1)[..., None]
+        normal, gradient = normal_equations(moments.flatten(0, 1), difference.flatten(0, 1), state.tangents(), h)
+        step = torch.linalg.solve_ex(normal, gradient)[0][..., 0]
+        return torch.unflatten(state.retract(-step).M.mT, 0, M.shape[:2])

@@ -3,7 +3,7 @@ r"""The learned homography: a matrix between two views of a plane, or of a camer
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from kornia_learnnorm.estimators.homography_stages import HomographyRefinement
 from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
 from kornia_learnnorm.estimators.match_features import CommonFrame
 from kornia_learnnorm.estimators.stages import Refinement
+from kornia_learnnorm.geometry.checks import check_whole_number
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.homography import Homography
 
@@ -42,9 +43,10 @@ class LearnedHomography(LearnedLayer):
 
     The sibling of :class:`~kornia_learnnorm.LearnedEightPoint` for homographies, differentiable too. Each stage's
     network predicts a logit for every correspondence and two transforms, the weighted DLT follows in their
-    coordinates, and reweighted least squares of the Sampson distances refine its matrix. In the last stage a
-    correspondence counts with the tenth root of its probability: full probabilities leave out true matches that the
-    matrix needs where noise is coarse.
+    coordinates, and reweighted least squares of the Sampson distances refine its matrix. In the last stage of sets of
+    eight correspondences and more, minimal samples of four are drawn by the probabilities. Of their matrices and the
+    network's, the one of least robust cost over all correspondences is fitted to all of them, nearly whatever their
+    probabilities: full ones leave out true matches that the matrix needs where noise is coarse.
 
     Four correspondences determine their matrix exactly, whatever the weights; the networks get a gradient of zero. The
     order of the correspondences has no effect. Swapping the views gives :math:`H^{-1}` up to scale. Moving both images
@@ -58,6 +60,7 @@ class LearnedHomography(LearnedLayer):
         stages: number of stages.
         refine_steps: reweightings in the last stage, and at most three in the others. Derivatives are those of the
             steps: more steps bring them closer to those of the optimum.
+        samples: minimal samples in the last stage; without (0), the last fit begins at the network's matrix.
 
     Attributes:
         detach_stages: send no gradient from a stage into the one before and don't refine the last, as when the layer
@@ -76,10 +79,15 @@ class LearnedHomography(LearnedLayer):
 
     model: Homography
     model_name = Homography.name
-    architecture = ("width", "depth", "stages", "refine_steps")
+    architecture = ("width", "depth", "stages", "refine_steps", "samples")
+    added: ClassVar[dict[str, Any]] = {"samples": 64}
 
-    def __init__(self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 3) -> None:
+    def __init__(
+        self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 3, samples: int = 64
+    ) -> None:
         super().__init__(Homography(), width, depth, stages, True, refine_steps)
+        check_whole_number("samples", samples, 0)
+        self.samples = samples
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-homography") -> LearnedHomography:
@@ -99,12 +107,14 @@ class LearnedHomography(LearnedLayer):
         return super().from_pretrained(name)  # configurations need the name of the class, not Self
 
     @classmethod
-    def from_eight_point(cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 3) -> LearnedHomography:
+    def from_eight_point(
+        cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 3, samples: int = 64
+    ) -> LearnedHomography:
         """Return an untrained estimator whose networks start from the first ones of one of fundamental matrices.
 
         Stages beyond those of ``layer`` are new.
         """
-        return cls(layer.width, layer.depth, stages, refine_steps).start_from(layer)
+        return cls(layer.width, layer.depth, stages, refine_steps, samples).start_from(layer)
 
     def estimate(
         self,
@@ -154,4 +164,4 @@ class LearnedHomography(LearnedLayer):
         return torch.where(swapped[..., None], self.model.swap(M), M), logits
 
     def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
-        return HomographyRefinement(self.model, problem, frame)
+        return HomographyRefinement(self.model, problem, frame, self.samples)

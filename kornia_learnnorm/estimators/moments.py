@@ -19,6 +19,7 @@ from kornia_learnnorm.geometry.checks import safe_divisor
 __all__ = [
     "Evidence",
     "descend",
+    "draw_matches",
     "draw_samples",
     "evenly_ranked",
     "geometric_scale",
@@ -171,6 +172,19 @@ def pick(state: Any, index: Tensor, number: int) -> Any:
 def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int) -> tuple[Tensor, Tensor]:
     """Return the null spaces (B S, 9 - size, 3, 3) of minimal samples, and which have no larger one, (B S,) bool.
 
+    Samples are those of :func:`draw_matches`.
+    """
+    rows = evidence.select(draw_matches(weights, order, number, size)).rows
+    rows = torch.unflatten(rows, 2, (number, size)).transpose(1, 2).flatten(0, 1)  # (B S, 9, size)
+    Q, R = torch.linalg.qr(rows, mode="complete")
+    pivots = R.diagonal(dim1=-2, dim2=-1).abs()
+    determined = pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1)
+    return torch.unflatten(Q[..., size:].mT, -1, (3, 3)).mT, determined
+
+
+def draw_matches(weights: Tensor, order: Tensor, number: int, size: int) -> Tensor:
+    """Return the correspondences of minimal samples, indices (B, number size), one sample after another.
+
     They are drawn by the weights (B, N), without a generator of random numbers.
     ``order`` (B, N) sorts the correspondences by their weights. The samples are those of multiples of the powers of the
     root of :math:`x^{d + 1} = x + 1` for d = ``size``, which spread evenly (M. Roberts, 2018).
@@ -180,12 +194,7 @@ def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int
     steps = EVEN_ROOTS[size] ** -torch.arange(1, size + 1, dtype=shares.dtype, device=shares.device)
     chances = (torch.arange(1, number + 1, device=shares.device)[:, None] * steps).frac().flatten()
     ranks = torch.searchsorted(shares, chances + 0.0 * shares[:, :1]).clamp(max=shares.shape[1] - 1)
-    rows = evidence.select(order.gather(1, ranks)).rows
-    rows = torch.unflatten(rows, 2, (number, size)).transpose(1, 2).flatten(0, 1)  # (B S, 9, size)
-    Q, R = torch.linalg.qr(rows, mode="complete")
-    pivots = R.diagonal(dim1=-2, dim2=-1).abs()
-    determined = pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1)
-    return torch.unflatten(Q[..., size:].mT, -1, (3, 3)).mT, determined
+    return order.gather(1, ranks)
 
 
 def evenly_ranked(order: Tensor, most: int) -> Tensor:
@@ -195,7 +204,7 @@ def evenly_ranked(order: Tensor, most: int) -> Tensor:
     return order[:, torch.arange(few, device=order.device) * number // few]
 
 
-EVEN_ROOTS = {5: 1.1347241384015194, 7: 1.0969815577985598}
+EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.0969815577985598}
 
 
 _FLAT = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))

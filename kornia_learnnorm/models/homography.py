@@ -122,6 +122,14 @@ class Homography(TwoViewModel):
         The second tensor, the inverse of the mean eigenvalue of :math:`J J^\top`, turns squared algebraic residuals
         into about as much.
         """
+        p, q, a, b, c, volume = self.sampson_parts(M, terms)
+        return (c * p.square() - 2 * b * p * q + a * q.square()) / volume, 2 / (a + c)
+
+    def sampson_parts(self, M: Tensor, terms: Tensor) -> tuple[Tensor, ...]:
+        r"""Return the residuals p, q, then a, b, c of :math:`J J^\top = [[a, b], [b, c]]` and its determinant.
+
+        Each is (*, K, N), for matrices (*, K, 3, 3).
+        """
         x1, x2, products = torch.split(terms[..., None, :, :], [3, 3, 6], -2)
         uv, w, y = x2[..., :2, :], x2[..., 2:, :], M @ x1
         z = y[..., 2, :].square()
@@ -153,8 +161,7 @@ class Homography(TwoViewModel):
         floor = COVARIANCE_FLOOR**2 * trace.detach().mean(-1, keepdim=True) + torch.finfo(M.dtype).tiny
         z = z + floor
         volume = (a * c - b.square()).clamp(min=0) + z * (trace + z)
-        squares = (c * p.square() - 2 * b * p * q + a * q.square() + z * (p.square() + q.square())) / volume
-        return squares, 2 / (trace + 2 * z)
+        return p, q, a + z, b, c + z, volume
 
     def score_terms(self, x1: Tensor, x2: Tensor) -> Tensor:
         """Return the points and, for Sampson distances, products of those of view 2."""

@@ -1,5 +1,6 @@
 """The learned relative pose and homography: truth, invariances, small and degenerate sets, gradients, files, errors."""
 
+import json
 import pickle
 
 import pytest
@@ -16,6 +17,7 @@ from scenes import (
     corner_error,
     correspondences,
     plane,
+    rewrite_weights,
     scenes,
     seeded,
     signless,
@@ -54,7 +56,7 @@ def pose_layer(**options) -> kln.LearnedRelativePose:
 
 def homography_layer(**options) -> kln.LearnedHomography:
     torch.manual_seed(0)
-    return roughened(kln.LearnedHomography(**{"width": 16, "depth": 2, "stages": 2} | options))
+    return roughened(kln.LearnedHomography(**{"width": 16, "depth": 2, "stages": 2, "samples": 8} | options))
 
 
 def inputs(name="orbit", *args, **options):
@@ -170,6 +172,28 @@ def test_planes_and_outliers():
         found = pose_layer(samples=64).estimate(points1, points2, K, K)
     assert (kln.sampson_distance(points1[:, 20:], points2[:, 20:], found.F_mat).amax(1) < 1e-3).double().mean() >= 0.8
     assert ((found.R - R).flatten(1).norm(dim=1) < 1e-3).any()  # a plane has two poses
+
+
+@torch.no_grad()
+def test_samples_find_the_homography_where_the_weights_do_not():
+    """An untrained network gives all matches the same weight."""
+    points1, points2, H = plane(10, 100, noise=0.1, outliers=0.3)
+    torch.manual_seed(0)
+    layers = [kln.LearnedHomography(width=16, depth=1, stages=1, samples=samples) for samples in (0, 256)]
+    without, found = (
+        torch.tensor([corner_error(*pair) for pair in zip(layer(points1, points2), H, strict=True)]) for layer in layers
+    )
+    assert (found < without / 4).double().mean() >= 0.8
+
+
+@pytest.mark.parametrize("number", [7, 8, 40])
+@torch.no_grad()
+def test_padding_of_a_homography_has_no_effect(number):
+    """Few present matches are not searched, however many rows there are."""
+    points1, points2 = planar(3, number)
+    layer, mask = homography_layer(), torch.arange(number + 20).expand(3, -1) < number
+    padded = [torch.cat([p, p[:, :1].expand(-1, 20, -1)], 1) for p in (points1, points2)]
+    assert up_to_sign(layer(*padded, mask=mask), layer(points1, points2)) < 1e-6
 
 
 @settings(max_examples=8)
@@ -325,7 +349,7 @@ def test_finite_on_degenerate_sets(kind, name):
 @both
 def test_gradients(kind):
     """With many steps derivatives are those of the optimum."""
-    layer = LAYERS[kind](stages=1, refine_steps=60, **({"samples": 0} if kind == "pose" else {}))
+    layer = LAYERS[kind](stages=1, refine_steps=60, samples=0 if kind == "pose" else 8)
     points1, points2, *cameras = INPUTS[kind]("orbit", 1, 12)
 
     def numbers(points1, points2, scores):
@@ -394,6 +418,19 @@ def test_files(kind, tmp_path):
         kln.LearnedEightPoint.from_pretrained(tmp_path / "own.safetensors")
 
 
+def test_homography_of_an_earlier_version(tmp_path):
+    """Before, there were no samples."""
+
+    def drop(_, metadata):
+        architecture = json.loads(metadata["architecture"])
+        del architecture["samples"]
+        metadata["architecture"] = json.dumps(architecture)
+
+    homography_layer().save_pretrained(tmp_path / "own.safetensors")
+    rewrite_weights(tmp_path / "own.safetensors", drop)
+    assert kln.LearnedHomography.from_pretrained(tmp_path / "own.safetensors").samples == 64
+
+
 @both
 def test_starts_from_an_eight_point_estimator(kind):
     eight = kln.LearnedEightPoint.from_pretrained("robust-tiny")
@@ -429,8 +466,9 @@ def test_wrong_input_of_a_homography():
     points = torch.rand(2, 8, 2)
     with pytest.raises(ValueError, match=r"scores .* got 2 to 2"):
         homography_layer()(points, points, scores=torch.full((2, 8), 2.0))
-    with pytest.raises(ValueError, match="refine_steps must be"):
-        kln.LearnedHomography(refine_steps=-1)
+    for name in ("refine_steps", "samples"):
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            kln.LearnedHomography(**{name: -1})
 
 
 def test_wrong_options():
