@@ -52,7 +52,7 @@ class FundamentalRefinement(Refinement):
     ) -> None:
         super().__init__(model, problem, frame)
         self.training = training
-        self.easy: Tensor | None = None
+        self.few_outliers: Tensor | None = None
         # A traced program serves sets of any size.
         self.samples = samples if torch.compiler.is_compiling() or self.x1.shape[-1] >= MIN_MATCHES else 0
 
@@ -62,8 +62,8 @@ class FundamentalRefinement(Refinement):
         There minimal samples find what the other stages would.
         """
         if not self.training and self.samples:
-            self.easy = few_outliers(logits, None if self.weights is None else self.weights > 0)
-        return self.easy
+            self.few_outliers = few_outliers(logits, None if self.weights is None else self.weights > 0)
+        return self.few_outliers
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
         """Return the matrices after so many steps; in the last stage, searched sets take some from their best one.
@@ -75,13 +75,13 @@ class FundamentalRefinement(Refinement):
         weights = probability if self.weights is None else probability * self.weights
         evidence, mean = Evidence.from_points(self.x1, self.x2), geometric_scale(weights, self.model.dof, SQUARE_FLOOR)
         own = M
-        if self.easy is not None and not is_known_true(~self.easy.any()):
+        if self.few_outliers is not None and not is_known_true(~self.few_outliers.any()):
             with torch.no_grad():
                 state, square = self.model.state(M), FIRST_SCALE**2
                 own = descend(evidence, state, weights[:, None], lambda s: square * mean(s), FIRST_STEPS).matrix()
-        if self.easy is None or not is_known_true(self.easy.all()):
+        if self.few_outliers is None or not is_known_true(self.few_outliers.all()):
             damped = super().optimize(M, probability, steps, last)
-            own = damped if self.easy is None else torch.where(self.easy[:, None, None], own, damped)
+            own = damped if self.few_outliers is None else torch.where(self.few_outliers[:, None, None], own, damped)
         with torch.no_grad():
             square_mean = mean(evidence.squares(own[:, None])[0])
             best = self._most_consistent(evidence, torch.stack([own, M], 1), weights, COMPARED_SCALE**2 * square_mean)

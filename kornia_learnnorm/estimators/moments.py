@@ -75,7 +75,7 @@ class Evidence(NamedTuple):
 
         Of weights times gradient factors, and of squared distances, both (B, S, N).
         """
-        M = ((self.rows[:, None] * share[:, :, None]) @ self.rows.mT[:, None]).flatten(0, 1)
+        M = self.moments(share).flatten(0, 1)
         trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
         points1, points2 = ((share * squares) @ self.products.mT).view(-1, 2, 3, 3).unbind(1)
         flat = _FLAT.to(M)

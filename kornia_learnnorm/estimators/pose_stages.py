@@ -112,7 +112,7 @@ def run_pose_stages(
     share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
     options = weights, torch.where(settled[:, None], SETTLED_SCALE, LAST_SCALE * scale), unit, refine_steps
     state = _reweight(evidence, state, share, *options)
-    if drawn:
+    if not detach_stages:
         state = _leave_cameras(evidence, model, state, share, *options)
     # A settled set has gone to the last stage at once.
     states = [state.where(settled, other) for other in states]
