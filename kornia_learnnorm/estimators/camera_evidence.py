@@ -36,7 +36,7 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     F_mat = state.matrix()
     squares, factor = (value[:, 0] for value in evidence.squares(F_mat[:, None]))
     inner = weights * UNROLLED_LOSS(squares / square_scale)[1]
-    M, X = evidence.forms((inner * factor)[:, None], squares[:, None])
+    M, difference = evidence.forms((inner * factor)[:, None], squares[:, None])
     cost = (inner * squares).sum(1)
     free = torch.linalg.matrix_norm(F_mat, keepdim=True) * Fundamental().state(F_mat).tangents()
     tangents = state.tangents()
@@ -45,7 +45,7 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     scale = cost / safe_divisor((e.mT @ M @ e)[:, 0, 0])
     gains, variances = [], []
     for D, steps in ((tangents, torch.eye(Essential.dof).to(pose)), (free, pose)):
-        normal, gradient = normal_equations(M, M - X, D, e)
+        normal, gradient = normal_equations(M, difference @ e, D)
         inverse = torch.linalg.inv_ex(normal)[0]
         gains.append((gradient.mT @ inverse @ gradient)[:, 0, 0] * scale)
         variances.append((steps @ inverse @ steps.mT).diagonal(dim1=-2, dim2=-1).sum(-1))

@@ -154,6 +154,6 @@ class HomographyRefinement(Refinement):
         difference = moments - held.flatten(4, 5).flatten(2, 3)
         state = UnitMatrix(M.flatten(0, 1).mT)  # moments are those of row-major entries
         h = M.flatten(0, 1).flatten(1)[..., None]
-        normal, gradient = normal_equations(moments.flatten(0, 1), difference.flatten(0, 1), state.tangents(), h)
+        normal, gradient = normal_equations(moments.flatten(0, 1), difference.flatten(0, 1) @ h, state.tangents())
         step = torch.linalg.solve_ex(normal, gradient)[0][..., 0]
         return torch.unflatten(state.retract(-step).M.mT, 0, M.shape[:2])

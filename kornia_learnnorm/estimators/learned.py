@@ -15,7 +15,13 @@ from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_
 from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
 from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, run_stages
-from kornia_learnnorm.geometry.checks import check_cameras, check_tensor, check_whole_number, read_condition
+from kornia_learnnorm.geometry.checks import (
+    check_cameras,
+    check_tensor,
+    check_whole_number,
+    inference_mode,
+    read_condition,
+)
 from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
@@ -133,7 +139,10 @@ class LearnedLayer(MatchLayer):
         scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
 
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
-            return self._run(problem, scores if scores is None or rows is None else scores[rows])
+            given = scores if scores is None or rows is None else scores[rows]
+            with inference_mode(problem.x1, problem.x2, given):
+                found = self._run(problem, given)
+            return found if torch.is_grad_enabled() else tuple(map(Tensor.clone, found))
 
         def solve_rest(problem: LinearProblem) -> tuple[Tensor, ...]:
             number = self.stages if self.detach_stages else self.stages + 1

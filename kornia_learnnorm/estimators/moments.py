@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
+from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS, choose
 from kornia_learnnorm.geometry.checks import safe_divisor
 
 __all__ = [
@@ -49,39 +49,37 @@ class Evidence(NamedTuple):
 
     def select(self, index: Tensor) -> Evidence:
         """Return the correspondences of given indices (B, M)."""
-        return Evidence(*(value.gather(2, index[:, None].expand(-1, value.shape[1], -1)) for value in self))
+        return Evidence(*[value.gather(2, index[:, None].expand(-1, value.shape[1], -1)) for value in self])
 
     def single(self) -> Evidence:
         """Return the same in float32, which is enough to compare matrices."""
-        return Evidence(*(value.float() for value in self))
+        return Evidence(*map(Tensor.float, self))
 
     def squares(self, F_mat: Tensor) -> tuple[Tensor, Tensor]:
         """Return squared Sampson distances under matrices (B, S, 3, 3) and gradient factors, each (B, S, N).
 
         The factors turn squared algebraic residuals into squared distances.
         """
-        forms = torch.stack([F_mat[:, :, :2].mT @ F_mat[:, :, :2], F_mat[..., :2] @ F_mat[..., :2].mT], 2).flatten(2)
-        norms = forms @ self.products
-        floor = NORMAL_FLOOR**2 * F_mat.square().sum((2, 3))[..., None] + torch.finfo(norms.dtype).tiny
-        factor = 1 / (norms + floor)
-        return (F_mat.mT.flatten(2) @ self.rows).square() * factor, factor
+        e = F_mat.mT.flatten(2)
+        forms = (e[..., None] * e[..., None, :]).flatten(2) @ _FORMS.mT.to(e)
+        factor = (forms @ self.products + torch.finfo(e.dtype).tiny).reciprocal()
+        return (e @ self.rows).square() * factor, factor
 
     def losses(self, F_mat: Tensor, square_scale: Tensor) -> Tensor:
         """Return Geman and McClure's loss (B, S, N) under matrices (B, S, 3, 3), of a squared scale (B, S or 1, 1)."""
         return UNROLLED_LOSS(self.squares(F_mat)[0] / square_scale.to(F_mat))[0]
 
     def forms(self, share: Tensor, squares: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the matrices M and X of a step (:func:`descend`) over the trace of M, each (B S, 9, 9).
+        """Return the matrices M and M - X of a step (:func:`descend`) over the trace of M, each (B S, 9, 9).
 
         Of weights times gradient factors, and of squared distances, both (B, S, N).
         """
         M = self.moments(share).flatten(0, 1)
         trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
-        points1, points2 = ((share * squares) @ self.products.mT).view(-1, 2, 3, 3).unbind(1)
-        flat = _FLAT.to(M)
-        # Kronecker products: the normal of x1's line is the first two rows of F x1, that of x2's the first columns.
-        X = points1[:, :, None, :, None] * flat[:, None] + flat[:, None, :, None] * points2[:, None, :, None]
-        return M / (trace + (trace == 0)), X.view(-1, 9, 9) / (trace + (trace == 0))
+        scale = (trace + (trace == 0)).reciprocal()
+        M = M * scale
+        points = ((share * squares) @ self.products.mT).view(-1, 1, 18) * scale
+        return M, M - torch.unflatten(points @ _FORMS.to(M), 2, (9, 9))[:, 0]
 
     def moments(self, weights: Tensor) -> Tensor:
         """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9)."""
@@ -114,27 +112,31 @@ def descend(
     F_mat = state.matrix()
     for _ in range(steps):
         squares, factor = evidence.squares(torch.unflatten(F_mat, 0, (-1, weights.shape[1])))
-        M, X = evidence.forms(weights * UNROLLED_LOSS(squares / square_scale(squares))[1] * factor, squares)
-        difference, e = M - X, F_mat.mT.reshape(-1, 9, 1)
-        normal, gradient = normal_equations(M, difference, state.tangents(), e)
+        scale = square_scale(squares)
+        slope = (scale / (scale + squares)).square()  # of Geman and McClure's loss
+        M, difference = evidence.forms(weights * slope * factor, squares)
+        e = F_mat.mT.reshape(-1, 9, 1)
+        pull = difference @ e
+        normal, gradient = normal_equations(M, pull, state.tangents())
         moved = state.retract(-relaxation * torch.linalg.solve_ex(normal, gradient)[0][..., 0])
         moved_F = moved.matrix()
         new = moved_F.mT.reshape(-1, 9, 1)
         # A step at the optimum, whose derivative is the optimum's, may raise the cost by rounding.
-        lower = new.mT @ difference @ new <= e.mT @ difference @ e + torch.finfo(M.dtype).eps
-        tensors = []
-        for value, old in zip(moved, state, strict=True):
-            tensors.append(torch.where(lower.view(-1, *[1] * (value.ndim - 1)), value, old))
-        state, F_mat = type(state)(*tensors), torch.where(lower, moved_F, F_mat)
+        lower = new.mT @ difference @ new <= e.mT @ pull + torch.finfo(M.dtype).eps
+        state, F_mat = choose(lower, moved, state), torch.where(lower, moved_F, F_mat)
     return state
 
 
-def normal_equations(M: Tensor, difference: Tensor, tangents: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal matrices (B, P, P) of steps along tangents, a little damped, and the gradients (B, P, 1)."""
-    normal = tangents.mT @ M @ tangents
+def normal_equations(M: Tensor, pull: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal matrices (B, P, P) of steps along tangents, a little damped, and the gradients (B, P, 1).
+
+    ``pull`` (B, 9, 1) is half of the derivative of the cost by the entries.
+    """
+    along = tangents.mT
+    normal = along @ M @ tangents
     damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
     eye = torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
-    return normal + damping * eye, tangents.mT @ (difference @ e)
+    return normal + damping * eye, along @ pull
 
 
 def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float) -> Callable[[Tensor], Tensor]:
@@ -166,7 +168,7 @@ def least_cost(M: Tensor, real: Tensor, losses: Tensor, weights: Tensor, number:
 def pick(state: Any, index: Tensor, number: int) -> Any:
     """Return, of ``number`` states of each set, those of given indices (B,)."""
     rows = index + number * torch.arange(index.shape[0], device=index.device)
-    return type(state)(*(value[rows] for value in state))
+    return type(state)(*[value[rows] for value in state])
 
 
 def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int) -> tuple[Tensor, Tensor]:
@@ -207,4 +209,18 @@ def evenly_ranked(order: Tensor, most: int) -> Tensor:
 EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.0969815577985598}
 
 
-_FLAT = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))
+def _normal_forms() -> Tensor:
+    r"""Return the matrix (18, 81) from products :math:`x_1 x_1^\top, x_2 x_2^\top` to :math:`B` of :math:`e^\top B e`.
+
+    Of column-major entries :math:`e` of a matrix, the form is the sum of the squared norms of the normals of both lines
+    and a small share of the squared norm of the matrix.
+    """
+    eye, flat = torch.eye(3, dtype=torch.float64), torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))
+    normals2 = torch.einsum("pa,qb,kl->pqakbl", eye, eye, flat)  # F_{1:2} x1
+    normals1 = torch.einsum("ab,pk,ql->pqakbl", flat, eye, eye)  # (F^T)_{1:2} x2
+    forms = torch.stack([normals2, normals1]).view(2, 3, 3, 81)
+    forms[:, 2, 2] += NORMAL_FLOOR**2 / 2 * torch.eye(9, dtype=torch.float64).flatten()  # the third coordinate is one
+    return forms.view(18, 81)
+
+
+_FORMS = _normal_forms()

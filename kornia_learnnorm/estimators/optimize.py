@@ -21,6 +21,7 @@ __all__ = [
     "Optimum",
     "RobustCost",
     "attach_gradient",
+    "choose",
     "differentiable_state",
     "minimize",
     "refine_unrolled",
@@ -204,15 +205,20 @@ def refine_unrolled(model: TwoViewModel, x1: Tensor, x2: Tensor, M: Tensor, weig
         distance, J = distance / scale, J / scale[..., None]
         new_total, new_normal, new_gradient, _ = _normal_equations(cost, distance, J, moved.tangents())
         better = (new_total < total)[:, None]  # false where it is NaN
-        tensors = []
-        for new, old in zip(moved, state, strict=True):
-            tensors.append(torch.where(better.view(-1, *[1] * (new.ndim - 1)), new, old))
-        state = type(state)(*tensors)
+        state = choose(better[:, 0], moved, state)
         total, gradient = torch.where(better[:, 0], new_total, total), torch.where(better, new_gradient, gradient)
         normal = torch.where(better[..., None], new_normal, normal)
         damping = torch.where(better, 0.1 * damping, 10 * damping)
     refined: Tensor = state.matrix()
     return refined
+
+
+def choose(chosen: Tensor, states: Any, others: Any) -> Any:
+    """Return the states of a manifold where chosen, (B,) bool, else the other ones."""
+    tensors = []
+    for own, other in zip(states, others, strict=True):
+        tensors.append(torch.where(chosen.view(-1, *[1] * (own.ndim - 1)), own, other))
+    return type(states)(*tensors)
 
 
 def differentiable_state(model: TwoViewModel, M: Tensor) -> Any:

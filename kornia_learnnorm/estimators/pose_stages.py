@@ -26,7 +26,7 @@ from kornia_learnnorm.estimators.moments import (
     least_cost,
     pick,
 )
-from kornia_learnnorm.estimators.optimize import differentiable_state
+from kornia_learnnorm.estimators.optimize import choose, differentiable_state
 from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.geometry.checks import is_known_true
 from kornia_learnnorm.geometry.five_point import essential_in_span
@@ -115,7 +115,7 @@ def run_pose_stages(
     if not detach_stages:
         state = _leave_cameras(evidence, model, state, share, *options)
     # A settled set has gone to the last stage at once.
-    states = [state.where(settled, other) for other in states]
+    states = [choose(settled, state, other) for other in states]
     left = len(networks) - len(states)
     return states + left * [state], found + (len(networks) - len(found)) * found[-1:]
 
@@ -127,15 +127,6 @@ def _rays(frame: CommonFrame, model: Essential, x1: Tensor, x2: Tensor) -> Tenso
     rays = rays[:, :, :2] / rays[:, :, 2:]
     unit = (frame.inverse[:, :1, :1] / 100).log().expand(-1, 1, rays.shape[-1])
     return torch.cat([rays.flatten(1, 2), unit], 1).mT
-
-
-def _suggested(evidence: Evidence, model: Essential, weights: Tensor, before: Candidates | None) -> Candidates:
-    """Return the matrices of moments under weights (B, S, N) and those of the stage before."""
-    found = _span_moments(evidence, model, weights)
-    if before is None:
-        return found
-    E_mat, real = (torch.cat(pair, 1) for pair in zip(found, before, strict=True))
-    return E_mat, real
 
 
 def _losses(evidence: Evidence, model: Essential, E_mat: Tensor, scale: Tensor) -> Tensor:
@@ -153,7 +144,8 @@ def _likeliest(
     before: Candidates | None,
 ) -> Calibrated:
     """Return the states of least weighted cost among those that the weights suggest."""
-    E_mat, real = _suggested(evidence, model, suggested[:, None], before)
+    spans = _moment_spans(evidence, model, suggested[:, None])
+    E_mat, real = _suggested(spans, _in_spans(spans), before)
     losses = _losses(evidence, model, E_mat, EARLY_PIXELS / unit)
     return model.calibrated(least_cost(E_mat, real, losses, weights, 1)[:, 0])
 
@@ -174,20 +166,22 @@ def _most_consistent(
     are fitted to all matches. A match behind a camera, (B, N) bool, costs as much as one far away.
     """
     present, scale = (weights > 0).to(weights), LAST_PIXELS / unit
-    E_mat, real = _suggested(evidence, model, torch.stack([suggested, present], 1), before)
-    E_mat = least_cost(E_mat, real, _losses(evidence, model, E_mat, scale), present, 2)
-    if samples:
-        # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
-        order = weights.argsort(dim=1, descending=True, stable=True)
-        basis, determined = draw_samples(evidence, weights, order, samples, Essential.sample_size)
-        inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (model.C1, model.C2))
-        basis = inverse2.mT[:, None] @ basis.reshape(-1, 4 * samples, 3, 3) @ inverse1[:, None]
-        drawn, real = essential_in_span(basis.reshape(-1, 4, 3, 3))
-        drawn = drawn.view(-1, 10 * samples, 3, 3)
-        real = (real & determined[:, None]).view(-1, 10 * samples)
-        some = evenly_ranked(order, MAX_SCORED)
-        losses = _losses(evidence.select(some), model, drawn, scale)
-        E_mat = torch.cat([E_mat, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
+    # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
+    order = weights.argsort(dim=1, descending=True, stable=True)
+    few = (samples + 1) // 2  # are enough for a settled set
+    samples = few if is_known_true(settled.all()) else samples
+    drawn, used = _sample_spans(evidence, model, weights, order, samples)
+    used = used & (~settled[:, None] | (torch.arange(samples, device=settled.device) < few))
+    spans = _moment_spans(evidence, model, torch.stack([suggested, present], 1))
+    found, real = _in_spans(torch.cat([spans, drawn], 1))
+    number = 10 * spans.shape[1]
+    E_mat, drawn = found[:, :number], found[:, number:]
+    E_mat, own_real = _suggested(spans, (E_mat, real[:, :number]), before)
+    E_mat = least_cost(E_mat, own_real, _losses(evidence, model, E_mat, scale), present, 2)
+    real = real[:, number:] & used.repeat_interleave(10, 1)
+    some = evenly_ranked(order, MAX_SCORED)
+    losses = _losses(evidence.select(some), model, drawn, scale)
+    E_mat = torch.cat([E_mat, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
     number = E_mat.shape[1]
     repeated = Essential(*(C.repeat_interleave(number, 0) for C in (model.C1, model.C2)))
     state, square = repeated.calibrated(E_mat.flatten(0, 1)), scale.square()[:, None]
@@ -195,7 +189,7 @@ def _most_consistent(
     options = present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION
     state = descend(evidence, state, *options)
     if not is_known_true(settled.all()):
-        state = state.where(settled.repeat_interleave(number, 0), descend(evidence, state, *options))
+        state = choose(settled.repeat_interleave(number, 0), state, descend(evidence, state, *options))
     losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square)
     cost = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0]
     best = cost.argmin(1)
@@ -221,18 +215,38 @@ def _in_front(evidence: Evidence, state: Calibrated, weights: Tensor, number: in
     return front.gather(2, best.expand(-1, -1, 1, front.shape[-1]))[:, :, 0]
 
 
-def _span_moments(evidence: Evidence, model: Essential, weights: Tensor) -> Candidates:
-    """Return the matrices (B, 11 S, 3, 3) that moments under weights (B, S, N) suggest, and which of them are real."""
+def _moment_spans(evidence: Evidence, model: Essential, weights: Tensor) -> Tensor:
+    """Return the four likeliest matrices of moments under weights (B, S, N), (B, S, 4, 3, 3), the likeliest last."""
     carry = torch.einsum("bik,bjl->bklij", model.C1, model.C2)  # of the entries of E to those of F
     carry = carry.flatten(3, 4).flatten(1, 2)[:, None]
-    moments = carry.mT @ evidence.moments(weights) @ carry
-    basis = torch.linalg.eigh(moments.flatten(0, 1))[1][..., :4].flip(-1).mT
-    basis = torch.unflatten(basis, -1, (3, 3)).mT
-    E_mat, real = essential_in_span(basis)
-    nearest = nearest_essential(basis[:, 3])[:, None]
-    E_mat, real = torch.cat([E_mat, nearest], 1), torch.cat([real, torch.ones_like(real[:, :1])], 1)
-    number = 11 * weights.shape[1]
-    return E_mat.view(-1, number, 3, 3), real.view(-1, number)
+    basis = torch.linalg.eigh(carry.mT @ evidence.moments(weights) @ carry)[1][..., :4].flip(-1).mT
+    return torch.unflatten(basis, -1, (3, 3)).mT
+
+
+def _sample_spans(
+    evidence: Evidence, model: Essential, weights: Tensor, order: Tensor, number: int
+) -> tuple[Tensor, Tensor]:
+    """Return the null spaces of minimal samples, (B, S, 4, 3, 3), and which of them are not larger, (B, S) bool."""
+    spans, determined = draw_samples(evidence, weights, order, number, Essential.sample_size)
+    inverse1, inverse2 = (torch.linalg.inv_ex(C)[0][:, None, None] for C in (model.C1, model.C2))
+    spans, determined = (torch.unflatten(value, 0, (order.shape[0], number)) for value in (spans, determined))
+    return inverse2.mT @ spans @ inverse1, determined
+
+
+def _in_spans(spans: Tensor) -> Candidates:
+    """Return the essential matrices in spans of four matrices (B, S, 4, 3, 3), (B, 10 S, 3, 3)."""
+    E_mat, real = essential_in_span(spans.flatten(0, 1))
+    E_mat, real = (torch.unflatten(value, 0, spans.shape[:2]).flatten(1, 2) for value in (E_mat, real))
+    return E_mat, real
+
+
+def _suggested(spans: Tensor, found: Candidates, before: Candidates | None) -> Candidates:
+    """Return the matrices found in spans, those nearest to the likeliest ones, and those of the stage before."""
+    nearest = nearest_essential(spans[:, :, 3].flatten(0, 1)).view_as(spans[:, :, 3])
+    candidates = [found, (nearest, torch.ones_like(nearest[..., 0, 0], dtype=torch.bool))]
+    candidates += [] if before is None else [before]
+    E_mat, real = (torch.cat(values, 1) for values in zip(*candidates, strict=True))
+    return E_mat, real
 
 
 def _reweight(
@@ -269,5 +283,5 @@ def _leave_cameras(
     if is_known_true(~left.any()):
         return state
     free = _reweight(evidence, Fundamental().state(state.matrix()), weights, inliers, scale, unit, steps)
-    nearest: Calibrated = differentiable_state(model, free.matrix())
-    return nearest.where(left, state)
+    nearest: Calibrated = choose(left, differentiable_state(model, free.matrix()), state)
+    return nearest

@@ -16,7 +16,7 @@ from kornia_learnnorm.estimators.pose_stages import (
     POSE_RESIDUAL_FEATURES,
     run_pose_stages,
 )
-from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number
+from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, inference_mode
 from kornia_learnnorm.geometry.dlt import MIN_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.pose import choose_pose
@@ -235,7 +235,8 @@ class LearnedRelativePose(LearnedLayer):
         C1, C2 = (torch.where(rows[..., None], K, eye) for K in (K1, K2))
         settle = self.samples > 0 and not (self.training or self.detach_stages)
         options = self.refine_steps, self.samples, self.detach_stages, settle
-        states, logits = run_pose_stages(self.networks, solved, C1, C2, scores, *options)
+        with inference_mode(solved.x1, solved.x2, C1, C2, scores):
+            states, logits = run_pose_stages(self.networks, solved, C1, C2, scores, *options)
         sideways = Essential(eye[None], eye[None]).calibrated(
             p1.new_tensor(self.model.preferred).view(1, 3, 3).expand(p1.shape[0], -1, -1)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -19,6 +20,7 @@ __all__ = [
     "check_pairs",
     "check_tensor",
     "check_whole_number",
+    "inference_mode",
     "is_known_true",
     "needs_gradient",
     "read_condition",
@@ -174,10 +176,28 @@ def needs_gradient(*values: Tensor | None) -> bool:
     for value in values:
         if value is None:
             continue
-        wrapped = torch._C._functorch.is_functorch_wrapped_tensor(value)  # noqa: SLF001 (there is no public name)
-        if value.requires_grad or wrapped or unpack_dual(value).tangent is not None:  # type: ignore[no-untyped-call]
+        if value.requires_grad or _is_traced(value):
             return True
     return False
+
+
+def inference_mode(*values: Tensor | None) -> AbstractContextManager[object]:
+    """Return PyTorch's inference mode, in which operations cost less, where nobody can ask for derivatives by a tensor.
+
+    What is made in it must be cloned outside of it before it leaves a layer.
+    """
+    if torch.is_grad_enabled() or torch.compiler.is_compiling():
+        return nullcontext()
+    for value in values:
+        if value is not None and _is_traced(value):
+            return nullcontext()
+    return torch.inference_mode()
+
+
+def _is_traced(value: Tensor) -> bool:
+    """Return whether a transform such as ``vmap`` or forward-mode differentiation sees what becomes of a tensor."""
+    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(value)  # noqa: SLF001 (there is no public name)
+    return wrapped or unpack_dual(value).tangent is not None  # type: ignore[no-untyped-call]
 
 
 def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:

@@ -91,13 +91,6 @@ class Calibrated(NamedTuple):
         """Return the essential matrices, (B, 3, 3)."""
         return Rank2(self.axes, self.A).matrix()
 
-    def where(self, chosen: Tensor, other: Calibrated) -> Calibrated:
-        """Return these states where chosen (B,), else the other ones."""
-        found = []
-        for own, others in zip(self, other, strict=True):
-            found.append(torch.where(chosen.view(-1, *[1] * (own.ndim - 1)), own, others))
-        return Calibrated(*found)
-
     def matrix(self) -> Tensor:
         """Return the fundamental matrices, (B, 3, 3)."""
         return self.C2.mT @ self.essential() @ self.C1

@@ -181,7 +181,8 @@ class Rank2(NamedTuple):
 
     def matrix(self) -> Tensor:
         """Return the matrices themselves, (B, 3, 3)."""
-        return self.axes[:, 0, :, :2] @ self.A @ self.axes[:, 1, :, :2].mT
+        U, V = self.axes[..., :2].unbind(1)
+        return U @ self.A @ V.mT
 
     def tangents(self) -> Tensor:
         """Return the derivatives (B, 9, 7) of the matrices' column-major entries by a step."""
@@ -198,9 +199,9 @@ class Rank2(NamedTuple):
         # Cayley's map agrees with the exponential to second order and has no sine.
         S = torch.unflatten(tilt @ _SKEW.to(a), -1, (3, 3))
         square = S @ S
-        rotation = (S + square / 2) / (1 - square[..., 2:, 2:] / 4)
-        axes = self.axes + self.axes @ rotation
-        return Rank2(axes, torch.unflatten(normalize(turned, dim=-1), -1, (2, 2)))
+        rotation = torch.add(S, square, alpha=0.5) / (1 - square[..., 2:, 2:] / 4)
+        unit = turned / torch.linalg.vector_norm(turned, dim=-1, keepdim=True)  # at least one: turns are orthogonal
+        return Rank2(self.axes + self.axes @ rotation, torch.unflatten(unit, -1, (2, 2)))
 
 
 def _turns(a: Tensor) -> Tensor:

@@ -12,8 +12,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import kornia_learnnorm
 from kornia_learnnorm import EightPoint, Hartley, LearnedEightPoint, LearnedNormalizer, ReweightedWhitening, Whitening
 
-READS = ("_local_scalar_dense", "nonzero")  # for which a GPU would wait
+READS = ("_local_scalar_dense", "is_nonzero", "nonzero")  # for which a GPU would wait
+# By both of their names: in inference mode, operations arrive before they are taken apart.
 FACTORISATIONS = ("linalg_lu_factor_ex", "_linalg_eigh", "_linalg_svd", "linalg_qr", "_linalg_det", "linalg_inv_ex")
+FACTORISATIONS += ("linalg_eigh", "linalg_svd", "linalg_det")
 
 
 def python_calls(function) -> tuple[int, int]:
@@ -38,7 +40,7 @@ def python_calls(function) -> tuple[int, int]:
     ("layer", "num_points", "most", "files"),
     [
         (EightPoint(), 8, 35, 6),
-        (LearnedEightPoint.from_pretrained(), 50, 240, 17),  # sets of few outliers, which leave stages out
+        (LearnedEightPoint.from_pretrained(), 50, 228, 17),  # sets of few outliers, which leave stages out
         (LearnedEightPoint.from_pretrained().train(), 50, 438, 17),
     ],
 )
@@ -72,8 +74,8 @@ class Operations(TorchDispatchMode):
         (EightPoint(ReweightedWhitening()), 8, 1375, 1),
         (EightPoint(LearnedNormalizer.from_pretrained()), 8, 1855, 1),
         (EightPoint(Hartley()), 128, 295, 1),
-        (LearnedEightPoint.from_pretrained(), 128, 4200, 6),
-        (LearnedEightPoint.from_pretrained().train(), 128, 8700, 10),
+        (LearnedEightPoint.from_pretrained(), 128, 2300, 6),
+        (LearnedEightPoint.from_pretrained().train(), 128, 5500, 10),
     ],
 )
 def test_operations_of_a_forward_pass(layer, num_points, most, factorisations):
