@@ -9,10 +9,12 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from kornia_learnnorm.data.sets import MatchSets
-from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner, RefinedMatches
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.ransac.ransac import RANSAC
 from lightning_modules.task import EstimatorTask, Median, adamw, cameras_of
 
 TRUE_MATCH = 4.0  # pixels, the largest distance of the found matches that the validation's medians are of
@@ -21,16 +23,19 @@ TRUE_MATCH = 4.0  # pixels, the largest distance of the found matches that the v
 class HeldOutLoss(nn.Module):
     r"""Distances of one half of the moved matches under the matrix of the other half, and the reverse.
 
-    The matrix comes from a learned layer, which is not trained and sends gradients to the points of its half. The loss
-    is the mean of :math:`\log(d + f)` with the symmetric epipolar distance :math:`d`, at most ``ceiling``. The
-    predicted noise :math:`\sigma` is trained by the likelihood of :math:`d / 2` under Laplace's distribution.
+    The matrix comes from an estimator, which is not trained and sends gradients to the points of its half. The loss is
+    the mean of :math:`\log(d + f)` with the symmetric epipolar distance :math:`d`, at most ``ceiling``. The predicted
+    noise :math:`\sigma` is trained by the likelihood of :math:`d / 2` under Laplace's distribution.
 
     Args:
-        estimator: :class:`~kornia_learnnorm.LearnedEightPoint`, ``robust-synthetic`` when not given, or
-            :class:`~kornia_learnnorm.LearnedRelativePose`, which needs stores with cameras.
+        estimator: :class:`~kornia_learnnorm.LearnedEightPoint`, ``robust-synthetic`` when not given;
+            :class:`~kornia_learnnorm.LearnedRelativePose`, which needs stores with cameras;
+            :class:`~kornia_learnnorm.EightPoint`; or :class:`~kornia_learnnorm.RANSAC`, which sends no gradients.
         floor: distance :math:`f` in pixels, far below which nothing is gained.
         ceiling: larger distances, pixels, count as this and send no gradient. ValueError unless both are positive.
         scale_weight: weight of the likelihood.
+        detach: hold the matrices fixed, so that no gradient passes the estimator.
+        labels: use the true matrix instead, in sets where it is known.
     """
 
     def __init__(
@@ -39,15 +44,18 @@ class HeldOutLoss(nn.Module):
         floor: float = 0.05,
         ceiling: float = 6.0,
         scale_weight: float = 0.2,
+        detach: bool = False,
+        labels: bool = False,
     ) -> None:
         super().__init__()
         estimator = LearnedEightPoint.from_pretrained() if estimator is None else estimator
-        if not isinstance(estimator, LearnedLayer):
-            raise TypeError(f"expected a learned layer, got {type(estimator).__name__}")
+        if not isinstance(estimator, LearnedEightPoint | LearnedRelativePose | EightPoint | RANSAC):
+            raise TypeError(f"expected an estimator of fundamental matrices, got {type(estimator).__name__}")
         if not min(floor, ceiling) > 0:
             raise ValueError(f"floor and ceiling must be positive, got {floor} and {ceiling}")
-        self.estimator = estimator.requires_grad_(False)
+        self.estimator = estimator.requires_grad_(False).train()  # of no effect, but Lightning warns of other modes
         self.floor, self.ceiling, self.scale_weight = floor, ceiling, scale_weight
+        self.detach, self.labels = detach, labels
 
     def forward(self, sets: MatchSets, moved: RefinedMatches) -> Tensor:
         """Return the loss of each set, (B,), of the moved matches (B, 2 N), in the order of :func:`all_matches`."""
@@ -58,11 +66,25 @@ class HeldOutLoss(nn.Module):
     def distances(self, sets: MatchSets, points1: Tensor, points2: Tensor) -> Tensor:
         """Return the distances (B, 2 N) of both halves of matches, each under the matrix of the other half."""
         halves1, halves2 = (torch.cat([*points.double().chunk(2, 1)]) for points in (points1, points2))  # (2 B, N, 2)
+        F_mat = self._estimate(sets, halves1, halves2).roll(len(points1), 0)
+        if self.detach:
+            F_mat = F_mat.detach()
+        if self.labels and sets.E_mat is not None:
+            inverse1, inverse2 = (torch.linalg.inv_ex(K)[0] for K in cameras_of(sets))
+            true = (inverse2.mT @ sets.E_mat.double() @ inverse1).repeat(2, 1, 1)
+            F_mat = torch.where(true.isfinite().all(-1).all(-1)[:, None, None], true, F_mat)
+        distance = symmetric_epipolar_distance(halves1, halves2, F_mat)
+        return torch.cat([*distance.chunk(2)], 1)
+
+    def _estimate(self, sets: MatchSets, halves1: Tensor, halves2: Tensor) -> Tensor:
+        """Return the matrices (2 B, 3, 3) of halves (2 B, N, 2)."""
+        if isinstance(self.estimator, RANSAC):  # of one pair
+            pairs = zip(halves1.detach(), halves2.detach(), strict=True)
+            return torch.stack([self.estimator(*pair)[0] for pair in pairs])
         calibrated = isinstance(self.estimator, LearnedRelativePose)
         cameras = [K.repeat(2, 1, 1) for K in cameras_of(sets)] if calibrated else []
-        F_mat = self.estimator.estimate(halves1, halves2, *cameras).F_mat
-        distance = symmetric_epipolar_distance(halves1, halves2, F_mat.roll(len(points1), 0))
-        return torch.cat([*distance.chunk(2)], 1)
+        F_mat: Tensor = self.estimator.estimate(halves1, halves2, *cameras).F_mat
+        return F_mat
 
 
 def all_matches(sets: MatchSets) -> tuple[Tensor, Tensor]:
@@ -85,6 +107,7 @@ class RefinerTask(EstimatorTask):
     """
 
     loss: HeldOutLoss
+    trains = (MatchRefiner,)
     errors = ("median_moved",)
 
     def __init__(
@@ -95,16 +118,14 @@ class RefinerTask(EstimatorTask):
         lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
         warm_up: float = 0.05,
     ) -> None:
-        loss = loss or HeldOutLoss()
-        super().__init__(loss.estimator, loss, optimizer, lr_scheduler, warm_up)
-        self.refiner = refiner.train()
+        super().__init__(refiner, loss or HeldOutLoss(), optimizer, lr_scheduler, warm_up)
         for name in ("found", "moved"):
             self.metrics[f"median_{name}"] = Median().set_dtype(torch.float64)
 
     @property
     def trained(self) -> Any:
         """The refiner, whose weights ``from_pretrained`` reads."""
-        return self.refiner
+        return self.estimator
 
     def compute_loss(self, batch: MatchSets) -> Tensor:
         """Return the mean loss of a batch."""
@@ -128,5 +149,5 @@ class RefinerTask(EstimatorTask):
     def _move(self, batch: MatchSets) -> RefinedMatches:
         if batch.image1 is None or batch.image2 is None:
             raise ValueError("a refiner needs sets with images, of ImageSets, got none")
-        moved: RefinedMatches = self.refiner(batch.image1 / 255, batch.image2 / 255, *all_matches(batch))
+        moved: RefinedMatches = self.estimator(batch.image1 / 255, batch.image2 / 255, *all_matches(batch))
         return moved

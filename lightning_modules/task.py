@@ -109,6 +109,7 @@ class EstimatorTask(pl.LightningModule):
             average, since near-degenerate sets have gradients a thousand times the typical one. None for no limit.
     """
 
+    trains: ClassVar[tuple[type[nn.Module], ...]] = (LearnedLayer, EightPoint)
     # Metrics of the validation whose decrease is what the training is for.
     errors: ClassVar = ("log_sed", *(f"median_{name}" for name in SIZES.values()))
 
@@ -122,11 +123,12 @@ class EstimatorTask(pl.LightningModule):
         sample_gradient: float | None = 1.0,
     ) -> None:
         super().__init__()
-        if not isinstance(estimator, LearnedLayer | EightPoint):
-            raise TypeError(f"expected a learned layer or an EightPoint, got {type(estimator).__name__}")
+        if not isinstance(estimator, self.trains):
+            expected = " or ".join(kind.__name__ for kind in self.trains)
+            raise TypeError(f"expected a {expected}, got {type(estimator).__name__}")
         if isinstance(estimator, EightPoint) and not isinstance(estimator.normalizer, LearnedNormalizer):
             raise TypeError(f"expected a LearnedNormalizer in EightPoint, got {type(estimator.normalizer).__name__}")
-        self.estimator: LearnedLayer | EightPoint = estimator.train()  # shipped weights come in evaluation mode
+        self.estimator = cast(LearnedLayer | EightPoint, estimator.train())  # shipped weights come in evaluation mode
         self.loss = loss or SetLoss()
         self.optimizer, self.lr_scheduler = optimizer, lr_scheduler
         self.warm_up, self.sample_gradient = warm_up, sample_gradient

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -128,7 +128,7 @@ class RANSAC(nn.Module):
         distance: Literal["sampson", "symmetric"] = "sampson",
         rank2: Literal["projection", "optimal"] | None = None,
         refine: bool = True,
-        sampler: Callable[..., Sampler] = ProsacSampler,
+        sampler: Callable[..., Any] = ProsacSampler,
         seed: int | None = None,
         model: Literal["fundamental", "homography"] | TwoViewModel = "fundamental",
     ) -> None:

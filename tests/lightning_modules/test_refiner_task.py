@@ -1,6 +1,7 @@
 """Refiners of matches: sets with images from stores, the loss, and a training on rendered pairs by the command line."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from kornia_learnnorm.data.writer import write_store
 from lightning_modules.refiner_task import HeldOutLoss, RefinerTask, all_matches
 
 pytestmark = pytest.mark.usefixtures("program")
+CONFIGS = Path(__file__).parents[2] / "configs"
 WIDTH, HEIGHT = 200, 150
 NOISE = 0.7  # pixels, standard deviation of each coordinate of the second points
 
@@ -96,23 +98,54 @@ def test_images_of_stores(folder, tmp_path):
         source(folder, jitter=-1.0)
 
 
-def test_the_loss_is_that_of_the_other_half(folder):
+@pytest.mark.parametrize("kind", ["learned", "eight-point", "RANSAC"])
+def test_the_loss_is_that_of_the_other_half(folder, kind):
     """Against a computation half by half."""
     sets = source(folder).draw(2, 32, seeded())
     points = all_matches(sets)
     moved = kln.MatchRefiner()(sets.image1 / 255, sets.image2 / 255, *points)
-    layer = kln.LearnedEightPoint.from_pretrained("robust-tiny")
-    loss = HeldOutLoss(layer, scale_weight=0.5)(sets, moved)
+    estimator = kln.LearnedEightPoint.from_pretrained("robust-tiny") if kind == "learned" else kln.EightPoint()
+    if kind == "RANSAC":
+        estimator = kln.RANSAC(inl_th=3.0, seed=0)
+    loss = HeldOutLoss(estimator, scale_weight=0.5)(sets, moved)
     expected = torch.zeros(2).double()
     halves = [[p[:, :32].double() for p in points], [p[:, 32:].double() for p in points]]
     for fit, test in (halves, halves[::-1]):
-        distance = kln.symmetric_epipolar_distance(*test, layer(*fit)).clamp(max=6)
+        pairs = zip(*fit, strict=True)
+        F_mat = torch.stack([estimator(*pair)[0] for pair in pairs]) if kind == "RANSAC" else estimator(*fit)
+        distance = kln.symmetric_epipolar_distance(*test, F_mat).clamp(max=6)
         expected += ((distance + 0.05).log() + 0.5 * 2**0.5 * distance / 2).mean(-1) / 2  # the scale is one
     torch.testing.assert_close(loss.double(), expected, atol=1e-5, rtol=0)
-    with pytest.raises(TypeError, match="expected a learned layer, got EightPoint"):
-        HeldOutLoss(kln.EightPoint())
+
+
+def test_bad_arguments_of_the_loss():
+    with pytest.raises(TypeError, match="expected an estimator of fundamental matrices, got LearnedHomography"):
+        HeldOutLoss(kln.LearnedHomography())
     with pytest.raises(ValueError, match="floor and ceiling"):
-        HeldOutLoss(layer, floor=0.0)
+        HeldOutLoss(floor=0.0)
+
+
+def test_labels_take_the_place_of_matrices_where_they_are_known(folder):
+    sets = source(folder).draw(2, 32, seeded())
+    assert sets.E_mat.isfinite().all()
+    unknown = sets._replace(E_mat=torch.where(torch.tensor([True, False])[:, None, None], sets.E_mat, torch.nan))
+    points = all_matches(sets)
+    found = HeldOutLoss(kln.EightPoint(), labels=True).distances(unknown, *points)
+    torch.testing.assert_close(found[0], true_distance(sets, *points)[0], rtol=1e-3, atol=1e-3)  # cameras are float32
+    without = HeldOutLoss(kln.EightPoint()).distances(sets, *points)
+    torch.testing.assert_close(found[1], without[1])
+    with pytest.raises(ValueError, match="sets with cameras"):
+        HeldOutLoss(labels=True).distances(sets._replace(K1=None), *points)
+
+
+@pytest.mark.parametrize("options", [{}, {"detach": True}, {"estimator": kln.RANSAC(seed=0)}])
+def test_a_fixed_matrix_sends_no_gradient_to_its_own_half(folder, options):
+    sets = source(folder).draw(1, 32, seeded())
+    points1, points2 = all_matches(sets)
+    points1.requires_grad_()
+    HeldOutLoss(**options).distances(sets, points1, points2)[:, :32].sum().backward()  # by the second half's matrix
+    assert points1.grad[:, :32].all(-1).any()
+    assert bool(points1.grad[:, 32:].any()) == (options == {})
 
 
 @pytest.mark.parametrize("calibrated", [False, True])
@@ -123,14 +156,14 @@ def test_gradients_pass_the_layer_and_leave_it(folder, calibrated):
     task = RefinerTask(kln.MatchRefiner(), HeldOutLoss(kind.from_pretrained(name)))
     task.compute_loss(source(folder).draw(2, 16, seeded())).backward()
     assert all(p.grad is None for p in task.loss.estimator.parameters())
-    assert task.refiner.shift.weight.grad.any()
-    assert task.refiner.gates.weight.grad.isfinite().all()
+    assert task.trained.shift.weight.grad.any()
+    assert task.trained.gates.weight.grad.isfinite().all()
     sets = RandomSets([SyntheticSets()], sizes=(16, 16)).draw(0, 0)
     with pytest.raises(ValueError, match="needs sets with images"):
         task.compute_loss(sets)
 
 
-def test_a_training_moves_matches_nearer_to_the_truth(folder, tmp_path, monkeypatch, capsys):
+def test_a_training_moves_matches_nearer_to_the_truth(folder, tmp_path, monkeypatch, capsys, refused):
     """By the command line, with checkpoints, weights, validation and predictions."""
     monkeypatch.setenv("LEARNNORM_DATA", str(folder))
     images = {"paths": [f"{folder}/matches.h5"], "images": [f"{folder}/images"]}
@@ -150,3 +183,6 @@ def test_a_training_moves_matches_nearer_to_the_truth(folder, tmp_path, monkeypa
     assert moved.scale.min() > 0
     assert main(["validate", *options, f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"]) == 0
     assert "val/median_moved" in capsys.readouterr().out
+    for name in ("detached", "eight-point", "labels", "ransac"):
+        loss = ["--config", str(CONFIGS / f"ablations/refiner/{name}.yaml")]
+        refused(["fit", *options, *loss, "--trainer.max_steps=0"], "trainer.max_steps is 0")  # the last that is checked
