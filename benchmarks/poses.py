@@ -16,7 +16,7 @@ import torch
 from results_file import write_csv
 
 from kornia_learnnorm.data.store import read_store
-from kornia_learnnorm.evaluation.robust.robust_estimators import find_estimator, run_estimator
+from kornia_learnnorm.evaluation.robust.robust_estimators import estimator_names, find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import even_pairs, measure, shuffled_pair
 from kornia_learnnorm.evaluation.tables import format_table, names_of
 from kornia_learnnorm.metrics.poses import pose_auc
@@ -33,11 +33,11 @@ THRESHOLD = 1.0  # pixels
 
 
 def find_installed(names: list[str]) -> dict:
-    """Return the estimators whose packages are installed, by their names; print the others."""
+    """Return the estimators whose packages are installed, by their short names; print the others."""
     found = {}
-    for name in names:
+    for name, short in estimator_names(names).items():
         try:
-            found[name] = find_estimator(name)
+            found[short] = find_estimator(name)
         except ImportError as error:
             print(f"left out: {error}")
     return found

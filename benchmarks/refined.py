@@ -7,10 +7,10 @@ matches, ms, of one thread. Lucas-Kanade is OpenCV's, with a window of 15 px, st
 found match stays.
 
     python benchmarks/refined.py STORE.h5 [STORE.h5 ...] --images FOLDER [FOLDER ...] [--pairs 25] [--filtered]
-        [--weights refiner] [--passes 1] [--estimators NAME ...] [--csv FILE]
+        [--weights refiner ...] [--passes 1] [--estimators NAME ...] [--csv FILE]
 
-An estimator is one of learnnorm robust; what is not installed is left out. --csv adds the rows to those of other stores
-in the file.
+Each of several weights has a row. An estimator is one of learnnorm robust; what is not installed is left out. --csv
+adds the rows to those of other stores in the file.
 """
 
 import argparse
@@ -108,15 +108,16 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--images", nargs="+", required=True, help="folders below which the images lie")
     parser.add_argument("--pairs", type=int, default=25, help="of each store, evenly spaced; 0: all")
     parser.add_argument("--filtered", action="store_true", help="matches that pass the ratio test, as for SIFT")
-    parser.add_argument("--weights", default="refiner", help="of a MatchRefiner, by name or a file")
+    parser.add_argument("--weights", nargs="+", default=["refiner"], help="of a MatchRefiner, by name or a file")
     parser.add_argument("--passes", type=int, default=1, help="how often the refiner is applied")
     parser.add_argument("--estimators", nargs="*", default=[*ESTIMATORS])
     parser.add_argument("--csv", help="add the rows to this file")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    move = mover(kln.MatchRefiner.from_pretrained(args.weights), args.passes)
-    movers = {"found": lambda _, pair: (pair.points1, pair.points2), "moved": move, "Lucas-Kanade": track}
+    names = names_of(args.weights) if len(args.weights) > 1 else {args.weights[0]: "moved"}
+    moved = {name: mover(kln.MatchRefiner.from_pretrained(path), args.passes) for path, name in names.items()}
+    movers = {"found": lambda _, pair: (pair.points1, pair.points2), **moved, "Lucas-Kanade": track}
     estimators, protocol = find_installed(args.estimators), "filtered" if args.filtered else "unfiltered"
     header, rows = ["matches", "px", "fit", *estimators, "ms"], []
     for path, name in names_of(args.stores).items():

@@ -216,6 +216,10 @@ def test_refined_matches_beside_found_and_tracked_ones(benchmark, tmp_path):
     assert header == ["store", "matches", "px", "fit", "ground-truth", "ms"]
     assert [row[:2] for row in rows] == [["store", name] for name in ("found", "moved", "Lucas-Kanade")]
     assert rows[0][2:5] == rows[1][2:5]  # untrained, it moves nothing
+    options[3:4] = [str(untrained), "refiner"]
+    refined.main([str(tmp_path / "store.h5"), *options, "--csv", str(tmp_path / "refined.csv")])
+    rows = [line.split(",") for line in (tmp_path / "refined.csv").read_text().splitlines()][1:]
+    assert [row[1] for row in rows] == ["found", "untrained", "refiner", "Lucas-Kanade"]
 
 
 def test_reconstruction(benchmark, real_data, tmp_path, monkeypatch, capsys):

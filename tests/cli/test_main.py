@@ -48,7 +48,9 @@ PAPER_BASE = ("paper-short", "ablations/paper-base")
 ABLATIONS = runs("ablations/*", "ablations/base")
 ABLATIONS |= runs("ablations/loss-[as]*", *PAPER_BASE, prefix="paper-")
 ABLATIONS |= runs("ablations/reduction-log", *PAPER_BASE, prefix="paper-", but=())
-LAYER = runs("ablations/layer/*", "robust", "ablations/layer/base", prefix="layer-")
+SHORTER = {}  # ablations of longer trainings
+for part, whole in {"layer": "robust", "pose": "robust-pose", "refiner": "refiner"}.items():
+    SHORTER |= runs(f"ablations/{part}/*", whole, f"ablations/{part}/base", prefix=f"{part}-")
 TABLE1 = runs("table1/*", "crossview") | runs("table1/paper*", "paper-short")
 RUNS = runs("*", but=(*OF_SETS, "own")) | runs("ablations/base", but=()) | ABLATIONS | TABLE1
 TRAINED = ("crossview", "paper", "transform-paper")
@@ -123,11 +125,12 @@ def settings(node, name=""):
 # Seeds have two settings, the transform of the paper needs three parameters, a source leaves its share.
 TWO = {"seed-1", "seed-2", "transform-paper", "layer-hartley-optimal", "layer-seed-1", "layer-seed-2"}
 TWO |= {f"layer-without-{source}" for source in ("kitti", "photos", "synthetic")}
+TWO |= {"pose-seed-1", "pose-seed-2", "pose-synthetic", "refiner-seed-1", "refiner-xfeat"}
 
 
-@pytest.mark.parametrize("name", ABLATIONS | LAYER)
+@pytest.mark.parametrize("name", ABLATIONS | SHORTER)
 def test_an_ablation_changes_one_thing(name):
-    changed = settings(yaml.safe_load((ABLATIONS | LAYER)[name][-1].read_text()))
+    changed = settings(yaml.safe_load((ABLATIONS | SHORTER)[name][-1].read_text()))
     assert len(changed) == 1 + (name in TWO), changed
 
 
