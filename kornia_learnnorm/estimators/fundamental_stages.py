@@ -24,11 +24,11 @@ from kornia_learnnorm.models.fundamental import Rank2
 
 __all__ = ["FundamentalRefinement"]
 
-COMPARED_SCALE, LAST_SCALE = 1.5, 2.0  # of comparisons and of the last fit, in geometric means of the distances
+COMPARED_SCALE, FIT_SCALE = 2.2, 3.0  # of comparisons and of fits on moments, in geometric means of the distances
 LAST_FLOOR = 0.002  # of the frame's unit, about half a pixel, added to the last scale
 LAST_POWER = 0.2  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
-FIRST_SCALE = 3.0  # of the first fit of settled sets, in geometric means of the distances
 FIRST_STEPS, LOCAL_STEPS = 2, 3  # reweightings of the first fit of settled sets, and of candidates
+DAMPED_STEPS = 3  # of Levenberg-Marquardt before a search, in evaluation
 SEARCH_STEPS = 5  # of the last stage's steps that a search takes the place of
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
@@ -74,13 +74,17 @@ class FundamentalRefinement(Refinement):
             return super().optimize(M, probability, steps, last)
         weights = probability if self.weights is None else probability * self.weights
         evidence, mean = Evidence.from_points(self.x1, self.x2), geometric_scale(weights, self.model.dof, SQUARE_FLOOR)
+        present = weights > 0
+        few = (present.sum(1) < MIN_MATCHES) | ((probability * present).sum(1) < MIN_INLIERS)
         own = M
         if self.few_outliers is not None and not is_known_true(~self.few_outliers.any()):
             with torch.no_grad():
-                state, square = self.model.state(M), FIRST_SCALE**2
+                state, square = self.model.state(M), FIT_SCALE**2
                 own = descend(evidence, state, weights[:, None], lambda s: square * mean(s), FIRST_STEPS).matrix()
         if self.few_outliers is None or not is_known_true(self.few_outliers.all()):
-            damped = super().optimize(M, probability, steps, last)
+            damped = super().optimize(M, probability, steps if self.training else min(DAMPED_STEPS, steps), last)
+            if not (self.training or is_known_true(~few.any())):
+                damped = torch.where(few[:, None, None], super().optimize(M, probability, steps, last), damped)
             own = damped if self.few_outliers is None else torch.where(self.few_outliers[:, None, None], own, damped)
         with torch.no_grad():
             square_mean = mean(evidence.squares(own[:, None])[0])
@@ -91,12 +95,10 @@ class FundamentalRefinement(Refinement):
 
         def square_scale(squares: Tensor) -> Tensor:
             """Return a scale that moves along, so that derivatives don't depend on where the fit began."""
-            return LAST_SCALE**2 * mean(squares) + LAST_FLOOR**2
+            return FIT_SCALE**2 * mean(squares) + LAST_FLOOR**2
 
         steps = max(1, steps - SEARCH_STEPS)
         fitted = descend(evidence, state, power[:, None], square_scale, steps, RELAXATION).matrix()
-        present = weights > 0
-        few = (present.sum(1) < MIN_MATCHES) | ((probability * present).sum(1) < MIN_INLIERS)
         return torch.where(few[:, None, None], own, fitted)
 
     def _most_consistent(self, evidence: Evidence, M: Tensor, weights: Tensor, square_scale: Tensor) -> Rank2:
