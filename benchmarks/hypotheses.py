@@ -11,13 +11,13 @@ groups of k samples and over image pairs, pixels; pairs with fewer than 16 groun
 A solver is seven-point, which is Kornia's, or a method of learnnorm evaluate.
 """
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar.fundamental import run_7point
+from shared import make_parser
 from torch import Tensor
 
 import kornia_learnnorm as kln
@@ -87,7 +87,7 @@ def errors_of(path: str, protocol: str, name: str, pairs: int, samples: int, num
 
 def main() -> None:
     """Measure and print a table per store."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("stores", nargs="+", help="stores of correspondences with ground truth")
     parser.add_argument("--pairs", type=int, default=12, help="image pairs of each store; 0: all")
     parser.add_argument("--samples", type=int, default=10_000, help="minimal samples of each pair")

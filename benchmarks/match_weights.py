@@ -10,8 +10,6 @@ The folder of the test, such as $LEARNNORM_DATA/images/photographs, has a file c
 camera_to_world.
 """
 
-import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -22,11 +20,11 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.data.images import read_colour
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.geometry.pose import relative_pose
-from kornia_learnnorm.metrics.poses import pose_auc, pose_error
+from kornia_learnnorm.metrics.poses import pose_error
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import finetune_lightglue as example
-from results_file import write_csv
+from shared import auc_cells, make_parser, photograph_pairs, write_csv
 
 HEADER = ["matches", "log px, held out", "layer AUC 5", "10", "20", "RANSAC AUC 5", "10", "20"]
 SEEDS = 3
@@ -34,17 +32,11 @@ SEEDS = 3
 
 def read_test(lightglue: nn.Module, folder: Path) -> list[example.Pair]:
     """Match the image pairs of a folder with cameras and poses."""
-    cameras = json.loads((folder / "cameras.json").read_text(encoding="utf-8"))
-    names = sorted(cameras)
-    chosen = [pair for gap in (1, 3) for pair in zip(names, names[gap:], strict=False)]
     pairs = []
-    for pair in [pair for pair in chosen if len({name.split("/")[0] for name in pair}) == 1]:
-        K1, K2, pose1, pose2 = (
-            torch.tensor(cameras[name][key]).double() for key in ("K", "camera_to_world") for name in pair
-        )
-        motion = torch.linalg.solve(pose2, pose1)
-        images = [read_colour(folder / name, 1024) for name in pair]
-        pairs.append(example.match(lightglue, example.features(images, 2000), (K1, K2, motion[:3, :3], motion[:3, 3])))
+    for pair in photograph_pairs(folder, (1, 3)):
+        truth = tuple(map(torch.from_numpy, (pair.frame1.K, pair.frame2.K, *pair.motion)))
+        images = [read_colour(frame.path, 1024) for frame in pair]
+        pairs.append(example.match(lightglue, example.features(images, 2000), truth))
     return pairs
 
 
@@ -65,15 +57,14 @@ def pose_shares(layer: nn.Module, weigh: nn.Module | None, pairs: list[example.P
             near = kln.symmetric_epipolar_distance(x1[None], x2[None], F_mat) < 1
             pose = relative_pose(F_mat, K1[None], K2[None], x1[None], x2[None], near)
             errors[place > 0].append(pose_error(*pose, R[None], t[None]))
-    return [f"{100 * share:.1f}" for found in errors for share in pose_auc(torch.cat(found))]
+    return [cell for found in errors for cell in auc_cells(torch.cat(found))]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, csv="write the table to this file")
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--csv", help="write the table to this file")
     args = parser.parse_args()
     torch.set_num_threads(1)
     layer, lightglue = example.pretrained()
@@ -90,8 +81,7 @@ def main() -> None:
     example.train(layer, weigh, training, args.steps)
     rows.append(row("scores and trained weights"))
     print(format_table(HEADER, rows))
-    if args.csv:
-        write_csv(args.csv, [HEADER, *rows])
+    write_csv(args.csv, [HEADER, *rows])
 
 
 if __name__ == "__main__":

@@ -19,8 +19,6 @@ With --outliers, random matches are mixed into those of the images, with scores 
 gets the first of these shares of outliers, the second the second, and so on, in turn.
 """
 
-import argparse
-import json
 import math
 import sys
 import time
@@ -32,14 +30,14 @@ import cv2
 import numpy as np
 import torch
 from rendered import KINDS, render_kind
-from results_file import write_csv
+from shared import make_parser, write_csv, write_json
 from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld, orbit
 from kornia_learnnorm.data.synthetic.render import RenderedPair
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import atomic_write, write_text
+from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error, rotation_error
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
@@ -118,13 +116,6 @@ def is_determined(points1: Tensor, points2: Tensor) -> bool:
     return bool(mask is None or 1 - mask.mean() >= MIN_PARALLAX)
 
 
-def estimate(case: Case, options: dict[str, Any]) -> PairEstimate:
-    """Return the package's estimate of a pair; raises NoReliableMatrixError where it refuses."""
-    if case.size is None:
-        return estimate_pair(*case.read, **options)
-    return estimate_matches(*case.read, size1=case.size, size2=case.size, **options)
-
-
 def error_of_pose(case: Case, found: PairEstimate) -> float:
     """Return the larger error of rotation and translation, degrees; infinite where one is not defined.
 
@@ -140,12 +131,6 @@ def error_of_pose(case: Case, found: PairEstimate) -> float:
     if found.t is None:
         return math.inf if case.t.any() else rotation_error(found.R, case.R).item()
     return pose_error(found.R, found.t, case.R, case.t).nan_to_num(nan=math.inf).item()
-
-
-def errors_in_pixels(case: Case, found: PairEstimate) -> Tensor:
-    """Return the distances of the exact correspondences to the matrix."""
-    distance = parallax if found.model == "homography" else kln.symmetric_epipolar_distance
-    return distance(case.points1, case.points2, found.matrix.double())
 
 
 def score(case: Case, solve: Callable[[Case], PairEstimate]) -> dict[str, Any]:
@@ -169,7 +154,9 @@ def score(case: Case, solve: Callable[[Case], PairEstimate]) -> dict[str, Any]:
         return record
     record["warnings"] = [str(warning.code) for warning in found.warnings]
     record["matches"], record["inliers"] = len(found.points1), int(found.inliers.sum())
-    record["model"], record["gric"], errors = found.model, found.choice.by_gric, errors_in_pixels(case, found)
+    record["model"], record["gric"] = found.model, found.choice.by_gric
+    distance = parallax if found.model == "homography" else kln.symmetric_epipolar_distance
+    errors = distance(case.points1, case.points2, found.matrix.double())  # of the exact correspondences
     record["pose_error"], record["true_error"] = error_of_pose(case, found), errors.median().item()
     record["predicted_error"] = float(found.predicted_error)
     record["right"] = not record["pose_error"] > MAX_POSE_ERROR
@@ -258,7 +245,8 @@ def failures(records: Iterable[dict[str, Any]]) -> list[str]:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Make the pairs, estimate them, print the tables and write the numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    files = {"json": "write a record of every pair to this file", "csv": "write the table of counts to this file"}
+    parser = make_parser(__doc__, **files)
     parser.add_argument("--pairs", type=int, default=200, help="pairs, shared out evenly among the kinds")
     parser.add_argument("--kinds", nargs="+", choices=[*KINDS, OUTLIERS], default=[*KINDS, OUTLIERS])
     parser.add_argument("--seed", type=int, default=0, help="first seed of each kind")
@@ -269,8 +257,6 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--cameras", action="store_true", help="give the true cameras to the estimator")
     parser.add_argument("--size", type=int, nargs=2, default=[640, 480], help="width and height of the images, pixels")
     parser.add_argument("--cache", type=Path, help="folder that keeps the rendered pairs; empty it for a new renderer")
-    parser.add_argument("--json", help="write a record of every pair to this file")
-    parser.add_argument("--csv", help="write the table of counts to this file")
     options = parser.parse_args(args)
     layer = kln.LearnedEightPoint.from_pretrained(options.weights) if options.estimator == "learned" else None
     if options.cache:
@@ -278,7 +264,9 @@ def main(args: Sequence[str] | None = None) -> None:
 
     def solve(case: Case) -> PairEstimate:
         cameras = {"K1": case.K, "K2": case.K} if options.cameras else {}
-        return estimate(case, {"layer": layer, "model": options.model, **cameras})
+        if case.size is None:
+            return estimate_pair(*case.read, layer=layer, model=options.model, **cameras)
+        return estimate_matches(*case.read, case.size, case.size, layer=layer, model=options.model, **cameras)
 
     records = []
     for index in range(options.pairs):
@@ -294,14 +282,8 @@ def main(args: Sequence[str] | None = None) -> None:
     if wrong := failures(records):
         print("\nWrong without a warning:\n\n" + "\n".join(f"- {line}" for line in wrong))
     print(f"{np.mean([record['seconds'] for record in records]):.2f} s per estimate", file=sys.stderr)
-    if options.csv:
-        write_csv(options.csv, [header, *counts])
-    if options.json:
-        finite = [
-            {name: value if not isinstance(value, float) or math.isfinite(value) else None for name, value in r.items()}
-            for r in records
-        ]
-        write_text(options.json, json.dumps(finite, indent=1, allow_nan=False) + "\n")
+    write_csv(options.csv, [header, *counts])
+    write_json(options.json, records)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ of one thread; learned matrices are estimated 32 sets at once. Thresholds are 2 
 What is not installed is left out.
 """
 
-import argparse
 import importlib
 import time
 from collections.abc import Callable
@@ -19,14 +18,13 @@ import cv2
 import torch
 from kornia.geometry import ransac as kornia_ransac
 from kornia.geometry.homography import find_homography_dlt, find_homography_dlt_iterated
-from results_file import write_csv
+from shared import auc_cells, make_parser, write_csv
 from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic.draws import normal, uniform
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.metrics.poses import pose_auc
 
 THRESHOLD = 2.0  # pixels
 THRESHOLDS = (1, 3, 5)  # of the AUC, pixels
@@ -74,19 +72,18 @@ def find_estimators() -> dict[str, Callable[[Tensor, Tensor], Tensor | None]]:
 
         return estimate
 
-    def one(find: Callable[..., Tensor], *more: object) -> Callable[[Tensor, Tensor], Tensor]:
-        return lambda points1, points2: find(points1[None], points2[None], *more)[0]
+    def one(find: Callable[..., Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
+        return lambda points1, points2: find(points1[None], points2[None])[0]
 
-    kornia, own = (
-        kornia_ransac.RANSAC("homography", inl_th=THRESHOLD, seed=0),
-        kln.RANSAC(model="homography", inl_th=THRESHOLD, seed=0),
-    )
+    def iterated(points1: Tensor, points2: Tensor) -> Tensor:
+        return find_homography_dlt_iterated(points1, points2, torch.ones(points1.shape[:2]))
+
+    kornia = kornia_ransac.RANSAC("homography", inl_th=THRESHOLD, seed=0)
+    own = kln.RANSAC(model="homography", inl_th=THRESHOLD, seed=0)
     found = {
         "kln.find_homography": one(kln.find_homography),
         "kornia-dlt": one(find_homography_dlt),
-        "kornia-dlt-iterated": lambda *points: one(find_homography_dlt_iterated, torch.ones(1, len(points[0])))(
-            *points
-        ),
+        "kornia-dlt-iterated": one(iterated),
         "kornia": lambda points1, points2: kornia(points1.float(), points2.float())[0],
         "opencv-ransac": opencv(cv2.RANSAC),
         "opencv-usac-magsac": opencv(cv2.USAC_MAGSAC),
@@ -124,18 +121,17 @@ def measure(size: int, outliers: float, number: int, estimators: dict, layer: kl
     rows = []
     for name, matrices in solved.items():
         error = torch.tensor([corner_error(*row) for row in zip(matrices, true, corners, strict=True)]).double()
-        cells = [f"{100 * share:.1f}" for share in pose_auc(error, THRESHOLDS)]
-        rows.append([name, f"{error.median().item():.2f}", *cells, f"{1000 * seconds[name] / number:.1f}"])
+        cells = [f"{error.median().item():.2f}", *auc_cells(error, THRESHOLDS)]
+        rows.append([name, *cells, f"{1000 * seconds[name] / number:.1f}"])
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(arguments: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, csv="write all tables to this file")
     parser.add_argument("--sizes", type=int, nargs="+", default=[16, 64, 256, 512])
     parser.add_argument("--outliers", type=float, nargs="+", default=[0.1, 0.5, 0.8])
     parser.add_argument("--sets", type=int, default=32)
-    parser.add_argument("--csv", help="write all tables to this file")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     estimators, layer, rows = find_estimators(), kln.LearnedHomography.from_pretrained(), []
@@ -144,8 +140,7 @@ def main() -> None:
             found = measure(size, outliers, args.sets, estimators, layer)
             print(f"N = {size}, {outliers:.0%} outliers\n\n{format_table(HEADER, found)}\n", flush=True)
             rows += [[f"{outliers:.0%}", str(size), *row] for row in found]
-    if args.csv:
-        write_csv(args.csv, [["outliers", "N", *HEADER], *rows])
+    write_csv(args.csv, [["outliers", "N", *HEADER], *rows])
 
 
 if __name__ == "__main__":

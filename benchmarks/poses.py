@@ -9,17 +9,15 @@ threshold of 1 px, and the scores of the matches where its name ends in +scores.
 An estimator is one of learnnorm robust; what is not installed is left out.
 """
 
-import argparse
 import math
 
 import torch
-from results_file import write_csv
+from shared import auc_cells, make_parser, write_csv
 
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.evaluation.robust.robust_estimators import estimator_names, find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import even_pairs, measure, shuffled_pair
 from kornia_learnnorm.evaluation.tables import format_table, names_of
-from kornia_learnnorm.metrics.poses import pose_auc
 
 ESTIMATORS = (
     *("opencv-usac-magsac", "poselib", "pysuperansac", "kornia", "RANSAC"),
@@ -61,26 +59,23 @@ def measure_store(path: str, number: int, estimators: dict) -> list[list[str]]:
     rows = []
     for name, values in errors.items():
         error, ms = torch.tensor(values).double(), 1000 * torch.tensor(seconds[name]).median().item()
-        cells = [f"{100 * share:.1f}" for share in pose_auc(error)]
-        rows.append([name, *cells, f"{error.median().item():.2f}", f"{ms:.1f}"])
+        rows.append([name, *auc_cells(error), f"{error.median().item():.2f}", f"{ms:.1f}"])
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(arguments: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, csv="write all tables to this file")
     parser.add_argument("stores", nargs="+")
     parser.add_argument("--pairs", type=int, default=0, help="of each store, evenly spaced; 0: all")
     parser.add_argument("--estimators", nargs="+", default=[*ESTIMATORS])
-    parser.add_argument("--csv", help="write all tables to this file")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     estimators, rows = find_installed(args.estimators), []
     for path, name in names_of(args.stores).items():
         found = measure_store(path, args.pairs, estimators)
         print(f"{name}\n\n{format_table(HEADER, found)}\n", flush=True)
         rows += [[name, *row] for row in found]
-    if args.csv:
-        write_csv(args.csv, [["store", *HEADER], *rows])
+    write_csv(args.csv, [["store", *HEADER], *rows])
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ Solvers take 2,048 samples of eight and, where the name says so, one. Training s
 - outside: Python and PyTorch between the operations; the profiler makes it larger.
 """
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from io import StringIO
 
 import speed
 import torch
+from shared import make_parser
 from torch.profiler import ProfilerActivity, profile
 
 from kornia_learnnorm.cli.main import main as learnnorm
@@ -84,7 +84,7 @@ def training_shares(config: str, steps: int) -> dict[str, float]:
 
 def main() -> None:
     """Profile and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--steps", type=int, default=40, help="of each training")
     args = parser.parse_args()
     torch.set_num_threads(1)

@@ -16,8 +16,6 @@ DATA holds the folders `tum/SEQUENCE`, `kitti/sequences/06`, `kitti/poses/06.txt
 cameras.json: for each image K and camera_to_world.
 """
 
-import argparse
-import json
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -28,16 +26,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from kornia.geometry.epipolar import get_closest_point_on_epipolar_line
-from results_file import write_csv
+from shared import make_parser, photograph_pairs, write_csv, write_json
 from torch import Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.datasets.frames import Frame, FramePair
+from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
-from kornia_learnnorm.data.images import image_size
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, find_peer
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import write_text
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view.estimate_pair import MatchedPair, match_two_images
 from kornia_learnnorm.two_view.result import PairEstimate
@@ -77,14 +73,9 @@ class Pair(NamedTuple):
 
 def read_pairs(dataset: str, data: Path) -> list[FramePair]:
     """Return the image pairs of a dataset."""
-    if dataset != PHOTOGRAPHS:
-        return [FramePair(*pair) for pair in pairwise(read_dataset(dataset, data / dataset, **DATASETS[dataset]))]
-    folder, frames = data / "images" / dataset, []
-    for name, known in sorted(json.loads((folder / "cameras.json").read_text(encoding="utf-8")).items()):
-        camera, pose = (np.array(known[key]) for key in ("K", "camera_to_world"))
-        frames.append(Frame(folder / name, name, name.split("/")[0], image_size(folder / name), camera, pose))
-    pairs = [pair for gap in GAPS for pair in zip(frames, frames[gap:], strict=False)]
-    return [FramePair(*pair) for pair in pairs if pair[0].sequence == pair[1].sequence]
+    if dataset == PHOTOGRAPHS:
+        return photograph_pairs(data / "images" / dataset, GAPS)
+    return [FramePair(*pair) for pair in pairwise(read_dataset(dataset, data / dataset, **DATASETS[dataset]))]
 
 
 def error_of_pose(pair: Pair, F_mat: Tensor, points1: Tensor, points2: Tensor) -> float:
@@ -251,8 +242,7 @@ def print_tables(records: Sequence[Record], peers: Sequence[str], csv: str | Non
     counts = ["pairs", "median degrees", "largest", f"within {MAX_RATIO:g} times RANSAC", "silently wrong"]
     counts += ["flagged", "F", *(f"predicted / true: {share} %" for share in (10, 50, 90))]
     print("Summary\n\n" + format_table([*label, *counts], summary))
-    if csv:
-        write_csv(csv, [[*label, *counts], *summary])
+    write_csv(csv, [[*label, *counts], *summary])
     if subsets:
         sizes = [f"{size or 'all'} matches" for size in SIZES]
         print("\nSubsets: median degrees (silently wrong)\n")
@@ -261,14 +251,13 @@ def print_tables(records: Sequence[Record], peers: Sequence[str], csv: str | Non
 
 def main(args: Sequence[str] | None = None) -> None:
     """Estimate the pairs, print the tables and write the numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    files = {"json": "write a record of every pair to this file", "csv": "write the summary to this file"}
+    parser = make_parser(__doc__, **files)
     parser.add_argument("data", type=Path, help="folder with tum/, kitti/ and images/photographs/")
     parser.add_argument("--datasets", nargs="+", choices=[*DATASETS, PHOTOGRAPHS], default=[*DATASETS, PHOTOGRAPHS])
     parser.add_argument("--methods", nargs="+", default=["sift+nearest"], help="DETECTOR+MATCHER")
     parser.add_argument("--pairs", type=int, default=50, help="first pairs of each set")
     parser.add_argument("--every", type=int, default=4, help="subsets are drawn of each so many-th pair; 0 for none")
-    parser.add_argument("--json", help="write a record of every pair to this file")
-    parser.add_argument("--csv", help="write the summary to this file")
     options = parser.parse_args(args)
     peers = {name: {} for name in PEERS}
     for name in PEERS:
@@ -288,17 +277,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 records += measure(Pair(dataset, number, frames, calibrated, method, matched), solvers, sizes)
             print(f"{dataset} {method} {number}", file=sys.stderr, flush=True)
     print_tables(records, [*peers], options.csv)
-    if options.json:
-        write_text(options.json, json.dumps(_finite(records), indent=1, allow_nan=False) + "\n")
-
-
-def _finite(value: Any) -> Any:
-    """Return records with null in the place of infinite errors."""
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    write_json(options.json, records)
 
 
 if __name__ == "__main__":

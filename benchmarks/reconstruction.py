@@ -10,7 +10,6 @@ The folder, such as $LEARNNORM_DATA/images/photographs, has a file cameras.json:
 metres; a scene is a subfolder of images of one camera. Cameras are either given, or estimated from COLMAP's default.
 """
 
-import argparse
 import json
 import shutil
 import tempfile
@@ -22,7 +21,7 @@ import numpy as np
 import pycolmap
 import torch
 from numpy.typing import NDArray
-from results_file import write_csv
+from shared import make_parser, write_csv
 
 from kornia_learnnorm.data.datasets.pairing import choose_pairs
 from kornia_learnnorm.data.datasets.reading import read_folder
@@ -120,16 +119,15 @@ def measure(scene: Scene, work: Path, method: str, known: bool, about: str) -> l
     return [*row, f"{seconds:.1f}", f"{took:.1f}"]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(arguments: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, csv="write the table to this file")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", nargs="+", help="subfolders (default: all)")
     text = "COLMAP, RANSAC or weights, such as robust (default: COLMAP RANSAC)"
     parser.add_argument("--methods", metavar="NAME", nargs="+", default=METHODS, help=text)
     text = "detectors and matchers (default: %(default)s)"
     parser.add_argument("--matches", metavar="DETECTOR+MATCHER", nargs="+", default=["sift+nearest"], help=text)
-    parser.add_argument("--csv", help="write the table to this file")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     rows = []
@@ -144,8 +142,7 @@ def main() -> None:
                         rows.append(measure(scene, place, method, known, matches))
                         print(*rows[-1], flush=True)
     print(format_table(HEADER, rows))
-    if args.csv:
-        write_csv(args.csv, [HEADER, *rows])
+    write_csv(args.csv, [HEADER, *rows])
 
 
 if __name__ == "__main__":

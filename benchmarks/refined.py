@@ -13,8 +13,6 @@ Each of several weights has a row. An estimator is one of learnnorm robust; what
 adds the rows to those of other stores in the file.
 """
 
-import argparse
-import csv
 import math
 import time
 from collections.abc import Callable
@@ -24,7 +22,7 @@ import cv2
 import numpy as np
 import torch
 from poses import THRESHOLD, find_installed
-from results_file import write_csv
+from shared import auc_cells, make_parser, read_csv, write_csv
 from torch import Tensor
 
 import kornia_learnnorm as kln
@@ -34,7 +32,6 @@ from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.evaluation.robust.robust_estimators import EvaluatedPair, find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import even_pairs, measure, shuffled_pair
 from kornia_learnnorm.evaluation.tables import format_table, names_of
-from kornia_learnnorm.metrics.poses import pose_auc
 
 ESTIMATORS = ("RANSAC", "poselib", "RANSAC-calibrated", "poselib-calibrated", "learned:robust-pose-synthetic+scores")
 TRUE_MATCH = 4.0  # pixels from the true lines
@@ -96,14 +93,14 @@ def measure_store(path: str, folders: list[str], number: int, protocol: str, mov
                 errors[name, other].append(max(results["rotation_error"], results["translation_error"]))
     rows = []
     for name in movers:
-        aucs = [f"{100 * pose_auc(torch.tensor(errors[name, other]).double(), [5])[0]:.1f}" for other in estimators]
+        aucs = [cell for other in estimators for cell in auc_cells(errors[name, other], [5])]
         ms = 1000 * np.median(seconds[name])
         rows.append([name, *(f"{mean:.3f}" for mean in np.nanmean(pixels[name], 0)), *aucs, f"{ms:.1f}"])
     return rows
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, csv="add the rows to this file")
     parser.add_argument("stores", nargs="+")
     parser.add_argument("--images", nargs="+", required=True, help="folders below which the images lie")
     parser.add_argument("--pairs", type=int, default=25, help="of each store, evenly spaced; 0: all")
@@ -111,7 +108,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--weights", nargs="+", default=["refiner"], help="of a MatchRefiner, by name or a file")
     parser.add_argument("--passes", type=int, default=1, help="how often the refiner is applied")
     parser.add_argument("--estimators", nargs="*", default=[*ESTIMATORS])
-    parser.add_argument("--csv", help="add the rows to this file")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -124,12 +120,9 @@ def main(arguments: list[str] | None = None) -> None:
         found = measure_store(path, args.images, args.pairs, protocol, movers, estimators)
         print(f"{name}\n\n{format_table(header, found)}\n", flush=True)
         rows += [[name, *row] for row in found]
-    if args.csv:
-        kept = []
-        if Path(args.csv).exists():
-            with Path(args.csv).open(newline="", encoding="utf-8") as file:
-                kept = [row for row in [*csv.reader(file)][1:] if row[0] not in {row[0] for row in rows}]
-        write_csv(args.csv, [["store", *header], *kept, *rows])
+    before = read_csv(args.csv)[1:] if args.csv and Path(args.csv).exists() else []
+    kept = [row for row in before if row[0] not in {row[0] for row in rows}]
+    write_csv(args.csv, [["store", *header], *kept, *rows])
 
 
 if __name__ == "__main__":

@@ -13,8 +13,6 @@ A method learned:WEIGHTS is a learned estimator by the name or file of its weigh
 networks compute in bfloat16. With +scores last, it also reads the score of each match, as RANSAC+scores does.
 """
 
-import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -24,13 +22,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from shared import make_parser, write_json
 from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test, read_store
 from kornia_learnnorm.evaluation.robust.peers import find_peer
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import short_name, write_text
+from kornia_learnnorm.files import short_name
+from kornia_learnnorm.layer_export import load_layer
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, PROTOCOLS, RATIO
 
 BATCH = 32  # sets solved at once, as in training
@@ -74,56 +74,36 @@ def peer_matrix(name: str, points1: Tensor, points2: Tensor) -> Tensor | None:
     return None if F_mat is None or np.shape(F_mat) != (3, 3) else torch.tensor(np.array(F_mat, float))
 
 
-def peer(name: str) -> Solver:
-    """Return an estimator of another package."""
-    return partial(one_by_one, lambda x1, x2, _: peer_matrix(name, x1, x2))
-
-
-def ransac(with_scores: bool) -> Solver:
-    """Return RANSAC, whose samples follow the scores or not."""
-    estimate = kln.RANSAC(seed=0)
-    return partial(one_by_one, lambda x1, x2, scores: estimate(x1, x2, scores if with_scores else None)[0])
-
-
-def learned(name: str) -> Solver:
-    """Return a learned estimator by the name or file of its weights, with what the suffixes of the name say."""
-    without, with_scores = name.removesuffix(SCORES), name.endswith(SCORES)
-    layer = kln.LearnedEightPoint.from_pretrained(without.removesuffix(HALF))
-    if without.endswith(HALF):
-        layer.networks.bfloat16()
-    return partial(batched, lambda x1, x2, scores: layer(x1, x2, scores=scores if with_scores else None))
-
-
-def normalized(layer: kln.EightPoint) -> Solver:
-    """Return the eight-point algorithm with a normaliser."""
-    return partial(batched, lambda x1, x2, _: layer(x1, x2))
+LAYERS: dict[str, Callable[[], kln.EightPoint]] = {
+    "Hartley": kln.EightPoint,
+    "whitening": lambda: kln.EightPoint(kln.Whitening()),
+    "reweighted": lambda: kln.EightPoint(kln.ReweightedWhitening()),
+    **{name: partial(load_layer, name) for name in ("paper", "crossview", "crossview-synthetic", "crossview-sets")},
+    "Hartley+optimal": lambda: kln.EightPoint(rank2="optimal"),
+}
+PEERS = ("opencv-usac-magsac", "poselib", "kornia")
+ROBUST = (*PEERS, "RANSAC", "RANSAC" + SCORES)  # need more than eight matches
+METHODS = (*LAYERS, "Hartley+LM", *ROBUST)
+SHIPPED = ["learned:robust", "learned:robust-synthetic"]
 
 
 def find_method(name: str) -> Solver:
-    """Return a method by its name."""
-    if name.startswith(LEARNED):
-        return learned(name.removeprefix(LEARNED))
-    return METHODS[name]()
-
-
-METHODS: dict[str, Callable[[], Solver]] = {
-    "Hartley": lambda: normalized(kln.EightPoint()),
-    "whitening": lambda: normalized(kln.EightPoint(kln.Whitening())),
-    "reweighted": lambda: normalized(kln.EightPoint(kln.ReweightedWhitening())),
-    **{
-        name: partial(lambda name: normalized(kln.EightPoint(kln.LearnedNormalizer.from_pretrained(name))), name)
-        for name in ("paper", "crossview", "crossview-synthetic", "crossview-sets")
-    },
-    "Hartley+optimal": lambda: normalized(kln.EightPoint(rank2="optimal")),
-    "Hartley+LM": lambda: partial(batched, hartley_lm),
-    "opencv-usac-magsac": lambda: peer("opencv-usac-magsac"),
-    "poselib": lambda: peer("poselib"),
-    "kornia": lambda: peer("kornia"),
-    "RANSAC": lambda: ransac(with_scores=False),
-    "RANSAC+scores": lambda: ransac(with_scores=True),
-}
-SHIPPED = ["learned:robust", "learned:robust-synthetic"]
-ROBUST = ("opencv-usac-magsac", "poselib", "kornia", "RANSAC", "RANSAC+scores")  # need more than eight matches
+    """Return a method by its name, of ``METHODS`` or learned:WEIGHTS."""
+    if name in LAYERS:
+        layer = LAYERS[name]()
+        return partial(batched, lambda x1, x2, _: layer(x1, x2))
+    if name == "Hartley+LM":
+        return partial(batched, hartley_lm)
+    if name in PEERS:
+        return partial(one_by_one, lambda x1, x2, _: peer_matrix(name, x1, x2))
+    without, with_scores = name.removesuffix(SCORES), name.endswith(SCORES)
+    if without == "RANSAC":
+        estimate = kln.RANSAC(seed=0)
+        return partial(one_by_one, lambda x1, x2, scores: estimate(x1, x2, scores if with_scores else None)[0])
+    learned = kln.LearnedEightPoint.from_pretrained(without.removeprefix(LEARNED).removesuffix(HALF))
+    if without.endswith(HALF):
+        learned.networks.bfloat16()
+    return partial(batched, lambda x1, x2, scores: learned(x1, x2, scores=scores if with_scores else None))
 
 
 def shown(name: str) -> str:
@@ -192,7 +172,7 @@ def table(results: dict[str, dict[str, list[float]]], sizes: list[int], column: 
 
 def main() -> None:
     """Measure, print the tables, write the numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, json="write the numbers to this file")
     parser.add_argument("stores", nargs="+", help="stores of correspondences with ground truth")
     parser.add_argument("--sizes", type=int, nargs="+", default=[8, 16, 32, 64, 128, 512], help="matches in a set")
     parser.add_argument("--sets", type=int, default=128, help="sets of each size")
@@ -204,7 +184,6 @@ def main() -> None:
         help="of these: %(default)s",
     )
     parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
-    parser.add_argument("--json", help="write the numbers to this file")
     args = parser.parse_args()
     if unknown := [name for name in args.methods if name not in METHODS and not name.startswith(LEARNED)]:
         parser.error(f"--methods {' '.join(unknown)}: expected some of {', '.join(METHODS)} or learned:WEIGHTS")
@@ -233,8 +212,7 @@ def main() -> None:
             print("\n" + table(results, args.sizes, 1, "ms per set", 2), flush=True)
     for name, error in missing.items():
         print(f"without {name}: {error}", file=sys.stderr)
-    if args.json:
-        write_text(args.json, json.dumps(everything, indent=1))
+    write_json(args.json, everything)
 
 
 if __name__ == "__main__":

@@ -29,13 +29,13 @@ from typing import NamedTuple
 
 import torch
 from kornia.geometry.epipolar import find_fundamental
+from shared import make_parser, write_json
 from torch import Tensor, nn
 from torch.profiler import ProfilerActivity, profile
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import random_scenes
 from kornia_learnnorm.evaluation.tables import format_table
-from kornia_learnnorm.files import write_text
 
 KORNIA = "kornia"
 SECONDS = 1.0  # spent on a method in a table's cell, at most
@@ -239,7 +239,7 @@ def table(results: dict[str, dict[str, float]]) -> str:
 
 def main() -> None:
     """Measure, print the tables and write the file."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dtype", choices=["float32", "float64"], default="float32")
@@ -264,15 +264,9 @@ def main() -> None:
                 title = f"{name}, {case}"
                 found[title] = measure_compiled(layer, case, args)
                 print(f"{title}: " + ", ".join(f"{key} {value:.3g}" for key, value in found[title].items()), flush=True)
-                save(found, args.out)
+                write_json(args.out, found)
     else:
         measure_all(differentiable, outliers, args, found)
-
-
-def save(found: dict[str, object], path: Path | None) -> None:
-    """Write what was measured so far."""
-    if path is not None:
-        write_text(path, json.dumps(found, indent=1) + "\n")
 
 
 def measure_all(
@@ -302,7 +296,7 @@ def measure_all(
             for name, results, unit in ((title, times, "ms a batch"), (f"{title}, memory", memory, "MiB")):
                 found[name] = results
                 print(f"\n{name}: {unit} (ratio to Kornia)\n\n{table(results)}", flush=True)
-            save(found, args.out)
+            write_json(args.out, found)
 
 
 if __name__ == "__main__":

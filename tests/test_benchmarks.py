@@ -1,10 +1,9 @@
 """The scores of benchmarks/pairs.py on cases whose outcome is known, its tables, and what the other benchmarks time."""
 
 import argparse
-import csv
-import importlib
 import json
 import math
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,29 +16,23 @@ from PIL import Image
 from torch import Tensor
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.data.datasets.frames import Frame, FramePair
+from kornia_learnnorm.data.datasets.frames import Frame, FramePair, fundamental_from_motion
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 pytest.importorskip("cv2")
+import pairs
+import planes
+import poses
+import real_pairs
+import refined
+import speed
+from shared import read_csv
 
 
 @pytest.fixture(scope="module")
-def benchmark():
-    """A function that imports a benchmark by name."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
-        yield importlib.import_module
-
-
-@pytest.fixture(scope="module")
-def pairs(benchmark):
-    return benchmark("pairs")
-
-
-@pytest.fixture(scope="module")
-def case(pairs):
+def case():
     return pairs.rendered("room", 0, (160, 120), None)
 
 
@@ -57,17 +50,11 @@ def answer_homography(case, H_mat: Tensor, **more) -> SimpleNamespace:
 
 
 def true_matrix(case) -> Tensor:
-    K_inverse = torch.linalg.inv(case.K)
-    return K_inverse.mT @ torch.linalg.cross(case.t[:, None], case.R, dim=0) @ K_inverse
-
-
-def sideways(case) -> Tensor:
-    """The matrix of a camera that moves along y, far from the truth."""
-    return true_matrix(case._replace(R=torch.eye(3).double(), t=torch.tensor([0.0, 1.0, 0.0]).double()))
+    return fundamental_from_motion(case.K, case.K, case.R, case.t)
 
 
 class TestPairs:
-    def test_right_and_wrong_answers(self, pairs, case):
+    def test_right_and_wrong_answers(self, case):
         record = pairs.score(case, lambda case: answer(case, true_matrix(case)))
         assert record["determined"]
         assert max(record["pose_error"], record["true_error"]) < 1e-6
@@ -76,13 +63,14 @@ class TestPairs:
         flagged = pairs.score(case, lambda case: answer(case, true_matrix(case), "planar"))
         assert flagged["warnings"] == ["planar"]
         assert pairs.outcome(flagged) == "right, flagged"
-        record = pairs.score(case, lambda case: answer(case, sideways(case)))
+        along_y = case._replace(R=torch.eye(3).double(), t=torch.tensor([0.0, 1.0, 0.0]).double())
+        record = pairs.score(case, lambda case: answer(case, true_matrix(along_y)))
         assert record["pose_error"] > 45
         assert record["true_error"] > 1
         assert pairs.outcome(record) == "wrong"
         assert pairs.outcome(record | {"warnings": ["planar"]}) == "wrong, flagged"
 
-    def test_right_and_wrong_homographies(self, pairs, case):
+    def test_right_and_wrong_homographies(self, case):
         H_mat = case.K @ case.R @ torch.linalg.inv(case.K)
         turned = case._replace(t=torch.zeros(3).double(), points2=transform_points(H_mat[None], case.points1[None])[0])
         for R, outcome in ((None, "right"), (case.R, "right"), (torch.diag(torch.tensor([-1.0, -1, 1])), "wrong")):
@@ -95,7 +83,7 @@ class TestPairs:
         assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R)) == math.inf
         assert pairs.error_of_pose(case, answer_homography(case, H_mat, R=case.R, t=-case.t)) == pytest.approx(180)
 
-    def test_a_fault_of_the_estimator_is_no_refusal(self, pairs, case, capsys):
+    def test_a_fault_of_the_estimator_is_no_refusal(self, case, capsys):
         def solve(case):
             raise error
 
@@ -108,7 +96,7 @@ class TestPairs:
         assert "oops" in crashed["crashed"]
         assert "room 0: ZeroDivisionError('oops')" in capsys.readouterr().err
 
-    def test_runs(self, pairs, tmp_path, capsys):
+    def test_runs(self, tmp_path, capsys):
         arguments = ["--pairs", "3", "--kinds", "plane", "rotation", "outliers", "--size", "160", "120"]
         pairs.main([*arguments, "--json", str(tmp_path / "pairs.json")])
         assert "| rotation |" in capsys.readouterr().out
@@ -119,11 +107,7 @@ class TestPairs:
 
 class TestRealPairs:
     @pytest.fixture
-    def real_pairs(self, benchmark):
-        return benchmark("real_pairs")
-
-    @pytest.fixture
-    def real_pair(self, real_pairs, case):
+    def real_pair(self, case):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = case.R.mT, -case.R.mT @ case.t  # camera 2 to camera 1, which is the world
         first = Frame(Path("1.png"), "1.png", "room", (160, 120), case.K.numpy(), np.eye(4))
@@ -135,7 +119,7 @@ class TestRealPairs:
         )
         return real_pairs.Pair("tum", 3, FramePair(first, second), True, "sift+nearest", matched)
 
-    def test_all_get_the_same_matches_and_cameras_where_known(self, real_pairs, real_pair, case):
+    def test_all_get_the_same_matches_and_cameras_where_known(self, real_pair, case):
         given = []
 
         def peer(x1, x2, sizes, seed, threshold, *cameras):
@@ -157,8 +141,7 @@ class TestRealPairs:
 
 
 @pytest.mark.parametrize("backward", [False, True])
-def test_every_method_is_timed(benchmark, backward, monkeypatch):
-    speed = benchmark("speed")
+def test_every_method_is_timed(backward, monkeypatch):
     monkeypatch.setattr(speed, "SECONDS", 1e-3)
     monkeypatch.setattr(speed, "MIN_TURNS", 1)
     args = argparse.Namespace(device="cpu", dtype="float64", quick=True)
@@ -172,35 +155,31 @@ def test_every_method_is_timed(benchmark, backward, monkeypatch):
     assert lines[-1].rstrip("| ").endswith("-")
 
 
-def test_poses_of_a_store(benchmark, tmp_path, capsys, monkeypatch):
-    poses, store = benchmark("poses"), tmp_path / "pairs.h5"
+def test_poses_of_a_store(tmp_path, capsys):
+    store, file = tmp_path / "pairs.h5", tmp_path / "poses.csv"
     write_store(store, synthetic_store(2, points=80, scenes=["orbit"]))
     names = ["RANSAC-calibrated", "learned:robust-pose-synthetic+scores"]
-    monkeypatch.setattr("sys.argv", ["poses", str(store), "--estimators", *names, "--csv", str(tmp_path / "poses.csv")])
-    poses.main()
-    rows = [line.split(",") for line in (tmp_path / "poses.csv").read_text().splitlines()]
-    assert rows[0] == ["store", *poses.HEADER]
-    assert [row[:2] for row in rows[1:]] == [["pairs", name] for name in names]
-    assert all(float(row[2]) > 50 for row in rows[1:])
+    poses.main([str(store), "--estimators", *names, "--csv", str(file)])
+    header, *rows = read_csv(file)
+    assert header == ["store", *poses.HEADER]
+    assert [row[:2] for row in rows] == [["pairs", name] for name in names]
+    assert all(float(row[2]) > 50 for row in rows)
     assert "| RANSAC-calibrated" in capsys.readouterr().out
 
 
-def test_planes(benchmark, tmp_path, capsys, monkeypatch):
-    planes, file = benchmark("planes"), tmp_path / "planes.csv"
-    options = ["--sizes", "64", "--outliers", "0.2", "--sets", "3", "--csv", str(file)]
-    monkeypatch.setattr("sys.argv", ["planes", *options])
-    planes.main()
-    rows = [line.split(",") for line in file.read_text().splitlines()]
-    assert rows[0] == ["outliers", "N", *planes.HEADER]
-    errors = {row[2]: float(row[3]) for row in rows[1:]}
+def test_planes(tmp_path, capsys):
+    file = tmp_path / "planes.csv"
+    planes.main(["--sizes", "64", "--outliers", "0.2", "--sets", "3", "--csv", str(file)])
+    header, *rows = read_csv(file)
+    assert header == ["outliers", "N", *planes.HEADER]
+    errors = {row[2]: float(row[3]) for row in rows}
     assert max(errors[name] for name in ("RANSAC", "opencv-usac-magsac", "learned:robust-homography")) < 20
     assert errors["kornia-dlt"] > 20
     assert "20% outliers" in capsys.readouterr().out
     assert planes.corner_error(None, torch.eye(3).double(), torch.zeros(4, 2).double()) == planes.MAX_ERROR
 
 
-def test_refined_matches_beside_found_and_tracked_ones(benchmark, tmp_path):
-    refined = benchmark("refined")
+def test_refined_matches_beside_found_and_tracked_ones(tmp_path):
     store = synthetic_store(1, points=60, seed=0)
     write_store(tmp_path / "store.h5", store)
     image, untrained = texture(0, 640, 480), tmp_path / "untrained.safetensors"
@@ -208,21 +187,20 @@ def test_refined_matches_beside_found_and_tracked_ones(benchmark, tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(np.resize(image, (height, width))).save(tmp_path / name, format="png")
     kln.MatchRefiner().save_pretrained(untrained)
-    options = ["--images", str(tmp_path), "--weights", str(untrained), "--pairs", "1"]
-    options += ["--estimators", "ground-truth"]
+    file = tmp_path / "refined.csv"
+    options = [str(tmp_path / "store.h5"), "--images", str(tmp_path), "--pairs", "1", "--estimators", "ground-truth"]
+    options += ["--csv", str(file), "--weights", str(untrained)]
     for _ in range(2):  # rows of a store are replaced
-        refined.main([str(tmp_path / "store.h5"), *options, "--csv", str(tmp_path / "refined.csv")])
-    header, *rows = (line.split(",") for line in (tmp_path / "refined.csv").read_text().splitlines())
+        refined.main(options)
+    header, *rows = read_csv(file)
     assert header == ["store", "matches", "px", "fit", "ground-truth", "ms"]
     assert [row[:2] for row in rows] == [["store", name] for name in ("found", "moved", "Lucas-Kanade")]
     assert rows[0][2:5] == rows[1][2:5]  # untrained, it moves nothing
-    options[3:4] = [str(untrained), "refiner"]
-    refined.main([str(tmp_path / "store.h5"), *options, "--csv", str(tmp_path / "refined.csv")])
-    rows = [line.split(",") for line in (tmp_path / "refined.csv").read_text().splitlines()][1:]
-    assert [row[1] for row in rows] == ["found", "untrained", "refiner", "Lucas-Kanade"]
+    refined.main([*options, "refiner"])
+    assert [row[1] for row in read_csv(file)[1:]] == ["found", "untrained", "refiner", "Lucas-Kanade"]
 
 
-def test_reconstruction(benchmark, real_data, tmp_path, monkeypatch, capsys):
+def test_reconstruction(real_data, tmp_path):
     """Four photographs of half the size."""
     pytest.importorskip("pycolmap")
     source, names = real_data / "images/photographs", [f"fountain-P11/000{number}.jpg" for number in range(3, 7)]
@@ -234,14 +212,10 @@ def test_reconstruction(benchmark, real_data, tmp_path, monkeypatch, capsys):
             image.reduce(2).crop((0, 0, 512, 341)).save(tmp_path / name, quality=95)
         cameras[name]["K"] = (half @ cameras[name]["K"]).tolist()
     (tmp_path / "cameras.json").write_text(json.dumps(cameras))
-    table = tmp_path / "table.csv"
-    methods = ["--methods", "COLMAP", "RANSAC", "--csv", str(table)]
-    monkeypatch.setattr("sys.argv", ["reconstruction.py", str(tmp_path), *methods])
-    benchmark("reconstruction").main()
-    capsys.readouterr()
-    with table.open() as file:
-        rows = [*csv.DictReader(file)]
-    assert [(row["cameras"], row["verified by"]) for row in rows[:2]] == [("given", "COLMAP"), ("given", "RANSAC")]
+    options = ["--methods", "COLMAP", "RANSAC", "--csv", str(tmp_path / "table.csv")]
+    import_module("reconstruction").main([str(tmp_path), *options])
+    _, *rows = read_csv(tmp_path / "table.csv")
+    assert [row[2:4] for row in rows[:2]] == [["given", "COLMAP"], ["given", "RANSAC"]]
     for row in rows[:2]:
-        assert row["images"] == "4 of 4"
-        assert float(row["centres mm"]) < 50
+        assert row[6] == "4 of 4"  # images
+        assert float(row[8]) < 50  # centres, mm
