@@ -16,6 +16,7 @@ import sys
 from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 from IPython.display import HTML, Markdown
@@ -39,37 +40,25 @@ FIT_WIDTH = 6  # inches; a wider plot scrolls within its box on narrow pages, ot
 REM = 6  # of the page for an inch of a plot
 
 SIZES = (8, 16, 32, 64, 128, 512)
-ESTIMATORS = {  # as benchmarks/sizes.py names them, and how they are drawn
-    "Hartley": (GREY, "-"),
-    "Hartley+optimal": (GREY, "--"),
-    "Hartley+LM": (GREY, ":"),
-    "opencv-usac-magsac": (PURPLE, "-"),
-    "poselib": (GREEN, "-"),
-    "kornia": (GREEN, "--"),
-    "RANSAC": (ORANGE, "-"),
-    "learned:robust": (BLUE, "-"),
-    "learned:robust-synthetic": (BLUE, "--"),
-    "learned:robust-tiny": (BLUE, ":"),
+# As benchmarks/sizes.py names estimators: colour, mark over the time, and line over the sizes of those drawn there.
+TIMED = {
+    "Hartley": (GREY, "o", "-"),
+    "whitening": (GREY, "^", ""),
+    "reweighted": (GREY, "v", ""),
+    "Hartley+optimal": (GREY, "s", "--"),
+    "Hartley+LM": (GREY, "P", ":"),
+    "paper": (GREY, "X", ""),
+    "opencv-usac-magsac": (PURPLE, "o", "-"),
+    "poselib": (GREEN, "o", "-"),
+    "kornia": (GREEN, "^", "--"),
+    "RANSAC": (ORANGE, "o", "-"),
+    "learned:robust": (BLUE, "o", "-"),
+    "learned:robust+bfloat16": (BLUE, "^", ""),
+    "learned:robust-synthetic": (BLUE, "s", "--"),
+    "learned:robust-tiny": (BLUE, "D", ":"),
+    "learned:robust-tiny+bfloat16": (BLUE, "v", ""),
 }
-
-
-TIMED = {  # as benchmarks/sizes.py names them, and how they are drawn
-    "Hartley": (GREY, "o"),
-    "whitening": (GREY, "^"),
-    "reweighted": (GREY, "v"),
-    "Hartley+optimal": (GREY, "s"),
-    "Hartley+LM": (GREY, "P"),
-    "paper": (GREY, "X"),
-    "opencv-usac-magsac": (PURPLE, "o"),
-    "poselib": (GREEN, "o"),
-    "kornia": (GREEN, "^"),
-    "RANSAC": (ORANGE, "o"),
-    "learned:robust": (BLUE, "o"),
-    "learned:robust+bfloat16": (BLUE, "^"),
-    "learned:robust-synthetic": (BLUE, "s"),
-    "learned:robust-tiny": (BLUE, "D"),
-    "learned:robust-tiny+bfloat16": (BLUE, "v"),
-}
+ESTIMATORS = {name: (colour, line) for name, (colour, _, line) in TIMED.items() if line}
 COMPARED = {  # in the picture of the landing page and the README, each divided by PoseLib's: name, colour and line
     "opencv-usac-magsac": ("OpenCV MAGSAC", PURPLE, "-"),
     "poselib": ("PoseLib", GREEN, "-"),
@@ -78,7 +67,7 @@ COMPARED = {  # in the picture of the landing page and the README, each divided 
     "learned:robust-synthetic": ("LearnedEightPoint", BLUE, "-"),
 }
 VIEWS = {"kitti_06": "Street from a car (KITTI 06)", "tum_fr3_office": "Office, camera in hand (TUM)"}
-POSE_STORES = {"photographs": "photos", "kitti_06": "KITTI 06", "tum_fr3_office": "TUM"}
+POSE_STORES = {"photographs": "photos", **STORES}
 DETECTORS = {"xfeat": "XFeat", "aliked": "ALIKED"}
 POSE_ROWS = {  # of poses.csv, and how the landing page and the README call them
     "opencv-usac-magsac": "OpenCV MAGSAC",
@@ -115,6 +104,18 @@ def read_rows(name: str) -> list[list[str]]:
         return list(csv.reader(file))
 
 
+def read_json(name: str) -> Any:
+    """Return the content of a file of results; ``sizes`` has errors (px) and times by title, method and size."""
+    return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def cross_table(corner: str, cells: dict[tuple[str, str], str]) -> Markdown:
+    """Return a table of cells by the names of their row and column."""
+    names, columns = (dict.fromkeys(key[k] for key in cells) for k in (0, 1))
+    rows = [[name, *(cells[name, column] for column in columns)] for name in names]
+    return Markdown(format_table([corner, *columns], rows))
+
+
 def table(name: str) -> Markdown:
     """Return a file of results as a table."""
     header, *rows = read_rows(name)
@@ -129,8 +130,7 @@ def _on(machine: dict[str, object]) -> str:
 
 def layer_times() -> Markdown:
     """Return the milliseconds of one forward and backward pass of the layers, and their ratios to Kornia's solver."""
-    found = json.loads((RESULTS / "speed.json").read_text(encoding="utf-8"))
-    rows = []
+    found, rows = read_json("speed"), []
     for name, (method, parts) in LAYERS.items():
         both = [found[f"{part}, forward and backward"] for part in parts]
         times = {case: row for part in both for case, row in part.items() if method in row}
@@ -141,7 +141,7 @@ def layer_times() -> Markdown:
 
 def compile_times() -> Markdown:
     """Return what compiling a layer takes and gains: seconds of the first call, milliseconds of later ones."""
-    found = json.loads((RESULTS / "compile.json").read_text(encoding="utf-8"))
+    found = read_json("compile")
     columns = ("first call, processor s", "later calls, ms", "not compiled, ms")
     rows = [[name, *(f"{times[key]:.3g}" for key in columns)] for name, times in found.items() if name != "machine"]
     return Markdown(format_table(["layer, batch x correspondences", *columns], rows) + _on(found["machine"]))
@@ -149,7 +149,7 @@ def compile_times() -> Markdown:
 
 def speed_tables(memory: bool = False) -> Markdown:
     """Return the times of all parts of a measurement and their ratios to Kornia's, or the memory."""
-    found = json.loads((RESULTS / "speed.json").read_text(encoding="utf-8"))
+    found = read_json("speed")
     machine, texts = found.pop("machine"), []
     for title, cases in found.items():
         if title.endswith(", memory") == memory:
@@ -171,11 +171,6 @@ def losses_table() -> Markdown:
     return Markdown(format_table(["loss", "better than Hartley %", "better than whitening %"], rows))
 
 
-def read_sizes() -> dict[str, dict[str, dict[str, list[float]]]]:
-    """Return the errors (pixels) and times by store and protocol, method, and number of matches."""
-    return json.loads((RESULTS / "sizes.json").read_text(encoding="utf-8"))
-
-
 def _words(title: str) -> str:
     store, _, protocol = title.partition(", ")
     return f"{STORES.get(store, store)}, {protocol} matches"
@@ -183,7 +178,7 @@ def _words(title: str) -> str:
 
 def sizes_rows(title: str, methods: Sequence[str], sizes: Sequence[int] = SIZES) -> list[list[str]]:
     """Return a row of median errors for each method, from the measurements of one store and protocol."""
-    found = read_sizes()[title]
+    found = read_json("sizes")[title]
     if missing := [name for name in methods if name not in found]:
         raise ValueError(f"sizes.json has no {', '.join(missing)} for {title}: run benchmarks/sizes.py with --methods")
     errors = {name: {int(size): f"{values[0]:.3f}" for size, values in found[name].items()} for name in methods}
@@ -204,8 +199,8 @@ def poses_summary() -> Markdown:
     """Return the pose errors of the landing page and the README: rows of poses.csv, in words."""
     found = {(row[0], row[1]): row[2] for row in read_rows("poses")[1:]}
     stores = [f"{store}_{detector}_lightglue" for store in ("photographs", "tum_fr3_office") for detector in DETECTORS]
-    rows = [[words, *(found[store, name] for store in stores)] for name, words in POSE_ROWS.items()]
-    return Markdown(format_table(["", *map(_store_words, stores)], rows))
+    rows = POSE_ROWS.items()
+    return cross_table("", {(words, _store_words(s)): found[s, name] for name, words in rows for s in stores})
 
 
 def _store_words(store: str) -> str:
@@ -216,20 +211,16 @@ def _store_words(store: str) -> str:
 def poses_table(column: str, matcher: str, name: str = "poses") -> Markdown:
     """Return a column of poses.csv or refined.csv by row and store, of the stores that a matcher's name ends."""
     header, *rows = read_rows(name)
-    stores = dict.fromkeys(row[0] for row in rows if row[0].endswith(matcher))
-    found = {(row[0], row[1]): row[header.index(column)] for row in rows}
-    names = dict.fromkeys(row[1] for row in rows)
-    cells = [[name, *(found[store, name] for store in stores)] for name in names]
-    return Markdown(format_table([column, *map(_store_words, stores)], cells))
+    place = header.index(column)
+    return cross_table(column, {(r[1], _store_words(r[0])): r[place] for r in rows if r[0].endswith(matcher)})
 
 
 def planes_table(column: str, outliers: str) -> Markdown:
     """Return a number of planes.csv by estimator and number of matches, at one share of outliers."""
     header, *rows = read_rows("planes")
-    found = {(row[2], row[1]): row[header.index(column)] for row in rows if row[0] == outliers}
-    names, sizes = (dict.fromkeys(key[k] for key in found) for k in (0, 1))
-    cells = [[name, *(found[name, size] for size in sizes)] for name in names]
-    return Markdown(format_table([f"{column}, {outliers} outliers", *(f"N = {size}" for size in sizes)], cells))
+    place = header.index(column)
+    cells = {(row[2], f"N = {row[1]}"): row[place] for row in rows if row[0] == outliers}
+    return cross_table(f"{column}, {outliers} outliers", cells)
 
 
 def scores_table(title: str) -> Markdown:
@@ -242,7 +233,7 @@ def scores_table(title: str) -> Markdown:
 def sizes_ratios(method: str, reference: str) -> Markdown:
     """Return by how much the errors of a method are above those of a reference, percent, for every size of both."""
     rows, sizes = [], SIZES[1:]
-    for title in read_sizes():
+    for title in read_json("sizes"):
         pair = zip(*sizes_rows(title, [method, reference], sizes), strict=True)
         next(pair)  # the names
         rows.append([_words(title), *(f"{100 * (float(error) / float(other) - 1):+.0f} %" for error, other in pair)])
@@ -268,7 +259,7 @@ def draw_relative(ink: str) -> Figure:
         figure, axes = plt.subplots(2, 1, figsize=(4.4, 5.4), layout="constrained", sharex=True)
         sizes = SIZES[1:]
         for ax, (store, words) in zip(axes, VIEWS.items(), strict=True):
-            found = read_sizes()[f"{store}, unfiltered"]
+            found = read_json("sizes")[f"{store}, unfiltered"]
             for name, (label, colour, line) in COMPARED.items():
                 ratios = [found[name][str(size)][0] / found["poselib"][str(size)][0] for size in sizes]
                 width = 2.8 if name.startswith("learned") else 1.6
@@ -297,7 +288,7 @@ def sizes_plot(protocols: Sequence[str] = ("unfiltered", "filtered")) -> HTML:
         figure, axes = plt.subplots(len(protocols), len(STORES), sharex=True, sharey="row", **options)
         titles = [f"{store}, {protocol}" for protocol in protocols for store in STORES]
         for title, ax in zip(titles, axes.flat, strict=True):
-            found = read_sizes()[title]
+            found = read_json("sizes")[title]
             for name, (colour, style) in ESTIMATORS.items():
                 errors = {int(size): values[0] for size, values in found[name].items()}
                 width = 2.2 if name.startswith("learned") else 1.2
@@ -307,31 +298,33 @@ def sizes_plot(protocols: Sequence[str] = ("unfiltered", "filtered")) -> HTML:
             ax.set_xticks(SIZES, map(str, SIZES))
             ax.minorticks_off()
             ax.grid(visible=True)
-        for ax in axes[-1]:
-            ax.set_xlabel("matches in the set")
-        figure.supylabel("median error of true inliers, px", fontsize=9)
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        _label_errors(figure, axes, "matches in the set")
         return show(figure, f"Median error against the number of matches, on KITTI and TUM, {' and '.join(protocols)}")
+
+
+def _label_errors(figure: Figure, axes: Any, xlabel: str) -> None:
+    """Label the axes of panels of errors, and add their legend."""
+    for ax in axes[-1]:
+        ax.set_xlabel(xlabel)
+    figure.supylabel("median error of true inliers, px", fontsize=9)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
 def time_plot(name: str) -> HTML:
     """Draw the median error against the time of a set of unfiltered matches, a row for each size of sets."""
     with plt.rc_context(PLAIN):
-        found = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+        found = read_json(name)
         figure, axes = plt.subplots(2, 2, figsize=(6, 6.4), layout="constrained", sharex=True)
         cells = [(size, store) for size in ("128", "512") for store in STORES]
         for (size, store), ax in zip(cells, axes.flat, strict=True):
-            for method, (colour, mark) in TIMED.items():
+            for method, (colour, mark, _) in TIMED.items():
                 error, milliseconds = found[f"{store}, unfiltered"][method][size]
                 ax.plot(milliseconds, error, mark, color=colour, label=method, markersize=6)
             ax.set(title=f"{_words(f'{store}, unfiltered')}, N = {size}", xscale="log", yscale="log")
             ax.xaxis.set_major_formatter("{x:g}")
             ax.yaxis.set_major_formatter("{x:g}")
             ax.grid(visible=True)
-        for ax in axes[-1]:
-            ax.set_xlabel("ms per set")
-        figure.supylabel("median error of true inliers, px", fontsize=9)
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        _label_errors(figure, axes, "ms per set")
         return show(figure, "Median error against time, on KITTI and TUM, unfiltered, sets of 128 and of 512 matches")
 
 

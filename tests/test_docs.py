@@ -1,9 +1,7 @@
 """The README and the pages: commands parse, tables are those of the results, public names are in the reference."""
 
-import csv
 import hashlib
 import importlib.util
-import json
 import re
 import tomllib
 from contextlib import redirect_stdout
@@ -18,6 +16,7 @@ from kornia_learnnorm.cli.main import TRAINING, make_parser
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.metrics.poses import rotation_error
 
+results_tables = pytest.importorskip("results_tables")
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 CARDS = sorted((ROOT / "kornia_learnnorm/weights").glob("*.md"))
@@ -79,45 +78,22 @@ def read_table(table):
     ]
 
 
-def read_rows(name):
-    with (DOCS / f"results/{name}.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.reader(file))
-
-
-def results(name):
-    return json.loads((DOCS / f"results/{name}.json").read_text(encoding="utf-8"))
-
-
-def sizes_rows(title, sizes):
-    """Return the rows of a table of median errors by number of matches."""
-    cells = {
-        row: {f"N = {size}": f"{found[0]:.3f}" for size, found in by.items()}
-        for row, by in results("sizes")[title].items()
-    }
-    return [[row, *(by_size.get(size, "-") for size in sizes)] for row, by_size in cells.items()]
-
-
 @pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if TABLE.search(text)])
 def test_tables_are_those_of_the_results(page):
     for name, group, table in TABLE.findall(TEXTS[page]):
         header, *rows = read_table(table)
         if group:
-            expected = sizes_rows(group, header[1:])
+            sizes = [int(label.removeprefix("N = ")) for label in header[1:]]
+            expected = results_tables.sizes_rows(group, results_tables.read_json(name)[group], sizes)
         else:
-            expected = read_rows(name)
+            expected = results_tables.read_rows(name)
             assert header == expected[0], name
         assert [row for row in rows if row not in expected] == [], (name, group)
 
 
 def test_the_readme_has_poses_of_the_results():
-    found = {(row[0], row[1]): row[2] for row in read_rows("poses")}
-    stores = [
-        f"{name}_{detector}_lightglue" for name in ("photographs", "tum_fr3_office") for detector in ("xfeat", "aliked")
-    ]
-    expected = [[found[store, name] for store in stores] for name in {name for _, name in found} - {"estimator"}]
-    table = re.findall(r"^\| [^|]+ \| (\d+\.\d \| .*) \|$", TEXTS["README.md"], flags=re.MULTILINE)
-    assert len(table) == 6
-    assert [row for row in table if row.split(" | ") not in expected] == []
+    tables = re.findall(r"^(?:\|.*\n)+", TEXTS["README.md"], flags=re.MULTILINE)
+    assert read_table(results_tables.poses_summary().data) in [*map(read_table, tables)]
 
 
 def test_the_picture_of_the_readme_is_of_the_results():
