@@ -174,8 +174,7 @@ def _to_onnx(network: nn.Module, example: dict[str, Tensor], outputs: list[str])
     level = logger.level
     logger.setLevel(logging.ERROR)  # it reports every package that it would also support, and warns of its own calls
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return torch.onnx.export(
                 copy.deepcopy(network).float().cpu().eval(),
                 (),

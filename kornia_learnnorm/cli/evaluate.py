@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from kornia_learnnorm.evaluation.methods import KEPT_METHODS, SHIPPED, default_methods, short_name_of, short_names
+from kornia_learnnorm.evaluation.methods import KEPT_METHODS, SHIPPED, default_methods, short_name_of
 from kornia_learnnorm.evaluation.report.method_tables import HEADER, method_rows, was_trained_on
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, SampleOptions, read_run, record_run, temporary_run
 from kornia_learnnorm.evaluation.tables import Table, format_table, names_of, tables_as_json
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         record_run(args.out, stores, methods, options, command=args.command_line)
         recorded = read_run(args.out)
         _print_tables(args, recorded, tables)
-    further = [name for name in recorded.about["methods"] if name not in short_names(methods).values()]
+    further = [name for name in recorded.about["methods"] if name not in map(short_name_of, methods)]
     if further:
         print(f"{args.out} also holds, from before: {', '.join(further)}", file=sys.stderr)
     done = f"\nwrote {args.out}; learnnorm report {args.out} makes tables and figures of it"

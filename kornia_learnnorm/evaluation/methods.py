@@ -15,7 +15,6 @@ from kornia_learnnorm.estimators.learned import FORMAT as LAYER_FORMAT
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.evaluation.search import SearchedNormalizer
-from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.files import short_name
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.fundamental import Fundamental
@@ -176,8 +175,3 @@ def short_name_of(name: str) -> str:
     """Return a method's name for tables and files: for a path, that of the run's folder or of the file."""
     base = base_name(name)
     return short_name(_own_weights(base)[1]) + name[len(base) :] if Path(base).suffix == ".safetensors" else name
-
-
-def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return the short name of each method; raise ValueError if two are equal."""
-    return names_of(names, short_name_of, "methods")

@@ -44,12 +44,11 @@ def mean_share(values: Tensor, pair: Tensor) -> Cell:
     return found._replace(interval=(100 * low, 100 * high))
 
 
-def better_share(cell: RunCell, name: str, baseline: str, quantity: str, rows: Tensor | None = None) -> Cell:
-    """Return a better rate against a baseline with its interval, %, of all samples or of those in the mask ``rows``."""
-    rows = torch.ones_like(cell.pair, dtype=torch.bool) if rows is None else rows
-    value, other = cell.predictions[name][quantity][rows], cell.predictions[baseline][quantity][rows]
+def better_share(cell: RunCell, name: str, baseline: str, quantity: str) -> Cell:
+    """Return a better rate against a baseline with its interval, %."""
+    value, other = cell.predictions[name][quantity], cell.predictions[baseline][quantity]
     valid = comparable(value, other)
-    return mean_share((value < other)[valid].double(), cell.pair[rows][valid])
+    return mean_share((value < other)[valid].double(), cell.pair[valid])
 
 
 def paired_change(values: Tensor, baseline: Tensor, pair: Tensor | None = None, *, logarithms: bool = False) -> Cell:

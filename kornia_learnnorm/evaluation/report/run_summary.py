@@ -1,7 +1,6 @@
 """Summary of a run: which method or estimator won in each store and protocol, by how much, and on what."""
 
 import math
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -31,8 +30,6 @@ class _Ranking(NamedTuple):
 
     winner: str
     second: str  # empty for a single method
-    level: list[str]  # whose difference from the winner has a 95 % interval that includes zero
-    ahead: list[str]  # whose mean score is below the winner's, with the whole 95 % interval
     against: dict[str, PairedDifference]  # the winner's difference from each other method; empty for too few pairs
     samples: int  # compared
     pairs: int  # their image pairs
@@ -54,14 +51,14 @@ def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> 
     """Rank methods by the values that the summary quotes, and compare the winner's scores (S,) with each other's."""
     valid = torch.stack([*scores.values()]).isfinite().all(0)
     winner, *others = sorted(values, key=lambda name: math.inf if math.isnan(values[name]) else values[name])
-    differences, pair = {}, pair[valid]
+    pair = pair[valid]
     pairs = len(torch.unique(pair))
-    for name in others if pairs >= MIN_BOOTSTRAP_PAIRS else []:
-        both = scores[winner][valid], scores[name][valid]
-        differences[name] = paired_bootstrap(*both, pair, draws=numbers.RESAMPLES)
-    level = [name for name, found in differences.items() if found.low <= 0 <= found.high]
-    ahead = [name for name, found in differences.items() if found.low > 0]
-    return _Ranking(winner, others[0] if others else "", level, ahead, differences, len(pair), pairs)
+    against = {
+        name: paired_bootstrap(scores[winner][valid], scores[name][valid], pair, draws=numbers.RESAMPLES)
+        for name in others
+        if pairs >= MIN_BOOTSTRAP_PAIRS
+    }
+    return _Ranking(winner, others[0] if others else "", against, len(pair), pairs)
 
 
 def _about_methods(cell: RunCell, own: list[str]) -> str:
@@ -76,8 +73,8 @@ def _about_methods(cell: RunCell, own: list[str]) -> str:
     for name in own:
         if name in cell.predictions and name != winner:
             text += f" `{name}` has {median_number(cell.predictions[name][key])} px."
-    if ranking.ahead:
-        text += f" The geometric mean of the errors is smaller for {_names(ranking.ahead)}."
+    if ahead := [f"`{name}`" for name, found in ranking.against.items() if found.low > 0]:
+        text += f" The geometric mean of the errors is smaller for {', '.join(ahead)}."
     if key != "truth" and "inliers" in best:
         means = {n: cell.predictions[n]["inliers"][:, AT_INLIERS].nanmean().item() for n in (winner, BASELINE)}
         shares = [f"`{name}` {100 * mean:.1f} %" for name, mean in means.items()]
@@ -107,11 +104,8 @@ def _level(ranking: _Ranking) -> str:
     if not ranking.against:
         count = "is 1 image pair" if ranking.pairs == 1 else f"are {ranking.pairs} image pairs"
         return f" Not tested: there {count}, a test needs {MIN_BOOTSTRAP_PAIRS}."
-    return f" Level with it: {_names(ranking.level)}." if ranking.level else ""
-
-
-def _names(names: Iterable[str]) -> str:
-    return ", ".join(f"`{name}`" for name in names)
+    level = [f"`{name}`" for name, found in ranking.against.items() if found.low <= 0 <= found.high]
+    return f" Level with it: {', '.join(level)}." if level else ""
 
 
 def _about_estimators(cell: RobustCell) -> str:

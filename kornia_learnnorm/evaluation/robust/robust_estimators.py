@@ -15,7 +15,7 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
-from kornia_learnnorm.evaluation.methods import OPTIMAL, REFINED, base_name, find_method, identify_method, short_name_of
+from kornia_learnnorm.evaluation.methods import REFINED, base_name, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.models.essential import Essential
@@ -107,10 +107,10 @@ def find_estimator(name: str) -> Estimator:
     if kind == GUIDED and method:
         return partial(_guided, LearnedEightPoint.from_pretrained(method))
     if kind and method:
-        if method.endswith(REFINED):
+        found = find_method(method)
+        if found.refined:
             raise ValueError(f"RANSAC refines by itself: expected {base_name(method)!r}, got {method!r}")
-        rank2 = {"rank2": "optimal"} if method.endswith(OPTIMAL) else {}
-        options = {"normalizer": find_method(method).normalizer, "max_samples": MAX_SAMPLES, **rank2}
+        options = {"normalizer": found.normalizer, "rank2": found.rank2, "max_samples": MAX_SAMPLES}
         return partial(_ransac, options, False)
     own = f"learned:WEIGHTS, with {REFINED} or {SCORED}, guided:WEIGHTS, RANSAC, RANSAC{CALIBRATED}, RANSAC:METHOD"
     raise ValueError(f"no estimator {name!r}: expected {', '.join(PEERS)}, {own} or {TRUTH}")

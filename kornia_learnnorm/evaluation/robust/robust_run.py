@@ -15,10 +15,9 @@ from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.robust import robust_estimators
-from kornia_learnnorm.evaluation.robust.peers import PEERS
 from kornia_learnnorm.evaluation.robust.robust_estimators import Estimator, EvaluatedPair, run_estimator
 from kornia_learnnorm.evaluation.runs import results_store
-from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, file_name, read_arrays
+from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, array_path, read_arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
@@ -88,13 +87,11 @@ def record_robust(
 
 
 def _find(name: str) -> Estimator | None:
-    """Return an estimator; None if it is from another package that is not installed."""
+    """Return an estimator; None if its package is not installed."""
     try:
         return robust_estimators.find_estimator(name)
     except ImportError:
-        if name in PEERS:
-            return None
-        raise
+        return None
 
 
 def _jobs(
@@ -157,7 +154,7 @@ def measure(pair: EvaluatedPair, F_mat: Tensor, threshold: float) -> dict[str, f
 
 def estimate_path(folder: Path, store: str, protocol: str, threshold: float, name: str) -> Path:
     """Return the file of an estimator's results."""
-    return folder / "robust" / file_name(store) / protocol / f"{threshold:g}px" / f"{file_name(name)}.npz"
+    return array_path(folder / "robust", store, protocol, f"{threshold:g}px", name)
 
 
 def read_robust(folder: str | Path) -> RobustRun | None:

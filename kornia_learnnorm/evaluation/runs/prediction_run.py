@@ -6,6 +6,7 @@ Each store has a folder with, for each protocol, the samples and a file per meth
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,9 +18,10 @@ from torch import Tensor
 from kornia_learnnorm.data.sets import MatchSets, draw_samples, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
-from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_names
+from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.runs import results_store
-from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, file_name, read_arrays
+from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, array_path, read_arrays
+from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem
@@ -194,7 +196,7 @@ def record_run(
     ``complete`` has shares of inliers and F1, too. ``command`` is the command line that asks for it, for the report.
     """
     options = SampleOptions() if options is None else options
-    folder, names = Path(folder), short_names(methods)
+    folder, names = Path(folder), names_of(methods, short_name_of, "methods")
     found = {names[name]: find_method(name) for name in methods}
     read = {name: read_store(path) for name, path in stores.items()}
     about = {
@@ -214,15 +216,10 @@ def _jobs(
     for name, store in stores.items():
         for protocol, max_ratio in PROTOCOLS.items():
             place = f"{name}, {protocol}"
-            samples = _samples(_path(folder, name, protocol, "samples"), place, options, store, max_ratio)
+            samples = _samples(array_path(folder, name, protocol, "samples"), place, options, store, max_ratio)
             for label, method in methods.items():
                 compute = partial(predict, method, samples, store, max_ratio, complete)
-                yield Job(label, _path(folder, name, protocol, label), compute)
-
-
-def _path(folder: Path, *names: str) -> Path:
-    *parents, last = map(file_name, names)
-    return folder.joinpath(*parents, f"{last}.npz")
+                yield Job(label, array_path(folder, name, protocol, label), compute)
 
 
 def _samples(
@@ -249,21 +246,20 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
     if about is None:
         raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
     cells = []
-    for store in about["stores"]:
-        for protocol in PROTOCOLS:
-            absent = ["all methods"]
-            if _path(folder, store, protocol, "samples").is_file():
-                cells.append(_read_cell(folder, about, store, protocol, complete))
-                absent = [name for name in about["methods"] if name not in cells[-1].predictions]
-            missing += [f"{name} on {store}, {protocol}" for name in absent]
+    for store, protocol in product(about["stores"], PROTOCOLS):
+        absent = ["all methods"]
+        if array_path(folder, store, protocol, "samples").is_file():
+            cells.append(_read_cell(folder, about, store, protocol, complete))
+            absent = [name for name in about["methods"] if name not in cells[-1].predictions]
+        missing += [f"{name} on {store}, {protocol}" for name in absent]
     return Run(about, cells, missing)
 
 
 def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, complete: bool) -> RunCell:
-    samples = read_arrays(_path(folder, store, protocol, "samples"), SAMPLES)
+    samples = read_arrays(array_path(folder, store, protocol, "samples"), SAMPLES)
     kept = torch.from_numpy(samples["plain_residual"] < about["max_residual"])
     pair = torch.from_numpy(samples["pair"])[kept]
-    paths = {name: _path(folder, store, protocol, name) for name in about["methods"]}
+    paths = {name: array_path(folder, store, protocol, name) for name in about["methods"]}
     predictions = {
         name: {key: torch.from_numpy(value) for key, value in read_arrays(path, KEYS[complete], len(pair)).items()}
         for name, path in paths.items()

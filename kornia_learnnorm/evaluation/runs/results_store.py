@@ -67,7 +67,8 @@ def record(
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: expected a folder for the run, or a new name")
     folder.mkdir(parents=True, exist_ok=True)
-    tqdm, failed = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm, dict[str, str]()
+    tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
+    failed: dict[str, str] = {}
     with exclusive(folder):
         before = _begin(folder, section, stores, about, redo, command)
         _forget(folder, section, redo)
@@ -144,17 +145,16 @@ def _begin(folder: Path, section: str, stores: Stores, about: About, redo: Colle
 def _read(folder: Path) -> dict[str, Any]:
     """Return the sections; none where there is no run."""
     path = folder / "run.json"
-    advice = "another version of the package made it, remove it or give another folder to --out"
     if not path.is_file():
         return {}
     try:
-        sections = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is damaged, it is not JSON: {error}") from error
-    if not isinstance(sections, dict):
-        raise ValueError(f"{path} is damaged: expected an object of JSON, got {type(sections).__name__}")
-    if (found := sections.pop("format", None)) != FORMAT:
-        raise ValueError(f"{folder} is a run of format {found}, expected {FORMAT}: {advice}")
+    sections: dict[str, Any] = found if isinstance(found, dict) else {}
+    if (number := sections.pop("format", None)) != FORMAT:
+        advice = "another version of the package made it, remove it or give another folder to --out"
+        raise ValueError(f"{folder} is a run of format {number}, expected {FORMAT}: {advice}")
     return sections
 
 
@@ -169,6 +169,12 @@ def file_name(name: str) -> str:
     return safe if safe and safe == name else f"{safe}-{sha256(name.encode()).hexdigest()[:8]}"
 
 
+def array_path(folder: Path, *names: str) -> Path:
+    """Return the file of arrays that belongs to a store, its protocol and a method, by their names in tables."""
+    *parents, last = map(file_name, names)
+    return folder.joinpath(*parents, f"{last}.npz")
+
+
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays to a compressed ``.npz`` file, whole or not at all; make its folder if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -178,8 +184,6 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> Arrays:
     """Return the arrays of a file; raise ValueError if it is damaged, lacks ``keys`` or these have not ``rows``."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} is missing: call the command that began the run again, it completes it")
     try:
         with path.open("rb") as file, np.load(file) as data:
             found = dict(data)
