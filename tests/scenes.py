@@ -335,11 +335,8 @@ def repeated_wall(copies: int = 90, seed: int = 0) -> tuple[Tensor, Tensor, Tens
     """
     cell, epipole = np.array([60.0, 0.0]), np.array([0.8, 0.6])  # from a window to the next, pixels; a direction
     rng = np.random.default_rng(seed)
-    wall, board, false = (
-        rng.uniform(0, (640, 480), (600, 2)),
-        rng.uniform(200, 300, (120, 2)),
-        rng.uniform(0, (640, 480), (copies, 2)),
-    )
+    wall, board = rng.uniform(0, (640, 480), (600, 2)), rng.uniform(200, 300, (120, 2))
+    false = rng.uniform(0, (640, 480), (copies, 2))
     wall = wall[((wall < 195) | (wall > 305)).any(-1)]
     points1 = np.concatenate([wall, board, false])
     label = np.repeat([0, 1, 2], [len(wall), len(board), len(false)])

@@ -59,7 +59,6 @@ def test_weights_of_matches_learn_which_are_coarse_without_labels(example, monke
     points += 2 * coarse[..., None] * torch.randn(3, 160, 4, generator=generator)
     descriptors = torch.where(coarse, 1.0, -1.0)[:, None, :, None].expand(3, 2, 160, 96)
     pairs = [module.Pair(*fields) for fields in zip(points, torch.full((3, 160), 0.5), descriptors, strict=True)]
-    torch.manual_seed(0)
     layer, weigh = kln.LearnedEightPoint.from_pretrained(), module.MatchWeights()
     assert torch.equal(weigh(pairs[0]), torch.ones(160, dtype=torch.float64))
     before = module.held_out_loss(layer, weigh, pairs)

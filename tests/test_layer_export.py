@@ -113,7 +113,6 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
 def test_relative_pose(monkeypatch):
     for name in ("EARLY_STEPS", "LOCAL_STEPS"):
         monkeypatch.setattr(pose_stages, name, 1)
-    torch.manual_seed(0)
     layer = LearnedRelativePose(width=8, depth=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()
     for size in SIZES:
@@ -121,7 +120,6 @@ def test_relative_pose(monkeypatch):
 
 
 def test_homography():
-    torch.manual_seed(0)
     layer = LearnedHomography(width=8, depth=1, refine_steps=1)
     program = export_layer(layer, ["scores"]).module()
     for batch_size, num_points in SIZES:

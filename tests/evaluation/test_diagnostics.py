@@ -62,20 +62,10 @@ def test_wrong_shapes(function, shapes, error, message):
         function(*map(torch.rand, shapes))
 
 
-class TestConditionNumber:
-    @given(st.integers(0, 2**31), st.sampled_from([1e-6, -3.0, 1e6]))
-    def test_scale_and_rotations_do_not_matter(self, seed, factor):
-        A, Q = uniform(10, 9, low=-1, seed=seed), torch.linalg.qr(uniform(9, 9, low=-1, seed=seed + 1))[0]
-        assert condition_number(factor * A @ Q).item() == pytest.approx(condition_number(A).item(), rel=1e-9)
-
-
-class TestNormalizedDistance:
-    def test_by_hand(self, device, dtype):
-        points = torch.tensor([[[5.0, 3.0], [2.0, 5.0], [2.0, 1.0]]], dtype=dtype, device=device)
-        T = torch.tensor([[[2.0, 0.0, -4.0], [0.0, 4.0, -4.0], [0.0, 0.0, 1.0]]], dtype=dtype, device=device)
-        # The first lands on (6, 8), the second on (0, 16), the third on the origin.
-        assert normalized_distance(points, T).tolist() == pytest.approx([26 / 3])
-        assert normalized_distance(points[0], T[0]).item() == pytest.approx(26 / 3)
+@given(st.integers(0, 2**31), st.sampled_from([1e-6, -3.0, 1e6]))
+def test_scale_and_rotations_do_not_matter_to_the_condition_number(seed, factor):
+    A, Q = uniform(10, 9, low=-1, seed=seed), torch.linalg.qr(uniform(9, 9, low=-1, seed=seed + 1))[0]
+    assert condition_number(factor * A @ Q).item() == pytest.approx(condition_number(A).item(), rel=1e-9)
 
 
 class TestDiagnose:
@@ -100,11 +90,6 @@ class TestDiagnose:
         np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=1e-2 if loose else 1e-5)
         np.testing.assert_allclose(found[:, 1:], expected[:, 1:], rtol=1e-3 if loose else 1e-6, atol=1e-6)
 
-    @pytest.mark.parametrize("normalizer", NORMALIZERS[1:])
-    def test_eight_points_leave_all_to_the_projection(self, normalizer):
-        points = correspondences("handheld", 50, noise=1.0)
-        np.testing.assert_allclose(diagnose(*points, normalizer).rank2_share.numpy(), 1, atol=1e-6)
-
     @given(st.integers(0, 2**31), st.sampled_from([8, 9, 20]), st.floats(-2, 2), st.randoms())
     def test_order_scale_and_shift_do_not_matter_to_hartley(self, seed, num_points, log_scale, random):
         """One scale for both views, which the sum of their distances asks for; the share has no unit."""
@@ -116,14 +101,6 @@ class TestDiagnose:
         moved = [10**log_scale * (p + o) for p, o in zip(points, shifts, strict=True)]
         torch.testing.assert_close(torch.stack(diagnose(*moved, Hartley())), expected, rtol=1e-5, atol=1e-5)
 
-    @pytest.mark.parametrize(
-        ("points1", "normalizer", "message"),
-        [
-            (torch.rand(2, 7, 2), Hartley(), "at least 8 correspondences are needed, got 7"),
-            (torch.full((2, 8, 2), torch.nan), Hartley(), "points1 must be finite"),
-            (torch.rand(2, 8, 2), lambda *_: (torch.eye(3), torch.eye(3)), "two transforms of shape"),
-        ],
-    )
-    def test_exceptions(self, points1, normalizer, message):
-        with pytest.raises(ValueError, match=message):
-            diagnose(points1, torch.rand_like(points1), normalizer)
+    def test_exceptions(self):
+        with pytest.raises(ValueError, match="at least 8 correspondences are needed, got 7"):
+            diagnose(torch.rand(2, 7, 2), torch.rand(2, 7, 2), Hartley())

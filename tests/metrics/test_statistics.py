@@ -108,35 +108,21 @@ class TestPairedBootstrap:
         better = torch.tensor([True, True, False])
         assert paired_bootstrap(better, better, groups[:3]).mean == 0  # shares of booleans
 
-    def test_p_values_are_uniform_where_there_is_no_effect(self):
-        found = [paired_bootstrap(*map(torch.tensor, uneven(seed=s)), draws=199).p_value for s in range(400)]
-        for level in (0.1, 0.5):
-            assert np.mean(np.array(found) < level) == pytest.approx(level, abs=0.07)
 
-
-FEW = "at least two groups are needed, got"
+VALUES = torch.tensor([1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize(
     ("function", "arguments", "message"),
     [
-        (bootstrap_interval, (torch.rand(3), torch.arange(4)), r"two \(S,\) tensors, got \[3\] and \[4\]"),
-        (bootstrap_interval, (torch.rand(2, 2), torch.ones(2, 2).long()), r"got \[2, 2\] and \[2, 2\]"),
-        (bootstrap_interval, (torch.tensor(1.0), torch.tensor(1)), r"got \[\] and \[\]"),
-        *(
-            (bootstrap_interval, (torch.rand(3), torch.arange(3), n), f"between 0 and 1, got {n}")
-            for n in (0.0, 1.0, 95, NAN)
-        ),
-        (bootstrap_interval, (torch.rand(3), torch.full((3,), 7)), f"{FEW} 1"),
-        (bootstrap_interval, (torch.rand(0), torch.arange(0)), f"{FEW} 0"),
-        (paired_bootstrap, (torch.rand(3, 1), torch.rand(3, 1), torch.arange(3)), r"two \(S,\) tensors, got \[3, 1\]"),
-        (paired_bootstrap, (torch.rand(3), torch.rand(3), torch.arange(4)), r"got \[3\] and \[4\]"),
-        (paired_bootstrap, (torch.rand(3), torch.rand(3), torch.zeros(3).long()), f"{FEW} 1"),
-        (
-            paired_bootstrap,
-            (torch.tensor([1.0, NAN, INF]), torch.rand(3), torch.arange(3)),
-            "2 NaN or infinite ones of 3",
-        ),
+        (bootstrap_interval, (VALUES, torch.arange(4)), r"two \(S,\) tensors, got \[3\] and \[4\]"),
+        (bootstrap_interval, (VALUES[None], VALUES[None]), r"got \[1, 3\] and \[1, 3\]"),
+        *((bootstrap_interval, (VALUES, VALUES, n), f"between 0 and 1, got {n}") for n in (0.0, 1.0, 95, NAN)),
+        (bootstrap_interval, (VALUES, torch.full((3,), 7)), "at least two groups are needed, got 1"),
+        (bootstrap_interval, (VALUES[:0], VALUES[:0]), "at least two groups are needed, got 0"),
+        (paired_bootstrap, (VALUES[None], VALUES[None], VALUES), r"two \(S,\) tensors, got \[1, 3\]"),
+        (paired_bootstrap, (VALUES, VALUES, torch.arange(4)), r"got \[3\] and \[4\]"),
+        (paired_bootstrap, (torch.tensor([1.0, NAN, INF]), VALUES, VALUES), "2 NaN or infinite ones of 3"),
     ],
 )
 def test_exceptions(function, arguments, message):
@@ -188,9 +174,7 @@ class TestBetterRate:
         [
             (torch.rand(3), torch.rand(4), r"two \(S,\) tensors, got \[3\] and \[4\]"),
             (torch.rand(3, 2), torch.rand(3, 2), r"two \(S,\) tensors, got \[3, 2\] and \[3, 2\]"),
-            (torch.tensor(1.0), torch.tensor(2.0), r"two \(S,\) tensors, got \[\] and \[\]"),
             (torch.rand(0), torch.rand(0), "none of 0 samples can be compared"),
-            (torch.full((3,), NAN), torch.rand(3), "none of 3 samples can be compared"),
         ],
     )
     def test_exceptions(self, residual, baseline, message):
