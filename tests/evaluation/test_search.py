@@ -48,13 +48,6 @@ def test_exceptions(steps):
         SearchedNormalizer(steps=steps)
 
 
-def test_one_step_is_exactly_the_base(dtype):
-    points = [p.to(dtype) for p in correspondences("handheld", 5)]
-    expected = Hartley()(*(p.double() for p in points))
-    for T, H in zip(SearchedNormalizer(Hartley(), steps=1)(*points), expected, strict=True):
-        assert torch.equal(T, H.to(dtype))
-
-
 class TestSearch:
     @pairwise(base=BASES, scene=SCENES, num_points=[8, 20])
     def test_never_worse_than_its_base(self, base, scene, num_points):

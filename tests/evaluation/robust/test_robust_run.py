@@ -13,7 +13,6 @@ from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.evaluation.robust import peers
 from kornia_learnnorm.evaluation.robust.robust_estimators import find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import estimate_path, measure, read_robust, shuffled_pair
-from kornia_learnnorm.metrics.inliers import f1_score
 
 
 def times(folder):
@@ -109,9 +108,6 @@ def test_measure(matches):
     true = measure(drawn, drawn.F_mat, 0.5)
     assert true["f1"] == 1
     assert max(true["rotation_error"], true["translation_error"]) < 1e-4
-    F_mat = drawn.F_mat * (1 + 1e-3 * torch.randn(3, 3, dtype=torch.float64))
-    expected = f1_score(drawn.points1, drawn.points2, F_mat, drawn.F_mat, 0.5)
-    assert measure(drawn, F_mat, 0.5)["f1"] == pytest.approx(expected.item())
     failed = measure(drawn, torch.full((3, 3), torch.nan, dtype=torch.float64), 1.0)
     assert failed["inliers"] == failed["f1"] == 0
     assert failed["error"] == failed["rotation_error"] == failed["translation_error"] == math.inf
