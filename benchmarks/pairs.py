@@ -263,10 +263,11 @@ def main(args: Sequence[str] | None = None) -> None:
         options.cache.mkdir(parents=True, exist_ok=True)
 
     def solve(case: Case) -> PairEstimate:
-        cameras = {"K1": case.K, "K2": case.K} if options.cameras else {}
+        given: dict[str, Any] = {"layer": layer, "model": options.model}
+        given |= {"K1": case.K, "K2": case.K} if options.cameras else {}
         if case.size is None:
-            return estimate_pair(*case.read, layer=layer, model=options.model, **cameras)
-        return estimate_matches(*case.read, case.size, case.size, layer=layer, model=options.model, **cameras)
+            return estimate_pair(*case.read, **given)
+        return estimate_matches(*case.read, size1=case.size, size2=case.size, **given)
 
     records = []
     for index in range(options.pairs):

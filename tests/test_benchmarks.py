@@ -103,6 +103,7 @@ class TestPairs:
         records = json.loads((tmp_path / "pairs.json").read_text())
         assert [record["kind"] for record in records] == ["plane", "rotation", "outliers"]
         assert [record["determined"] for record in records] == [False, False, True]
+        assert {record["crashed"] for record in records} == {None}
 
 
 class TestRealPairs:
