@@ -26,7 +26,7 @@ from kornia_learnnorm.data.images import read_colour
 from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
-from kornia_learnnorm.two_view.drawing import INLIER, blend_images, draw_line, draw_matches, import_matplotlib, stacked
+from kornia_learnnorm.two_view.drawing import INLIER, OUTLIER, blend_images, draw_line, import_matplotlib, stacked
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
 from kornia_learnnorm.two_view.inputs import MODELS
 from kornia_learnnorm.two_view.many_pairs import PairOptions
@@ -55,7 +55,6 @@ CSS = "#estimate textarea {font: clamp(8.5px, 2.2vw, 14px) / 1.5 monospace}"
 PROGRESS = gr.Progress()
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]  # RGB, (H, W, 3)
 
 
@@ -65,28 +64,6 @@ class Result:
 
     images: tuple[Pixels, Pixels]
     estimate: PairEstimate
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where an image lies in the picture of two; the unit of the picture is a pixel of image 1."""
-
-    size: Array  # width and height of the full image, pixels
-    scale: float = 1.0
-    corner: Array | float = 0.0  # x and y of the left upper corner
-
-    def to_picture(self, points: Array) -> Array:
-        """Move pixels of the image (..., 2) to the picture."""
-        return np.asarray(self.scale * (points + 0.5) - 0.5 + self.corner)
-
-    def from_picture(self, points: Array) -> Array:
-        """Move points of the picture (..., 2) to pixels of the image."""
-        return np.asarray((points + 0.5 - self.corner) / self.scale - 0.5)
-
-    @property
-    def ends(self) -> Array:
-        """Left upper and right lower corner in the picture, (2, 2)."""
-        return self.to_picture(np.stack([np.full(2, -0.5), self.size - 0.5]))
 
 
 def solve(
@@ -144,60 +121,55 @@ def draw_result(result: Result, pixel: Sequence[float] | None = None) -> Pixels:
     ``pixel`` is x and y of a point of an image in the picture: it is marked, and so is its epipolar line in the other
     image, or its match where the model is a homography; lines do not join the matches then.
     """
-    found, (first, second) = result.estimate, _places(result.estimate)
-    size = np.maximum(first.ends[1], second.ends[1]) + 0.5
-    shape = np.ceil(size * SHOWN_SIZE / max(found.size1))  # width and height of the picture, pixels
-    figure = import_matplotlib().figure.Figure(figsize=tuple(shape / DPI), dpi=DPI, facecolor="white")
-    axes = _axes(figure, Place(size), size)
-    for image, place in zip(result.images, (first, second), strict=True):
-        (left, top), (right, bottom) = place.ends
-        axes.imshow(image, extent=(left, right, bottom, top), aspect="auto", interpolation="lanczos")
-    points1, points2 = first.to_picture(found.points1.numpy()), second.to_picture(found.points2.numpy())
-    inliers = found.inliers.numpy()
-    joined = np.random.default_rng(0).permutation(np.flatnonzero(inliers))[: MAX_LINES if pixel is None else 0]
-    rows = np.concatenate([joined, np.flatnonzero(~inliers)])
-    draw_matches(axes, points1[rows], points2[rows], inliers[rows])
-    axes.plot(*np.concatenate([points1[inliers], points2[inliers]]).T, "o", color=INLIER, markersize=2)
-    if pixel is not None:
-        _mark(figure, found, (np.array(pixel) + 0.5) * size / shape - 0.5, size)
+    found = result.estimate
+    figure, views = _views((found.size1, found.size2))
+    points, inliers = (found.points1.numpy(), found.points2.numpy()), found.inliers.numpy()
+    for axes, image, x in zip(views, result.images, points, strict=True):
+        axes.imshow(image, extent=(*axes.get_xlim(), *axes.get_ylim()), aspect="auto", interpolation="lanczos")
+        axes.plot(*x[inliers].T, "o", color=INLIER, markersize=2)
+    views[0].plot(*points[0][~inliers].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8)
+    if pixel is None:
+        joined = np.random.default_rng(0).permutation(np.flatnonzero(inliers))[:MAX_LINES]
+        ends = np.stack([axes.transData.transform(x[joined]) for axes, x in zip(views, points, strict=True)], 1)
+        style = {"colors": INLIER, "linewidths": 0.7, "alpha": 0.8}
+        figure.add_artist(import_matplotlib().collections.LineCollection(ends, transform=None, **style))
+    else:
+        _mark(views, found, (pixel[0] + 0.5, figure.bbox.height - pixel[1] - 0.5))
     with io.BytesIO() as file:
         figure.savefig(file, format="rgba", dpi=DPI)
         drawn = np.frombuffer(file.getvalue(), np.uint8)
-    return drawn.reshape(int(shape[1]), int(shape[0]), 4)[..., :3].copy()
+    return drawn.reshape(round(figure.bbox.height), round(figure.bbox.width), 4)[..., :3].copy()
 
 
-def _places(estimate: PairEstimate) -> tuple[Place, Place]:
-    """Return the places of both images, with equal heights side by side or with equal widths one above the other."""
-    sizes = estimate.size1, estimate.size2
-    size1, size2 = np.array(sizes, float)
+def _views(sizes: tuple[tuple[int, int], tuple[int, int]]) -> tuple[Any, list[Any]]:
+    """Return a figure and axes of both images, with equal heights side by side or with equal widths stacked."""
     axis = int(stacked(sizes))  # along which image 2 follows
-    corner = np.where(np.arange(2) == axis, (1 + GAP) * size1, 0.0)
-    return Place(size1), Place(size2, float(size1[1 - axis] / size2[1 - axis]), corner)
+    size1, size2 = (np.array(size, float) for size in sizes)
+    size1 = size1 * SHOWN_SIZE / size1.max()  # in the picture
+    size2 = size2 * size1[1 - axis] / size2[1 - axis]
+    step = np.where(np.arange(2) == axis, (1 + GAP) * size1, 0.0)
+    shape = np.ceil(np.maximum(size1, step + size2))
+    figure, views = import_matplotlib().figure.Figure(figsize=tuple(shape / DPI), dpi=DPI, facecolor="white"), []
+    for (width, height), size, corner in zip(sizes, (size1, size2), (0 * step, step), strict=True):
+        (left, top), (wide, high) = corner / shape, size / shape
+        axes = figure.add_axes((left, 1 - top - high, wide, high))
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), autoscale_on=False)
+        axes.set_axis_off()
+        views.append(axes)
+    return figure, views
 
 
-def _axes(figure: Any, place: Place, size: Array) -> Any:
-    """Return new axes in pixels of an image, at its place in a picture of a width and height; their limits stay."""
-    (left, top), (right, bottom) = (place.ends + 0.5) / size
-    axes = figure.add_axes((left, 1 - bottom, right - left, bottom - top))
-    axes.set(xlim=(-0.5, place.size[0] - 0.5), ylim=(place.size[1] - 0.5, -0.5), autoscale_on=False)
-    axes.set_axis_off()
-    return axes
-
-
-def _mark(figure: Any, found: PairEstimate, point: Array, size: Array) -> None:
-    """Draw a point of the picture, if it lies in an image, and in the other image its epipolar line or its match."""
-    places = _places(found)
-    pixels = [place.from_picture(point) for place in places]
-    inside = [abs(2 * x + 1 - place.size) <= place.size for x, place in zip(pixels, places, strict=True)]
-    view = next((number for number, both in enumerate(inside) if both.all()), None)
+def _mark(views: list[Any], found: PairEstimate, point: tuple[float, float]) -> None:
+    """Draw a point of the figure, if it lies in an image, and in the other image its epipolar line or its match."""
+    view = next((number for number, axes in enumerate(views) if axes.bbox.contains(*point)), None)
     if view is None:
         return
-    x, here, there = pixels[view], _axes(figure, places[view], size), _axes(figure, places[1 - view], size)
-    cross: dict[str, Any] = {"marker": "+", "markersize": 16, "markeredgewidth": 2.5, "color": MARK}
-    here.plot(*x, **cross)
+    here, there = views[view], views[1 - view]
+    x, cross = here.transData.inverted().transform(point), {"markersize": 16, "markeredgewidth": 2.5, "color": MARK}
+    here.plot(*x, "+", **cross)
     if found.model == "homography":
         H_mat = torch.linalg.inv(found.matrix) if view else found.matrix
-        there.plot(*transform_points(H_mat[None], torch.from_numpy(x)[None, None]).flatten().tolist(), **cross)
+        there.plot(*transform_points(H_mat[None], torch.from_numpy(x)[None, None]).flatten().tolist(), "+", **cross)
     else:
         F_mat = found.matrix.mT if view else found.matrix
         draw_line(there, F_mat.numpy() @ np.append(x, 1.0), color=LINE, linewidth=2.5)

@@ -56,15 +56,6 @@ def draw_line(axes: Axes, line: Array, **style: Any) -> Line2D | None:
     return axes.axline((-a * c, -b * c), slope=-a / b if b else math.inf, **style)
 
 
-def draw_matches(axes: Axes, points1: Array, points2: Array, inliers: NDArray[np.bool_]) -> None:
-    """Draw the matches (N, 2) in image 1: inliers as dots with their motion to image 2, outliers as crosses."""
-    motion = np.stack([points1, points2], 1)[inliers]
-    lines = import_matplotlib().collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8)
-    axes.add_collection(lines)
-    axes.plot(*points1[inliers].T, "o", color=INLIER, markersize=2, label="inliers and their motion")
-    axes.plot(*points1[~inliers].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8, label="outliers")
-
-
 def draw_pair(image1: Pixels, image2: Pixels, estimate: PairEstimate, path: str | Path) -> None:
     """Draw the matches in image 1 and what the matrix says in image 2, and write the picture whole or not at all.
 
@@ -92,7 +83,12 @@ def draw_pair(image1: Pixels, image2: Pixels, estimate: PairEstimate, path: str 
     figure.suptitle(above, x=0.01, ha="left", color=TEXT, fontsize=9, linespacing=1.2)
     if below:
         figure.supxlabel("\n".join(below), x=0.01, ha="left", color=OUTLIER, fontsize=9, linespacing=1.2)
-    draw_matches(axes1, estimate.points1.numpy(), estimate.points2.numpy(), estimate.inliers.numpy())
+    points1, points2, inliers = (x.numpy() for x in (estimate.points1, estimate.points2, estimate.inliers))
+    motion = np.stack([points1, points2], 1)[inliers]
+    lines = import_matplotlib().collections.LineCollection(motion, colors=INLIER, linewidths=0.7, alpha=0.8)
+    axes1.add_collection(lines)
+    axes1.plot(*points1[inliers].T, "o", color=INLIER, markersize=2)
+    axes1.plot(*points1[~inliers].T, "x", color=OUTLIER, markersize=3.5, markeredgewidth=0.8)
     if not moved:
         _draw_lines(axes2, estimate)
     with atomic_write(path) as temporary:
