@@ -29,13 +29,13 @@ from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.two_view.inputs import check_settings, read_cameras
 from kornia_learnnorm.two_view.reliability import MAX_LOG_FALSE_ALARMS, log_false_alarms
+from kornia_learnnorm.two_view.solver import MIN_SCORE
 
 CORNER = 0.5  # pixels from the corner of the first pixel to its centre
 THRESHOLD = 2.0  # pixels, of RANSAC
 INLIER_FACTOR = 2.0  # thresholds within which a match is an inlier: a few coarse ones are better than broken tracks
 MIN_INLIERS = 15  # of a verified pair, COLMAP's own number
 PLANAR_SHARE = 0.8  # of the inliers on one homography, COLMAP's own number
-MIN_SCORE = 1e-3  # a match of weight zero would never be sampled
 Array = NDArray[np.float64]
 
 
@@ -62,8 +62,7 @@ class _Geometry(NamedTuple):
     config: str  # a name of pycolmap.TwoViewGeometryConfiguration
     matrices: dict[str, Array]  # F, E, H, (3, 3), where there are some
     pose: tuple[Array, Array] | None  # R (3, 3) and t (3,)
-    points1: Array  # of the inliers, (N, 2)
-    points2: Array
+    inliers: NDArray[np.bool_]  # (N,)
 
 
 def export_colmap(
@@ -125,7 +124,7 @@ def export_colmap(
         with open_workers(jobs) as workers, workers.results(_estimate, arguments) as results:
             found = [*tqdm(results, "estimating", len(pairs), unit="pair", file=sys.stderr)]
         _write_pairs(pycolmap, temporary, ids, pairs, found)
-    inliers = [len(geometry.points1) for geometry in found if geometry is not None]
+    inliers = [int(geometry.inliers.sum()) for geometry in found if geometry is not None]
     matches = sum(len(pair.scores) for pair in pairs)
     return DatabaseCounts(len(ids), len(pairs), matches, len(inliers), sum(inliers))
 
@@ -187,7 +186,7 @@ def _estimate(
     if int(on_plane.sum()) > PLANAR_SHARE * number:
         config = "PLANAR_OR_PANORAMIC"
     arrays = {name: matrix.numpy() for name, matrix in matrices.items()}
-    return _Geometry(config, arrays, pose, pair.points1[inliers.numpy()], pair.points2[inliers.numpy()])
+    return _Geometry(config, arrays, pose, inliers.numpy())
 
 
 def _write_images(
@@ -225,22 +224,20 @@ def _write_pairs(
     keypoints = {name: np.unique(np.concatenate(parts), axis=0) for name, parts in seen.items()}
     places = {name: {tuple(point): n for n, point in enumerate(points.tolist())} for name, points in keypoints.items()}
 
-    def indices(pair: _Pair, points1: Array, points2: Array) -> NDArray[np.uint32]:
-        views = zip(pair.names, (points1, points2), strict=True)
-        columns = [[places[name][tuple(point)] for point in points.tolist()] for name, points in views]
-        return np.array(columns, np.uint32).T
-
     with pycolmap.Database.open(database) as file, pycolmap.DatabaseTransaction(file):
         for name, points in keypoints.items():
             file.write_keypoints(ids[name], points.astype(np.float32))
         for pair, found in zip(pairs, geometries, strict=True):
             numbers = ids[pair.names[0]], ids[pair.names[1]]
-            file.write_matches(*numbers, indices(pair, pair.points1, pair.points2))
+            views = zip(pair.names, (pair.points1, pair.points2), strict=True)
+            columns = [[places[name][tuple(point)] for point in points.tolist()] for name, points in views]
+            matches = np.array(columns, np.uint32).T
+            file.write_matches(*numbers, matches)
             if found is None:
                 continue
             geometry = pycolmap.TwoViewGeometry()
             geometry.config = int(getattr(pycolmap.TwoViewGeometryConfiguration, found.config))
-            geometry.inlier_matches = indices(pair, found.points1, found.points2)
+            geometry.inlier_matches = matches[found.inliers]
             for name, matrix in found.matrices.items():
                 setattr(geometry, name, matrix)
             if found.pose is not None:
