@@ -10,8 +10,9 @@ well as the poses are. The last table is of random subsets of the matches of eve
 stderr.
 
     python benchmarks/real_pairs.py DATA [--datasets tum kitti photographs] [--methods DETECTOR+MATCHER ...]
-        [--pairs 50] [--every 4] [--json FILE] [--csv FILE]
+        [--pairs 50] [--every 4] [--focal FACTOR] [--json FILE] [--csv FILE]
 
+With --focal, the focal lengths given to all estimators are wrong by this factor, and nothing runs without cameras.
 DATA holds the folders `tum/SEQUENCE`, `kitti/sequences/06`, `kitti/poses/06.txt`, and `images/photographs` with a file
 cameras.json: for each image K and camera_to_world.
 """
@@ -59,6 +60,7 @@ class Pair(NamedTuple):
     calibrated: bool
     method: str  # detector and matcher
     matched: MatchedPair
+    focal: float = 1.0  # of the focal lengths given over the true ones
 
     @property
     def cameras(self) -> dict[str, Tensor]:
@@ -67,8 +69,9 @@ class Pair(NamedTuple):
 
     @property
     def K(self) -> tuple[Tensor, Tensor]:  # noqa: N802
-        """Return the true cameras."""
-        return torch.from_numpy(self.frames.frame1.K), torch.from_numpy(self.frames.frame2.K)
+        """Return the true cameras, or those of a wrong focal length."""
+        scale = torch.tensor([self.focal, self.focal, 1.0], dtype=torch.float64)
+        return torch.from_numpy(self.frames.frame1.K) * scale, torch.from_numpy(self.frames.frame2.K) * scale
 
 
 def read_pairs(dataset: str, data: Path) -> list[FramePair]:
@@ -258,6 +261,7 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--methods", nargs="+", default=["sift+nearest"], help="DETECTOR+MATCHER")
     parser.add_argument("--pairs", type=int, default=50, help="first pairs of each set")
     parser.add_argument("--every", type=int, default=4, help="subsets are drawn of each so many-th pair; 0 for none")
+    parser.add_argument("--focal", type=float, default=1.0, help="factor of the focal lengths given")
     options = parser.parse_args(args)
     peers = {name: {} for name in PEERS}
     for name in PEERS:
@@ -272,9 +276,10 @@ def main(args: Sequence[str] | None = None) -> None:
             detector, matcher = method.split("+")
             matched = match_two_images(*(frame.path for frame in frames), detector=detector, matcher=matcher)
             sizes = SIZES if options.every and number % options.every == 0 else ()
-            for calibrated in (False, True):
+            for calibrated in (False, True) if options.focal == 1 else (True,):
                 solvers = {name: solver[calibrated] for name, solver in peers.items()}
-                records += measure(Pair(dataset, number, frames, calibrated, method, matched), solvers, sizes)
+                pair = Pair(dataset, number, frames, calibrated, method, matched, options.focal)
+                records += measure(pair, solvers, sizes)
             print(f"{dataset} {method} {number}", file=sys.stderr, flush=True)
     print_tables(records, [*peers], options.csv)
     write_json(options.json, records)

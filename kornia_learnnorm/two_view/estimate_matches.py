@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -19,15 +19,17 @@ from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view import reliability
+from kornia_learnnorm.two_view.camera_check import find_camera_doubt
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.model_choice import choose_model
-from kornia_learnnorm.two_view.parallax import Parallax
-from kornia_learnnorm.two_view.plane_pose import PlanePose, angle_between, plane_poses
+from kornia_learnnorm.two_view.plane_pose import angle_between, plane_poses
 from kornia_learnnorm.two_view.reliability import CAMERA_ERROR, PairWarning, PredictedError
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
+# Fields of PairEstimate, those of a pose only where there is one; standard errors; reasons for doubt.
+Answer = tuple[dict[str, Any], PredictedError, tuple[PairWarning, ...]]
 
 
 def estimate_matches(
@@ -80,27 +82,30 @@ def estimate_matches(
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)
     points1, points2, scores = _usable(*read_matches(points1, points2, scores), threshold)
+    given = size1, size2
     size1, size2 = read_size("size1", size1, points1), read_size("size2", size2, points2)
     solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras, sampler)
     choice, found, H_mat = choose_model(solver, model, size1, size2)
+    F_mat = None if found is None else found.matrix
     if choice.model == "homography":
-        answer = _answer_homography(solver, cast(Tensor, H_mat), None if found is None else found.matrix)
+        fields, error, doubts = _answer_homography(solver, cast(Tensor, H_mat), F_mat)
     else:
-        answer = _answer_fundamental(solver, cast(Solution, found), cast(Parallax, choice.parallax), size1, size2)
-    doubts = reliability.find_warnings(points1, points2, answer.inliers, threshold, size2, answer.error.angle)
+        fields, error, doubts = _answer_fundamental(solver, cast(Solution, found), size1, size2)
+    if cameras is not None:
+        doubts += find_camera_doubt(cameras, given, points1, points2, F_mat, threshold)
+    elif choice.model == "fundamental" and choice.parallax is not None and choice.parallax.planar:
+        doubts += (PairWarning("planar", choice.parallax.describe(threshold)),)
+    about = points1, points2, fields["inliers"], threshold, size2, error.angle
     return PairEstimate(
         choice=choice,
-        F_mat=answer.F_mat,
         H_mat=H_mat,
-        **answer.pose._asdict(),
-        estimator=solver.estimator if choice.model == "fundamental" else RANSAC.__name__,
+        **fields,
+        estimator=(RANSAC if layer is None or choice.model == "homography" else type(layer)).__name__,
         points1=points1,
         points2=points2,
         scores=scores,
-        weights=answer.weights,
-        inliers=answer.inliers,
-        predicted_error=min(math.hypot(answer.error.distance, CAMERA_ERROR * max(size2)), float(max(size2))),
-        warnings=(*doubts, *answer.warnings),
+        predicted_error=min(math.hypot(error.distance, CAMERA_ERROR * max(size2)), float(max(size2))),
+        warnings=(*reliability.find_warnings(*about), *doubts),
         size1=size1,
         size2=size2,
         ratio=None,
@@ -125,64 +130,43 @@ def _usable(points1: Tensor, points2: Tensor, scores: Tensor, threshold: float) 
     return points1[kept], points2[kept], scores[kept]
 
 
-class _Pose(NamedTuple):  # all None without cameras; R, t and front also where two poses of an essential matrix tie
-    E_mat: Tensor | None = None
-    R: Tensor | None = None
-    t: Tensor | None = None
-    front: Tensor | None = None
-    n: Tensor | None = None
-    other_pose: PlanePose | None = None
-
-
-class _Answer(NamedTuple):
-    F_mat: Tensor | None
-    inliers: Tensor
-    weights: Tensor
-    error: PredictedError
-    pose: _Pose = _Pose()
-    warnings: tuple[PairWarning, ...] = ()
-
-
-def _answer_fundamental(
-    solver: TwoViewSolver, found: Solution, parallax: Parallax, size1: Size, size2: Size
-) -> _Answer:
+def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, size2: Size) -> Answer:
     F_mat, inliers, matches = found.matrix, solver.inliers(found.matrix), (solver.points1, solver.points2)
     cameras = solver.cameras or (reliability.nominal_camera(size1), reliability.nominal_camera(size2))
     error = reliability.predict_error(found.parts, found.part_size, *matches, F_mat, inliers, *cameras)
-    answer = _Answer(F_mat, inliers, inliers.double() if solver.layer is None else found.weights, error)
+    weights = inliers.double() if solver.layer is None else found.weights
+    fields: dict[str, Any] = {"F_mat": F_mat, "inliers": inliers, "weights": weights}
     if solver.cameras is None:
-        if not parallax.planar:
-            return answer
-        return answer._replace(warnings=(PairWarning("planar", parallax.describe(solver.threshold)),))
-    E_mat = nearest_essential(transform_fundamental(F_mat, *cameras)[None])[0]
+        return fields, error, ()
+    fields["E_mat"] = nearest_essential(transform_fundamental(F_mat, *cameras)[None])[0]
     K1, K2, x1, x2 = (value[None] for value in (*cameras, *matches))
     R, t = relative_pose(F_mat[None], K1, K2, x1, x2, inliers[None])
-    if bool(R.isfinite().all()):
-        return answer._replace(pose=_Pose(E_mat, R[0], t[0], in_front(R, t, K1, K2, x1, x2)[0]))
-    text = "the matches do not decide between the four poses of the essential matrix"
-    return answer._replace(pose=_Pose(E_mat), warnings=(PairWarning("no_pose", text),))
+    if not bool(R.isfinite().all()):
+        text = "the matches do not decide between the four poses of the essential matrix"
+        return fields, error, (PairWarning("no_pose", text),)
+    return fields | {"R": R[0], "t": t[0], "front": in_front(R, t, K1, K2, x1, x2)[0]}, error, ()
 
 
-def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | None) -> _Answer:
+def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | None) -> Answer:
     found, cameras, matches = solver.check_homography(H_mat), solver.cameras, (solver.points1, solver.points2)
     inliers = found.weights > 0
     about = found.parts, found.part_size, solver.points1, H_mat, inliers
-    answer = _Answer(F_mat, inliers, found.weights, reliability.predict_transfer_error(*about))
+    fields: dict[str, Any] = {"F_mat": F_mat, "inliers": inliers, "weights": found.weights}
     if cameras is None:
-        return answer
+        return fields, reliability.predict_transfer_error(*about), ()
     seen = (*cameras, *(points[inliers] for points in matches))
     poses = plane_poses(H_mat, *seen)
     if not poses:
         text = "no plane in front of both cameras has this homography"
-        return answer._replace(warnings=(PairWarning("no_pose", text),))
+        return fields, reliability.predict_transfer_error(*about), (PairWarning("no_pose", text),)
     if len(poses) > 1:  # matches off the plane agree with the true pose alone
         support = solver.support(torch.stack([pose.fundamental(*cameras) for pose in poses]))
         poses = [poses[row] for row in support.argsort(descending=True, stable=True).tolist()]
     (R, t, n), *others = poses
     angles = torch.tensor([angle_between(poses[0], plane_poses(part, *seen)) for part in found.parts]).double()
-    answer = answer._replace(error=reliability.predict_transfer_error(*about, angles))
-    if t is None:
-        return answer._replace(pose=_Pose(R=R))
-    front = in_front(R[None], t[None], *(value[None] for value in (*cameras, *matches)))[0]
-    pose = _Pose(poses[0].essential(), R, t, front, n, others[0] if others else None)
-    return answer._replace(F_mat=poses[0].fundamental(*cameras), pose=pose)
+    fields["R"] = R
+    if t is not None:
+        front = in_front(R[None], t[None], *(value[None] for value in (*cameras, *matches)))[0]
+        fields |= {"F_mat": poses[0].fundamental(*cameras), "E_mat": poses[0].essential(), "t": t, "n": n}
+        fields |= {"front": front, "other_pose": others[0] if others else None}
+    return fields, reliability.predict_transfer_error(*about, angles), ()

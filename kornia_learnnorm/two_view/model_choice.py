@@ -10,13 +10,11 @@ from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.two_view.parallax import measure_parallax
-from kornia_learnnorm.two_view.reliability import MIN_SUPPORT
+from kornia_learnnorm.two_view.reliability import MEDIAN_SQUARE, MIN_NOISE, MIN_SUPPORT
 from kornia_learnnorm.two_view.result import ModelChoice, NoReliableMatrixError
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
 ASKED = "asked for"
-MIN_NOISE = 1e-6  # thresholds; of matches without noise
-MEDIAN_SQUARE = 0.455  # of a standard normal variable
 
 
 def choose_model(
@@ -52,9 +50,9 @@ def choose_model(
 
 def _compare(solver: TwoViewSolver, F_mat: Tensor, H_mat: Tensor | None, size1: Size, size2: Size) -> ModelChoice:
     """Return the choice between a fundamental matrix and a homography (3, 3)."""
-    points1, points2, threshold, distance = solver.points1, solver.points2, solver.threshold, solver.distance(F_mat)
-    inliers = int((distance < threshold).sum())
-    parallax = measure_parallax(points1, points2, distance, threshold, size1, size2)
+    points1, points2, threshold = solver.points1, solver.points2, solver.threshold
+    inliers = int(solver.inliers(F_mat).sum())
+    parallax = measure_parallax(points1, points2, F_mat, threshold, size1, size2)
     reason = parallax.describe(threshold)
     if H_mat is None:
         return ModelChoice("fundamental", reason, parallax, inliers)

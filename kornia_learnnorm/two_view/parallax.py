@@ -7,18 +7,20 @@ pixels.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
-from kornia.geometry.epipolar import cross_product_matrix
+from kornia.geometry.epipolar import cross_product_matrix, left_to_right_epipolar_distance
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size, import_cv2
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.models.contract import Residuals
 from kornia_learnnorm.models.fundamental import Fundamental
@@ -28,14 +30,14 @@ from kornia_learnnorm.ransac.scoring import PairScorer
 __all__ = ["MAX_LOG_CHANCE_PARALLAX", "MIN_PLANAR_SHARE", "Parallax", "distances_from_plane", "find_main_plane"]
 __all__ += ["fit_plane_and_parallax", "parallax", "parallax_evidence"]
 
-OFF_PLANE = 2.0  # thresholds; a match that the homography misses by more lies off the plane
+OFF_PLANE = 2.0  # thresholds, or standard deviations; a match that the homography misses by more is off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
 MIN_PARALLAX_INLIERS = 3  # matches off the plane that a matrix must have to be more than a choice of two
 MAX_DISTORTION = 0.2  # of the radius at the corners of an image
 MAX_LM_STEPS = 10
 TOLERANCE = 1e-6  # cosine of offsets and derivatives at which Levenberg-Marquardt has converged
 MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
-PARALLAX_SCALES = (1.0, 0.5, 0.25, 0.125)  # of the threshold at which parallax is sought; SIFT errs by 0.1 px or so
+PARALLAX_NOISE = (1.0, 0.5, 0.25, 0.125)  # thresholds; noise that is tried, SIFT errs by 0.1 px or so
 MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
 AT_INFINITY = 1e6  # halves of the diagonal; offset of a point that the homography moves to infinity
 
@@ -62,17 +64,16 @@ class Parallax(NamedTuple):
 
 
 def measure_parallax(
-    points1: Tensor, points2: Tensor, distance: Tensor, threshold: float, size1: Size, size2: Size
+    points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, size1: Size, size2: Size
 ) -> Parallax:
-    """Return the parallax of matches (N, 2) that are ``distance`` (N,) from the fundamental matrix, pixels."""
-    inliers = distance < threshold
+    """Return the parallax of matches (N, 2) of a fundamental matrix (3, 3)."""
+    inliers = symmetric_epipolar_distance(points1, points2, F_mat) < threshold
     H = find_main_plane(points1[inliers], points2[inliers], threshold)
     if H is None:
         return Parallax(0.0, 0.0, 0.0)
     off_plane = distances_from_plane(points1, points2, H, size1, size2, threshold)
     near, wide = (float((off_plane[inliers] < k * threshold).double().mean()) for k in (1, 3))
-    evidence = (parallax_evidence(off_plane, distance < k * threshold, k * threshold) for k in PARALLAX_SCALES)
-    return Parallax(near, wide, min(0.0, *evidence))
+    return Parallax(near, wide, min(0.0, parallax_evidence(points1, points2, F_mat, off_plane, threshold)))
 
 
 def find_main_plane(points1: Tensor, points2: Tensor, threshold: float) -> Tensor | None:
@@ -92,24 +93,46 @@ def parallax(points1: Tensor, points2: Tensor, H: Tensor) -> Tensor:
     return distance.nan_to_num(nan=math.inf)
 
 
-def parallax_evidence(distance: Tensor, inliers: Tensor, threshold: float) -> float:
-    r"""Return log10 of the expected number of epipoles with as many inliers off the plane among random matches.
+def parallax_evidence(
+    points1: Tensor,
+    points2: Tensor,
+    F_mat: Tensor,
+    distance: Tensor,
+    threshold: float,
+    noises: Sequence[float] = PARALLAX_NOISE,
+) -> float:
+    r"""Return log10 of the expected number of epipoles with as much evidence among matches without parallax.
 
-    A random match at the distance :math:`r` from :math:`H x_1` lies within :math:`\tau` of its epipolar line with
-    probability :math:`\frac{2}{\pi} \arcsin(\tau / r)`. Two matches determine an epipole; the others are evidence for
-    it (as in L. Moisan, B. Stival, IJCV 2004), infinite where fewer than three matches off the plane are inliers.
-    ``distance`` (N,) is that of :func:`parallax`, ``threshold`` is :math:`\tau`.
+    Without parallax, a match at the distance :math:`r` from :math:`H x_1` lies in any direction from it. With parallax,
+    and noise of a standard deviation :math:`\sigma`, its distance :math:`d` from its epipolar line is more likely by
+
+    .. math:: \exp(-d^2 / 2 \sigma^2) \, / \, \big(\exp(-r^2 / 4 \sigma^2) \, I_0(r^2 / 4 \sigma^2)\big)
+
+    The evidence is this likelihood ratio over all matches off the plane, a share of which has parallax. It is that of
+    the likeliest noise, out of some shares of the threshold, and share, out of ten. Two matches determine an epipole,
+    so the two that agree best do not count. Of one epipole, chance gives a ratio of :math:`\Lambda` with a probability
+    of at most :math:`1 / \Lambda` (Markov's inequality).
+
+    Args:
+        points1: pixels in image 1, (N, 2).
+        points2: pixels in image 2, (N, 2).
+        F_mat: fundamental matrix (3, 3).
+        distance: :math:`r`, that of :func:`parallax` or :func:`distances_from_plane`, pixels, (N,).
+        threshold: largest distance of an inlier, pixels.
+        noises: standard deviations, as shares of the threshold.
     """
-    off = distance > OFF_PLANE * threshold
-    number, agree = int(off.sum()), int((off & inliers).sum())
-    if agree < MIN_PARALLAX_INLIERS:
-        return math.inf
-    chance = 2 / math.pi * (threshold / distance[off]).clamp(max=1.0).asin()
-    expected, excess = float(chance.mean()) * (number - 2), agree - 2
-    if excess <= expected:
-        return math.inf
-    tail = excess - expected - excess * math.log(excess / max(expected, 1e-9))  # Chernoff's bound
-    return math.log10(number * (number - 1) / 2) + tail / math.log(10)
+    across = left_to_right_epipolar_distance(points1[None], points2[None], F_mat[None])[0]
+    shares, evidence = torch.arange(0.05, 1.0, 0.1).to(F_mat), math.inf
+    for noise in noises:
+        off = (distance > OFF_PLANE * noise * threshold) & distance.isfinite()
+        if (number := int(off.sum())) < MIN_PARALLAX_INLIERS:
+            continue
+        d, r = (value[off] / (noise * threshold) for value in (across, distance))
+        ratio = (torch.exp(-d.square() / 2) / torch.special.i0e(r.square() / 4)).sort().values[:-2]
+        gain = float(torch.log1p(shares[:, None] * (ratio - 1)).sum(-1).max())
+        tests = len(noises) * len(shares) * number * (number - 1) / 2
+        evidence = min(evidence, math.log10(tests) - gain / math.log(10))
+    return evidence
 
 
 def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshold: float, seed: int) -> Tensor | None:

@@ -24,6 +24,8 @@ MIN_SUPPORT = 0.75  # of the inliers; the matrix of a part with fewer is that of
 MIN_SOLVED_PARTS = 4  # with fewer matrices of as much support, those of all parts count
 NOMINAL_FOCAL = 1.2  # of the longer image side: focal length where no camera is given
 COMMON_ERRORS = 400  # matches beyond which more do not help: the errors of neighbours are alike
+MEDIAN_SQUARE = 0.455  # of a standard normal variable
+MIN_NOISE = 1e-6  # thresholds; of matches without noise
 CAMERA_ERROR = 1e-4  # of the longer image side, in photographs: what matches do not tell, such as distortion
 MAX_ANGLE = 8.0  # degrees; a pose that moves by more in half of the parts is unstable
 MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
@@ -107,7 +109,7 @@ def nominal_camera(size: Size) -> Tensor:
 class PairWarning(NamedTuple):
     """A reason to doubt a matrix."""
 
-    code: str  # few_inliers, chance, clustered, planar, unstable, ambiguous or no_pose
+    code: str  # few_inliers, chance, clustered, planar, unstable, ambiguous, no_pose or cameras
     text: str  # one sentence for people
 
 

@@ -15,7 +15,7 @@ from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.two_view.parallax import find_main_plane, parallax
+from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX, find_main_plane, parallax, parallax_evidence
 from kornia_learnnorm.two_view.reliability import MIN_INLIERS, PairWarning
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
@@ -28,7 +28,7 @@ MIN_MATCHES_OFF_PLANE = 16  # fewer tell nothing of a matrix
 MIN_FALSE_SHARE = 0.15  # of the false matches off the plane; as many fit the true matrix by chance
 MAX_FALSE_SHARE = 0.3  # of the false matches off the plane; more fit only a matrix that they decided
 MAX_SHARE_LEFT = 0.8  # of the false matches per coherent one that fit the first matrix, for another to replace it
-MIN_COHERENT_SHARE = 2 / 3  # of the coherent matches off the plane; with fewer, they belong to two matrices
+MIN_COHERENT_SHARE = 2 / 3  # of the coherent matches off the plane; with fewer, another matrix is sought
 MIN_AGREEING_SHARE = 0.8  # of the inliers of either matrix off the plane that fit the other one, for them to be alike
 
 
@@ -64,8 +64,14 @@ def resolve_ambiguity(
     def fitting(F_mat: Tensor) -> list[float]:  # shares of the false and of the coherent matches off the plane
         return [fitting_share(*x, plane, F_mat, first.threshold) for x in ((false1, false2), matches)]
 
+    def doubtful(estimate: PairEstimate, true: float) -> bool:  # whether the coherent matches do not speak for it
+        if true < MIN_COHERENT_SHARE and (estimate is first or estimate.E_mat is not None):
+            return True
+        evidence = parallax_evidence(*matches, estimate.matrix, parallax(*matches, plane), first.threshold)
+        return estimate.E_mat is None and evidence > MAX_LOG_CHANCE_PARALLAX  # with cameras a plane is enough
+
     best, (false, true) = first, fitting(first.matrix)
-    if false > MIN_FALSE_SHARE or true < MIN_COHERENT_SHARE:
+    if false > MIN_FALSE_SHARE or doubtful(first, true):
         with suppress(NoReliableMatrixError):
             second = again(coherent)
             left, gained = fitting(second.matrix)
@@ -73,11 +79,11 @@ def resolve_ambiguity(
                 best, false, true = second, left, gained
             if _agree(first, second, plane):
                 return best
-    off = "of the matches off the main plane that"
     if false > MAX_FALSE_SHARE:
-        return _with_doubt(best, f"{false:.0%} {off} are nearest in one direction only fit")
-    if true < MIN_COHERENT_SHARE:
-        return _with_doubt(best, f"only {true:.0%} {off} move like their neighbours fit")
+        reason = f"{false:.0%} of the matches off the main plane that are nearest in one direction only fit"
+        return _with_doubt(best, reason)
+    if doubtful(best, true):
+        return _with_doubt(best, "the matches that move like their neighbours fit another matrix or several")
     return best
 
 

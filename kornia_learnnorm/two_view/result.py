@@ -54,16 +54,12 @@ class PairEstimate:
     choice: ModelChoice
     F_mat: Tensor | None  # (3, 3), float64, unit Frobenius norm, x2^T F x1 = 0 in pixels; None where none was found
     H_mat: Tensor | None  # (3, 3), float64, unit Frobenius norm, x2 ~ H x1 in pixels; None where none was found
-    E_mat: Tensor | None  # essential matrix (3, 3) nearest to K2^T F K1, unit norm; None without cameras or translation
-    R: Tensor | None  # rotation (3, 3) of X2 = R X1 + t; None without cameras, and where two poses tie
-    t: Tensor | None  # direction of translation (3,); None without cameras, and where the camera only turned
     estimator: str  # what made the matrix: "RANSAC" or "LearnedEightPoint"
     points1: Tensor  # pixels of the matches in image 1, (N, 2), float64
     points2: Tensor  # pixels of the matches in image 2, (N, 2), float64
     scores: Tensor  # of each match, 1 minus its ratio or the matcher's score, (N,), float64
     weights: Tensor  # probability of each match to be an inlier as the estimator sees it, (N,), float64
     inliers: Tensor  # mask of the matches with a distance to the matrix below the threshold, (N,), bool
-    front: Tensor | None  # mask of the matches in front of both cameras, (N,), bool; None without cameras
     predicted_error: float  # median distance of exact correspondences to the matrix that is expected, pixels
     warnings: tuple[PairWarning, ...]  # reasons to doubt the matrix; empty when all is well
     size1: tuple[int, int]  # width and height of image 1
@@ -73,6 +69,10 @@ class PairEstimate:
     seed: int
     path1: Path | None = None
     path2: Path | None = None
+    E_mat: Tensor | None = None  # (3, 3), nearest to K2^T F K1, unit norm; None without cameras or translation
+    R: Tensor | None = None  # rotation (3, 3) of X2 = R X1 + t; None without cameras, and where two poses tie
+    t: Tensor | None = None  # direction of translation (3,); None without cameras, and where the camera only turned
+    front: Tensor | None = None  # mask of the matches in front of both cameras, (N,), bool; None without cameras
     n: Tensor | None = None  # unit normal (3,) of the plane, n^T X1 > 0; None without cameras or a plane
     other_pose: PlanePose | None = None  # second pose and normal that the plane allows; None where there is one alone
 

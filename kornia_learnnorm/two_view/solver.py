@@ -73,11 +73,6 @@ class TwoViewSolver:
     cameras: Cameras | None = None
     sampler: Callable[..., Sampler] = ProsacSampler  # of RANSAC, by the scores
 
-    @property
-    def estimator(self) -> str:
-        """Name of the class that estimates."""
-        return RANSAC.__name__ if self.layer is None else type(self.layer).__name__
-
     def search(self, first: Solution, size2: Size) -> Solution:
         """Return the best matrix of :meth:`solve` and random parts; raise NoReliableMatrixError for few inliers."""
         F_mat, weights = first.matrix, first.weights
@@ -227,7 +222,7 @@ class TwoViewSolver:
             F_mat = other
         distance = self.distance(F_mat)
         inliers = distance < self.threshold
-        evidence = parallax_evidence(off_plane, inliers, self.threshold)
+        evidence = parallax_evidence(self.points1, self.points2, F_mat, off_plane, self.threshold, (1.0,))
         if evidence <= MAX_LOG_CHANCE_PARALLAX or not bool(inliers.any()):
             return F_mat
         # Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would

@@ -64,6 +64,8 @@ class TestOnePair:
         assert "points1" not in json.loads(Path("F.json").read_text())
         assert "\nwarning  planar: one homography explains" in capsys.readouterr().out
         assert "planar" in [warning["code"] for warning in json.loads(Path("F.json").read_text())["warnings"]]
+        assert command("--K", "600,600,320,240") == 4  # of images of twice the size
+        assert "\nwarning  cameras: the principal point of K1" in capsys.readouterr().out
         assert command("--json", "F.json", "--out", "pair.png", images=("left", "left")) == 3
         captured = capsys.readouterr()
         assert captured.out == "wrote    F.json\n"

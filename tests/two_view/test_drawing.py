@@ -24,8 +24,8 @@ def make_pair(width: int = 160, height: int = 120, points: int = 30) -> tuple[np
     F_mat = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / 2**0.5
     matches = (points1, points2, torch.ones(points), inliers.double(), inliers)
     sizes, settings = ((width, height), (width, height)), (0.8, 1.0, 0)  # ratio, threshold, seed
-    matrices = ModelChoice("fundamental", ""), F_mat, None, None, None, None
-    estimate = PairEstimate(*matrices, "RANSAC", *matches, None, 0.1, (), *sizes, *settings)
+    choice = ModelChoice("fundamental", "")
+    estimate = PairEstimate(choice, F_mat, None, "RANSAC", *matches, 0.1, (), *sizes, *settings)
     return image1, image2, estimate
 
 

@@ -12,6 +12,7 @@ from scenes import epipolar_distances
 import kornia_learnnorm as kln
 from kornia_learnnorm.two_view import parallax as parallax_module
 from kornia_learnnorm.two_view.parallax import (
+    MAX_LOG_CHANCE_PARALLAX,
     distances_from_plane,
     find_main_plane,
     fit_plane_and_parallax,
@@ -24,6 +25,9 @@ K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
 R = np.array([[0.9998, 0, 0.02], [0, 1, 0], [-0.02, 0, 0.9998]])
 t = np.array([0.4, 0.05, 0.1])
 H = torch.from_numpy(K @ (R + np.outer(t, [0, 0, 1]) / 5) @ np.linalg.inv(K))  # of the plane Z = 5
+
+
+ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # epipolar lines are the rows
 
 
 def make_scene(plane: int, off: int, outliers: int, noise: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -64,17 +68,32 @@ class TestEvidence:
         assert torch.isinf(parallax(torch.zeros(1, 2), torch.zeros(1, 2), torch.diag(torch.tensor([1.0, 1, 0]))))
 
     def test_by_hand(self):
-        """Ten matches at 20 px, six of them inliers at 1 px: 45 epipoles; 0.0318 * 8 agree by chance, 4 do."""
-        inliers = torch.arange(10) < 6
-        mean = 2 / math.pi * math.asin(1 / 20) * 8
-        expected = math.log10(45) + (4 - mean - 4 * math.log(4 / mean)) / math.log(10)
-        assert parallax_evidence(torch.full((10,), 20.0), inliers, 1.0) == pytest.approx(expected)
+        """Ten matches at 20 px, six of them on their lines and four across; two of the six determine the epipole."""
+        points1 = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (10, 2)))
+        points2 = points1 + torch.tensor([[20.0, 0]] * 6 + [[0.0, 20]] * 4)
+        ratio, shares = math.exp(100) / np.i0(100), np.arange(0.05, 1, 0.1)
+        gain = (4 * np.log1p(shares * (ratio - 1)) + 4 * np.log1p(-shares)).max()
+        found = parallax_evidence(points1, points2, ROWS, torch.full((10,), 20.0), 1.0, (1.0,))
+        assert found == pytest.approx(math.log10(10 * 45) - gain / math.log(10))
+
+    def test_too_few_matches_off_the_plane(self):
+        assert parallax_evidence(*torch.rand(2, 5, 2).double(), ROWS, torch.tensor([9.0, 9, 0, 0, 0]), 1.0) == math.inf
 
     @given(st.integers(3, 40), st.integers(0, 40))
     def test_more_inliers_are_stronger_evidence(self, inliers, outliers):
-        distance = torch.full((inliers + outliers + 1,), 30.0)
-        less, more = (torch.arange(len(distance)) < number for number in (inliers, inliers + 1))
-        assert parallax_evidence(distance, more, 1.0) <= parallax_evidence(distance, less, 1.0)
+        points1 = torch.zeros(inliers + outliers + 1, 2).double()
+        distance = torch.full((len(points1),), 30.0)
+        less, more = (torch.where(torch.arange(len(points1)) < n, 0.0, 30.0) for n in (inliers, inliers + 1))
+        less, more = (torch.stack([torch.zeros(len(points1)), across], 1).double() for across in (less, more))
+        evidence = [parallax_evidence(points1, points2, ROWS, distance, 1.0) for points2 in (less, more)]
+        assert evidence[1] <= evidence[0]
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_of_a_plane_there_is_none(self, seed):
+        """Although the epipole is the best one, and a third of the matches is random."""
+        points = make_scene(200, 0, 100, 0.5, seed)
+        F_mat = fit_plane_and_parallax(*points, H, 1.0, 0)
+        assert parallax_evidence(*points, F_mat, parallax(*points, H), 1.0) > MAX_LOG_CHANCE_PARALLAX
 
 
 def test_main_plane():
@@ -160,9 +179,10 @@ SHIFT = torch.cat([torch.zeros(60), torch.linspace(10, 60, 40)])
     [
         (0 * SHIFT, 0.3, 1.0, True),
         (SHIFT, 0.3, 0.6, False),
-        # Parallax in one direction is evidence where the matches fit within less than half of it.
-        *((1.5 * (SHIFT == 0), distance, 0.4, distance > 0.5) for distance in (0.3, 0.7)),
-        *((0.4 * (SHIFT == 0), distance, 1.0, distance > 0.2) for distance in (0.1, 0.3)),
+        # Parallax is evidence where the matches fit within much less than it.
+        (1.5 * (SHIFT == 0), 0.3, 0.4, False),
+        *((0.9 * (SHIFT == 0), distance, 1.0, distance > 0.5) for distance in (0.3, 0.95)),
+        *((0.4 * (SHIFT == 0), distance, 1.0, distance > 0.2) for distance in (0.1, 0.5)),
     ],
 )
 def test_measure_parallax(shift, distance, near, planar, monkeypatch):
@@ -170,7 +190,7 @@ def test_measure_parallax(shift, distance, near, planar, monkeypatch):
     monkeypatch.setattr(parallax_module, "find_main_plane", lambda *_: torch.eye(3).double())
     monkeypatch.setattr(parallax_module, "distances_from_plane", lambda *_: shift)
     points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (100, 2)))
-    distances = torch.full((100,), distance, dtype=torch.float64)
-    found = measure_parallax(points, points, distances, 1.0, (640, 480), (640, 480))
+    across = torch.tensor([0, distance / 2], dtype=torch.float64)  # in each image
+    found = measure_parallax(points, points + across, ROWS, 1.0, (640, 480), (640, 480))
     assert (found.near, found.planar) == (pytest.approx(near), planar)
     assert f"explains {near:.0%} of the inliers within 1 px" in found.describe(1.0)

@@ -1,0 +1,73 @@
+"""Reasons to doubt the cameras of an image pair: matches that contradict them, and those of another image size."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.data.images import Size
+from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure
+from kornia_learnnorm.geometry.distances import sampson_distance
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
+from kornia_learnnorm.two_view.inputs import Cameras
+from kornia_learnnorm.two_view.reliability import MEDIAN_SQUARE, MIN_NOISE, PairWarning
+
+MIN_MISFIT = 8e-5  # of the longer image side; the distortion of photographs that are called undistorted adds up to 7e-5
+MAX_LOG_CHANCE = -3.0  # log10 of the probability that noise alone adds as much
+MAX_OFFSET = 0.2  # of both sides of an image; a principal point is closer to the centre
+
+
+def find_camera_doubt(
+    cameras: Cameras,
+    sizes: tuple[Size | None, Size | None],
+    points1: Tensor,
+    points2: Tensor,
+    F_mat: Tensor | None,
+    threshold: float,
+) -> tuple[PairWarning, ...]:
+    """Return at most one warning: of a camera that is not of its image's size, or that matches (N, 2) contradict.
+
+    Sizes are None where they are not known, F_mat (3, 3) where none was found.
+    """
+    for name, K, size in zip(("K1", "K2"), cameras, sizes, strict=True):
+        if size is not None and is_of_other_size(K, size):
+            x, y = (K[:2, 2] / K[2, 2] / torch.tensor(size)).tolist()
+            text = f"the principal point of {name} is at {x:.0%} of the width and {y:.0%} of the height of its image"
+            return (PairWarning("cameras", f"{text}: {name} may be that of another image size"),)
+    if F_mat is None:
+        return ()
+    misfit, log_chance = camera_misfit(points1, points2, F_mat, threshold, cameras)
+    if misfit < MIN_MISFIT * float(points2.max()) or log_chance > MAX_LOG_CHANCE:
+        return ()
+    text = f"the matches contradict K1 and K2, which add {misfit:.2f} px to their distances"
+    return (PairWarning("cameras", text),)
+
+
+def is_of_other_size(K: Tensor, size: Size) -> bool:
+    """Return whether the principal point of a camera (3, 3) is outside of its image, or far from its centre."""
+    offset = (K[:2, 2] / K[2, 2] / torch.tensor(size) - 0.5).abs()
+    return bool((offset > 0.5).any() or (offset > MAX_OFFSET).all())
+
+
+def camera_misfit(
+    points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, cameras: Cameras
+) -> tuple[float, float]:
+    """Return the root mean square distance that cameras add to matches (N, 2), pixels, and log10 of its probability.
+
+    It is that between the essential and the fundamental matrix next to F_mat (3, 3), over the inliers. Noise alone
+    makes the likelihood ratio of both twice an F-distributed number of 2, for as many more parameters, and :math:`m`
+    degrees of freedom: it is above :math:`2x` with probability :math:`(1 + 2x / m)^{-m / 2}`.
+    """
+    x1, x2, loss = points1[None], points2[None], GemanMcClure(FINAL_LOSS_SCALE * threshold)
+    free = refine_fundamental(x1, x2, F_mat[None], loss=loss)
+    tied = refine_essential(x1, x2, (cameras[1].mT @ F_mat @ cameras[0])[None], *cameras, loss=loss)
+    squares = sampson_distance(x1, x2, free.F_mat)[0].square()
+    inlying = squares[squares < threshold**2]
+    freedom = len(inlying) - Fundamental.dof
+    if freedom < 1:
+        return 0.0, 0.0
+    added = max(0.0, float(tied.cost - free.cost)) / freedom
+    noise = max(float(inlying.median()) / MEDIAN_SQUARE, (MIN_NOISE * threshold) ** 2)
+    return math.sqrt(added), -freedom / 2 * math.log10(1 + added / noise)
