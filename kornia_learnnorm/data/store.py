@@ -23,7 +23,6 @@ Array = NDArray[np.float32]
 FORMAT = "correspondences"  # attribute of the file
 VERSION = 1  # attribute of the file
 READING = "reading HDF5 files"  # what needs h5py, in messages
-COUNT_BLOCK = 4096  # pairs whose ratios are in memory at once while matches are counted
 # name: shape behind the first axis, dtype, and the first axis: "M" correspondences or "P" pairs
 LAYOUT: dict[str, tuple[tuple[int, ...], str, str]] = {
     "points1": ((2,), "float32", "M"),
@@ -52,9 +51,9 @@ class CorrespondenceStore:
     K: NDArray[np.float64]  # cameras, (P, 2, 3, 3)
     R: NDArray[np.float64]  # rotations of x2 = R x1 + t, (P, 3, 3)
     t: NDArray[np.float64]  # translations of x2 = R x1 + t in metres, (P, 3)
-    dataset: str  # name of the data set and its sequences
-    pairs: str  # how the pairs were chosen
-    detector: str  # detector and matcher
+    dataset: str = ""  # name of the data set and its sequences
+    pairs: str = ""  # how the pairs were chosen
+    detector: str = ""  # detector and matcher
     provenance: dict[str, Any] = field(default_factory=dict)  # options, versions, skipped pairs; values of JSON's types
     # from 0 to 1, (M,): 1 - ratio, and the matcher's score, to be given, of matches without a ratio
     score: Array = field(default_factory=lambda: np.full(1, np.nan, np.float32))
@@ -154,14 +153,11 @@ class StoreReader:
         """Return how many correspondences of each pair have a ratio below ``max_ratio``, all if it is None, (P,)."""
         if max_ratio is None:
             return np.diff(self.offsets)
-        counts = np.zeros(len(self), np.int64)
+        first, stop = int(self.offsets[0]), int(self.offsets[-1])
         with open_hdf5(self.path) as file:
-            for first in range(0, len(self), COUNT_BLOCK):
-                offsets = self.offsets[first : first + COUNT_BLOCK + 1]
-                passes = passes_ratio_test(file["ratio"][int(offsets[0]) : int(offsets[-1])], max_ratio)
-                total = np.concatenate([[0], passes.cumsum()])
-                counts[first : first + COUNT_BLOCK] = np.diff(total[offsets - offsets[0]])
-        return counts
+            passes = passes_ratio_test(file["ratio"][first:stop], max_ratio)
+        total = np.concatenate([[0], passes.cumsum()])
+        return np.asarray(np.diff(total[self.offsets - first]))
 
 
 @contextmanager

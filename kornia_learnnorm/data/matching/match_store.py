@@ -90,8 +90,6 @@ def match_frames(
         K=np.stack([pair.frame1.K, pair.frame2.K])[None],
         R=R[None],
         t=t[None],
-        dataset="",
-        pairs="",
         detector=f"{options.detector}, {options.num_features} features, {options.matcher}",
     )
 
