@@ -1,7 +1,7 @@
 """Cambridge Landmarks as frames."""
 
 from itertools import islice
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
             if name in frames:
                 raise ValueError(f"{path}, line {line.number}: {name} is listed twice")
             size = image_size(root / line.image(name))
-            focal = focals.get(_without_suffix(name), np.nan) if size != (0, 0) else np.nan
+            focal = focals.get(name.rsplit(".", 1)[0], np.nan) if size != (0, 0) else np.nan
             K = np.full((3, 3), np.nan)
             if focal > 0:
                 K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
@@ -47,7 +47,7 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
 
 
 def _nvm_focals(path: Path) -> dict[str, float]:
-    """Return the focal lengths, pixels, by the images' names without suffix; the points after them are not read."""
+    """Return the focal lengths, pixels, by the images' names without suffix, which differs from that of the lists."""
     lines = text_lines(path, "reconstruction")
     line = next(lines, TextLine(path, 1, ""))
     if line.text != "NVM_V3":
@@ -59,14 +59,9 @@ def _nvm_focals(path: Path) -> dict[str, float]:
     for line in islice(lines, number):
         name, *words = line.text.split()
         row = line.numbers(words, 10, "an image, its focal length, quaternion, centre, radial distortion and 0")
-        focals[_without_suffix(name)] = float(row[0])
+        focals[name.rsplit(".", 1)[0]] = float(row[0])
         if row[0] <= 0:
             raise ValueError(f"{path}, line {line.number}: a positive focal length expected, got {words[0]}")
     if len(focals) < number:
         raise ValueError(f"{path} announces {number} images and has {len(focals)}")
     return focals
-
-
-def _without_suffix(name: str) -> str:
-    """Return a name without the suffix, which differs between the lists and the reconstruction."""
-    return str(PurePosixPath(name).with_suffix(""))

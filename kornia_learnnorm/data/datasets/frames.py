@@ -135,8 +135,6 @@ def sequence_folders(dataset: str, root: str | Path) -> dict[str, Path]:
         if not parent.is_dir():
             raise FileNotFoundError(f"no folder {parent}, expected the sequences of KITTI in it")
         return {folder.name: folder for folder in sorted(parent.iterdir()) if folder.is_dir()}
-    if not root.is_dir():
-        raise FileNotFoundError(f"no folder at {root}")
     folders = [root] if (root / MARKER).exists() else sorted(root.iterdir())
     found = {folder.resolve().name: folder for folder in folders if (folder / MARKER).exists()}
     if not found:

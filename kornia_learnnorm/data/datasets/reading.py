@@ -25,8 +25,6 @@ def read_folder(root: str | Path) -> list[Frame]:
     are skipped. A folder without images is a FileNotFoundError.
     """
     root = Path(root)
-    if not root.is_dir():
-        raise FileNotFoundError(f"no folder at {root}")
     paths = [path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()]
     names = [path.relative_to(root).as_posix() for path in paths]
     names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
