@@ -137,13 +137,11 @@ def _corrupt(
         learned = draws.uniform((batch_size, 1), 0.0, 1.0, generator) < coarse
         wide = draws.log_uniform((batch_size, 1, 1), 0.2, 1.5, generator)
         scale = torch.where(learned[..., None], wide, scale)
-    points1, points2 = (
-        p
-        + scale
-        * uneven
-        * torch.where(heavy, 0.6 * draws.student_t(p.shape, generator), draws.normal(tuple(p.shape), generator))
-        for p in (points1, points2)
+    shape = (batch_size, num_points, 2)
+    noise1, noise2 = (
+        torch.where(heavy, 0.6 * draws.student_t(shape, generator), draws.normal(shape, generator)) for _ in range(2)
     )
+    points1, points2 = points1 + scale * uneven * noise1, points2 + scale * uneven * noise2
     clean, common = (draws.uniform((batch_size, 1), 0.0, 1.0, generator) < share for share in (0.5, 0.25))
     share = draws.uniform((batch_size, 1), 0.0, 1.0, generator)
     dirty = torch.where(learned, 0.1 + 0.6 * share, 0.2 + 0.7 * share)
