@@ -42,9 +42,7 @@ def match_nearest(features1: Features, features2: Features) -> Matches:
     All matches are returned: keep ``ratio < 0.8`` for Lowe's ratio test. Several may share a feature of image 2. An
     image of fewer than two features, as a blank one, is a ValueError.
     """
-    _check(features1, features2)
-    index2, ratio = _nearest(features1, features2)
-    return Matches(torch.from_numpy(features1.points), torch.from_numpy(features2.points[index2]), ratio)
+    return _nearest(features1, features2)[0]
 
 
 def match_both_ways(features1: Features, features2: Features) -> tuple[Matches, Tensor]:
@@ -52,21 +50,21 @@ def match_both_ways(features1: Features, features2: Features) -> tuple[Matches, 
 
     The latter is 1 where the feature of image 1 is not the nearest neighbour of its match among those of image 1.
     """
-    _check(features1, features2)
-    (index2, ratio), (index1, ratio_back) = _nearest(features1, features2), _nearest(features2, features1)
-    matches = Matches(torch.from_numpy(features1.points), torch.from_numpy(features2.points[index2]), ratio)
+    (matches, index2), (back, index1) = _nearest(features1, features2), _nearest(features2, features1)
     mutual = torch.from_numpy(index1[index2] == np.arange(len(index2)))
-    return matches, torch.where(mutual, ratio_back[index2], 1.0)
+    return matches, torch.where(mutual, back.ratio[index2], 1.0)
 
 
-def _nearest(features1: Features, features2: Features) -> tuple[NDArray[np.int64], Tensor]:
-    """Return the nearest neighbours of features of image 1 in image 2, (N,), and the ratios of distances, (N,)."""
+def _nearest(features1: Features, features2: Features) -> tuple[Matches, NDArray[np.int64]]:
+    """Return the nearest neighbours of features of image 1, and their indices among those of image 2, (N,)."""
+    _check(features1, features2)
     descriptors1, descriptors2 = (features.descriptors.astype(np.float32) for features in (features1, features2))
     pairs = import_cv2().BFMatcher().knnMatch(descriptors1, descriptors2, k=2)
     index2 = np.array([nearest.trainIdx for nearest, _ in pairs])
     distances = torch.tensor([[nearest.distance, second.distance] for nearest, second in pairs])
     # two neighbours at distance zero are a tie, ratio 1
-    return index2, torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
+    ratio = torch.where(distances[:, 1] > 0, distances[:, 0] / distances[:, 1], 1.0)
+    return Matches(torch.from_numpy(features1.points), torch.from_numpy(features2.points[index2]), ratio), index2
 
 
 def match_lightglue(features1: Features, features2: Features, detector: str = "disk") -> tuple[Tensor, Tensor, Tensor]:
