@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.sources import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
-from kornia_learnnorm.data.store import StoreReader, passes_ratio_test
+from kornia_learnnorm.data.store import passes_ratio_test, read_store
 from kornia_learnnorm.data.synthetic.draws import log_uniform, normal, uniform
 from kornia_learnnorm.data.synthetic.random_matches import SyntheticMatches, random_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
@@ -164,11 +164,9 @@ class _Pair(NamedTuple):
 
 def _read_pairs(path: str, labels: bool) -> list[_Pair]:
     """Return the pairs of a store that have enough matches that supervise."""
-    reader = StoreReader(expand_path(path))
-    store = reader.read(range(len(reader)))
-    pairs = []
-    for i in range(len(reader)):
-        rows = slice(int(store.offsets[i]), int(store.offsets[i + 1]))
+    store, pairs = read_store(expand_path(path)), []
+    for i in range(len(store)):
+        rows = store.rows(i)
         points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
         F_mat = torch.from_numpy(store.F[i]) if labels else torch.full((3, 3), torch.nan, dtype=torch.float64)
         distance = symmetric_epipolar_distance(points1, points2, F_mat)
