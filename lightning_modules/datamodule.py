@@ -2,6 +2,7 @@
 
 import signal
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,6 +18,7 @@ from kornia_learnnorm.data.sources import SEEDS_PER_RUN, BlockSource, block_gene
 EVALUATION_SEED = 4_000_000_007  # far from the seeds of training epochs, below 2^32 as the generator needs it
 
 
+@dataclass(eq=False)
 class BatchLoader:
     """Batches of sets, drawn anew each epoch; the state is the epoch and the batch, so training resumes exactly.
 
@@ -29,24 +31,19 @@ class BatchLoader:
     samples. With None, each block is a batch as it is. Without ``shuffle`` one draw is kept in order, for evaluation.
     """
 
-    def __init__(
-        self,
-        source: BlockSource,
-        batch_size: int | None,
-        seed: int,
-        shuffle: bool,
-        by_pair: bool = False,
-        workers: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
-    ) -> None:
-        self.source = source
-        self.batch_size, self.by_pair = batch_size, by_pair
-        self.seed, self.shuffle = seed, shuffle
-        self.workers, self.rank, self.world_size = workers, rank, world_size
+    source: BlockSource
+    batch_size: int | None
+    seed: int
+    shuffle: bool
+    by_pair: bool = False
+    workers: int = 0
+    rank: int = 0
+    world_size: int = 1
+
+    def __post_init__(self) -> None:
         self.epoch, self.batch = 0, 0
         self._drawn: tuple[int, int, MatchSets] | None = None
-        self._length = len(source.blocks(seed)) if batch_size is None else self._count(batch_size)
+        self._length = len(self._sizes(0)) if self.batch_size is None else self._count(self.batch_size)
 
     def _count(self, batch_size: int) -> int:
         unit = "image pair" if self.by_pair else "sample"
