@@ -31,21 +31,13 @@ def find_config(name: str) -> Path:
 
 def with_config_paths(args: Sequence[str]) -> list[str]:
     """Return command-line arguments with the names of configurations replaced by their paths."""
-    replaced = list(args)
-    for i, arg in enumerate(args):
-        option, equals, value = arg.partition("=")
-        if i and args[i - 1] in OPTIONS:
-            replaced[i] = str(find_config(arg))
-        elif option == "--config" and equals:
-            replaced[i] = f"--config={find_config(value)}"
-    return replaced
+    words = [word for arg in args for word in (arg.split("=", 1) if arg.startswith("--config=") else [arg])]
+    return [str(find_config(word)) if before in OPTIONS else word for before, word in pairwise(["", *words])]
 
 
 def names_task(args: Sequence[str]) -> bool:
     """Return whether a configuration of :func:`with_config_paths` names the class of its task."""
-    paths = [after for before, after in pairwise(args) if before in OPTIONS]
-    paths += [arg.removeprefix("--config=") for arg in args if arg.startswith("--config=")]
-    for path in paths:
+    for path in (after for before, after in pairwise(args) if before in OPTIONS):
         try:
             with Path(path).open(encoding="utf-8") as file:  # whose name is in the messages of yaml
                 model = yaml.safe_load(file)["model"]
