@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--weights", metavar="NAME_OR_PATH", help="of the learned one (default: robust-synthetic)")
     distance = f"largest distance of inliers {default}"
     add("--threshold", metavar="PX", type=float, default=options.threshold, help=distance)
-    add("--seed", metavar="N", type=_seed, default=options.seed, help=default)
+    add("--seed", metavar="N", type=int, default=options.seed, help=default)
     add("--K", metavar="CAMERA", nargs="+", default=[], help="one or two: fx,fy,cx,cy, a file, exif; adds E, R, t")
     group = parser.add_argument_group("matching")
     add_feature_arguments(group)
@@ -63,12 +63,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = many.add_mutually_exclusive_group().add_argument
     add("--jobs", type=int, default=-1, help=f"processes; -1: all cores {default}")
     add("--dask", metavar="ADDRESS", help="scheduler of Dask's workers: tcp://host:8786")
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal() or int(text) >= 2**63:
-        raise argparse.ArgumentTypeError(f"a whole number from 0 to 2^63 - 1 expected, got {text}")
-    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -72,32 +72,29 @@ def main(args: Sequence[str] | None = None) -> int:
     It is 0; 2 after an error, whose message is printed as one line; 130 when interrupted; 141, as of a program that the
     signal SIGPIPE ends, when the reader of the output, such as ``head``, has ended.
     """
-    try:
-        try:
-            return _run(args)
-        finally:
-            sys.stdout.flush()  # what is not written yet fails here instead of when Python ends
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still in the buffer
-        return 141
-
-
-def _run(args: Sequence[str] | None) -> int:
     words = list(sys.argv[1:] if args is None else args)
     try:
-        if not words or words[0] not in TRAINING:
-            return _run_tool(words)
-        if {"-h", "--help"} & {*words}:
-            return _run_tool([words[0], "--help"])
-        return _run_training(words)
+        try:
+            return _run(words)
+        finally:
+            sys.stdout.flush()  # what is not written yet fails here instead of when Python ends
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still in the buffer
+        return 141
     except (ValueError, OSError, ImportError) as error:
         print(f"learnnorm {words[0]}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+
+
+def _run(words: list[str]) -> int:
+    if not words or words[0] not in TRAINING:
+        return _run_tool(words)
+    if {"-h", "--help"} & {*words}:
+        return _run_tool([words[0], "--help"])
+    return _run_training(words)
 
 
 def make_parser(names: Collection[str] = (*TRAINING, *TOOLS)) -> argparse.ArgumentParser:
@@ -120,11 +117,11 @@ def make_parser(names: Collection[str] = (*TRAINING, *TOOLS)) -> argparse.Argume
             tool = importlib.import_module(module)
             tool.add_arguments(command)
             command.epilog = _examples(tool.EXAMPLES)
-            command.set_defaults(run=tool.run)
+            command.set_defaults(run=tool.run, error=command.error)
     command = commands.add_parser("completion", help=COMPLETION, description=COMPLETION, formatter_class=HelpFormatter)
     command.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
     command.epilog = _examples(COMPLETION_EXAMPLES)
-    command.set_defaults(run=_print_completion)
+    command.set_defaults(run=_print_completion, error=command.error)
     return parser
 
 
@@ -175,7 +172,8 @@ def _print_completion(args: argparse.Namespace) -> int:
     from lightning_modules.config_files import config_names
 
     parser = make_parser()
-    for name, command in _parsers_of_commands(parser).items():
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
+    for name, command in commands.choices.items():
         for action in command._actions:  # noqa: SLF001
             if name in TRAINING and action.dest == "config":
                 action.choices = config_names()
@@ -185,17 +183,11 @@ def _print_completion(args: argparse.Namespace) -> int:
     return 0
 
 
-def _parsers_of_commands(parser: argparse.ArgumentParser) -> dict[str, Any]:
-    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
-    return dict(commands.choices)
-
-
 def _run_tool(words: list[str]) -> int:
-    parser = make_parser(words[:1])
-    parsed, unknown = parser.parse_known_args(words)
+    parsed, unknown = make_parser(words[:1]).parse_known_args(words)
     if unknown:  # parse_args would print the usage of learnnorm instead of the command's
-        command = _parsers_of_commands(parser)[parsed.command]
-        command.error(f"unrecognized arguments: {shlex.join(unknown)}; {command.prog} --help lists the options")
+        hint = f"learnnorm {parsed.command} --help lists the options"
+        parsed.error(f"unrecognized arguments: {shlex.join(unknown)}; {hint}")
     parsed.command_line = shlex.join(["learnnorm", *words])
     return int(parsed.run(parsed))
 

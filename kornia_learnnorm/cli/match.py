@@ -45,11 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pairs.add_argument("--exhaustive", dest="gap", action="store_const", const=None, help="all pairs of frames")
     match = parser.add_argument_group("matching")
     add_matching_arguments(match)
-    for option, text in (
-        ("max_matches", "per pair, of those that fail the ratio test and of others; 0 keeps all"),
-        ("seed", "seed of the order of matches"),
-    ):
-        _add_number(match, option, text)
+    _add_number(match, "max_matches", "per pair, of those that fail the ratio test and of others; 0 keeps all")
+    _add_number(match, "seed", "seed of the order of matches")
 
 
 def add_feature_arguments(parser: argparse._ActionsContainer) -> None:
