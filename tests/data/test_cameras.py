@@ -49,16 +49,6 @@ def test_files(tmp_path, name, text, expected):
         assert read_camera(str(tmp_path / name)).tolist() == [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
 
 
-@pytest.mark.parametrize("line", [line for line, expected in COLMAP.items() if isinstance(expected, list)])
-def test_cameras_of_colmap_are_pycolmaps(tmp_path, line):
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    (tmp_path / "cameras.txt").write_text(line)
-    _, model, width, height, *params = line.split()
-    camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=[*map(float, params)])
-    expected = camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    assert np.array_equal(read_camera(str(tmp_path / "cameras.txt")), expected)
-
-
 @pytest.mark.parametrize("text", ["700,710,320,240", " 700, 710, 320, 240"])
 def test_numbers(text):
     assert read_camera(text).tolist() == [[700, 0, 320], [0, 710, 240], [0, 0, 1]]
