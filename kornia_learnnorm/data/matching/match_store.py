@@ -148,8 +148,7 @@ def _match_all(
     pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: Mapping[str, Any], workers: Workers
 ) -> dict[str, str]:
     """Match the pairs that are not done; continue after a worker was killed. Return the skipped pairs and why."""
-    done = writer.done()
-    skipped: dict[str, str] = {}
+    done, skipped = writer.done(), dict[str, str]()
 
     def match_rest() -> Generator[tuple[int, Result], None, None]:
         todo = [place for place in range(len(pairs)) if place not in done]
@@ -180,7 +179,8 @@ def _match_some(
         cache = FeatureCache(Path(features), [pairs[place] for place in todo])
         for first in range(0, len(todo), window):
             places = todo[first : first + window]
-            missing = cache.missing([pairs[place] for place in places])
+            frames = {frame.name: frame for place in places for frame in pairs[place]}
+            missing = [frame for name, frame in frames.items() if name not in cache.held]
             with workers.results(_detect, ((frame, options) for frame in missing)) as found:
                 for frame, detected in zip(missing, found, strict=True):
                     cache.put(frame, detected)
@@ -220,36 +220,31 @@ class FeatureCache:
     def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
         self.folder = folder
         self.uses = Counter(frame.name for pair in pairs for frame in pair)
-        self.held: dict[str, str] = {}  # name -> reason why there are none; empty where there are some
+        self.held: dict[str, Path | str] = {}  # by the frame's name: a file, or the reason why there are no features
 
-    def missing(self, pairs: Sequence[FramePair]) -> list[Frame]:
-        """Return the frames of the pairs that have not been put, each once."""
-        frames = {frame.name: frame for pair in pairs for frame in pair}
-        return [frame for name, frame in frames.items() if name not in self.held]
-
-    def put(self, frame: Frame, features: Found) -> None:
+    def put(self, frame: Frame, found: Found) -> None:
         """Keep the features of a frame, or the reason why it has none; OSError on a full disk."""
-        self.held[frame.name] = features if isinstance(features, str) else ""
-        if isinstance(features, str):
+        if isinstance(found, str):
+            self.held[frame.name] = found
             return
+        path = self.held[frame.name] = self.folder / f"{len(self.held)}.npz"
         try:
-            np.savez(self._path(frame), **{k: v for k, v in features._asdict().items() if v is not None})
+            np.savez(path, **{name: value for name, value in found._asdict().items() if value is not None})
         except OSError as error:  # NumPy's message does not name the file
             raise OSError(f"cannot write the features of {frame.name}, is the disk full? {error}") from error
 
     def get(self, frame: Frame) -> Found:
         """Return the features of a frame, or the reason why there are none."""
-        if reason := self.held[frame.name]:
-            return reason
-        with np.load(self._path(frame)) as data:
+        held = self.held[frame.name]
+        if isinstance(held, str):
+            return held
+        with np.load(held) as data:
             return Features(data["points"], data["descriptors"], tuple(data["size"].tolist()), data.get("lafs"))
 
     def release(self, pair: FramePair) -> None:
         """Mark a pair as done and delete features that no other pair needs."""
         for frame in pair:
             self.uses[frame.name] -= 1
-            if self.uses[frame.name] == 0:
-                self._path(frame).unlink(missing_ok=True)
-
-    def _path(self, frame: Frame) -> Path:
-        return self.folder / f"{sha256(frame.name.encode()).hexdigest()}.npz"
+            held = self.held[frame.name]
+            if self.uses[frame.name] == 0 and isinstance(held, Path):
+                held.unlink()

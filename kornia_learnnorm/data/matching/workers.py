@@ -78,7 +78,7 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
         return
     distributed = import_extra("distributed", "dask", "matching on a Dask cluster")
     try:
-        import_extra("distributed.comm.addressing", "dask", "matching on a Dask cluster").get_address_host_port(dask)
+        distributed.comm.get_address_host_port(dask)
     except ValueError as error:
         raise ValueError(f"a Dask scheduler needs an address as tcp://host:8786, got {dask!r}: {error}") from error
     # Collect an earlier client that could not connect: its finaliser would wait for a lock of the new one.

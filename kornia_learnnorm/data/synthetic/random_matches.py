@@ -16,7 +16,6 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, tra
 ORBIT_CANDIDATES = 6  # motions per scene
 PLANE_CANDIDATES = 6  # planes and motions per scene
 MIN_DEPTH = 0.15  # of a point of a plane, over its depth in the other view
-KINDS = 5  # of scenes
 
 
 class SyntheticMatches(NamedTuple):
@@ -52,16 +51,10 @@ def random_matches(
 
     A scene has ``num_points`` matches and ``num_exact`` further correspondences without noise.
     """
-    kind = int(torch.randint(KINDS, (), generator=generator, device=generator.device))
-    total = num_points + num_exact
-    if kind == 0:
-        scene = scenes.random_views(batch_size, total, generator)
-    elif kind == 4:
-        scene = wide_baseline(batch_size, total, generator)
-    else:
-        draw = (scenes.forward_driving, scenes.handheld, scenes.orbit)[kind - 1]
-        scene = draw(batch_size, total, generator, noise=0.0)
-    scene = _distort(scene, generator)
+    named = (partial(draw, noise=0.0) for draw in (scenes.forward_driving, scenes.handheld, scenes.orbit))
+    kinds: list[Callable[..., scenes.TwoViewScene]] = [scenes.random_views, *named, wide_baseline]
+    kind = int(torch.randint(len(kinds), (), generator=generator, device=generator.device))
+    scene = _distort(kinds[kind](batch_size, num_points + num_exact, generator), generator)
     points1, exact1 = torch.split(scene.points1, [num_points, num_exact], 1)
     points2, exact2 = torch.split(scene.points2, [num_points, num_exact], 1)
     distance = partial(symmetric_epipolar_distance, F_mat=scene.F_mat)
