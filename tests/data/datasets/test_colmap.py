@@ -2,7 +2,7 @@ import shutil
 
 import numpy as np
 import pytest
-from make_sequences import FOCAL, SIZE, STEP, moved, names
+from make_sequences import SIZE, names
 from PIL import Image
 
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap
@@ -25,17 +25,6 @@ def set_camera(folder, camera: str) -> None:
 
 
 class TestReadColmap:
-    def test_frames(self, model):
-        frames = read(model)
-        assert [frame.name for frame in frames] == ["one/0.png", "one/1.png", "two/2.png", "two/3.png"]
-        for number, frame in enumerate(frames):
-            assert frame.path == model / "images" / frame.name
-            assert frame.sequence == frame.name[:3]
-            assert frame.size == SIZE
-            assert frame.distortion == ()
-            assert np.allclose(frame.K, [[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1]])
-            assert np.allclose(frame.pose, moved(STEP * number), atol=1e-7)
-
     def test_binary_model(self, model, tmp_path):
         pycolmap.Reconstruction(str(model / "model")).write_binary(str(tmp_path))
         for text, binary in zip(read(model), read_colmap(str(tmp_path), str(model / "images")), strict=True):

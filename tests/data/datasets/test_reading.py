@@ -4,11 +4,43 @@ import shutil
 
 import numpy as np
 import pytest
-from make_sequences import FR1, FR3, SIZE, STEP, edit, names
+from make_sequences import FOCAL, FR1, FR3, FRAMES, KITTI_K, SIZE, STEP, TUM_START, edit, moved, names
 
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.pairing import pair_frames
 from kornia_learnnorm.data.datasets.reading import read_dataset, read_folder
+
+IN_A_FOLDER = ("a.png", "b.PNG", "left/1.jpg", "left/2.JPG", "left/deep/1.bmp", "right/1.tif", "right/2.webp")
+LISTED = {  # sequences and names of all frames
+    "kitti": [(s, f"sequences/{s}/image_0/{n:06}.png") for s in ("00", "06", "11") for n in range(FRAMES)],
+    "tum": [(s, f"{s}/rgb/{TUM_START + n:.6f}.png") for s in (FR1, FR3) for n in range(FRAMES)],
+    "cambridge": [(s, f"{s}/frame{n + 1:05}.png") for s in ("seq1", "seq2") for n in range(FRAMES)],
+    "colmap": [(s, f"{s}/{n}.png") for s, n in (("one", 0), ("one", 1), ("two", 2), ("two", 3))],
+    "folder": [(name.rpartition("/")[0], name) for name in IN_A_FOLDER],
+}
+CENTRED = [[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1]]
+CAMERAS = {"kitti": KITTI_K, "cambridge": CENTRED, "colmap": CENTRED, "folder": np.full((3, 3), np.nan)}
+
+
+@pytest.mark.parametrize("dataset", LISTED)
+def test_frames(written, dataset):
+    """Cameras of TUM, and poses of KITTI and TUM, have their own tests."""
+    root, options = written / dataset, {}
+    if dataset == "colmap":
+        pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+        root, options = root / "images", {"model": root / "model"}
+    frames = read_dataset(dataset, root, **options)
+    assert [(frame.sequence, frame.name) for frame in frames] == LISTED[dataset]
+    for number, frame in enumerate(frames):
+        assert frame.path == root / frame.name
+        assert frame.size == ((640, 480) if dataset == "tum" else SIZE)
+        if dataset != "tum":
+            assert frame.distortion == ()
+            np.testing.assert_allclose(frame.K, CAMERAS[dataset])
+        if dataset in ("cambridge", "colmap"):
+            np.testing.assert_allclose(frame.pose, moved(STEP * (number % FRAMES)), atol=1e-7)
+        elif dataset == "folder":
+            assert np.isnan(frame.pose).all()
 
 
 def epipoles_agree(pair: FramePair) -> bool:
@@ -107,17 +139,6 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
 def test_wrong_arguments(written, dataset, root, arguments, error, message):
     with pytest.raises(error, match=message):
         read_dataset(dataset, written / root, **arguments)
-
-
-def test_frames_of_a_folder(written):
-    frames = read_folder(written / "folder")
-    listed = ("a.png", "b.PNG", "left/1.jpg", "left/2.JPG", "left/deep/1.bmp", "right/1.tif", "right/2.webp")
-    assert [frame.name for frame in frames] == list(listed)
-    assert [frame.sequence for frame in frames] == [name.rpartition("/")[0] for name in listed]
-    for frame in frames:
-        assert frame.size == SIZE
-        assert np.isnan(frame.K).all()
-        assert np.isnan(frame.pose).all()
 
 
 def test_a_folder_within_does_not_part_its_sequence(tmp_path):

@@ -5,13 +5,6 @@ from make_sequences import FR1, FR3, FRAMES, STEP, TUM_START, moved, rotated
 from kornia_learnnorm.data.datasets.tum import read_tum
 
 
-def test_frames(written):
-    frames = read_tum(written / "tum")
-    assert [frame.sequence for frame in frames] == [FR1] * FRAMES + [FR3] * FRAMES
-    assert frames[0].name == f"{FR1}/rgb/{TUM_START:.6f}.png"
-    assert all(frame.path == written / "tum" / frame.name and frame.size == (640, 480) for frame in frames)
-
-
 def test_cameras(written):
     first, third = read_tum(written / "tum")[:: 2 * FRAMES - 1]
     assert np.array_equal(first.K, [[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
