@@ -121,7 +121,7 @@ def write_folder(root: Path) -> None:
     write_lines(root / "left" / "notes.txt", "not an image")
 
 
-def write_colmap(root: Path, camera: str = f"PINHOLE {SIZE[0]} {SIZE[1]} {FOCAL} {FOCAL} 80 60") -> None:
+def write_colmap(root: Path) -> None:
     """A text model in ``model``, its images in ``images`` and all pairs of neighbours in ``pairs.txt``."""
     grid = np.stack(np.meshgrid(np.arange(-2.0, 2.6, 0.4), np.arange(-1.6, 1.7, 0.4)), -1).reshape(-1, 2)
     names = [f"{'one' if frame < 2 else 'two'}/{frame}.png" for frame in range(FRAMES)]
@@ -135,7 +135,7 @@ def write_colmap(root: Path, camera: str = f"PINHOLE {SIZE[0]} {SIZE[1]} {FOCAL}
             tracks[point].append(f"{frame + 1} {place}")
         lines.append(f"{frame + 1} {words(1, 0, 0, 0, -metres(STEP * frame), 0, 0)} 1 {name}")
         lines.append(" ".join(f"{words(*pixels[point])} {point + 1}" for point in seen))
-    write_lines(root / "model" / "cameras.txt", "# Camera list", f"1 {camera}")
+    write_lines(root / "model" / "cameras.txt", "# Camera list", f"1 PINHOLE {words(*SIZE, FOCAL, FOCAL, 80, 60)}")
     write_lines(root / "model" / "images.txt", "# Image list", *lines)
     points = [f"{n + 1} {words(*grid[n], DEPTH)} 90 90 90 0.1 {' '.join(t)}" for n, t in enumerate(tracks) if t]
     write_lines(root / "model" / "points3D.txt", "# 3D point list", *points)

@@ -27,10 +27,10 @@ def normal(shape: tuple[int, ...], generator: Generator) -> Tensor:
     return torch.randn(shape, generator=generator, dtype=torch.float64, device=generator.device)
 
 
-def student_t(shape: tuple[int, ...], generator: Generator, dof: float = 3.0) -> Tensor:
-    """Draw isotropic bivariate Student-t vectors ``(*, 2)`` (R. Bailey's polar method, Math. Comp. 1994)."""
+def student_t(shape: tuple[int, ...], generator: Generator) -> Tensor:
+    """Draw isotropic vectors ``(*, 2)`` of Student's t, 3 degrees of freedom (R. Bailey's polar method, 1994)."""
     u = 1 - uniform(shape[:-1], 0.0, 1.0, generator)  # in (0, 1]
-    radius = (dof * (u ** (-2 / dof) - 1)).sqrt()
+    radius = (3 * (u ** (-2 / 3) - 1)).sqrt()
     angle = uniform(shape[:-1], 0.0, 2 * math.pi, generator)
     return radius[..., None] * torch.stack([angle.cos(), angle.sin()], -1)
 
