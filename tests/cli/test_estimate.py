@@ -19,6 +19,8 @@ cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
 from two_planes import HEIGHT, WIDTH, K, R, t  # noqa: E402 (needs OpenCV)
 
+MANY = ["--pairs", "list.txt"]
+
 
 @pytest.fixture
 def command(planes, tmp_path, monkeypatch):
@@ -116,29 +118,30 @@ class TestOnePair:
             (["--gap", "2"], ValueError, "--gap: only for --pairs"),
             (["--pairs", "l.txt", "--json", "-"], ValueError, "cannot be combined with image files and --json$"),
             (["--weights", "robust"], ValueError, "--weights robust: only --estimator learned has weights"),
+            ([*MANY, "--out", "list.txt"], ValueError, r"--out list\.txt: a folder expected with --pairs, got a file"),
+            (MANY, ValueError, "--out FOLDER is needed"),
+            ([*MANY, "--out", "o", "--mask", "a.png"], ValueError, r"--pairs list\.txt: cannot .* with --mask$"),
+            ([*MANY, "--out", "o", "--estimator", "learned", "--weights", "no"], OSError, "no"),
+            ([*MANY, "--out", "o", "--K", "none.txt"], FileNotFoundError, r"camera none\.txt"),
+            ([*MANY, "--out", "o", "--exhaustive"], ValueError, r"--gap and --exhaustive are for a folder of images"),
         ],
     )
     def test_bad_options_are_refused_before_the_work(self, command, planes, arguments, error, message, monkeypatch):
+        Path("list.txt").write_text(f"{planes}/left.png {planes}/right.png\n")
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: pytest.fail("the work was begun"))
+        words = (f"{planes}/left.png" if text == "IMAGE" else text for text in arguments)
         with pytest.raises(error, match=message):
-            command(*(f"{planes}/left.png" if text == "IMAGE" else text for text in arguments))
-        assert not list(Path().iterdir())
+            command(*words, images=() if arguments[:2] == MANY else ("left", "right"))
+        assert [*Path().iterdir()] == [Path("list.txt")]
 
 
 class TestManyPairs:
-    @pytest.fixture
-    def many(self, command, planes):
-        """Run the command on a list of pairs."""
-        Path("list.txt").write_text(f"{planes}/left.png {planes}/right.png\n")
-        return lambda *arguments: command("--pairs", "list.txt", *arguments, images=())
-
-    def test_one_line_a_pair_and_what_is_done_stays(self, many, planes, result, capsys):
-        options, path = ("--out", "found", "--jobs", "1"), Path("found/pairs.jsonl")
-        with Path("list.txt").open("a") as file:
-            file.write(f"\n{planes}/left.png late.png\n")
+    def test_one_line_a_pair_and_what_is_done_stays(self, command, planes, result, capsys):
+        options, path = (*MANY, "--out", "found", "--jobs", "1"), Path("found/pairs.jsonl")
+        Path("list.txt").write_text(f"{planes}/left.png {planes}/right.png\n\n{planes}/left.png late.png\n")
         Path("late.png").write_bytes((planes / "half.png").read_bytes())
-        assert many(*options) == 3
+        assert command(*options, images=()) == 3
         printed = capsys.readouterr()
         assert printed.out.endswith("wrote found: 1 of 2 pairs solved, 1 failed\n")
         assert f"failed: {planes}/left.png late.png: " in printed.err
@@ -149,31 +152,15 @@ class TestManyPairs:
         assert lines[1]["F"] is None
         assert lines[1]["versions"] == lines[0]["versions"]
         with pytest.raises(ValueError, match="results with other options"):
-            many(*options, "--ratio", "0.7")
+            command(*options, "--ratio", "0.7", images=())
         path.write_text(first + '{"F": nu')  # as a killed run leaves it
         # what was unreadable is tried again
         Path("late.png").write_bytes((planes / "blank.png").read_bytes())
-        assert many(*options) == 3
+        assert command(*options, images=()) == 3
         solved, failed = path.read_text().splitlines()
         assert solved == first.splitlines()[0]
         assert [warning["code"] for warning in json.loads(failed)["warnings"]] == ["blank"]
         assert json.loads(failed)["image2"] == {"file": "late.png", "width": WIDTH, "height": HEIGHT}
-
-    @pytest.mark.parametrize(
-        ("options", "error", "message"),
-        [
-            (["--out", "list.txt"], ValueError, r"--out list\.txt: a folder expected with --pairs, got a file"),
-            ([], ValueError, "--out FOLDER is needed"),
-            (["--out", "found", "--mask", "a.png"], ValueError, r"--pairs list\.txt: cannot be combined with --mask$"),
-            (["--out", "found", "--estimator", "learned", "--weights", "no"], OSError, "no"),
-            (["--out", "found", "--K", "none.txt"], FileNotFoundError, r"camera none\.txt"),
-            (["--out", "found", "--exhaustive"], ValueError, r"--gap and --exhaustive are for a folder of images"),
-        ],
-    )
-    def test_bad_options_are_refused_before_the_work(self, many, options, error, message):
-        with pytest.raises(error, match=message):
-            many(*options)
-        assert not Path("found").exists()
 
     @pytest.mark.parametrize(("options", "pairs"), [([], 2), (["--gap", "2"], 1), (["--exhaustive"], 3)])
     def test_a_folder(self, planes, command, options, pairs):
