@@ -1,8 +1,6 @@
 """Train on one or several processes and write what came of it.
 
-    python train_processes.py PROCESSES FOLDER CASE...
-
-is started once for each process, with LOCAL_RANK, MASTER_ADDR and MASTER_PORT in its environment.
+python -m torch.distributed.run --nproc-per-node=PROCESSES train_processes.py PROCESSES FOLDER CASE...
 """
 
 import contextlib
@@ -22,6 +20,8 @@ from kornia_learnnorm.data.sources import Block, SyntheticSamples
 from lightning_modules.callbacks import Checkpoints, WritePredictions
 from lightning_modules.datamodule import CorrespondenceDataModule
 from lightning_modules.task import EstimatorTask
+
+SAMPLES = SyntheticSamples(number=400, num_heldout=4)
 
 
 class Pairs(SyntheticSamples):
@@ -115,6 +115,10 @@ def normaliser_task(double=False, **arguments):
     normalizer = kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=8, depth=1))
     estimator = kln.EightPoint(normalizer.double() if double else normalizer)
     return EstimatorTask(estimator, **{"loss": kln.EpipolarLoss(), **arguments})
+
+
+def make_data(source=SAMPLES, **arguments):
+    return CorrespondenceDataModule(source, source, source, **{"batch_size": 32, **arguments})
 
 
 def make_trainer(folder, callbacks=(), **arguments):

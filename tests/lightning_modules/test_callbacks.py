@@ -4,15 +4,9 @@ import pytest
 
 pytest.importorskip("pytorch_lightning", reason="PyTorch Lightning is not installed")
 
-from train_processes import Stop, make_trainer, normaliser_task
+from train_processes import Stop, make_data, make_trainer, normaliser_task
 
-from kornia_learnnorm.data.sources import SyntheticSamples
 from lightning_modules.callbacks import AgainstStart, Checkpoints
-from lightning_modules.datamodule import CorrespondenceDataModule
-
-
-def make_data():
-    return CorrespondenceDataModule(*[SyntheticSamples(number=200, num_heldout=4)] * 2, batch_size=32)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -14,25 +13,6 @@ from train_processes import run
 
 CASES = ["plain", "pairs", "filtered", "spoiled", "resumed"]
 SCRIPT = Path(__file__).parents[1] / "train_processes.py"
-
-
-def start(folder, processes, *cases):
-    """Run cases on processes of their own, and return how these ended."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    command = [sys.executable, str(SCRIPT), str(processes), str(folder), *cases]
-    address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
-    started = [
-        subprocess.Popen(command, env=os.environ | address | {"LOCAL_RANK": str(rank)}, stderr=subprocess.PIPE)
-        for rank in range(processes)
-    ]
-    try:
-        errors = [process.communicate(timeout=220)[1] for process in started]
-    finally:
-        for process in started:
-            process.kill()
-    return [(process.returncode, error.decode()) for process, error in zip(started, errors, strict=True)]
 
 
 def results(folder, rank=0):
@@ -68,8 +48,10 @@ def alone(tmp_path_factory):
 @pytest.mark.skipif(sys.platform == "win32", reason="the test starts its processes as on Unix")
 def test_two_processes_give_what_one_gives(alone, tmp_path):
     """All cases in one test, since two processes take long to start."""
-    ended = start(tmp_path, 2, *CASES)
-    assert [code for code, _ in ended] == [0, 0], ended
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--local-addr=127.0.0.1"]
+    command += ["--nproc-per-node=2", str(SCRIPT), "2", str(tmp_path), *CASES]
+    done = subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, timeout=220)
+    assert done.returncode == 0, done.stderr.decode()
     for case in CASES[:-1]:
         samples = [results(tmp_path / case, rank)["samples"] for rank in (0, 1)]
         assert samples[0] != samples[1]

@@ -5,21 +5,14 @@ import signal
 
 import pytest
 import torch
-from train_processes import Blocks, Interrupt, Pairs, Stop, Watch, make_trainer, normaliser_task
+from train_processes import SAMPLES, Blocks, Interrupt, Pairs, Stop, Watch, make_data, make_trainer, normaliser_task
 
 from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
-from kornia_learnnorm.data.sources import SyntheticSamples
 from lightning_modules.callbacks import Checkpoints
-from lightning_modules.datamodule import CorrespondenceDataModule
 
-SAMPLES = SyntheticSamples(number=400, num_heldout=4)
 BLOCKS = Blocks(96, (96, 96, 96))  # so that workers have something to draw
 RANDOM = RandomSets([SyntheticSets(16)], sizes=(9, 64), correspondences=256, batches=9)
 SIGNALS = signal.SIGINT, signal.SIGTERM
-
-
-def make_data(source=SAMPLES, **arguments):
-    return CorrespondenceDataModule(source, source, **{"batch_size": 32, **arguments})
 
 
 @pytest.mark.parametrize(

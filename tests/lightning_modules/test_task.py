@@ -3,7 +3,7 @@
 import pytest
 import torch
 from safetensors.torch import load_file
-from train_processes import make_trainer, normaliser_task
+from train_processes import make_data, make_trainer, normaliser_task
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
@@ -12,12 +12,6 @@ from kornia_learnnorm.data.synthetic.random_matches import random_matches, rando
 from lightning_modules.callbacks import ExportWeights, WritePredictions
 from lightning_modules.datamodule import EVALUATION_SEED, CorrespondenceDataModule
 from lightning_modules.task import EstimatorTask, SetLoss
-
-
-def make_data(**arguments):
-    source = SyntheticSamples(number=400, num_heldout=4)
-    return CorrespondenceDataModule(source, source, source, **{"batch_size": 32, **arguments})
-
 
 SMALL = {"width": 16, "depth": 1, "stages": 2}
 FASTER = {"optimizer": lambda params: torch.optim.AdamW(params, lr=1e-2)}
