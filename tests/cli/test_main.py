@@ -149,15 +149,6 @@ def test_missing_and_wrong_checkpoints(trained, monkeypatch, refused, commands, 
         refused([command, *trained[1], *options], message)
 
 
-def test_interrupted(monkeypatch, capsys):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("kornia_learnnorm.cli.evaluate.run", interrupt)
-    assert main(["evaluate", "store.h5"]) == 130
-    assert capsys.readouterr().err == "interrupted\n"
-
-
 # The console script in a process where importing torch is interrupted.
 INTERRUPTED_IMPORT = """
 import sys

@@ -50,13 +50,6 @@ def test_matches_without_a_ratio_pass_every_ratio_test(uneven, tmp_path):
     assert StoreReader(tmp_path / "scored.h5").passing(0.8).tolist() == np.diff(store.offsets).tolist()
 
 
-@pytest.mark.parametrize("change", [lambda data: b"not a store", lambda data: data[:3000]])
-def test_not_hdf5(path, change):
-    path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(ValueError, match="not a readable HDF5 file"):
-        read_store(path)
-
-
 LINKS = r"lacks the datasets ratio \(links"
 LAYOUT_OF_RATIO = h5py.VirtualLayout((180,), "float32")
 LAYOUT_OF_RATIO[:] = h5py.VirtualSource("other.h5", "ratio", (180,))

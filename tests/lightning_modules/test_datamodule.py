@@ -59,19 +59,6 @@ def test_validation_shares_no_sample_with_training_and_can_be_missing():
         CorrespondenceDataModule().train_dataloader()
 
 
-@pytest.mark.parametrize("batch_pairs", [3, 10])
-def test_batches_of_whole_pairs(batch_pairs):
-    loader = BatchLoader(Pairs(), batch_pairs, seed=5, shuffle=True, by_pair=True)
-    assert len(loader) == -(-10 // batch_pairs)
-    first, second = ([batch.pair.unique_consecutive().tolist() for batch in loader] for _ in range(2))
-    for pairs in (first, second):
-        assert all(0 <= batch_pairs - len(batch) <= 1 for batch in pairs)
-        assert sorted(pair for batch in pairs for pair in batch) == list(
-            range(10)
-        )  # what they hold, see test_processes_share_an_epoch
-    assert first != second
-
-
 def test_batch_pairs_are_for_training_alone():
     plain, paired = (CorrespondenceDataModule(*3 * [Pairs()], 32, pairs) for pairs in (None, 3))
     for stage in ("val", "test", "predict"):
