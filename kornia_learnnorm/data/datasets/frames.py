@@ -33,20 +33,16 @@ def fundamental_from_motion(K1: Tensor, K2: Tensor, R: Tensor, t: Tensor) -> Ten
     return F_mat / scale
 
 
-def _unknown(*shape: int) -> NDArray[np.float64]:
-    return np.full(shape, np.nan)
-
-
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """An image, its camera and its pose."""
+    """An image, its camera and its pose, which are NaN where they are not known."""
 
     path: Path  # of the image file
     name: str  # the path below the root of the dataset, with slashes; the name in stores
     sequence: str  # name of the sequence; frames are paired by their order within a sequence
     size: Size  # (width, height) of the file, pixels; (0, 0) where it cannot be read
-    camera: NDArray[np.float64] = field(default_factory=lambda: _unknown(3, 3))  # of the file's pixels, or NaN
-    pose: NDArray[np.float64] = field(default_factory=lambda: _unknown(4, 4))  # camera to world, metres, or NaN
+    camera: NDArray[np.float64] = field(default_factory=lambda: np.full((3, 3), np.nan))  # of the file's pixels
+    pose: NDArray[np.float64] = field(default_factory=lambda: np.full((4, 4), np.nan))  # camera to world, metres
     distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2[, k3] of the file's pixels; removed before matching
     resized: Size | None = None  # (width, height) to resize to after undistortion; None keeps the file's
 
@@ -73,8 +69,6 @@ class FramePair(NamedTuple):
     def motion(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return rotation R (3, 3) and translation t (3,) of x2 = R x1 + t, NaN where a pose is unknown."""
         pose1, pose2 = self.frame1.pose, self.frame2.pose
-        if not (np.isfinite(pose1).all() and np.isfinite(pose2).all()):
-            return _unknown(3, 3), _unknown(3)
         R = np.linalg.solve(pose2[:3, :3], pose1[:3, :3])
         # The difference first: a camera that stood still has a translation of exactly zero.
         t = np.linalg.solve(pose2[:3, :3], pose1[:3, 3] - pose2[:3, 3])
@@ -84,8 +78,6 @@ class FramePair(NamedTuple):
     def F(self) -> NDArray[np.float64]:  # noqa: N802
         """Return F with x2^T F x1 = 0 and unit norm, (3, 3); NaN where unknown or if the camera did not move."""
         cameras_and_motion = self.frame1.K, self.frame2.K, *self.motion
-        if not all(np.isfinite(array).all() for array in cameras_and_motion):
-            return _unknown(3, 3)
         return np.asarray(fundamental_from_motion(*map(torch.from_numpy, cameras_and_motion)))
 
 
