@@ -66,11 +66,7 @@ def test_resized_images_and_cameras_agree(written, tmp_path):
         ("folder", ["--sequences", "06"], "sequences is for kitti and tum, got folder"),
         ("kitti", ["--sequences", "06", "--split", "test"], "exclude each other"),
         ("kitti", ["--gap", "9"], "no pairs of frames to match (frames 9 apart) among 12 frames"),
-        (
-            "kitti",
-            ["--matcher", "lightglue"],
-            "lightglue needs detector rootsift, aliked, disk, xfeat, keynet, got sift",
-        ),
+        ("kitti", ["--matcher", "lightglue"], "needs detector rootsift, aliked, disk, xfeat, keynet, got sift"),
         ("kitti", ["--min-points", "5"], "min_points 5 needs a COLMAP model, got none"),
         ("colmap", [], "colmap needs a model"),
     ],

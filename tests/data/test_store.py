@@ -70,11 +70,7 @@ LAYOUT_OF_RATIO[:] = h5py.VirtualSource("other.h5", "ratio", (180,))
         ("ratio", lambda file: file.create_group("ratio"), LINKS),
         ("ratio", h5py.SoftLink("/offsets"), LINKS),
         ("ratio", h5py.ExternalLink("other.h5", "ratio"), LINKS),
-        (
-            "ratio",
-            lambda file: file.create_dataset("ratio", 180, "f4", external=[(f"{file.filename}.raw", 0, 720)]),
-            LINKS,
-        ),
+        ("ratio", lambda file: file.create_dataset("ratio", 180, "f4", external=[("raw", 0, 720)]), LINKS),
         ("ratio", lambda file: file.create_virtual_dataset("ratio", LAYOUT_OF_RATIO), LINKS),
         ("version", 2, r"expected format='correspondences', version=1, got .*version=.*2"),
     ],

@@ -53,10 +53,9 @@ def test_a_run_of_another_length_does_not_go_on(tmp_path, caplog):
         make_trainer(tmp_path, [Checkpoints(2), Stop(5)], max_steps=20).fit(normaliser_task(), make_data())
     for steps in (10, 40):
         caplog.clear()
+        trainer = make_trainer(tmp_path, [Checkpoints(2)], max_steps=steps)
         with pytest.raises(ValueError, match=f"a training of 20 steps, .* got {steps} steps"):
-            make_trainer(tmp_path, [Checkpoints(2)], max_steps=steps).fit(
-                normaliser_task(), make_data(), ckpt_path=last
-            )
+            trainer.fit(normaliser_task(), make_data(), ckpt_path=last)
         assert "stopped at step" not in caplog.text
 
 

@@ -76,13 +76,7 @@ class TestReadColmap:
         with pytest.raises(FileNotFoundError, match=r"no COLMAP model at .*model: it lacks points3D\.bin or"):
             read(colmap)
 
-    @pytest.mark.parametrize(
-        ("name", "text"),
-        [
-            ("cameras", "hello\n"),
-            ("points3D", "1 0 0 1 0 0 0 0.5 77 0 2 9\n"),
-        ],
-    )
+    @pytest.mark.parametrize(("name", "text"), [("cameras", "hello\n"), ("points3D", "1 0 0 1 0 0 0 0.5 77 0 2 9\n")])
     def test_malformed(self, colmap, name, text):
         (colmap / "model" / f"{name}.txt").write_text(text)
         with pytest.raises(ValueError, match=r"the COLMAP model .*model cannot be read: "):
