@@ -55,7 +55,7 @@ def mover(refiner: kln.MatchRefiner, passes: int) -> Mover:
 
     @torch.no_grad()
     def move(images: list[np.ndarray], pair: EvaluatedPair) -> tuple[Tensor, Tensor]:
-        views = [torch.from_numpy(image)[None, None] / 255 for image in images]
+        views = [torch.from_numpy(image)[None, None] for image in images]
         points1, points2 = pair.points1[None], pair.points2[None]
         for _ in range(passes):
             points1, points2, _ = refiner(*views, points1, points2)

@@ -8,13 +8,14 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample, pad
+from torch.nn.functional import grid_sample
 
 from kornia_learnnorm.geometry.checks import (
     check_correspondences,
     check_mask,
     check_tensor,
     check_whole_number,
+    inference_mode,
     read_condition,
 )
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
@@ -27,6 +28,7 @@ RANGE_ROUNDING = 1e-5  # by which interpolated grey values may exceed one
 NEIGHBOURHOOD = 60.0  # pixels, standard deviation of the distance of neighbours in both views
 MAX_NEIGHBOURS = 256
 ORDER = 1.0, 0.6, 1.0, 0.6  # direction along which neighbours are spread, alike in both views
+NEGLIGIBLE = -60.0  # logarithm of the weight of a neighbour, against that of the nearest one, that has no effect
 ABSENT = -1e9  # logarithm of the weight of neighbours that are masked; finite, also where all are
 FRAME_PRIOR = 6.0  # pixels, standard deviation of the spread that is added to neighbours, where the affinity is one
 FRAME_FLOOR = 1e-12  # added under a root
@@ -119,7 +121,7 @@ class MatchRefiner(nn.Module):
         Gradients reach points and images. ``1 / scale`` is a weight for layers.
 
         Args:
-            image1: first views with shape :math:`(B, C, H, W)`, grey or colour, values from 0 to 1.
+            image1: first views with shape :math:`(B, C, H, W)`, grey or colour, values from 0 to 1, or bytes.
             image2: second views, of any height and width.
             points1: pixels in the first view with shape :math:`(B, N, 2)`; the centre of the top left pixel is (0, 0).
             points2: pixels in the second view.
@@ -134,79 +136,72 @@ class MatchRefiner(nn.Module):
             ValueError: if numbers of images and points differ, or a value is not finite or out of its range.
 
         """
-        given1, given2 = points1, points2
+        views = [points1, points2]
         if mask is not None:
             check_mask(mask, points1, points2)
-            points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
-        check_correspondences(points1, points2, min_points=0)
-        dtype = self.shift.weight.dtype
-        views = points1.to(dtype), points2.to(dtype)
-        frames = local_frames(*views, mask)
-        patches = [
-            self._normalized_patches(_grey(name, image, len(points)).to(dtype), points, frame)
-            for name, image, points, frame in zip(("image1", "image2"), (image1, image2), views, frames, strict=True)
-        ]
-        displacement, log_scale = self._displacements(*patches)
-        half = 0.5 * displacement.view(points1.shape)
-        half1, half2 = ((frame @ half[..., None])[..., 0].to(points1.dtype) for frame in frames)
-        scale = log_scale.view(points1.shape[:-1]).exp().to(points1.dtype)
-        points1, points2 = points1 - half1, points2 + half2
+            views = [torch.where(mask[..., None], points, 0.0) for points in views]
+        check_correspondences(views[0], views[1], min_points=0)
+        for name, image in (("image1", image1), ("image2", image2)):
+            _check_image(name, image, len(points1))
+        views = [points.to(self.shift.weight.dtype) for points in views]
+        with inference_mode(image1, image2, points1, points2):
+            frames = local_frames(views[0], views[1], mask)
+            patches = map(self._normalized_patches, (image1, image2), views, frames)
+            displacement, log_scale = self._displacements(*patches)
+        half, scale = 0.5 * displacement.mT[..., None, :], log_scale.exp().to(points1.dtype)
         if mask is not None:
-            points1 = torch.where(mask[..., None], points1, given1)
-            points2 = torch.where(mask[..., None], points2, given2)
-            scale = torch.where(mask, scale, torch.inf)
-        return RefinedMatches(points1, points2, scale)
+            half, scale = torch.where(mask[..., None, None], half, 0.0), torch.where(mask, scale, torch.inf)
+        half1, half2 = ((frame * half).sum(-1).to(points1.dtype) for frame in frames)
+        return RefinedMatches(points1 - half1, points2 + half2, scale)
 
     def _normalized_patches(self, image: Tensor, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the patches around points of images (B, 1, H, W), (BN, S, S), and their variance, (BN, 1)."""
-        size = self.patch_size
-        margin = size // 2 + 1
-        image = pad(image, [margin] * 4, "replicate")  # faster than grid_sample's own padding
-        unit = 2 / points.new_tensor([image.shape[-1], image.shape[-2]])  # a pixel in grid_sample's coordinates
-        offsets = torch.arange(size, dtype=points.dtype, device=points.device) - size // 2
-        y, x = torch.meshgrid(offsets, offsets, indexing="ij")
-        # Points and both columns of their frames times constants: one product is faster than broadcasting.
-        constants = torch.stack([torch.ones_like(x), x, y]).view(3, -1, 1, 1) * unit.diag()
-        terms = torch.cat([points[..., None, :] + margin + 0.5 - 1 / unit, frame.mT], -2).view(-1, 6)
-        grid = terms @ constants.transpose(1, 2).reshape(6, -1)
-        grid = grid.view(len(points), points.shape[1] * size, size, 2)
-        patches = grid_sample(image, grid, align_corners=False).view(-1, size * size)
-        if patches.numel():
+        """Return the grey patches around points of images (B, C, H, W), (B, S S, N), and their variance, (B, 1, N)."""
+        white = 255 if image.dtype == torch.uint8 else 1
+        middle = 0.5 * points.new_tensor([image.shape[-1], image.shape[-2]])
+        terms = torch.stack([points + 0.5 - middle, frame[..., 1], frame[..., 0]], 1) / middle  # of grid_sample
+        line = torch.arange(self.patch_size, dtype=points.dtype, device=points.device) - self.patch_size // 2
+        constants = torch.cartesian_prod(line.new_ones(1), line, line)  # 1, y and x of the pixels of a patch
+        grid = (constants @ terms.flatten(2)).view(len(points), len(constants), points.shape[1], 2)
+        patches = grid_sample(image.to(points.dtype), grid, padding_mode="border", align_corners=False)
+        patches = patches[:, 0] if patches.shape[1] == 1 else patches.mean(1)
+        if patches.numel() and white == 1:
             low, high = patches.detach().aminmax()
             if read_condition(~((low >= 0) & (high <= 1 + RANGE_ROUNDING))):
                 raise ValueError(f"images must have values from 0 to 1, got {low.item():g} to {high.item():g}")
-        patches = patches - patches.mean(-1, keepdim=True)
-        variance = (patches * patches).mean(-1, keepdim=True) + VARIANCE_FLOOR
-        return (patches * variance.rsqrt()).view(-1, size, size), variance
+        patches = patches - patches.mean(1, keepdim=True)
+        variance = (patches * patches).mean(1, keepdim=True) / white**2 + VARIANCE_FLOOR
+        return patches * (variance.rsqrt() / white), variance
 
     def _displacements(self, first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the displacements of the second points against the first, (BN, 2), and the log noise, (BN,)."""
+        """Return the displacements of the second points against the first, (B, 2, N), and the log noise, (B, N)."""
         (patch1, variance1), (patch2, variance2) = first, second
         mean, difference = 0.5 * (patch1 + patch2), patch1 - patch2
         steps, statistics = self._lucas_kanade(mean, difference)
-        even = self.even(torch.cat([mean.flatten(1), statistics, (variance1 * variance2).log()], -1))
-        odd = self.odd(torch.cat([difference.flatten(1), steps.flatten(1)], -1))
-        forward, backward = (self.hidden((even + sign * odd).relu()).relu() for sign in (1, -1))
-        gates = self.gates(forward + backward)
-        shift = self.shift(forward - backward) + (gates[:, :-1, None] * steps).sum(1)
+        even = _linear(self.even, torch.cat([mean, statistics, (variance1 * variance2).log()], 1))
+        odd = _linear(self.odd, torch.cat([difference, steps.flatten(1, 2)], 1))
+        forward, backward = (_linear(self.hidden, both.relu()).relu() for both in (even + odd, even - odd))
+        gates = _linear(self.gates, forward + backward)
+        shift = _linear(self.shift, forward - backward) + (gates[:, :-1, None] * steps).sum(1)
         return _bounded(shift, self.bound), gates[:, -1]
 
     def _lucas_kanade(self, mean: Tensor, difference: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a step in each window, (BN, K, 2), and statistics that tell how far to trust it, (BN, 3 K)."""
-        size = self.patch_size - 2
-        offsets = torch.arange(size, dtype=mean.dtype, device=mean.device) - size // 2
-        squared = (offsets[:, None].square() + offsets.square()).flatten()
-        windows = (-0.5 * squared[:, None] / (2 * self.log_windows).exp()).softmax(0)
-        dx = 0.5 * (mean[:, 1:-1, 2:] - mean[:, 1:-1, :-2]).flatten(1)
-        dy = 0.5 * (mean[:, 2:, 1:-1] - mean[:, :-2, 1:-1]).flatten(1)
-        rest = difference[:, 1:-1, 1:-1].flatten(1)
-        products = (dx * dx, dx * dy, dy * dy, dx * rest, dy * rest, rest * rest)
-        xx, xy, yy, xr, yr, rr = (product @ windows for product in products)
+        """Return a step in each window, (B, K, 2, N), and statistics that tell how far to trust it, (B, 3 K, N)."""
+        size = self.patch_size
+        line = (torch.arange(1, size - 1, dtype=mean.dtype, device=mean.device) - size // 2).square()
+        squared = (line[:, None] + line).flatten()
+        windows = (-0.5 * squared / (2 * self.log_windows[:, None]).exp()).softmax(-1)
+        shape = len(mean), size, size, mean.shape[-1]
+        mean, difference = mean.view(shape), difference.view(shape)
+        dx = 0.5 * (mean[:, 1:-1, 2:] - mean[:, 1:-1, :-2]).flatten(1, 2)
+        dy = 0.5 * (mean[:, 2:, 1:-1] - mean[:, :-2, 1:-1]).flatten(1, 2)
+        rest = difference[:, 1:-1, 1:-1].flatten(1, 2)
+        pairs = (dx, dx), (dx, dy), (dy, dy), (dx, rest), (dy, rest), (rest, rest)
+        xx, xy, yy, xr, yr, rr = (windows @ (first * second) for first, second in pairs)
         xx, yy = xx + NOISE, yy + NOISE
         determinant = xx * yy - xy * xy
-        step = torch.stack([yy * xr - xy * yr, xx * yr - xy * xr], -1) / determinant[..., None]
+        step = torch.stack([yy * xr - xy * yr, xx * yr - xy * xr], 2) / determinant[:, :, None]
         statistics = [(xx + yy).log(), determinant.log(), (rr + FLOOR).log()]
-        return _bounded(step, LARGEST_STEP), torch.cat(statistics, -1)
+        return _bounded(step, LARGEST_STEP), torch.cat(statistics, 1)
 
     def save_pretrained(self, path: str | Path) -> None:
         """Write weights and architecture to one safetensors file, beside the target and then renamed.
@@ -248,12 +243,18 @@ class MatchRefiner(nn.Module):
         return load_module(name, FORMAT, build)
 
 
-def _grey(name: str, image: Tensor, number: int) -> Tensor:
-    """Return images (B, 1, H, W), after checking their shape; colours are averaged."""
-    check_tensor(name, image, ["B", "C", "H", "W"])
-    if len(image) != number or image.shape[1] not in (1, 3) or 0 in image.shape[2:]:
+def _check_image(name: str, image: Tensor, number: int) -> None:
+    """Raise a clear error for anything but images (B, 1 or 3, H, W) of floating-point numbers or bytes."""
+    if not isinstance(image, Tensor) or image.dtype != torch.uint8:
+        check_tensor(name, image, ["B", "C", "H", "W"])
+    if image.ndim != 4 or len(image) != number or image.shape[1] not in (1, 3) or 0 in image.shape[2:]:
         raise ValueError(f"{name} must have shape [{number}, 1 or 3, H, W], got {[*image.shape]}")
-    return image if image.shape[1] == 1 else image.mean(1, keepdim=True)
+
+
+def _linear(layer: nn.Linear, values: Tensor) -> Tensor:
+    """Return a layer's output for values (B, C, N): with the matches last, all loops are long."""
+    weight = layer.weight.expand(len(values), -1, -1)
+    return weight @ values if layer.bias is None else torch.baddbmm(layer.bias[:, None], weight, values)
 
 
 def local_frames(points1: Tensor, points2: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -267,25 +268,25 @@ def local_frames(points1: Tensor, points2: Tensor, mask: Tensor | None = None) -
     """
     joint = torch.cat([points - points.mean(1, keepdim=True) for points in (points1, points2)], -1)
     near, exponent = _neighbours(joint, mask)
-    weights = torch.baddbmm(exponent[:, None], joint / NEIGHBOURHOOD**2, near.mT).softmax(-1)
-    x1, y1, x2, y2 = near.unbind(-1)
-    products = [x1 * x1, x1 * y1, y1 * y1, x2 * x2, x2 * y2, y2 * y2, x2 * x1, x2 * y1, y2 * x1, y2 * y1]
-    moments = weights @ torch.stack([x1, y1, x2, y2, *products], -1)
-    x1, y1, x2, y2, *products = moments.unbind(-1)
-    means = [x1 * x1, x1 * y1, y1 * y1, x2 * x2, x2 * y2, y2 * y2, x2 * x1, x2 * y1, y2 * x1, y2 * y1]
-    xx1, xy1, yy1, xx2, xy2, yy2, *cross = (product - mean for product, mean in zip(products, means, strict=True))
-    prior = FRAME_PRIOR**2 * torch.eye(2).to(moments)
-    root1, root2 = (_root(_matrix(xx, xy, xy, yy) + prior) for xx, xy, yy in ((xx1, xy1, yy1), (xx2, xy2, yy2)))
-    inverse1 = _inverse(root1)
-    turn = _inverse(root2) @ (_matrix(*cross) + prior) @ inverse1
-    cosine, sine = turn[..., 0, 0] + turn[..., 1, 1], turn[..., 1, 0] - turn[..., 0, 1]
+    logits = torch.baddbmm(exponent[:, None], joint / NEIGHBOURHOOD**2, near.mT)
+    if logits.numel():  # denormal weights would take ten times as long
+        logits = torch.maximum(logits, logits.detach().amax(-1, keepdim=True) + NEGLIGIBLE)
+    features = torch.cat([near, (near[..., :, None] * near[..., None, :]).flatten(-2)], -1)
+    moments = (logits.softmax(-1) @ features).mT.contiguous()  # the matches last
+    squares = moments[:, :4, None] * moments[:, None, :4]
+    C = moments[:, 4:].view_as(squares) - squares
+    eye = torch.eye(2).to(C)[..., None]
+    blocks = torch.stack([C[:, :2, :2], C[:, 2:, 2:], C[:, 2:, :2]]) + FRAME_PRIOR**2 * eye
+    (_, root2), (inverse1, inverse2) = _roots(blocks[:2])
+    turn = _product(_product(inverse2, blocks[2]), inverse1)
+    cosine, sine = turn[:, 0, 0] + turn[:, 1, 1], turn[:, 1, 0] - turn[:, 0, 1]
     length = (cosine.square() + sine.square() + FRAME_FLOOR).sqrt()
-    A = root2 @ _matrix(cosine, -sine, sine, cosine) @ inverse1 / length[..., None, None]
-    determinant, trace = A[..., 0, 0] * A[..., 1, 1] - A[..., 0, 1] * A[..., 1, 0], A[..., 0, 0] + A[..., 1, 1]
+    rotation = torch.stack([cosine, -sine, sine, cosine], 1).view_as(root2) / length[:, None, None]
+    A = _product(_product(root2, rotation), inverse1)
+    determinant, trace = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0], A[:, 0, 0] + A[:, 1, 1]
     plausible = (determinant > 1 / MAX_AREA) & (determinant < MAX_AREA) & (trace > MIN_TRACE)
-    A = torch.where(plausible[..., None, None], A, torch.eye(2).to(A))
-    root = _root(A)
-    return _inverse(root), root
+    root, inverse = _roots(torch.where(plausible[:, None, None], A, eye))
+    return inverse.movedim(-1, 1), root.movedim(-1, 1)
 
 
 def _neighbours(joint: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -312,23 +313,21 @@ def _neighbours(joint: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     return joint, exponent if present is None else exponent.masked_fill(~present, ABSENT)
 
 
-def _matrix(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """Return the matrices (..., 2, 2) with rows (a, b) and (c, d)."""
-    return torch.stack([torch.stack([a, b], -1), torch.stack([c, d], -1)], -2)
+def _product(first: Tensor, second: Tensor) -> Tensor:
+    """Return the products of matrices (B, 2, 2, N); faster than matmul."""
+    return (first[:, :, :, None] * second[:, None]).sum(2)
 
 
-def _root(matrix: Tensor) -> Tensor:
-    """Return the square root of matrices (..., 2, 2) of positive determinant and no negative eigenvalue."""
-    a, b, c, d = matrix.flatten(-2).unbind(-1)
-    root = (a * d - b * c).sqrt()
-    return (matrix + root[..., None, None] * torch.eye(2).to(matrix)) / (a + d + 2 * root).sqrt()[..., None, None]
-
-
-def _inverse(matrix: Tensor) -> Tensor:
-    a, b, c, d = matrix.flatten(-2).unbind(-1)
-    return _matrix(d, -b, -c, a) / (a * d - b * c)[..., None, None]
+def _roots(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return roots, and their inverses, of matrices (..., 2, 2, N) without negative or zero eigenvalues."""
+    a, b, c, d = matrix.flatten(-3, -2)[..., None, None, :, :].unbind(-2)
+    eye = torch.eye(2).to(matrix)[..., None]
+    determinant, trace = (a * d - b * c).sqrt(), a + d  # the determinant of the root
+    length = (trace + 2 * determinant).sqrt()
+    root = (matrix + determinant * eye) / length
+    return root, ((trace + determinant) * eye - matrix) / (determinant * length)
 
 
 def _bounded(vectors: Tensor, bound: float) -> Tensor:
-    r"""Return vectors shortened to lengths below the bound, :math:`b v / \sqrt{b^2 + \|v\|^2}`."""
-    return vectors * (bound / (bound**2 + vectors.square().sum(-1, keepdim=True)).sqrt())
+    r"""Return vectors (..., 2, N) shortened to lengths below the bound, :math:`b v / \sqrt{b^2 + \|v\|^2}`."""
+    return vectors * (bound / (bound**2 + vectors.square().sum(-2, keepdim=True)).sqrt())

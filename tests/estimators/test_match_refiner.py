@@ -51,11 +51,19 @@ def inputs(number: int = 1, num_points: int = 20, channels: int = 1) -> list[Ten
 def test_smoke(number, num_points, channels, dtype, masked):
     values = [value.to(dtype) for value in inputs(number, num_points, channels)]
     mask = uniform(number, num_points) > 0.3 if masked else None
-    found = trained().float()(*values, mask=mask)
+    with torch.set_grad_enabled(masked):
+        found = trained().float()(*values, mask=mask)
     for name, shape in {"points1": (num_points, 2), "points2": (num_points, 2), "scale": (num_points,)}.items():
         value = getattr(found, name)
-        assert (value.shape, value.dtype) == ((number, *shape), dtype)
+        assert (value.shape, value.dtype, value.is_inference()) == ((number, *shape), dtype, False)
         assert value[torch.ones(number, num_points, dtype=torch.bool) if mask is None else mask].isfinite().all()
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_bytes_are_taken_as_they_are(channels):
+    image1, image2, *points = inputs(channels=channels)
+    grey1, grey2 = (255 * image1).byte(), (255 * image2).byte()
+    torch.testing.assert_close(trained()(grey1, grey2, *points), trained()(grey1 / 255, grey2 / 255, *points))
 
 
 def test_points_stay_before_training():
@@ -188,7 +196,7 @@ def test_exceptions():
     nan[0, 0, 0] = torch.nan
     for wrong, error, match in (
         ((255 * image1, image2, points1, points2), ValueError, "from 0 to 1, got"),
-        ((image1.mul(255).byte(), image2, points1, points2), TypeError, "image1 must be a floating-point tensor"),
+        ((image1.long(), image2, points1, points2), TypeError, "image1 must be a floating-point tensor"),
         ((image1[0], image2, points1, points2), Exception, "image1"),
         ((image1, image2.expand(2, -1, -1, -1), points1, points2), ValueError, r"image2 must have shape \[1, 1 or 3"),
         ((image1.expand(1, 2, -1, -1), image2, points1, points2), ValueError, r"got \[1, 2, 90, 120\]"),
