@@ -33,7 +33,7 @@ ABSENT = -1e9  # logarithm of the weight of neighbours that are masked; finite, 
 FRAME_PRIOR = 6.0  # pixels, standard deviation of the spread that is added to neighbours, where the affinity is one
 FRAME_FLOOR = 1e-12  # added under a root
 MAX_AREA = 3.0  # by which an affinity may enlarge or reduce
-MIN_TRACE = 0.5  # of an affinity; less is a turn by more than some 75 degrees
+MIN_TRACE = 0.5  # of an affinity divided by the root of its determinant; less is a turn by more than some 75 degrees
 LARGEST_STEP = 3.0  # pixels, the bound of what Lucas-Kanade gives in one window
 # Of patches with a variance of one:
 NOISE = 1e-2  # added to the moments of the gradients, so that patches without texture give no step
@@ -284,7 +284,7 @@ def local_frames(points1: Tensor, points2: Tensor, mask: Tensor | None = None) -
     rotation = torch.stack([cosine, -sine, sine, cosine], 1).view_as(root2) / length[:, None, None]
     A = _product(_product(root2, rotation), inverse1)
     determinant, trace = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0], A[:, 0, 0] + A[:, 1, 1]
-    plausible = (determinant > 1 / MAX_AREA) & (determinant < MAX_AREA) & (trace > MIN_TRACE)
+    plausible = (determinant > 1 / MAX_AREA) & (determinant < MAX_AREA) & (trace > MIN_TRACE * determinant.sqrt())
     root, inverse = _roots(torch.where(plausible[:, None, None], A, eye))
     return inverse.movedim(-1, 1), root.movedim(-1, 1)
 
