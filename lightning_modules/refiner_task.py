@@ -149,5 +149,5 @@ class RefinerTask(EstimatorTask):
     def _move(self, batch: MatchSets) -> RefinedMatches:
         if batch.image1 is None or batch.image2 is None:
             raise ValueError("a refiner needs sets with images, of ImageSets, got none")
-        moved: RefinedMatches = self.estimator(batch.image1 / 255, batch.image2 / 255, *all_matches(batch))
+        moved: RefinedMatches = self.estimator(batch.image1, batch.image2, *all_matches(batch))
         return moved
