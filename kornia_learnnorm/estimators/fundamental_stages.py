@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.match_features import CommonFrame
 from kornia_learnnorm.estimators.moments import (
     Evidence,
     descend,
@@ -15,11 +14,9 @@ from kornia_learnnorm.estimators.moments import (
     least_cost,
     pick,
 )
-from kornia_learnnorm.estimators.stages import Refinement, few_outliers
+from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.checks import is_known_true
-from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
-from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Rank2
 
 __all__ = ["FundamentalRefinement"]
@@ -28,7 +25,7 @@ COMPARED_SCALE, FIT_SCALE = 2.2, 3.0  # of comparisons and of fits on moments, i
 LAST_FLOOR = 0.002  # of the frame's unit, about half a pixel, added to the last scale
 LAST_POWER = 0.2  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
 FIRST_STEPS, LOCAL_STEPS = 2, 3  # reweightings of the first fit of settled sets, and of candidates
-DAMPED_STEPS = 3  # of Levenberg-Marquardt before a search, in evaluation
+DAMPED_STEPS = 3  # of Levenberg-Marquardt before a search, where sets may settle
 SEARCH_STEPS = 5  # of the last stage's steps that a search takes the place of
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
@@ -47,23 +44,7 @@ class FundamentalRefinement(Refinement):
     their probabilities, is fitted to them by reweighted least squares.
     """
 
-    def __init__(
-        self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, samples: int, training: bool
-    ) -> None:
-        super().__init__(model, problem, frame)
-        self.training = training
-        self.few_outliers: Tensor | None = None
-        # A traced program serves sets of any size.
-        self.samples = samples if torch.compiler.is_compiling() or self.x1.shape[-1] >= MIN_MATCHES else 0
-
-    def settled(self, logits: Tensor) -> Tensor | None:
-        """Return which sets of enough matches have few outliers, (B,) bool; None in training, or if none is searched.
-
-        There minimal samples find what the other stages would.
-        """
-        if not self.training and self.samples:
-            self.few_outliers = few_outliers(logits, None if self.weights is None else self.weights > 0)
-        return self.few_outliers
+    min_searched = MIN_MATCHES
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
         """Return the matrices after so many steps; in the last stage, searched sets take some from their best one.
@@ -82,8 +63,8 @@ class FundamentalRefinement(Refinement):
                 state, square = self.model.state(M), FIT_SCALE**2
                 own = descend(evidence, state, weights[:, None], lambda s: square * mean(s), FIRST_STEPS).matrix()
         if self.few_outliers is None or not is_known_true(self.few_outliers.all()):
-            damped = super().optimize(M, probability, steps if self.training else min(DAMPED_STEPS, steps), last)
-            if not (self.training or is_known_true(~few.any())):
+            damped = super().optimize(M, probability, min(DAMPED_STEPS, steps) if self.settle else steps, last)
+            if self.settle and not is_known_true(~few.any()):
                 damped = torch.where(few[:, None, None], super().optimize(M, probability, steps, last), damped)
             own = damped if self.few_outliers is None else torch.where(self.few_outliers[:, None, None], own, damped)
         with torch.no_grad():

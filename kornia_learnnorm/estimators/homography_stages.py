@@ -49,13 +49,14 @@ class HomographyRefinement(Refinement):
     """
 
     model: Homography
+    min_searched = MIN_MATCHES
 
-    def __init__(self, model: Homography, problem: LinearProblem, frame: CommonFrame, samples: int) -> None:
-        super().__init__(model, problem, frame)
+    def __init__(
+        self, model: Homography, problem: LinearProblem, frame: CommonFrame, samples: int, settle: bool
+    ) -> None:
+        super().__init__(model, problem, frame, samples, settle)
         products = (self.x1[:, :, None] * self.x1[:, None]).flatten(1, 2)
         self.evidence = model.sampson_terms(self.x1, self.x2), products
-        # A traced program serves sets of any size.
-        self.samples = samples if torch.compiler.is_compiling() or self.x1.shape[-1] >= MIN_MATCHES else 0
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
         """Return the matrices after so many steps.
@@ -152,8 +153,9 @@ class HomographyRefinement(Refinement):
         flat, last = torch.diag(M.new_tensor([1.0, 1.0, 0.0])), torch.diag(M.new_tensor([0.0, 0.0, 1.0]))
         held = L[..., :, None, :, None] * flat[:, None] + last[:, None, :, None] * depths[..., None, :, None, :]
         difference = moments - held.flatten(4, 5).flatten(2, 3)
-        state = UnitMatrix(M.flatten(0, 1).mT)  # moments are those of row-major entries
+        D = UnitMatrix(M.flatten(0, 1).mT).tangents()  # moments are those of row-major entries
         h = M.flatten(0, 1).flatten(1)[..., None]
-        normal, gradient = normal_equations(moments.flatten(0, 1), difference.flatten(0, 1) @ h, state.tangents())
-        step = torch.linalg.solve_ex(normal, gradient)[0][..., 0]
-        return torch.unflatten(state.retract(-step).M.mT, 0, M.shape[:2])
+        normal, gradient = normal_equations(moments.flatten(0, 1), difference.flatten(0, 1) @ h, D)
+        moved = h - D @ torch.linalg.solve_ex(normal, gradient)[0]
+        unit: Tensor = moved / torch.linalg.vector_norm(moved, dim=1, keepdim=True)
+        return unit.view_as(M)

@@ -251,7 +251,7 @@ class LearnedEightPoint(LearnedLayer):
         self.rank2, self.samples = rank2, samples
 
     def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
-        return FundamentalRefinement(self.model, problem, frame, self.samples, self.training)
+        return FundamentalRefinement(self.model, problem, frame, self.samples, not self.training)
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:

@@ -101,11 +101,27 @@ def few_outliers(logits: Tensor, present: Tensor | None) -> Tensor:
 
 
 class Refinement:
-    """Robust refinement of a stage's matrices in the frame; sets of as few as possible matches are solved once."""
+    """Robust refinement of a stage's matrices in the frame; sets of as few as possible matches are solved once.
 
-    def __init__(self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame) -> None:
+    With ``settle``, sets of few outliers leave stages out: ``samples`` of the last one find what the others would.
+    """
+
+    min_searched = 0  # matches of a set that is searched
+
+    def __init__(
+        self,
+        model: TwoViewModel,
+        problem: LinearProblem,
+        frame: CommonFrame,
+        samples: int = 0,
+        settle: bool = False,
+    ) -> None:
         self.model, self.weights = model, problem.weights
         self.x1, self.x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
+        # A traced program serves sets of any size.
+        searched = torch.compiler.is_compiling() or self.x1.shape[-1] >= self.min_searched
+        self.samples, self.settle = samples if searched else 0, settle
+        self.few_outliers: Tensor | None = None
         self.minimal: Tensor | None = None
         self.is_minimal: Tensor | None = None
         if problem.x1.shape[1] > model.min_points and problem.weights is None:
@@ -126,7 +142,9 @@ class Refinement:
 
     def settled(self, logits: Tensor) -> Tensor | None:
         """Return which sets need no stage but the first and its refinement, (B,) bool; None if all stages are run."""
-        return None
+        if self.settle and self.samples:
+            self.few_outliers = few_outliers(logits, None if self.weights is None else self.weights > 0)
+        return self.few_outliers
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:
         """Return the matrices after so many steps, with the probabilities of inliers; ``last`` in the last stage."""
