@@ -1,7 +1,5 @@
 """Whether correspondences contradict their cameras: a fundamental matrix explains them better and is as certain."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

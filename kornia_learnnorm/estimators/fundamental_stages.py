@@ -1,7 +1,5 @@
 r"""Refinement of the learned fundamental matrix, and the search among minimal samples before its last fit."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ Correspondences enter a step through the :math:`9 \times 9` matrix of the second
 which weighted moments of view 1's points make: a step costs little for ten matches and for thousands.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """Linear estimation: the DLT of a model in the coordinates of a normaliser, as a function and as a layer."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 import torch

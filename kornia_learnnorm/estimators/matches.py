@@ -1,7 +1,5 @@
 r"""Correspondences from the output of matching networks: matches by index, one padded batch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 

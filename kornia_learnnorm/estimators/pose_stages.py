@@ -1,7 +1,5 @@
 r"""The stages of the learned relative pose: features, logits, moment matrix, essential matrices, robust steps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 r"""Non-linear refinement of fundamental and essential matrices on distances in pixels, by Levenberg-Marquardt."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 import torch

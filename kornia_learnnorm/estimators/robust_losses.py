@@ -4,8 +4,6 @@ A loss returns its value and its derivative by the squared distance, which is th
 squares.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from numbers import Real
 

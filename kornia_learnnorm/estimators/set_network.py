@@ -3,8 +3,6 @@ r"""The network of a stage of :class:`~kornia_learnnorm.LearnedEightPoint`: a lo
 All operations are invariant or equivariant under permutations of the correspondences, and ignore absent ones.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

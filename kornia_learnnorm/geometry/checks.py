@@ -1,7 +1,5 @@
 """Input checks and helpers shared by all modules."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
 

@@ -4,8 +4,6 @@ Each step solves one linear system, a fraction of a step of Levenberg-Marquardt,
 optimum too. Nothing holds it there: of least squares with outliers, it may not converge.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ distance in pixels, a function of the squared norms :math:`n_1 = \|(F^\top x_2)_
 :math:`n_2 = \|(F x_1)_{1:2}\|^2` of the epipolar lines' normals. It returns its value and its derivatives by both.
 """
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager, nullcontext
 
 import torch

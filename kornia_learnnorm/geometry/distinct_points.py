@@ -1,7 +1,5 @@
 """Matches of which no two share a point, so that a point supports a hypothesis once."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -3,8 +3,6 @@ r"""Linear algebra of the DLT: design matrix and null vector.
 Every function is batched and has derivatives that stay finite on degenerate input.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

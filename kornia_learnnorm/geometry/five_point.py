@@ -7,8 +7,6 @@ by :math:`x` the ten others; its eigenvectors are their values at the solutions 
 Recent developments on direct relative orientation, ISPRS 2006).
 """
 
-from __future__ import annotations
-
 from itertools import product
 
 import torch

@@ -3,8 +3,6 @@ r"""Closed forms for matrices of three rows and columns: cofactors, and the vect
 A batch of them costs a few elementwise operations, where a decomposition loops over the batch.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize

@@ -4,8 +4,6 @@
 serves more points, weights, any normaliser and gradients, and takes several times as long.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -3,8 +3,6 @@ r"""The relative pose of two cameras from a fundamental matrix.
 A pose is :math:`X_2 = R X_1 + t` for points in space; the length of :math:`t` is unknown.
 """
 
-from __future__ import annotations
-
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import essential_from_fundamental, motion_from_essential

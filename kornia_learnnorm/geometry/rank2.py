@@ -5,8 +5,6 @@ combinations well and others hardly at all. The optimal correction moves :math:`
 its covariance, so no normalisation has to choose a metric for it.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize

@@ -1,7 +1,5 @@
 """The matrices of rank 2 in a span of two, as of seven correspondences (Hartley and Zisserman, section 11.1.2)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 r"""Normalising transforms of the plane, their builders, and how points and fundamental matrices follow them."""
 
-from __future__ import annotations
-
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Checks of RANSAC's arguments."""
 
-from __future__ import annotations
-
 from numbers import Integral, Real
 
 import torch

@@ -1,7 +1,5 @@
 """Local optimisation of RANSAC's hypotheses, and the final fit of the best ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The matrices of RANSAC's minimal samples."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

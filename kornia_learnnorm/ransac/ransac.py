@@ -1,7 +1,5 @@
 r"""RANSAC whose minimal samples and refits run through a normaliser, or through known cameras."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 r"""Minimal samples of eight correspondences or any size: uniform, by rank (PROSAC), and in proportion to weights."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import torch

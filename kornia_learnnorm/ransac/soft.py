@@ -4,8 +4,6 @@ What a loss of the chosen hypothesis says about the points, the normaliser and t
 what it says about the probabilities that the samples were drawn with comes from the score function (REINFORCE).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """One thread for many small operations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Lock
