@@ -22,10 +22,10 @@ SYMMETRIES = 8  # of a square: flips and transposition
 class ImageSets(StoreSets):
     """Random sets of matches without labels, as many held-out ones of the same pair, and both images, in grey.
 
-    An image is the file of its name in the store below one of the folders, or else the one whose name without folder
-    and suffix is that of the store's. Pairs without images, of another shape than in the store, or with fewer than 32
-    matches are left out. In half of the sets a random displacement is added to the matches. Images and matches are
-    flipped and transposed at random, both views alike.
+    An image is the file of its name in the store below one of the folders, or else the only one whose name without
+    folder and suffix is that of the store's. Pairs without images, of another shape than in the store, or with fewer
+    than 32 matches are left out. In half of the sets a random displacement is added to the matches. Images and matches
+    are flipped and transposed at random, both views alike.
 
     Args:
         paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables are filled in.
@@ -99,11 +99,13 @@ class ImageSets(StoreSets):
 def find_images(folders: Sequence[str]) -> Callable[[str, Size], Path | None]:
     """Return a function that finds the file, of its size or larger, of an image by its name and size in a store."""
     roots = [Path(expand_path(folder)) for folder in folders]
-    by_stem: dict[str, Path] = {}
+    by_stem: dict[str, Path | None] = {}  # None where several files have the name
     for root in roots:
         if not root.is_dir():
             raise FileNotFoundError(f"no folder of images at {root}")
-        by_stem |= {path.name.partition(".")[0]: path for path in sorted(root.rglob("*")) if path.is_file()}
+        for path in filter(Path.is_file, root.rglob("*")):
+            stem = path.name.partition(".")[0]
+            by_stem[stem] = path if by_stem.get(stem, path) == path else None
 
     def find(name: str, size: Size) -> Path | None:
         exact = (path for path in (root / name for root in roots) if path.is_file())

@@ -1,6 +1,7 @@
 """Refiners of matches: sets with images from stores, the loss, and a training on rendered pairs by the command line."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,10 @@ def test_images_of_stores(folder, tmp_path):
         ImageSets([f"{folder}/matches.h5"], [f"{folder}/none"])
     with pytest.raises(ValueError, match="jitter must be"):
         source(folder, jitter=-1.0)
+    shutil.copytree(folder / "images/place0", tmp_path / "copies/place0")
+    find = find_images([f"{folder}/images", f"{folder}/images/place0", f"{tmp_path}/copies"])
+    assert find("x/s0v1.png", (WIDTH, HEIGHT)) is None  # one of two
+    assert find("x/s1v1.png", (WIDTH, HEIGHT)) == folder / "images/place1/s1v1.png"
 
 
 @pytest.mark.parametrize("kind", ["learned", "eight-point", "RANSAC"])
