@@ -166,7 +166,8 @@ pose-ablations: $(VENV)/.ready $(POSE_RUNS)
 
 refiner-ablations: $(VENV)/.ready $(REFINER_RUNS)
 	$(BIN)/python benchmarks/refined.py $(call TESTED,lightglue) --csv runs/ablations/refiner.csv --weights $(REFINER_RUNS) \
-		--images "$(DATA)"/images/photographs "$(DATA)"/kitti/sequences/06 "$(DATA)"/tum --estimators RANSAC poselib-calibrated
+		--images "$(DATA)"/images/photographs "$(DATA)"/kitti/sequences/06 "$(DATA)"/tum/rgbd_dataset_freiburg3_long_office_household \
+		--estimators RANSAC poselib-calibrated
 
 CHANGED = --config configs/ablations/$(1)/base.yaml --config configs/ablations/$(1)/$*.yaml $(INTO)
 runs/ablations/layer/%/weights.safetensors: | $(VENV)/.ready
