@@ -16,7 +16,7 @@ from kornia_learnnorm.estimators.pose_stages import (
     POSE_RESIDUAL_FEATURES,
     run_pose_stages,
 )
-from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, inference_mode
+from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, inference_mode, is_known_true
 from kornia_learnnorm.geometry.dlt import MIN_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.pose import choose_pose
@@ -225,21 +225,20 @@ class LearnedRelativePose(LearnedLayer):
         scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
         K1, K2 = (K.to(problem.x1).expand(points1.shape[0], 3, 3) for K in (K1, K2))
         determined, gap = _determined(problem)
-        # No derivative meets an undetermined set: generic points take its place, and their result is dropped.
-        rows = determined[:, None]
-        points = zip((problem.points1, problem.points2), generic_points(problem.points1), strict=True)
-        p1, p2 = (torch.where(rows[..., None], own, other) for own, other in points)
-        given = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
-        solved = LinearProblem.from_points(p1, p2, given, self.model)
-        eye = torch.eye(3).to(K1)
-        C1, C2 = (torch.where(rows[..., None], K, eye) for K in (K1, K2))
+        solved, C1, C2, rows, eye = problem, K1, K2, determined[:, None], torch.eye(3).to(K1)
+        if not is_known_true(determined.all()):
+            # No derivative meets an undetermined set: generic points take its place, and their result is dropped.
+            points = zip((problem.points1, problem.points2), generic_points(problem.points1), strict=True)
+            p1, p2 = (torch.where(rows[..., None], own, other) for own, other in points)
+            given = None if problem.weights is None else torch.where(rows, problem.weights, 1.0)
+            solved = LinearProblem.from_points(p1, p2, given, self.model)
+            C1, C2 = (torch.where(rows[..., None], K, eye) for K in (K1, K2))
         settle = self.samples > 0 and not (self.training or self.detach_stages)
         options = self.refine_steps, self.samples, self.detach_stages, settle
         with inference_mode(solved.x1, solved.x2, C1, C2, scores):
             states, logits = run_pose_stages(self.networks, solved, C1, C2, scores, *options)
-        sideways = Essential(eye[None], eye[None]).calibrated(
-            p1.new_tensor(self.model.preferred).view(1, 3, 3).expand(p1.shape[0], -1, -1)
-        )
+        preferred = eye.new_tensor(self.model.preferred).view(1, 3, 3)
+        sideways = Essential(eye[None], eye[None]).calibrated(preferred)
         states = [
             state._replace(
                 axes=torch.where(rows[..., None, None], state.axes, sideways.axes),
