@@ -4,16 +4,19 @@ Table: median symmetric epipolar distance of the matches that are within 4 px of
 the true lines (px) and from those of RANSAC's matrix (fit), px, mean over pairs: the true poses of KITTI and TUM are no
 more exact than good matches. AUC of the pose error up to 5 degrees, %, by estimator; median CPU time of moving the
 matches, ms, of one thread. Lucas-Kanade is OpenCV's, with a window of 15 px, started at the match; where it fails the
-found match stays.
+found match stays. Keypt2Subpx (S. Kim, M. Pollefeys, D. Barath, ECCV 2024) has rows of XFeat's stores only, with a
+checkout of its repository: its authors' weights for XFeat, with descriptors of Kornia's XFeat.
 
     python benchmarks/refined.py STORE.h5 [STORE.h5 ...] --images FOLDER [FOLDER ...] [--pairs 25] [--filtered]
-        [--weights refiner ...] [--passes 1] [--estimators NAME ...] [--csv FILE]
+        [--weights refiner ...] [--passes 1] [--estimators NAME ...] [--keypt2subpx FOLDER] [--csv FILE]
 
 Each of several weights has a row. An estimator is one of learnnorm robust; what is not installed is left out. --csv
 adds the rows to those of other stores in the file.
 """
 
+import importlib
 import math
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,9 +24,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from kornia.feature import XFeat
 from poses import THRESHOLD, find_installed
 from shared import auc_cells, make_parser, read_csv, write_csv
 from torch import Tensor
+from torch.nn.functional import interpolate, normalize
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.image_sets import find_images
@@ -60,6 +65,33 @@ def mover(refiner: kln.MatchRefiner, passes: int) -> Mover:
         for _ in range(passes):
             points1, points2, _ = refiner(*views, points1, points2)
         return points1[0], points2[0]
+
+    return move
+
+
+def keypt2subpx(folder: str) -> Mover:
+    """Return Keypt2Subpx of a checkout as a function of grey images and a pair."""
+    sys.path.append(folder)
+    network = importlib.import_module("model").Keypt2Subpx(output_dim=64, use_score=False).eval()
+    scalars = [(np.float64().__reduce__()[0], "numpy.core.multiarray.scalar"), np.dtype, np.dtypes.Float64DType]
+    with torch.serialization.safe_globals(scalars):  # the file has its accuracy too
+        weights = torch.load(
+            Path(folder) / "pretrained/k2s_xfeat_pretrained.pth", map_location="cpu", weights_only=True
+        )
+    network.net.load_state_dict(weights["model"])
+    xfeat = XFeat.from_pretrained()
+
+    @torch.no_grad()
+    def move(images: list[np.ndarray], pair: EvaluatedPair) -> tuple[Tensor, Tensor]:
+        views = [torch.from_numpy(image)[None] / 255 for image in images]
+        points, descriptors = [pair.points1.float(), pair.points2.float()], []
+        for view, keypoints in zip(views, points, strict=True):
+            size = [32 * (length // 32) for length in view.shape[1:]]  # that XFeat reads
+            features = normalize(xfeat.net(interpolate(view[None], size, mode="bilinear"))[0], dim=1)
+            scaled = keypoints * torch.tensor(size[::-1]) / torch.tensor(view.shape[:0:-1])
+            descriptors.append(normalize(xfeat.interpolator(features, scaled[None], *size)[0], dim=-1))
+        moved1, moved2 = network(*points, *views, *descriptors)
+        return moved1.double(), moved2.double()
 
     return move
 
@@ -108,6 +140,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--weights", nargs="+", default=["refiner"], help="of a MatchRefiner, by name or a file")
     parser.add_argument("--passes", type=int, default=1, help="how often the refiner is applied")
     parser.add_argument("--estimators", nargs="*", default=[*ESTIMATORS])
+    parser.add_argument("--keypt2subpx", metavar="FOLDER", help="a checkout of its repository")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -117,7 +150,8 @@ def main(arguments: list[str] | None = None) -> None:
     estimators, protocol = find_installed(args.estimators), "filtered" if args.filtered else "unfiltered"
     header, rows = ["matches", "px", "fit", *estimators, "ms"], []
     for path, name in names_of(args.stores).items():
-        found = measure_store(path, args.images, args.pairs, protocol, movers, estimators)
+        peer = {"Keypt2Subpx": keypt2subpx(args.keypt2subpx)} if args.keypt2subpx and "xfeat" in name else {}
+        found = measure_store(path, args.images, args.pairs, protocol, movers | peer, estimators)
         print(f"{name}\n\n{format_table(header, found)}\n", flush=True)
         rows += [[name, *row] for row in found]
     before = read_csv(args.csv)[1:] if args.csv and Path(args.csv).exists() else []
