@@ -11,20 +11,7 @@ from hypothesis import strategies as st
 from kornia.feature import DISK, LightGlue, LightGlueMatcher, scale_laf
 from make_sequences import texture
 
-from kornia_learnnorm.data.matching import features as module
-from kornia_learnnorm.data.matching import matchers as matching
-from kornia_learnnorm.data.matching.features import (
-    DETECTORS,
-    Features,
-    MissingWeightsError,
-    detect_disk,
-    detect_keynet,
-    detect_rootsift,
-    detect_sift,
-    keep_features,
-    pretrained,
-)
-from kornia_learnnorm.data.matching.matchers import match_lightglue, match_nearest
+from kornia_learnnorm.data.matching import features, matchers
 from kornia_learnnorm.data.synthetic.render import render_pair
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.two_view.many_pairs import PairOptions, estimate_pairs
@@ -34,13 +21,13 @@ cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
 
 @pytest.fixture(autouse=True)
 def _no_networks_kept():
-    pretrained.cache_clear()
+    features.pretrained.cache_clear()
     yield
-    pretrained.cache_clear()
+    features.pretrained.cache_clear()
 
 
 def test_rootsift_is_the_root_of_sift_of_unit_sum():
-    sift, root = detect_sift(texture(), 100), detect_rootsift(texture(), 100)
+    sift, root = features.detect_sift(texture(), 100), features.detect_rootsift(texture(), 100)
     rows = sift.descriptors.astype(np.float64)
     assert np.allclose(root.descriptors, np.sqrt(rows / np.abs(rows).sum(1)[:, None]), atol=1e-6)
     assert np.allclose(np.linalg.norm(root.descriptors, axis=1), 1, atol=1e-5)
@@ -49,14 +36,14 @@ def test_rootsift_is_the_root_of_sift_of_unit_sum():
 
 
 def test_blank_has_none():
-    found = detect_rootsift(np.zeros((60, 80), np.uint8))
+    found = features.detect_rootsift(np.zeros((60, 80), np.uint8))
     assert (found.points.shape, found.descriptors.shape, found.size) == ((0, 2), (0, 128), (80, 60))
 
 
 def test_disk_of_random_weights(monkeypatch):
     weights = {"extractor": DISK().state_dict()}
     monkeypatch.setattr("kornia.feature.disk.disk.load_state_dict_from_url", lambda *_, **__: weights)
-    found = detect_disk(texture(width=200), 50)  # 180 and 200 are no multiples of 16
+    found = features.detect_disk(texture(width=200), 50)  # 180 and 200 are no multiples of 16
     assert 0 < len(found.points) <= 50
     assert (found.points.max(0) < (200, 180)).all()
     assert found.descriptors.shape == (len(found.points), 128)
@@ -69,25 +56,25 @@ def test_keynet_leaves_out_what_fills_up(monkeypatch):
     frames = torch.zeros(1, 5, 2, 3)
     frames[0, :2, :, 2] = torch.tensor([[30.0, 20.0], [70.0, 40.0]])
     output = frames, torch.zeros(1, 5), torch.rand(1, 5, 128)
-    monkeypatch.setattr(module, "pretrained", lambda *_: lambda image: output)
-    found = detect_keynet(texture(), 5)
+    monkeypatch.setattr(features, "pretrained", lambda *_: lambda image: output)
+    found = features.detect_keynet(texture(), 5)
     assert found.points.tolist() == [[30, 20], [70, 40]]
     assert found.descriptors.shape == (2, 128)
 
 
 def test_lightglue_of_random_weights(monkeypatch):
     network = LightGlue(None, input_dim=128, filter_threshold=0.0).eval()
-    monkeypatch.setattr(matching, "pretrained", lambda *_: network)
+    monkeypatch.setattr(matchers, "pretrained", lambda *_: network)
     rng = np.random.default_rng(0)
     points, rows = rng.uniform(0, 90, (2, 30, 2)), rng.normal(size=(2, 30, 128))
-    sides = [Features(*map(np.float32, side), (100, 90)) for side in zip(points, rows, strict=True)]
-    points1, points2, score = matching.match_lightglue(*sides)
+    sides = [features.Features(*map(np.float32, side), (100, 90)) for side in zip(points, rows, strict=True)]
+    points1, points2, score = matchers.match_lightglue(*sides)
     assert points1.shape == points2.shape == (len(score), 2)
     assert len(score) > 0
     assert all(part.dtype == torch.float32 for part in (points1, points2, score))
     assert ((score >= 0) & (score <= 1)).all()
     with pytest.raises(ValueError, match=r"LightGlue of disk needs .* 128 columns, got float32 with 64 columns"):
-        matching.match_lightglue(*(side._replace(descriptors=side.descriptors[:, :64]) for side in sides))
+        matchers.match_lightglue(*(side._replace(descriptors=side.descriptors[:, :64]) for side in sides))
 
 
 @pytest.mark.parametrize(
@@ -106,12 +93,12 @@ def test_lightglue_gets_the_frames_that_kornia_gives_it(monkeypatch, name, scale
             return {"matches0": torch.full((1, 2), -1), "matching_scores0": torch.zeros(1, 2)}
 
     monkeypatch.setattr("kornia.feature.integrated.LightGlue", Spy)
-    found = [detect_rootsift(texture(seed, 200), 50) for seed in range(2)]
+    found = [features.detect_rootsift(texture(seed, 200), 50) for seed in range(2)]
     rows, lafs = ([torch.from_numpy(getattr(side, part)) for side in found] for part in ("descriptors", "lafs"))
     frames = [scale_laf(side[None], scale) for side in lafs]
     LightGlueMatcher(name)(*rows, *frames, *(side.size[::-1] for side in found))
     for number, side in enumerate(found):
-        ours, expected = matching._lightglue_input(side), given[f"image{number}"]
+        ours, expected = matchers._lightglue_input(side), given[f"image{number}"]
         for part in ("keypoints", "descriptors", "image_size", *used):
             torch.testing.assert_close(ours[part], expected[part].to(ours[part].dtype), rtol=1e-5, atol=1e-4)
 
@@ -133,9 +120,9 @@ def test_matches_of_trained_networks_are_true(cached_weights, detector, files, l
     """On a rendered pair: share of matches within 2 px of their epipolar lines, median distance."""
     cached_weights(*files, lightglue)
     pair = render_pair(seed=0, width=240, height=180)
-    sides = [DETECTORS[detector](image, 300) for image in (pair.image1, pair.image2)]
-    points1, points2, ratio = match_nearest(*sides)
-    for found1, found2, score in ((points1, points2, 1 - ratio), match_lightglue(*sides, detector)):
+    sides = [features.DETECTORS[detector](image, 300) for image in (pair.image1, pair.image2)]
+    points1, points2, ratio = matchers.match_nearest(*sides)
+    for found1, found2, score in ((points1, points2, 1 - ratio), matchers.match_lightglue(*sides, detector)):
         points = (found[score > 0.2][None].double() for found in (found1, found2))
         found = symmetric_epipolar_distance(*points, torch.from_numpy(pair.F_mat)[None])[0]
         assert len(found) > 50
@@ -147,14 +134,15 @@ def test_matches_of_trained_networks_are_true(cached_weights, detector, files, l
 def test_grey_values_are_colours_of_three_equal_channels(cached_weights, detector, file):
     cached_weights(file)
     grey = texture(0, 120, 100)
-    one, three = DETECTORS[detector](grey, 50), DETECTORS[detector](np.stack([grey] * 3, -1), 50)
+    one, three = features.DETECTORS[detector](grey, 50), features.DETECTORS[detector](np.stack([grey] * 3, -1), 50)
     assert np.allclose(one.points, three.points, atol=1e-3)
     with pytest.raises(ValueError, match=r"grey or RGB with shape .*, got \(120, 100, 4\)"):
-        DETECTORS[detector](np.zeros((120, 100, 4), np.uint8), 50)
+        features.DETECTORS[detector](np.zeros((120, 100, 4), np.uint8), 50)
 
 
 @pytest.mark.parametrize(
-    ("detect", "error"), [(detect_disk, urllib.error.URLError("no network")), (detect_keynet, EOFError("Ran out"))]
+    ("detect", "error"),
+    [(features.detect_disk, urllib.error.URLError("no network")), (features.detect_keynet, EOFError("Ran out"))],
 )
 def test_weights_that_cannot_be_loaded(monkeypatch, detect, error):
     for place in ("disk.disk", "keynet", "affine_shape", "orientation", "hardnet"):
@@ -180,15 +168,15 @@ def test_weights_without_a_network_end_a_list_of_pairs(monkeypatch, tmp_path, pl
         "kornia.feature.xfeat.load_state_dict_from_url", Mock(side_effect=urllib.error.URLError("none"))
     )
     pairs, out = [(planes / "left.png", planes / "right.png")], tmp_path / "out"
-    with pytest.raises(MissingWeightsError, match="the weights of XFeat are not in"):
+    with pytest.raises(features.MissingWeightsError, match="the weights of XFeat are not in"):
         estimate_pairs(pairs, out, PairOptions(detector="xfeat"), jobs=1)
     assert (out / "pairs.jsonl").read_text() == ""
 
 
 class TestKeepFeatures:
     @staticmethod
-    def features(points: np.ndarray, size: tuple[int, int]) -> Features:
-        return Features(points.astype(np.float32), np.arange(len(points))[:, None], size)
+    def numbered(points: np.ndarray, size: tuple[int, int]) -> features.Features:
+        return features.Features(points.astype(np.float32), np.arange(len(points))[:, None], size)
 
     @given(seed=st.integers(0, 10**6), width=st.integers(1, 60), height=st.integers(1, 50), share=st.floats(0, 0.02))
     def test_against_distances(self, seed, width, height, share):
@@ -197,7 +185,7 @@ class TestKeepFeatures:
         points = rng.uniform(-0.5, (width - 0.5, height - 0.5), (40, 2))
         masked = np.argwhere(~mask)[:, ::-1]
         away = np.abs(points.astype(np.float32).round()[:, None] - masked).max(-1).min(-1, initial=np.inf) > 8
-        found = keep_features(self.features(points, (width, height)), mask)
+        found = features.keep_features(self.numbered(points, (width, height)), mask)
         assert found.descriptors[:, 0].tolist() == np.flatnonzero(away).tolist()
         assert np.array_equal(found.points, points[away].astype(np.float32))
         assert found.size == (width, height)
