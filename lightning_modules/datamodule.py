@@ -107,14 +107,10 @@ class BatchLoader:
 
     def _blocks(self, epoch: int, first: int) -> Iterator[MatchSets]:
         """Yield the blocks of an epoch from ``first`` on."""
-        number = len(self._sizes(epoch))
-        if self.workers and number > first + 1:
-            # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
-            indices: Any = range(first, number)
-            options: dict[str, Any] = {"num_workers": self.workers, "worker_init_fn": _ignore_interrupts}
-            yield from DataLoader(indices, None, collate_fn=partial(self.source.draw, self._seed(epoch)), **options)
-        else:
-            yield from (self._draw(epoch, block) for block in range(first, number))
+        # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
+        indices: Any = range(first, len(self._sizes(epoch)))
+        workers, draw = self.workers if len(indices) > 1 else 0, partial(self._draw, epoch)
+        yield from DataLoader(indices, None, num_workers=workers, collate_fn=draw, worker_init_fn=_ignore_interrupts)
 
     def _draw(self, epoch: int, block: int) -> MatchSets:
         seed = self._seed(epoch)
