@@ -65,7 +65,11 @@ class BatchLoader:
         shares = np.cumsum([0, *self._sizes(epoch)])
         bounds = [int(bound) for bound in np.rint(shares * (self._length / shares[-1]))]
         first = max(block for block, bound in enumerate(bounds[:-1]) if bound <= start)
-        for block, samples in zip(range(first, len(bounds) - 1), self._blocks(epoch, first), strict=True):
+        # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
+        blocks: Any = range(first, len(bounds) - 1)
+        workers, draw = self.workers if len(blocks) > 1 else 0, partial(self._draw, epoch)
+        drawn = DataLoader(blocks, None, num_workers=workers, collate_fn=draw, worker_init_fn=_ignore_interrupts)
+        for block, samples in zip(blocks, drawn, strict=True):
             number = bounds[block + 1] - bounds[block]
             for index, batch in enumerate(self._cut(samples, number, epoch, block), bounds[block]):
                 if index >= start:
@@ -104,13 +108,6 @@ class BatchLoader:
     def _sizes(self, epoch: int) -> list[int]:
         blocks = self.source.blocks(self._seed(epoch))
         return [block.pairs if self.by_pair else block.samples for block in blocks]
-
-    def _blocks(self, epoch: int, first: int) -> Iterator[MatchSets]:
-        """Yield the blocks of an epoch from ``first`` on."""
-        # The "items" are indices of blocks; the workers draw the blocks as they would collate items.
-        indices: Any = range(first, len(self._sizes(epoch)))
-        workers, draw = self.workers if len(indices) > 1 else 0, partial(self._draw, epoch)
-        yield from DataLoader(indices, None, num_workers=workers, collate_fn=draw, worker_init_fn=_ignore_interrupts)
 
     def _draw(self, epoch: int, block: int) -> MatchSets:
         seed = self._seed(epoch)
