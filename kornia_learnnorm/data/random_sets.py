@@ -121,9 +121,8 @@ class StoreSets:
         ratio, sizes = self.max_ratios[choice], self._sizes[choice]
         able = (sizes >= min(num_points, int(sizes.max()))).nonzero()[:, 0]
         chosen = able[torch.randint(len(able), (num_sets,), generator=generator)].tolist()
-        parts = [self._pairs[i].draw(num_points, self.num_heldout, ratio, generator) for i in chosen]
-        points1, points2, heldout1, heldout2, *rest = (torch.stack(values) for values in zip(*parts, strict=True))
-        return MatchSets(points1, points2, heldout1, heldout2, torch.tensor(chosen), *rest)
+        parts = [self._pairs[i].draw(i, num_points, self.num_heldout, ratio, generator) for i in chosen]
+        return MatchSets(*(torch.stack(values) for values in zip(*parts, strict=True)))
 
 
 class _Pair(NamedTuple):
@@ -149,17 +148,18 @@ class _Pair(NamedTuple):
         passing = self.passing(RATIO)
         return passing[self.distance[passing] < INLIER_THRESHOLD]
 
-    def draw(self, num_points: int, num_heldout: int, ratio: float | None, generator: Generator) -> Sequence[Tensor]:
-        """Return the fields of a :class:`MatchSets` of one set, without the index of the pair."""
+    def draw(
+        self, index: int, num_points: int, num_heldout: int, ratio: float | None, generator: Generator
+    ) -> Sequence[Tensor]:
+        """Return the fields of a :class:`MatchSets` of one set, of the pair of this index."""
         passing, heldout = self.passing(ratio), self.heldout
         rows = passing[torch.randperm(len(passing), generator=generator)]
         rows = rows[torch.arange(num_points) % len(rows)]
         held = self.points[heldout[torch.randint(len(heldout), (num_heldout,), generator=generator)]]
         points, distance = self.points[rows], self.distance[rows]
         inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
-        labelled = ~distance.isnan().any()
-        scores = self.score[rows]
-        return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], scores, inliers, labelled, *self.cameras
+        about = torch.tensor(index), self.score[rows], inliers, ~distance.isnan().any(), *self.cameras
+        return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], *about
 
 
 def _read_pairs(path: str, labels: bool) -> list[_Pair]:

@@ -180,14 +180,12 @@ def correspondences(planes: Sequence[Plane], K: Array, R: Array, t: Array, size:
     x, y = np.meshgrid(np.arange(step // 2, size[0], step), np.arange(step // 2, size[1], step))
     points1 = np.stack([x.ravel(), y.ravel()], -1).astype(float)
     surface1, X1 = _front_surface(planes, K, np.eye(3), np.zeros(3), points1)
-    shown = surface1 >= 0
-    points1, surface1 = points1[shown], surface1[shown]
-    X2 = X1[shown] @ R.T + t
-    ahead = X2[:, 2] > 0
-    projected = X2[ahead] @ K.T
-    points1, surface1, points2 = points1[ahead], surface1[ahead], projected[:, :2] / projected[:, 2:]
+    X2 = X1 @ R.T + t  # NaN where image 1 shows nothing
+    projected = X2 @ K.T
+    points2 = projected[:, :2] / projected[:, 2:]
     surface2, _ = _front_surface(planes, K, R, t, points2)
-    both = (surface1 == surface2) & ((points2 >= 0) & (points2 <= np.array(size) - 1)).all(-1)
+    inside = ((points2 >= 0) & (points2 <= np.array(size) - 1)).all(-1)
+    both = inside & (surface1 == surface2) & (X2[:, 2] > 0)
     return points1[both], points2[both]
 
 
