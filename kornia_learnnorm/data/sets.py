@@ -75,9 +75,8 @@ def draw_samples(
     rows = torch.from_numpy(passes_ratio_test(store.ratio, max_ratio)).nonzero()[:, 0]
     rows = rows[torch.randperm(len(rows), generator=generator)]
     rows = rows[torch.argsort(pair[rows], stable=True)]
-    count = torch.bincount(pair[rows], minlength=len(store))
-    place = torch.arange(len(rows)) - (count.cumsum(0) - count)[pair[rows]]
-    rows = rows[place < (count // size * size)[pair[rows]]].reshape(-1, size)
+    of_pairs = torch.split(rows, torch.bincount(pair[rows], minlength=len(store)).tolist())
+    rows = torch.cat([own[: len(own) // size * size] for own in of_pairs]).reshape(-1, size)
     if len(rows) == 0:
         limit = "" if max_ratio is None else f" with ratio below {max_ratio}"
         raise ValueError(f"no pair of the store has {size} correspondences{limit}, which a sample needs")
