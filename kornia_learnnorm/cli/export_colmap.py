@@ -48,8 +48,8 @@ def run(args: argparse.Namespace) -> int:
     K = None if args.K is None else read_camera(args.K)
     layer = None if args.weights is None else LearnedEightPoint.from_pretrained(args.weights)
     estimation = {"layer": layer, "threshold": args.threshold, "seed": args.seed, "jobs": args.jobs}
-    files, turned = (_matches(args), args.root, args.out), len(args.matches) != 2
-    counts = export_colmap(*files, K, args.single_camera, turned=turned, **estimation)
+    store, turned = _matches(args), len(args.matches) != 2
+    counts = export_colmap(store, args.root, args.out, K, args.single_camera, turned=turned, **estimation)
     print(
         f"wrote {args.out}: {counts.images} images; {counts.verified} of {counts.pairs} pairs verified, "
         f"{counts.inliers} of {counts.matches} matches are their inliers"

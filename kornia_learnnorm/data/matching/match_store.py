@@ -121,10 +121,9 @@ def collect_matches(
         if writer.complete:
             print(f"{path} exists already, made with these options; remove it to match again", file=sys.stderr)
             return writer.skipped
-        with closing(writer):
-            with open_workers(jobs, dask) as workers:
-                skipped = _match_all(pairs, writer, options, about, workers)
-            if not writer.done():
+        with closing(writer), open_workers(jobs, dask) as workers:
+            skipped = _match_all(pairs, writer, options, about, workers)
+            if len(skipped) == len(pairs):
                 first = next(iter(skipped.values()))
                 raise ValueError(f"none of the {len(pairs)} pairs could be matched; reason for the first: {first}")
             versions = {name: version(name) for name in ("kornia_learnnorm", "numpy", "h5py")}
