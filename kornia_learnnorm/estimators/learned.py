@@ -140,7 +140,7 @@ class LearnedLayer(MatchLayer):
 
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
             given = scores if scores is None or rows is None else scores[rows]
-            with inference_mode(problem.x1, problem.x2, given):
+            with inference_mode():
                 found = self._run(problem, given)
             return found if torch.is_grad_enabled() else tuple(map(Tensor.clone, found))
 

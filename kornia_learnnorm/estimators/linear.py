@@ -1,5 +1,6 @@
 """Linear estimation: the DLT of a model in the coordinates of a normaliser, as a function and as a layer."""
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Literal, NamedTuple
 
 import torch
@@ -10,7 +11,7 @@ from kornia_learnnorm.geometry.checks import (
     check_cameras,
     check_correspondences,
     check_mask,
-    needs_gradient,
+    inference_mode,
     solve_dtype,
 )
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP
@@ -21,7 +22,12 @@ from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.normalizers.closed_form import Hartley
-from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer, normalizing_transforms
+from kornia_learnnorm.normalizers.normalizer import (
+    Normalizer,
+    ProblemNormalizer,
+    check_normalizer,
+    normalizing_transforms,
+)
 
 __all__ = [
     "EightPoint",
@@ -87,7 +93,20 @@ def find_fundamental(
     """
     check_correspondences(points1, points2, weights)
     problem = LinearProblem.from_points(points1, points2, weights, Fundamental(rank2))
-    return solve_linear(problem, normalizer).to(points1.dtype)
+    with _inference_mode(normalizer):
+        F_mat = solve_linear(problem, normalizer)
+    return F_mat.to(points1.dtype, copy=not torch.is_grad_enabled())
+
+
+def _inference_mode(normalizer: Normalizer | None) -> AbstractContextManager[object]:
+    """Return inference mode where it can be and a normaliser keeps nothing of it, which would be of no use in training.
+
+    Those of the package without parameters keep nothing.
+    """
+    own = normalizer is None or (
+        isinstance(normalizer, ProblemNormalizer) and next(normalizer.parameters(), None) is None
+    )
+    return inference_mode() if own else nullcontext()
 
 
 def solve_linear(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
@@ -101,7 +120,7 @@ def solve_in_coordinates(problem: LinearProblem, T1: Tensor, T2: Tensor) -> Tens
     """Return the matrices of a problem under known transforms :math:`(B, 3, 3)` of the pixels."""
     null_matrix, gap = problem.solve_in(T1, T2)
     M = unit_matrix(problem.model.constrain_in(problem, null_matrix, T1, T2))
-    if not needs_gradient(M):
+    if not torch.is_grad_enabled():
         return M
     # Rounding chose among the solutions; one with an epipole on a point makes the loss as steep as rounding is small.
     return torch.where((gap > DEPENDENT_GAP[gap.dtype])[:, None, None], M, M.detach())
@@ -121,9 +140,10 @@ class LinearLayer(MatchLayer):
         self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, mask: Tensor | None = None
     ) -> Tensor:
         """Return the matrices (B, 3, 3); arguments, shapes and errors as for :meth:`EightPoint.estimate`."""
-        problem = prepare_problem(self.model, points1, points2, weights, mask)
-        (M,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
-        return M.to(points1.dtype)
+        with _inference_mode(self.normalizer):
+            problem = prepare_problem(self.model, points1, points2, weights, mask)
+            (M,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
+        return M.to(points1.dtype, copy=not torch.is_grad_enabled())
 
     def _solve(self, problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor]:
         return (solve_linear(problem, self.normalizer),)
@@ -274,11 +294,12 @@ class EightPoint(LinearLayer):
                 weight is negative, or only one camera is given or one is not invertible.
 
         """
-        problem = prepare_problem(self.model, points1, points2, weights, mask)
-        check_cameras(K1, K2, points1.shape[0])
-        (F_mat,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
-        F_mat = F_mat.to(points1.dtype)
-        return TwoViewEstimate(F_mat, essential_matrix(F_mat, K1, K2), problem.determined, problem.gap)
+        with _inference_mode(self.normalizer):
+            problem = prepare_problem(self.model, points1, points2, weights, mask)
+            check_cameras(K1, K2, points1.shape[0])
+            (F_mat,) = solve_where_determined(problem, self._solve, self._solve_undetermined)
+        F_mat, gap = F_mat.to(points1.dtype, copy=not torch.is_grad_enabled()), problem.gap.clone()
+        return TwoViewEstimate(F_mat, essential_matrix(F_mat, K1, K2), problem.determined, gap)
 
 
 def prepare_problem(

@@ -144,7 +144,7 @@ class MatchRefiner(nn.Module):
         for name, image in (("image1", image1), ("image2", image2)):
             _check_image(name, image, len(points1))
         views = [points.to(self.shift.weight.dtype) for points in views]
-        with inference_mode(image1, image2, points1, points2):
+        with inference_mode():
             frames = local_frames(views[0], views[1], mask)
             patches = map(self._normalized_patches, (image1, image2), views, frames)
             displacement, log_scale = self._displacements(*patches)

@@ -235,7 +235,7 @@ class LearnedRelativePose(LearnedLayer):
             C1, C2 = (torch.where(rows[..., None], K, eye) for K in (K1, K2))
         settle = self.samples > 0 and not (self.training or self.detach_stages)
         options = self.refine_steps, self.samples, self.detach_stages, settle
-        with inference_mode(solved.x1, solved.x2, C1, C2, scores):
+        with inference_mode():
             states, logits = run_pose_stages(self.networks, solved, C1, C2, scores, *options)
         preferred = eye.new_tensor(self.model.preferred).view(1, 3, 3)
         sideways = Essential(eye[None], eye[None]).calibrated(preferred)

@@ -7,6 +7,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import ShapeError
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.autograd.forward_ad import unpack_dual
 
 __all__ = [
@@ -174,28 +175,22 @@ def needs_gradient(*values: Tensor | None) -> bool:
     for value in values:
         if value is None:
             continue
-        if value.requires_grad or _is_traced(value):
+        wrapped = torch._C._functorch.is_functorch_wrapped_tensor(value)  # noqa: SLF001 (there is no public name)
+        if value.requires_grad or wrapped or unpack_dual(value).tangent is not None:  # type: ignore[no-untyped-call]
             return True
     return False
 
 
-def inference_mode(*values: Tensor | None) -> AbstractContextManager[object]:
-    """Return PyTorch's inference mode, in which operations cost less, where nobody can ask for derivatives by a tensor.
+def inference_mode() -> AbstractContextManager[object]:
+    """Return PyTorch's inference mode, in which operations cost less, where gradients are disabled.
 
-    What is made in it must be cloned outside of it before it leaves a layer.
+    Not inside ``torch.compile``, and transforms such as ``vmap`` or forward-mode differentiation. What is made in it
+    must be cloned outside of it before it leaves a layer.
     """
     if torch.is_grad_enabled() or torch.compiler.is_compiling():
         return nullcontext()
-    for value in values:
-        if value is not None and _is_traced(value):
-            return nullcontext()
-    return torch.inference_mode()
-
-
-def _is_traced(value: Tensor) -> bool:
-    """Return whether a transform such as ``vmap`` or forward-mode differentiation sees what becomes of a tensor."""
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(value)  # noqa: SLF001 (there is no public name)
-    return wrapped or unpack_dual(value).tangent is not None  # type: ignore[no-untyped-call]
+    transformed = torch._C._functorch.peek_interpreter_stack() is not None  # noqa: SLF001 (there are no public names)
+    return nullcontext() if transformed or forward_ad._current_level >= 0 else torch.inference_mode()  # noqa: SLF001
 
 
 def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:

@@ -90,7 +90,7 @@ class Fundamental(TwoViewModel):
     def constrain_in(self, problem: LinearProblem, M: Tensor, T1: Tensor, T2: Tensor) -> Tensor:
         """Return matrices of rank 2: projected in the coordinates of T1 and T2, or corrected in the problem's."""
         if self.rank2 == "projection":
-            return self.carry(nearest_rank2(M), T1, T2)
+            return T2.mT @ nearest_rank2(M) @ T1
         if T1 is not problem.T1:
             M = self.carry(M, *(torch.stack([T1, T2]) @ inverse(torch.stack([problem.T1, problem.T2]))))
         return self.carry(self.correct(problem, M), problem.T1, problem.T2)
