@@ -69,15 +69,8 @@ def solver_shares(name: str, case: speed.Case, backward: bool) -> dict[str, floa
 def training_shares(config: str, steps: int) -> dict[str, float]:
     """Return the shares of the time of a training's steps."""
     with tempfile.TemporaryDirectory() as folder:
-        options = [
-            "--trainer.max_steps",
-            str(steps),
-            "--trainer.limit_val_batches",
-            "0",
-            "--trainer.accelerator",
-            "cpu",
-        ]
-        command = ["fit", "--config", config, "--trainer.default_root_dir", folder, *options]
+        options = [f"--trainer.max_steps={steps}", "--trainer.limit_val_batches=0", "--trainer.accelerator=cpu"]
+        command = ["fit", "--config", config, f"--trainer.default_root_dir={folder}", *options]
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
             return shares(lambda: learnnorm(command))
 

@@ -110,13 +110,8 @@ def measure(scene: Scene, work: Path, method: str, known: bool, about: str) -> l
     images = 0 if found is None else found.num_reg_images()
     reprojection = float("nan") if found is None else found.compute_mean_reprojection_error()
     row = [scene.folder.name, about, "given" if known else "estimated", method, str(pairs), str(inliers)]
-    row += [
-        f"{images} of {len(names)}",
-        f"{reprojection:.2f}",
-        f"{1000 * error:.1f}",
-        f"{1000 * np.median(without):.1f}",
-    ]
-    return [*row, f"{seconds:.1f}", f"{took:.1f}"]
+    numbers = (1000 * error, 1000 * np.median(without), seconds, took)
+    return [*row, f"{images} of {len(names)}", f"{reprojection:.2f}", *(f"{number:.1f}" for number in numbers)]
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -177,12 +177,8 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[8, 16, 32, 64, 128, 512], help="matches in a set")
     parser.add_argument("--sets", type=int, default=128, help="sets of each size")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--methods",
-        nargs="+",
-        default=[*METHODS, *SHIPPED, *(name + SCORES for name in SHIPPED)],
-        help="of these: %(default)s",
-    )
+    methods = [*METHODS, *SHIPPED, *(name + SCORES for name in SHIPPED)]
+    parser.add_argument("--methods", nargs="+", default=methods, help="of these: %(default)s")
     parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     args = parser.parse_args()
     if unknown := [name for name in args.methods if name not in METHODS and not name.startswith(LEARNED)]:

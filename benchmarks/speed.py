@@ -243,13 +243,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dtype", choices=["float32", "float64"], default="float32")
-    parser.add_argument(
-        "--compile",
-        metavar="LAYER",
-        choices=COMPILED,
-        nargs="*",
-        help="torch.compile all or some of " + ", ".join(COMPILED),
-    )
+    text = "torch.compile all or some of " + ", ".join(COMPILED)
+    parser.add_argument("--compile", metavar="LAYER", choices=COMPILED, nargs="*", help=text)
     parser.add_argument("--quick", action="store_true", help="fewer turns and sizes")
     args = parser.parse_args()
     if args.out is not None:
