@@ -15,25 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.synthetic.render import (
-    SUPERSAMPLING,
-    Array,
-    Metres,
-    Plane,
-    Random,
-    RenderedPair,
-    Texture,
-    check_size,
-    circles,
-    framed,
-    letters,
-    masonry,
-    noise,
-    polygons,
-    render_views,
-    room,
-    rotation,
-)
+from kornia_learnnorm.data.synthetic import render
+from kornia_learnnorm.data.synthetic.render import SUPERSAMPLING, Array, Metres, Plane, Random, RenderedPair, Texture
 
 KINDS = ("room", "facade", "plane", "rotation", "repeated", "borders")
 DISTANCE = 6.0  # of facades and of the middle of the room, metres
@@ -41,14 +24,14 @@ BASELINES = (0.02, 0.35)  # shares of the distance
 MAX_RELIEF = 0.2  # share of the distance to the wall
 WALL = (13.0, 8.5)  # width and height, metres; fills every view
 TEXELS = 85  # of a wall, per metre and sample of an image 640 pixels wide; those of nearer boards are denser
-PAINTERS = (circles, polygons, letters)
+PAINTERS = (render.circles, render.polygons, render.letters)
 
 
 def render_kind(kind: str, seed: int = 0, width: int = 640, height: int = 480) -> RenderedPair:
     """Return an image pair of a kind; equal seeds give equal images, and no correspondence lies below a caption."""
     if kind not in KINDS:
         raise ValueError(f"unknown kind {kind!r}: expected one of {', '.join(KINDS)}")
-    check_size(seed, width, height)
+    render.check_size(seed, width, height)
     rng = np.random.default_rng([*kind.encode(), seed])
     texels = SUPERSAMPLING * width / 640
     R, t = _turn(rng) if kind == "rotation" else _motion(rng)
@@ -59,8 +42,8 @@ def render_kind(kind: str, seed: int = 0, width: int = 640, height: int = 480) -
     elif kind == "repeated":
         planes = _repeated(rng, texels)
     else:
-        planes = room(rng, cv2, texels)
-    pair = render_views(rng, cv2, planes, R, t, (width, height))
+        planes = render.room(rng, cv2, texels)
+    pair = render.render_views(rng, cv2, planes, R, t, (width, height))
     if kind == "borders":
         overlay = _caption(rng, width, height) if seed % 2 else _frame(rng, width, height)
         pair = _covered(pair, *overlay)
@@ -75,14 +58,14 @@ def _motion(rng: Random) -> tuple[Array, Array]:
     centre = baseline * direction / np.linalg.norm(direction)
     yaw = -rng.uniform(0.6, 1.0) * np.arctan2(centre[0], DISTANCE)
     pitch, roll = np.deg2rad(rng.uniform(-2, 2, 2))
-    R = rotation(yaw, pitch, roll)
+    R = render.rotation(yaw, pitch, roll)
     return R, -R @ centre
 
 
 def _turn(rng: Random) -> tuple[Array, Array]:
     """Draw a rotation about the camera's centre by 3 to 15 degrees and no translation."""
     yaw, pitch, roll = rng.choice([-1, 1]) * rng.uniform(3, 14), *rng.uniform(-4, 4, 2)
-    return rotation(*np.deg2rad([yaw, pitch, roll])), np.zeros(3)
+    return render.rotation(*np.deg2rad([yaw, pitch, roll])), np.zeros(3)
 
 
 class _Wall:
@@ -90,7 +73,7 @@ class _Wall:
 
     def __init__(self, rng: Random, texture: Texture) -> None:
         yaw, pitch, roll = np.deg2rad(rng.uniform((-12, -4, -2), (12, 4, 2)))
-        self.right, self.down, away = rotation(yaw, pitch, roll).T
+        self.right, self.down, away = render.rotation(yaw, pitch, roll).T
         self.centre = np.array([0.0, 0.0, DISTANCE])
         self.outwards = -away * (away @ self.centre)  # to the camera's height above the wall
         self.plane = self.board((0.0, 0.0), WALL, 0.0, texture)
@@ -104,7 +87,7 @@ class _Wall:
 
 def _facade(rng: Random, texels: float, relief: float) -> list[Plane]:
     """Return a wall with nine pictures, of which the one that stands out most does so by the relief."""
-    wall = _Wall(rng, masonry(rng, cv2, WALL, TEXELS * texels, brick=(0.62, 0.27), shift=0.5))
+    wall = _Wall(rng, render.masonry(rng, cv2, WALL, TEXELS * texels, brick=(0.62, 0.27), shift=0.5))
     shares = np.sort(relief * rng.uniform(size=9))
     shares[-1] = relief
     places = rng.permutation([(x, y) for x in (-2.2, 0.0, 2.2) for y in (-1.6, 0.0, 1.6)])
@@ -132,7 +115,7 @@ def _picture(rng: Random, wall: _Wall, place: Array, share: float, texels: float
     size = (rng.uniform(1.0, 1.7), rng.uniform(0.9, 1.3))
     middle = place + rng.uniform(-0.15, 0.15, 2)
     paint = PAINTERS[rng.integers(len(PAINTERS))]
-    return wall.board((middle[0], middle[1]), size, share, framed(rng, cv2, paint, size, 110 * texels))
+    return wall.board((middle[0], middle[1]), size, share, render.framed(rng, cv2, paint, size, 110 * texels))
 
 
 def _frame(rng: Random, width: int, height: int) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
@@ -157,7 +140,7 @@ def _caption(rng: Random, width: int, height: int) -> tuple[NDArray[np.bool_], N
         cv2.putText(levels, text, (int(8 * scale), baseline), cv2.FONT_HERSHEY_DUPLEX, 0.7 * scale, 235, 1, cv2.LINE_AA)
     side = int(rng.uniform(0.08, 0.16) * width)
     corner = (slice(0, side), slice(width - side, width) if rng.integers(2) else slice(0, side))
-    picture = framed(rng, cv2, PAINTERS[rng.integers(2)], (1.0, 1.0), side)
+    picture = render.framed(rng, cv2, PAINTERS[rng.integers(2)], (1.0, 1.0), side)
     mask[corner], levels[corner] = True, (235 * picture + 8).round().clip(0, 255)
     return mask, levels
 
@@ -182,11 +165,11 @@ def _masked(mask: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
 def windows(rng: Random, size: Metres, density: float, cell: Metres) -> Texture:
     """Return rows of one window with its frame, curtain and patch of wall; only stains of 2 % tell the cells apart."""
     width, height = (int(metres * density) for metres in cell)
-    one = (0.55 + 0.08 * noise(rng, cv2, (height, width), finest=4)).astype(np.float32)
+    one = (0.55 + 0.08 * render.noise(rng, cv2, (height, width), finest=4)).astype(np.float32)
     x, y = (np.round(np.array([0.2, 0.8]) * side).astype(int) for side in (width, height))
     bar = max(1, int(0.025 * width))
-    curtain = (0.45 + 0.1 * noise(rng, cv2, (y[1] - y[0], x[1] - x[0]), finest=4)).astype(np.float32)
-    circles(rng, cv2, curtain)
+    curtain = (0.45 + 0.1 * render.noise(rng, cv2, (y[1] - y[0], x[1] - x[0]), finest=4)).astype(np.float32)
+    render.circles(rng, cv2, curtain)
     one[y[0] - 2 * bar : y[1] + 2 * bar, x[0] - 2 * bar : x[1] + 2 * bar] = 0.95
     one[y[0] : y[1], x[0] : x[1]] = curtain
     for share in rng.uniform(0.25, 0.75, 2):
@@ -195,5 +178,5 @@ def windows(rng: Random, size: Metres, density: float, cell: Metres) -> Texture:
         one[middle[1] - bar : middle[1] + bar, x[0] : x[1]] = 0.85
     columns, rows = (int(np.ceil(side / part)) for side, part in zip(size, cell, strict=True))
     texture = np.tile(one, (rows, columns))
-    texture += 0.02 * noise(rng, cv2, texture.shape, finest=4)
+    texture += 0.02 * render.noise(rng, cv2, texture.shape, finest=4)
     return np.asarray(cv2.GaussianBlur(texture, None, 0.8), np.float32)
