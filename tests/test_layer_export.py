@@ -8,15 +8,7 @@ import pytest
 import torch
 from scenes import correspondences, plane, scenes, shaken, shaken_estimator, signless, up_to_sign
 
-from kornia_learnnorm import (
-    CrossViewNetwork,
-    EightPoint,
-    LearnedEightPoint,
-    LearnedHomography,
-    LearnedNormalizer,
-    LearnedRelativePose,
-    Whitening,
-)
+import kornia_learnnorm as kln
 from kornia_learnnorm.estimators import fundamental_stages, pose_stages
 from kornia_learnnorm.layer_export import export_layer, export_networks, load_layer
 from kornia_learnnorm.pretrained import shipped_weights
@@ -66,9 +58,9 @@ def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], d
 def estimates(layer, *points, **given) -> tuple[torch.Tensor, ...]:
     """What a program of the layer returns."""
     found = layer.estimate(*points, **given)
-    if isinstance(layer, LearnedRelativePose):
+    if isinstance(layer, kln.LearnedRelativePose):
         return found.E_mat, found.R, found.t, found.determined, found.weights
-    return (found[0], found.determined, *([] if isinstance(layer, EightPoint) else [found.weights]))
+    return (found[0], found.determined, *([] if isinstance(layer, kln.EightPoint) else [found.weights]))
 
 
 def check(program, layer, *points, **given) -> None:
@@ -113,14 +105,14 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
 def test_relative_pose(monkeypatch):
     for name in ("EARLY_STEPS", "LOCAL_STEPS"):
         monkeypatch.setattr(pose_stages, name, 1)
-    layer = LearnedRelativePose(width=8, depth=1, refine_steps=1, samples=4)
+    layer = kln.LearnedRelativePose(width=8, depth=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()
     for size in SIZES:
         check(program, layer, *calibrated_sets(*size), scores=torch.rand(size))
 
 
 def test_homography():
-    layer = LearnedHomography(width=8, depth=1, refine_steps=1)
+    layer = kln.LearnedHomography(width=8, depth=1, refine_steps=1)
     program = export_layer(layer, ["scores"]).module()
     for batch_size, num_points in SIZES:
         points = [p.float() for p in plane(batch_size, num_points, noise=1.0)[:2]]
@@ -128,13 +120,13 @@ def test_homography():
 
 
 def test_gradients_of_sets():
-    layer = EightPoint(Whitening())
+    layer = kln.EightPoint(kln.Whitening())
     check_gradients_of_program(export_layer(layer, gradients=True).module(), layer, *sets(3, 20))
 
 
 def test_eights_with_weights_mask_and_gradients():
-    network = CrossViewNetwork(width=8, depth=1)
-    layer, points = EightPoint(shaken(LearnedNormalizer(Whitening(), network))), sets(4, 8)
+    network = kln.CrossViewNetwork(width=8, depth=1)
+    layer, points = kln.EightPoint(shaken(kln.LearnedNormalizer(kln.Whitening(), network))), sets(4, 8)
     points[0][2] = points[0][2, :1]  # coincident
     mask, weights = torch.ones(4, 8, dtype=torch.bool), torch.rand(4, 8) + 0.5
     mask[3, 5:] = False
@@ -152,9 +144,9 @@ def test_shipped_weights(name):
     most = 12 if name.startswith("crossview") else 300
     program = export_layer(layer).module()
     for batch_size, num_points in SIZES:
-        draw = calibrated_sets if isinstance(layer, LearnedRelativePose) else sets
+        draw = calibrated_sets if isinstance(layer, kln.LearnedRelativePose) else sets
         check(program, layer, *draw(batch_size, min(num_points, most)))
-    if isinstance(layer, EightPoint):
+    if isinstance(layer, kln.EightPoint):
         check(export_layer(layer, num_points=8).module(), layer, *sets(5, 8))
 
 
@@ -192,7 +184,7 @@ class TestNetworks:
 
     def test_stages(self):
         with pytest.raises(ValueError, match="no network: its normaliser is Hartley"):
-            export_networks(EightPoint())
+            export_networks(kln.EightPoint())
         layer = shaken_estimator(depth=1)
         programs = export_networks(layer)
         assert [*programs] == ["stage1", "stage2"]
@@ -203,8 +195,8 @@ class TestNetworks:
 
     def test_network_of_a_normaliser(self):
         """The layer stays as it is, in training and float64."""
-        network = CrossViewNetwork(width=8, depth=1)
-        layer = EightPoint(shaken(LearnedNormalizer(network=network))).double().train()
+        network = kln.CrossViewNetwork(width=8, depth=1)
+        layer = kln.EightPoint(shaken(kln.LearnedNormalizer(network=network))).double().train()
         (program,) = export_networks(layer).values()
         assert layer.training
         assert next(layer.parameters()).dtype == torch.float64
@@ -217,17 +209,17 @@ class TestNetworks:
 def test_wrong_arguments():
     for layer, options, error, message in [
         (torch.nn.Linear(2, 2), {}, TypeError, "got .*Linear"),
-        (EightPoint(), {"inputs": ["scores"]}, ValueError, "weights, mask, got scores"),
-        (EightPoint(), {"num_points": 7}, ValueError, "num_points .* 8, got 7"),
+        (kln.EightPoint(), {"inputs": ["scores"]}, ValueError, "weights, mask, got scores"),
+        (kln.EightPoint(), {"num_points": 7}, ValueError, "num_points .* 8, got 7"),
     ]:
         with pytest.raises(error, match=message):
             export_layer(layer, **options)
 
 
 def test_load_layer():
-    assert isinstance(load_layer("robust-tiny"), LearnedEightPoint)
-    assert isinstance(load_layer("robust-pose"), LearnedRelativePose)
-    assert isinstance(load_layer("robust-homography"), LearnedHomography)
+    assert isinstance(load_layer("robust-tiny"), kln.LearnedEightPoint)
+    assert isinstance(load_layer("robust-pose"), kln.LearnedRelativePose)
+    assert isinstance(load_layer("robust-homography"), kln.LearnedHomography)
     assert load_layer("crossview").normalizer.max_points == 12
     with pytest.raises(FileNotFoundError, match=r"'rubust'.* crossview.* robust"):
         load_layer("rubust")
