@@ -66,9 +66,9 @@ def notebook_faults(source: Path, site: Path) -> list[str]:
         return [f"{source.stem}: not a notebook: {str(error).splitlines()[0]}"]
     code = [cell.source.strip() for cell in notebook.cells if cell.cell_type == "code"]
     shown = [TAGS.sub("", cell).strip() for cell in CELL.findall(source.read_text(encoding="utf-8"))]
-    faults = (
-        [] if code == shown else [f"{source.stem}: the notebook does not have the {len(shown)} code cells of the page"]
-    )
+    faults = []
+    if code != shown:
+        faults.append(f"{source.stem}: the notebook does not have the {len(shown)} code cells of the page")
     text = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
     if roles := ROLE.findall(text):
         faults.append(f"{source.stem}: the notebook has Sphinx's roles: {', '.join(sorted(set(roles)))}")

@@ -20,13 +20,8 @@ release = version = kornia_learnnorm.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
 sys.path.insert(0, str(Path(__file__).parent))
-extensions += [
-    "results_directive",
-    "sphinx.ext.autosummary",
-    "sphinx_copybutton",
-    "sphinxarg.ext",
-    "sphinx-mathjax-offline",
-]
+extensions += ["results_directive", "sphinx.ext.autosummary", "sphinx_copybutton"]
+extensions += ["sphinxarg.ext", "sphinx-mathjax-offline"]
 exclude_patterns = ["_build"]
 smartquotes = False  # they turn the two dashes of options into one
 html_theme = "furo"

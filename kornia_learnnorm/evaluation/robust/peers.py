@@ -84,15 +84,12 @@ def _pysuperansac(pysuperansac: Any, x1: Array, x2: Array, sizes: Sizes, seed: i
     return pysuperansac.estimateFundamentalMatrix(joined, sizes.ravel().astype(float).tolist(), config=settings)[0]
 
 
-OPENCV = {
-    "opencv-ransac": "FM_RANSAC",
-    "opencv-lmeds": "FM_LMEDS",
-    "opencv-usac": "USAC_DEFAULT",
-    "opencv-usac-accurate": "USAC_ACCURATE",
-    "opencv-usac-magsac": "USAC_MAGSAC",
-}
 PEERS = {
-    **{name: PeerPackage(partial(_opencv, method), "cv2", "images") for name, method in OPENCV.items()},
+    "opencv-ransac": PeerPackage(partial(_opencv, "FM_RANSAC"), "cv2", "images"),
+    "opencv-lmeds": PeerPackage(partial(_opencv, "FM_LMEDS"), "cv2", "images"),
+    "opencv-usac": PeerPackage(partial(_opencv, "USAC_DEFAULT"), "cv2", "images"),
+    "opencv-usac-accurate": PeerPackage(partial(_opencv, "USAC_ACCURATE"), "cv2", "images"),
+    "opencv-usac-magsac": PeerPackage(partial(_opencv, "USAC_MAGSAC"), "cv2", "images"),
     f"opencv-usac-magsac{CALIBRATED}": PeerPackage(_opencv_calibrated, "cv2", "images"),
     "poselib": PeerPackage(_poselib, "poselib"),
     f"poselib{CALIBRATED}": PeerPackage(_poselib_calibrated, "poselib"),
