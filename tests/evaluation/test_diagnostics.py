@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from pairwise import pairwise
-from scenes import SCENES, correspondences, epipolar_distances, homogeneous, uniform
+from scenes import SCENES, correspondences, epipolar_distances, homogeneous, null_matrices, uniform
 from torch.autograd import gradcheck
 
 from kornia_learnnorm import Hartley, Identity, ReweightedWhitening, Whitening
@@ -18,20 +18,16 @@ NORMALIZERS = [Identity(), Hartley(), Whitening(), ReweightedWhitening(3)]
 
 
 def numpy_diagnose(points1, points2, T1, T2) -> np.ndarray:
-    """All five numbers, sample by sample: eigenvalues of A^T A, and the eight-point algorithm in two steps."""
-    rows = []
-    for p1, p2, t1, t2 in zip(*(np.asarray(v, dtype=np.float64) for v in (points1, points2, T1, T2)), strict=True):
-        x1, x2 = homogeneous(p1) @ t1.T, homogeneous(p2) @ t2.T
-        A = np.stack([np.kron(b, a) for a, b in zip(x1, x2, strict=True)])
-        d = np.linalg.eigvalsh(A.T @ A)[::-1]
-        U, s, Vh = np.linalg.svd(np.linalg.svd(A, full_matrices=True)[2][-1].reshape(3, 3))
-        before, after = (
-            epipolar_distances(p1[None], p2[None], (t2.T @ U @ np.diag(r) @ Vh @ t1)[None]).mean()
-            for r in (s, [s[0], s[1], 0])
-        )
-        distances = [np.hypot(*x[:, :2].T).mean() for x in (x1, x2)]
-        rows.append([np.sqrt(d[0] / d[7]), s[1] / s[2], *distances, 1 - before / after])
-    return np.array(rows)
+    """All five numbers (B, 5): eigenvalues of A^T A, and the eight-point algorithm in two steps."""
+    T1, T2 = np.asarray(T1), np.asarray(T2)
+    x1, x2 = (homogeneous(np.asarray(p)) @ T.swapaxes(1, 2) for p, T in ((points1, T1), (points2, T2)))
+    A = (x2[..., :, None] * x1[..., None, :]).reshape(*x1.shape[:2], 9)
+    d = np.linalg.eigvalsh(A.swapaxes(1, 2) @ A)[:, ::-1]
+    U, s, Vh = np.linalg.svd(null_matrices(points1, points2, T1, T2))
+    matrices = (T2.swapaxes(1, 2) @ (U * r[:, None]) @ Vh @ T1 for r in (s, s * [1, 1, 0]))
+    before, after = (epipolar_distances(points1, points2, F).mean(1) for F in matrices)
+    distances = [np.linalg.norm(x[..., :2], axis=-1).mean(1) for x in (x1, x2)]
+    return np.stack([np.sqrt(d[:, 0] / d[:, 7]), s[:, 1] / s[:, 2], *distances, 1 - before / after], 1)
 
 
 @pytest.mark.parametrize(
