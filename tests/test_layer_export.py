@@ -47,13 +47,6 @@ def calibrated_sets(batch_size: int, num_points: int) -> list[torch.Tensor]:
     return [value.float() for value in (scene.points1, scene.points2, scene.K1, scene.K2)]
 
 
-def masked_sets(batch_size: int, num_points: int) -> tuple[list[torch.Tensor], dict[str, torch.Tensor]]:
-    """Points, and a mask and scores by name; the first set has eight correspondences, the last one all rows."""
-    numbers = torch.linspace(8, num_points, batch_size).long()
-    mask = torch.arange(num_points) < numbers[:, None]
-    return sets(batch_size, num_points), {"mask": mask, "scores": torch.rand(batch_size, num_points)}
-
-
 @torch.no_grad()
 def estimates(layer, *points, **given) -> tuple[torch.Tensor, ...]:
     """What a program of the layer returns."""
@@ -90,7 +83,9 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
     layer = shaken_estimator(stages=1, depth=1, refine_steps=1, samples=8)
     program = export_layer(layer, ["mask", "scores"])
     run, cases = program.module(), []
-    for points, given in (masked_sets(*size) for size in SIZES):
+    for batch_size, num_points in SIZES:  # the first set has eight correspondences, the last one all rows
+        mask = torch.arange(num_points) < torch.linspace(8, num_points, batch_size).long()[:, None]
+        points, given = sets(batch_size, num_points), {"mask": mask, "scores": torch.rand(batch_size, num_points)}
         check(run, layer, *points, **given)
         eight = layer(*(p[:1, :8] for p in points), scores=given["scores"][:1, :8])
         assert up_to_sign(run(*points, **given)[0][:1], eight.detach()) < 1e-5
