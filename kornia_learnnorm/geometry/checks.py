@@ -10,24 +10,6 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.autograd.forward_ad import unpack_dual
 
-__all__ = [
-    "check_cameras",
-    "check_choice",
-    "check_correspondences",
-    "check_mask",
-    "check_matrices",
-    "check_pairs",
-    "check_tensor",
-    "check_whole_number",
-    "inference_mode",
-    "is_known_true",
-    "needs_gradient",
-    "read_condition",
-    "safe_divisor",
-    "solve_dtype",
-    "weighted_mean",
-]
-
 
 def solve_dtype(device: torch.device) -> torch.dtype:
     """Return the dtype of the small linear algebra: float64, or float32 on MPS, which has no float64."""

@@ -13,8 +13,6 @@ from torch import Tensor
 from kornia_learnnorm.geometry.distances import sampson_scale
 from kornia_learnnorm.geometry.matrices import cofactors
 
-__all__ = ["Fit", "Loss", "constrained_fit"]
-
 Loss = Callable[[Tensor], tuple[Tensor, Tensor]]  # of squared distances: values and derivatives
 
 EPIPOLE_FLOOR = 1e-4  # smallest norm of a line's normal, relative to the size of the points
@@ -58,7 +56,6 @@ def constrained_fit(
         W. Chojnacki, M. Brooks, A. van den Hengel, D. Gawley, On the fitting of surfaces to data with covariances,
         TPAMI 2000, for :math:`X`; K. Kanatani, Y. Sugaya, Compact fundamental matrix computation, IPSJ Transactions on
         Computer Vision and Applications 2, 2010, for schemes with the constraint.
-
     """
     losses = [*losses]
     if not losses:

@@ -20,17 +20,6 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_tensor, safe_divisor, weighted_mean
 
-__all__ = [
-    "DISTANCE_SCALES",
-    "algebraic_distance",
-    "line_norms",
-    "sampson_distance",
-    "sampson_scale",
-    "symmetric_epipolar_distance",
-    "symmetric_scale",
-    "transfer_distance",
-]
-
 EPIPOLE_TOLERANCE = 1e-12  # length of an epipolar line's normal over that of its summands; rounding leaves less
 
 
@@ -68,7 +57,6 @@ def symmetric_epipolar_distance(points1: Tensor, points2: Tensor, F_mat: Tensor)
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])  # lines are rows
         >>> symmetric_epipolar_distance(torch.tensor([[[5.0, 1.0]]]), torch.tensor([[[9.0, 3.0]]]), F_mat)
         tensor([[4.]])
-
     """
     _check(points1, points2, F_mat)
     with _without_autocast(points1):
@@ -102,7 +90,6 @@ def sampson_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
         >>> sampson_distance(torch.tensor([[[5.0, 1.0]]]), torch.tensor([[[9.0, 3.0]]]), F_mat)
         tensor([[1.4142]])
-
     """
     _check(points1, points2, F_mat)
     with _without_autocast(points1):
@@ -121,7 +108,6 @@ def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tenso
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
         >>> algebraic_distance(torch.tensor([[[5.0, 1.0]]]), torch.tensor([[[9.0, 3.0]]]), F_mat)
         tensor([[1.4142]])
-
     """
     _check(points1, points2, F_mat)
     F_mat = F_mat / F_mat.norm(dim=(-2, -1), keepdim=True)
@@ -153,7 +139,6 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
         >>> H_mat = torch.diag(torch.tensor([2.0, 2.0, 1.0]))[None]
         >>> transfer_distance(torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[4.0, 0.0]]]), H_mat)
         tensor([[2.2361]])
-
     """
     _check(points1, points2, H_mat, "H_mat")
     with _without_autocast(points1):

@@ -3,8 +3,6 @@
 import torch
 from torch import Tensor
 
-__all__ = ["distinct_points"]
-
 
 def distinct_points(points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return a mask (N,) of matches of which no two share a point, chosen greedily from the best to the worst.

@@ -12,15 +12,6 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import needs_gradient, read_condition
 
-__all__ = [
-    "DEPENDENT_GAP",
-    "MIN_GAP",
-    "design_matrix",
-    "nearest_null_vector",
-    "null_vector",
-    "solve_rows",
-]
-
 MIN_GAP = 1e-6  # relative gap above which a null vector counts as unique; that of float32 pixels
 MIN_GRAM_RATIO = 1e-5  # of the last but one singular value to the first; below, a Gram matrix has lost too many digits
 # Generic numbers: no null vector of note is orthogonal to them.
@@ -46,7 +37,6 @@ def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
     Example:
         >>> design_matrix(torch.tensor([[[1.0, 2.0, 1.0]]]), torch.tensor([[[3.0, 4.0, 1.0]]]))
         tensor([[[3., 6., 3., 4., 8., 4., 1., 2., 1.]]])
-
     """
     KORNIA_CHECK_SHAPE(x1, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(x2, ["*", "N", "3"])
@@ -65,7 +55,6 @@ def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
 
     Returns:
         unit vectors with shape :math:`(*, 9)`, sign arbitrary; without gradient where the rows are linearly dependent.
-
     """
     return solve_rows(A, weights)[0]
 

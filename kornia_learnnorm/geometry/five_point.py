@@ -12,8 +12,6 @@ from itertools import product
 import torch
 from torch import Tensor
 
-__all__ = ["essential_in_span"]
-
 # Exponents of x, y and z: the cubic monomials, then the others, which the eigenvectors hold.
 MONOMIALS = sorted((m for m in product(range(4), repeat=3) if sum(m) <= 3), key=lambda m: (-sum(m), [-e for e in m]))
 MAX_IMAGINARY = 1e-6  # relative imaginary part of a real solution

@@ -9,16 +9,6 @@ from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import needs_gradient, safe_divisor
 
-__all__ = [
-    "cofactors",
-    "determinant",
-    "inverse",
-    "nearest_rank2",
-    "smallest_right_singular_vector_3x3",
-    "smallest_singular_vectors",
-    "unit_matrix",
-]
-
 RANK1_WEIGHT = 1e-27  # of the complement of the rows, above the square of what rounding leaves of vanishing cofactors
 EPSILON = 1e-15  # of the mean eigenvalue, which a threefold one leaves of itself
 COLUMN_PREFERENCE = 1.1893  # of the last diagonal entry over the first: equal entries are not tied

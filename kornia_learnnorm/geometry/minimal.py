@@ -13,8 +13,6 @@ from kornia_learnnorm.geometry.matrices import cofactors
 
 MIN_PIVOT = 1e-12  # of the largest one, of a sample of five correspondences that determine finitely many matrices
 
-__all__ = ["are_independent", "solve_calibrated_samples", "solve_samples"]
-
 
 def are_independent(A: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     """Return a mask of the non-degenerate minimal samples (K, S, 3), by their design matrices (K, M, 9).

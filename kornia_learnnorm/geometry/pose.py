@@ -10,8 +10,6 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_mask, check_tensor, solve_dtype
 
-__all__ = ["choose_pose", "in_front", "in_front_of_best_pose", "relative_pose"]
-
 
 def relative_pose(
     F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None = None
@@ -48,7 +46,6 @@ def relative_pose(
         >>> R, t = relative_pose(scene.F_mat, scene.K1, scene.K2, scene.points1, scene.points2)
         >>> bool((R - scene.R).abs().max() < 1e-6)
         True
-
     """
     _check(F_mat, K1, K2, points1, points2, mask)
     dtype, work = F_mat.dtype, solve_dtype(F_mat.device)

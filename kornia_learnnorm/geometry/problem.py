@@ -1,11 +1,9 @@
 r"""The linear problem of sets of correspondences: normalised and solved once, then handed down."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -15,8 +13,6 @@ from torch.nn.functional import pad
 from kornia_learnnorm.geometry.checks import needs_gradient, read_condition, solve_dtype, weighted_mean
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP, MIN_GAP, nearest_null_vector
 from kornia_learnnorm.geometry.matrices import inverse
-
-__all__ = ["LinearProblem", "generic_points", "hartley_coordinates", "solve_where_determined"]
 
 
 @dataclass
@@ -40,7 +36,7 @@ class LinearProblem:
     all_determined: bool | None = None  # whether all null matrices are unique; None where values cannot be read
 
     @classmethod
-    def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None, model: Any) -> LinearProblem:
+    def from_points(cls, points1: Tensor, points2: Tensor, weights: Tensor | None, model: Any) -> Self:
         r"""Return the problem of correspondences, in float64 where the device has it."""
         dtype = solve_dtype(points1.device)
         points = torch.stack([points1, points2]).to(dtype)
@@ -105,18 +101,18 @@ class LinearProblem:
         x1, x2 = (torch.stack([T1, T2]) @ rows).mT
         return self._solve_between(x1, x2)[:2]
 
-    def select(self, rows: Tensor) -> LinearProblem:
+    def select(self, rows: Tensor) -> Self:
         """Return the problem of some of the sets, by their indices or a mask (B,); solved if this one is."""
         return self._map(lambda value: value[rows])
 
-    def detach(self, rows: Tensor) -> LinearProblem:
+    def detach(self, rows: Tensor) -> Self:
         """Return the same problem, in which the sets marked in ``rows``, (B,) bool, send no gradient."""
         return self._map(lambda v: torch.where(rows.view(-1, *[1] * (v.ndim - 1)), v.detach(), v))
 
-    def _map(self, function: Callable[[Tensor], Tensor]) -> LinearProblem:
+    def _map(self, function: Callable[[Tensor], Tensor]) -> Self:
         tensors = (self.points1, self.points2, self.weights, self.T1, self.T2, self.x1, self.x2)
         changed: Any = [None if value is None else function(value) for value in tensors]
-        problem = LinearProblem(self.model, *changed)
+        problem = type(self)(self.model, *changed)
         if self.solution is not None:
             problem.solution = function(self.solution[0]), function(self.solution[1])
         return problem

@@ -22,8 +22,6 @@ from kornia_learnnorm.geometry.matrices import cofactors, inverse, nearest_rank2
 from kornia_learnnorm.geometry.problem import hartley_coordinates
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 
-__all__ = ["correct_rank2", "optimal_rank2", "rank2_projection"]
-
 ITERATIONS = 3  # steps of the optimal correction
 EPIPOLE_FLOOR = 1e-5  # of the mean norm of a line's normal, added to each in the covariance
 
@@ -45,7 +43,6 @@ def rank2_projection(F_mat: Tensor) -> Tensor:
         tensor([[3., 0., 0.],
                 [0., 2., 0.],
                 [0., 0., 0.]])
-
     """
     check_tensor("F_mat", F_mat, ["*", "3", "3"])
     return nearest_rank2(F_mat)
@@ -94,7 +91,6 @@ def optimal_rank2(F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tens
         >>> points1, points2 = torch.rand(4, 8, 2) * 600, torch.rand(4, 8, 2) * 600
         >>> optimal_rank2(torch.rand(4, 3, 3), points1, points2).shape
         torch.Size([4, 3, 3])
-
     """
     check_correspondences(points1, points2, weights)
     check_matrices("F_mat", F_mat, len(points1))

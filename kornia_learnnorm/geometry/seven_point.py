@@ -3,8 +3,6 @@
 import torch
 from torch import Tensor
 
-__all__ = ["fundamental_in_span"]
-
 MAX_IMAGINARY = 1e-6  # relative imaginary part of a real solution
 MIN_LEADING = 1e-12  # of the cubic's largest coefficient, at which its leading one is held
 

@@ -64,7 +64,6 @@ def paper_transform(params: Tensor) -> Tensor:
         tensor([[2., -0., 0.],
                 [0., 1., 0.],
                 [0., 0., 1.]])
-
     """
     KORNIA_CHECK_SHAPE(params, ["*", "3"])
     alpha, (c, s) = params[..., :2].exp(), (params[..., 2].cos(), params[..., 2].sin())
@@ -93,7 +92,6 @@ def spd_transform(params: Tensor) -> Tensor:
         tensor([[1., 0., 0.],
                 [0., 1., 0.],
                 [0., 0., 1.]])
-
     """
     if params.shape[-1] not in (3, 5):
         raise ValueError(f"an SPD transform has 3 or 5 parameters a view, got shape {[*params.shape]}")

@@ -6,8 +6,6 @@ essential one, and none of a homography: its four points give eight rows and an 
 weights matter above four.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Protocol, Self
@@ -18,8 +16,6 @@ from torch import Tensor
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
 from kornia_learnnorm.geometry.dlt import MIN_GAP, solve_rows
 from kornia_learnnorm.geometry.problem import LinearProblem
-
-__all__ = ["Residuals", "State", "TwoViewModel"]
 
 
 class State(Protocol):
@@ -167,7 +163,7 @@ class TwoViewModel(Residuals):
         """Return which correspondences (3, N) may support each state, (K, N) bool; gains are their votes, (K, N)."""
         return torch.ones_like(gains, dtype=torch.bool)
 
-    def relaxed(self) -> TwoViewModel | None:
+    def relaxed(self) -> "TwoViewModel | None":
         """Return the model of more parameters that takes over where correspondences contradict this one, or None."""
         return None
 

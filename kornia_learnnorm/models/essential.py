@@ -6,10 +6,8 @@ of :class:`~kornia_learnnorm.models.fundamental.Rank2` the matrix :math:`A` of :
 relative pose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -18,8 +16,6 @@ from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
 from kornia_learnnorm.geometry.minimal import solve_calibrated_samples
 from kornia_learnnorm.geometry.pose import in_front_of_best_pose
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2
-
-__all__ = ["Calibrated", "Essential", "nearest_essential"]
 
 
 class Essential(Fundamental):
@@ -41,7 +37,7 @@ class Essential(Fundamental):
     @classmethod
     def of_cameras(
         cls, K1: Tensor, K2: Tensor, T1: Tensor, T2: Tensor, distance: Literal["sampson", "symmetric"] = "sampson"
-    ) -> Essential:
+    ) -> Self:
         """Return the model of pixels after transforms, of cameras and transforms that broadcast to (B, 3, 3)."""
         return cls(torch.linalg.inv_ex(T1 @ K1)[0], torch.linalg.inv_ex(T2 @ K2)[0], distance)
 
@@ -55,7 +51,7 @@ class Essential(Fundamental):
         inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (self.C1, self.C2))
         return self.calibrated(inverse2.mT @ M @ inverse1)
 
-    def calibrated(self, E_mat: Tensor) -> Calibrated:
+    def calibrated(self, E_mat: Tensor) -> "Calibrated":
         """Return the nearest essential matrices of unit norm to matrices of directions (B, 3, 3)."""
         axes, A = Fundamental().state(E_mat)
         equal = torch.eye(2).to(A).expand_as(A) * 0.5**0.5
@@ -117,9 +113,9 @@ class Calibrated(NamedTuple):
         columns = self.C2.mT[:, None] @ torch.unflatten(D, 1, (3, 3))  # (B, column of E, row of F, 5)
         return (self.C1.mT @ columns.flatten(2)).view_as(D)
 
-    def retract(self, step: Tensor) -> Calibrated:
+    def retract(self, step: Tensor) -> Self:
         """Return the state after a step, (B, 5)."""
-        return Calibrated(*Rank2(self.axes, self.A).retract(step), self.C1, self.C2)
+        return type(self)(*Rank2(self.axes, self.A).retract(step), self.C1, self.C2)
 
 
 def nearest_essential(E_mat: Tensor) -> Tensor:

@@ -6,10 +6,8 @@ rotation, the epipole, and three turn :math:`A` on the unit sphere. Two rotation
 are seven parameters too, but are singular where the singular values are equal, as under pure forward motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -24,8 +22,6 @@ from kornia_learnnorm.geometry.minimal import solve_samples
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2
 from kornia_learnnorm.models.contract import TwoViewModel
-
-__all__ = ["Fundamental", "Rank2"]
 
 SIDEWAYS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, -(0.5**0.5), 0.0)  # F whose epipolar lines are the image's rows
 MIN_RANK2_DETERMINANT = 1e-9  # of the 2x2 part of a matrix of rank 2 and unit norm
@@ -191,7 +187,7 @@ class Rank2(NamedTuple):
         outer = V @ torch.unflatten(U @ inner, -1, (3, 7)).transpose(1, 2).flatten(2)
         return torch.unflatten(outer, -1, (3, 7)).flatten(1, 2)
 
-    def retract(self, step: Tensor) -> Rank2:
+    def retract(self, step: Tensor) -> Self:
         """Return the state after a step, (B, 7) or (B, 5): tilts of both views and turns of the matrix between them."""
         a, tilt, turn = self.A.flatten(1), torch.unflatten(step[:, :4], -1, (2, 2)), step[:, None, 4:]
         turns = torch.unflatten(a @ _TURNS.to(a), -1, (3, 4))[:, : turn.shape[-1]]
@@ -201,7 +197,7 @@ class Rank2(NamedTuple):
         square = S @ S
         rotation = torch.add(S, square, alpha=0.5) / (1 - square[..., 2:, 2:] / 4)
         unit = turned / torch.linalg.vector_norm(turned, dim=-1, keepdim=True)  # at least one: turns are orthogonal
-        return Rank2(self.axes + self.axes @ rotation, torch.unflatten(unit, -1, (2, 2)))
+        return type(self)(self.axes + self.axes @ rotation, torch.unflatten(unit, -1, (2, 2)))
 
 
 def _turns(a: Tensor) -> Tensor:

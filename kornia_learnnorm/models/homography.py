@@ -5,9 +5,7 @@ weights, unless three of them are on a line. On its manifold it is a matrix of u
 it.
 """
 
-from __future__ import annotations
-
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -16,8 +14,6 @@ from torch.nn.functional import normalize, pad
 from kornia_learnnorm.geometry.checks import check_choice, safe_divisor
 from kornia_learnnorm.geometry.matrices import cofactors, determinant, inverse
 from kornia_learnnorm.models.contract import TwoViewModel
-
-__all__ = ["Homography", "UnitMatrix", "solve_four_points"]
 
 IDENTITY = (3**-0.5, 0.0, 0.0, 0.0, 3**-0.5, 0.0, 0.0, 0.0, 3**-0.5)
 MAX_DETERMINANT = 3**-1.5  # of a matrix of unit norm
@@ -38,7 +34,6 @@ class Homography(TwoViewModel):
     Reference:
         R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, sections 4.1 and 4.2; O. Chum, T. Pajdla, P.
         Sturm, The geometric error for homographies, CVIU 2005, for the Sampson error.
-
     """
 
     name = "homography"
@@ -194,10 +189,10 @@ class UnitMatrix(NamedTuple):
         v = normalize(m + torch.where(m[:, :1] < 0, -1.0, 1.0) * first, dim=-1)[..., None]
         return (torch.eye(9, dtype=m.dtype, device=m.device) - 2 * v @ v.mT)[..., 1:]
 
-    def retract(self, step: Tensor) -> UnitMatrix:
+    def retract(self, step: Tensor) -> Self:
         """Return the state after a step, (B, 8)."""
         moved = self.M.mT.flatten(1) + (self.tangents() @ step[..., None])[..., 0]
-        return UnitMatrix(torch.unflatten(normalize(moved, dim=-1), -1, (3, 3)).mT)
+        return type(self)(torch.unflatten(normalize(moved, dim=-1), -1, (3, 3)).mT)
 
 
 def solve_four_points(x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:

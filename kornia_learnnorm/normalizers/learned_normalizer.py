@@ -19,8 +19,6 @@ from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
 from kornia_learnnorm.normalizers.normalizer import Normalizer, ProblemNormalizer, transforms_of
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
-__all__ = ["LearnedNormalizer"]
-
 BASES = (closed_form, reweighted)  # modules of the bases that a file may name
 FORMAT = "kornia_learnnorm.normalizer.v1"
 

@@ -16,8 +16,6 @@ from kornia_learnnorm.geometry.matrices import determinant
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["PerView", "ProblemNormalizer", "check_normalizer", "normalizing_transforms", "transforms_of"]
-
 Normalizer = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
 

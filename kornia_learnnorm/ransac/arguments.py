@@ -7,8 +7,6 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import check_pairs, check_tensor
 
-__all__ = ["check_matches", "check_numbers"]
-
 
 def check_numbers(
     inl_th: float, max_samples: int, max_seconds: float | None, confidence: float, seed: int | None

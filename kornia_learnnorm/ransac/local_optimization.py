@@ -13,8 +13,6 @@ from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Trunca
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
 
-__all__ = ["fit_final", "optimize_locally"]
-
 LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps: a noisy sample has few inliers
 FINAL_POOL_SIZE = 4  # best hypotheses that the final fit starts from
 FINAL_LOSS_SCALE = 0.7  # scale of the final fit's loss, in thresholds
@@ -31,7 +29,6 @@ def optimize_locally(scorer: PairScorer, M: Tensor, number: int) -> Hypotheses:
 
     Reference:
         O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM 2003.
-
     """
     losses = [Truncated(scale * scorer.threshold) for scale in LOCAL_SCALES]
     fit = scorer.model.reweighted_fit(scorer.x1[:, scorer.rows], scorer.x2[:, scorer.rows], M, losses)

@@ -10,8 +10,6 @@ from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.normalizers.normalizer import Normalizer
 from kornia_learnnorm.ransac.scoring import PairScorer
 
-__all__ = ["solve_minimal_samples"]
-
 MIN_SAMPLE_SHIFT = 0.01  # thresholds; a sample that a shift of a point by less makes degenerate is dropped
 
 

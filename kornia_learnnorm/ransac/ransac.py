@@ -27,8 +27,6 @@ from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, PRESCORED, Hypotheses, PairScorer, finite_and_bounded
 from kornia_learnnorm.ransac.threads import one_thread
 
-__all__ = ["RANSAC", "RansacResult"]
-
 FIRST_BATCH = 64  # samples in the first batch; each batch is four times as large as the one before
 MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
@@ -113,7 +111,6 @@ class RANSAC(nn.Module):
         >>> F_mat, inliers = RANSAC(seed=0)(points1, points2)
         >>> bool(inliers[:300].all()), (F_mat - F_true).norm() < 1e-6 or (F_mat + F_true).norm() < 1e-6
         (True, tensor(True))
-
     """
 
     def __init__(
@@ -199,7 +196,6 @@ class RANSAC(nn.Module):
             ValueError: if there are fewer than eight rows, or five with cameras, the views do not pair up, a weight is
                 negative or not finite, only one camera is given, or one is not a finite and invertible (3, 3) matrix
                 with a last row of (0, 0, w).
-
         """
         check_cameras(K1, K2)
         if K1 is not None and not isinstance(self.model, Fundamental):

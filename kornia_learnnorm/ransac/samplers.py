@@ -5,8 +5,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-__all__ = ["ProsacSampler", "Sampler", "UniformSampler", "WeightedSampler", "draw_distinct"]
-
 SAMPLE_SIZE = 8  # correspondences in a minimal sample without cameras
 MAX_RANDOM_NUMBERS = 1 << 22  # random numbers in memory at once
 MIN_WEIGHT = 1e-30  # smallest positive weight, relative to the largest
@@ -30,7 +28,6 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
 
     Reference:
         J. Bentley, R. Floyd, Programming pearls: a sample of brilliance, CACM 1987.
-
     """
     last = totals[:, None] - size + torch.arange(size, device=totals.device)
     uniform = torch.rand(len(totals), size, generator=generator, device=totals.device, dtype=torch.float32)
@@ -77,7 +74,6 @@ class ProsacSampler:
 
     Reference:
         O. Chum, J. Matas, Matching with PROSAC, CVPR 2005, section 2.
-
     """
 
     MAX_SAMPLES = 200_000  # uniform samples whose order PROSAC follows
@@ -125,7 +121,6 @@ class WeightedSampler:
 
     Reference:
         P. Efraimidis, P. Spirakis, Weighted random sampling with a reservoir, Information Processing Letters 2006.
-
     """
 
     def __init__(self, weights: Tensor, size: int = SAMPLE_SIZE) -> None:

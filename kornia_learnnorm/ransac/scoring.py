@@ -1,18 +1,14 @@
 r"""Scores of many fundamental matrices on the correspondences of one image pair."""
 
-from __future__ import annotations
-
 import copy
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.essential import Essential
-
-__all__ = ["Hypotheses", "PairScorer", "finite_and_bounded"]
 
 MAX_MEDIAN_DISTANCES = 1e6  # largest distance from the median point, in median distances or thresholds
 BLOCK = 1 << 16  # distances computed at once, which stay in a core's cache
@@ -26,13 +22,13 @@ class Hypotheses(NamedTuple):
     F_mat: Tensor  # in the scorer's coordinates, (K, 3, 3)
     score: Tensor  # MSAC scores, positive, (K,)
 
-    def join(self, other: Hypotheses, number: int) -> Hypotheses:
+    def join(self, other: Self, number: int) -> Self:
         """Return the best of both, at most so many; ``other`` comes first in ties."""
         if len(self.score) == 0:
-            return Hypotheses(other.F_mat[:number], other.score[:number])
-        both = Hypotheses(*(torch.cat([theirs, ours]) for ours, theirs in zip(self, other, strict=True)))
+            return type(self)(other.F_mat[:number], other.score[:number])
+        both = type(self)(*(torch.cat([theirs, ours]) for ours, theirs in zip(self, other, strict=True)))
         order = both.score.argsort(descending=True, stable=True)[:number]
-        return Hypotheses(*(values[order] for values in both))
+        return type(self)(*(values[order] for values in both))
 
 
 class PairScorer:
@@ -69,7 +65,7 @@ class PairScorer:
         self.T1, self.T2 = torch.cat([columns, torch.cat([-origin, spread], 1)], 2)
         self.terms = model.score_terms(self.x1[:, rows], self.x2[:, rows]).float()
 
-    def of_cameras(self, K1: Tensor, K2: Tensor) -> PairScorer:
+    def of_cameras(self, K1: Tensor, K2: Tensor) -> Self:
         """Return the scorer of the same correspondences whose model are essential matrices of cameras (3, 3)."""
         other = copy.copy(self)
         K1, K2 = (K.to(self.x1)[None] for K in (K1, K2))

@@ -16,8 +16,6 @@ from kornia_learnnorm.geometry.checks import check_correspondences, check_tensor
 from kornia_learnnorm.geometry.distances import sampson_distance
 from kornia_learnnorm.normalizers.normalizer import Normalizer
 
-__all__ = ["SoftChoice", "expected_loss", "sample_minimal_sets"]
-
 
 def sample_minimal_sets(logits: Tensor, count: int, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
     r"""Draw minimal samples of eight correspondences, without replacement within a sample.
@@ -48,7 +46,6 @@ def sample_minimal_sets(logits: Tensor, count: int, generator: Generator | None 
         >>> samples, log_probs = sample_minimal_sets(torch.zeros(2, 100), 16, torch.Generator().manual_seed(0))
         >>> samples.shape, log_probs.shape
         (torch.Size([2, 16, 8]), torch.Size([2, 16]))
-
     """
     check_tensor("logits", logits, ["B", "N"])
     if logits.shape[1] < 8:
@@ -133,7 +130,6 @@ def expected_loss(
         >>> choice.loss.sum().backward()
         >>> logits.grad.shape
         torch.Size([2, 50])
-
     """
     check_correspondences(points1, points2)
     _check(points1, samples, log_probs)

@@ -6,8 +6,6 @@ from threading import Lock
 
 import torch
 
-__all__ = ["one_thread"]
-
 
 class _Held:
     """How many callers hold PyTorch to one thread, and the number of threads before."""
