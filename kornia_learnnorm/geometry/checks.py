@@ -77,7 +77,11 @@ def check_correspondences(points1: Tensor, points2: Tensor, weights: Tensor | No
             raise ValueError(f"weights must have shape {[*points1.shape[:2]]}, got {[*weights.shape]}")
         valid = valid & ~(weights < 0).any() & weights.sum().isfinite()
     if read_condition(~valid):  # one look at the device for all values
-        _complain_about_values(points1, points2, weights)
+        for name, values in (("points1", points1), ("points2", points2), ("weights", weights)):
+            if values is not None and (bad := int((~values.isfinite()).sum())):
+                raise ValueError(f"{name} must be finite, got {bad} NaN or infinite values")
+        if weights is not None and bool((weights < 0).any()):
+            raise ValueError(f"weights must not be negative, got a minimum of {weights.min().item():g}")
 
 
 def check_pairs(points1: Tensor, points2: Tensor, shape: Sequence[str]) -> None:
@@ -88,14 +92,6 @@ def check_pairs(points1: Tensor, points2: Tensor, shape: Sequence[str]) -> None:
         raise TypeError(f"points1 and points2 must have one dtype, got {points1.dtype} and {points2.dtype}")
     if points1.shape != points2.shape:
         raise ValueError(f"points1 and points2 must pair up, got shapes {[*points1.shape]} and {[*points2.shape]}")
-
-
-def _complain_about_values(points1: Tensor, points2: Tensor, weights: Tensor | None) -> None:
-    for name, values in (("points1", points1), ("points2", points2), ("weights", weights)):
-        if values is not None and (bad := int((~values.isfinite()).sum())):
-            raise ValueError(f"{name} must be finite, got {bad} NaN or infinite values")
-    if weights is not None and bool((weights < 0).any()):
-        raise ValueError(f"weights must not be negative, got a minimum of {weights.min().item():g}")
 
 
 def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> None:

@@ -119,6 +119,8 @@ def algebraic_distance(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tenso
 def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor:
     r"""Return the root of the sum of both squared transfer errors, of :math:`H x_1` and of :math:`H^{-1} x_2`.
 
+    Errors are those of :func:`symmetric_epipolar_distance`.
+
     Args:
         points1: pixels in the first image with shape :math:`(B, N, 2)`.
         points2: pixels in the second image with shape :math:`(B, N, 2)`.
@@ -126,11 +128,6 @@ def transfer_distance(points1: Tensor, points2: Tensor, H_mat: Tensor) -> Tensor
 
     Returns:
         distances in pixels with shape :math:`(B, N)`; the largest number of the dtype under a singular matrix.
-
-    Raises:
-        TypeError: if an argument is not a floating-point tensor, or their dtypes differ.
-        ShapeError: if a shape is wrong.
-        ValueError: if the points do not pair up.
 
     Reference:
         R. Hartley, A. Zisserman, Multiple View Geometry, 2nd edition, Eq. 4.7.

@@ -38,7 +38,7 @@ def nearest_rank2(A: Tensor) -> Tensor:
 
     :math:`A - A v v^\top` with the right singular vector :math:`v` of the smallest singular value.
     """
-    v = _smallest(A)[0][..., None]
+    v = smallest_right_singular_vector(A)[0][..., None]
     return A - (A @ v) @ v.mT
 
 
@@ -57,30 +57,25 @@ def unit_matrix(M: Tensor) -> Tensor:
     return unit
 
 
-def smallest_right_singular_vector_3x3(A: Tensor) -> Tensor:
-    r"""Return the right singular vector :math:`(*, 3)` of the smallest singular value, twice differentiable.
-
-    The cofactors :math:`C = \det(A) A^{-\top}` have the singular vectors of :math:`A`, with singular values
-    :math:`\sigma_1 \sigma_2 \ge \sigma_1 \sigma_3 \ge \sigma_2 \sigma_3`. So the vector belongs to the **largest**
-    eigenvalue of :math:`C^\top C`, which the trigonometric solution of the characteristic polynomial gives with all its
-    digits: no condition number is squared. Its sign is arbitrary. Where the smallest singular value is not simple it is
-    one of its vectors and sends no gradient.
-    """
-    return _smallest(A)[0]
-
-
 def smallest_singular_vectors(A: Tensor) -> tuple[Tensor, Tensor]:
     r"""Return the left and right singular vectors of the smallest singular value, twice differentiable.
 
-    As :func:`smallest_right_singular_vector_3x3`, with :math:`u \propto C v`.
+    As :func:`smallest_right_singular_vector`, with :math:`u \propto C v`.
     """
-    v, C = _smallest(A)
+    v, C = smallest_right_singular_vector(A)
     u = (C @ v[..., None])[..., 0]
     return u / safe_divisor(torch.linalg.vector_norm(u, dim=-1, keepdim=True)), v
 
 
-def _smallest(A: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the vector, and the cofactors up to scale."""
+def smallest_right_singular_vector(A: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return the right singular vector :math:`(*, 3)` of the smallest singular value, and the cofactors up to scale.
+
+    The cofactors :math:`C = \det(A) A^{-\top}` have the singular vectors of :math:`A`, with singular values
+    :math:`\sigma_1 \sigma_2 \ge \sigma_1 \sigma_3 \ge \sigma_2 \sigma_3`. So the vector belongs to the **largest**
+    eigenvalue of :math:`C^\top C`, which the trigonometric solution of the characteristic polynomial gives with all its
+    digits: no condition number is squared. Its sign is arbitrary, and it is twice differentiable. Where the smallest
+    singular value is not simple it is one of its vectors and sends no gradient.
+    """
     peak = A.detach().abs().amax((-2, -1), keepdim=True)
     A = A / (peak + (peak == 0))  # a norm could over- or underflow
     norm = torch.linalg.matrix_norm(A.detach(), keepdim=True)

@@ -1,4 +1,4 @@
-"""Many minimal samples of eight correspondences, or of five with known cameras, at once and without derivatives.
+"""Many minimal samples of eight correspondences at once, without derivatives.
 
 :func:`~kornia_learnnorm.find_fundamental` with ``rank2="optimal"`` agrees to second order in the correction. It also
 serves more points, weights, any normaliser and gradients, and takes several times as long.
@@ -8,19 +8,18 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.dlt import design_matrix
-from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.matrices import cofactors
 
-MIN_PIVOT = 1e-12  # of the largest one, of a sample of five correspondences that determine finitely many matrices
 
-
-def are_independent(A: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-    """Return a mask of the non-degenerate minimal samples (K, S, 3), by their design matrices (K, M, 9).
+def are_independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
+    """Return a mask of the non-degenerate minimal samples (K, S, 3), by the R of their transposed design matrices.
 
     The constraints must be independent: each row of the design matrix is farther from the span of the rows before
     it than the least that a shift of the point, in pixels, moves it.
     """
-    return _independent(torch.linalg.qr(A.mT, mode="r")[1], x1, x2, shift)
+    distance = R.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
+    independent: Tensor = distance > shift * torch.minimum(x1[..., 2], x2[..., 2]).amin(-1)
+    return independent
 
 
 def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
@@ -35,7 +34,7 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     :func:`are_independent`. Matrices (M, 3, 3), M <= K, have unit norm and rank 2 up to the convergence of three steps.
     """
     Q, R = torch.linalg.qr(design_matrix(x1, x2).mT, mode="complete")
-    determined = _independent(R, x1, x2, shift)
+    determined = are_independent(R, x1, x2, shift)
     if not bool(determined.all()):
         Q, R, x1, x2 = Q[determined], R[determined], x1[determined], x2[determined]
     L = Q[..., :8] @ torch.linalg.solve_triangular(
@@ -51,26 +50,8 @@ def solve_samples(x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     return F_mat
 
 
-def solve_calibrated_samples(rays1: Tensor, rays2: Tensor) -> Tensor:
-    """Return the essential matrices of minimal samples of five correspondences.
-
-    Rays are directions :math:`K^{-1} x` (K, 5, 3) of any length. All real solutions come back, of unit norm, (M, 3, 3),
-    M <= 10 K; degenerate samples, as with a repeated correspondence, have none. Five points on one plane have.
-    """
-    Q, R = torch.linalg.qr(design_matrix(rays1, rays2).mT, mode="complete")
-    E_mat, real = essential_in_span(torch.unflatten(Q[..., 5:].mT, -1, (3, 3)))
-    pivots = R.diagonal(dim1=-2, dim2=-1).abs()
-    return E_mat[real & (pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1))[:, None]]
-
-
 def _deviation(u: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
     r"""Return the deviations :math:`\sqrt{(u, V_i u)}` of the algebraic residuals of samples, (K, 8)."""
     F, (x1, x2) = torch.unflatten(u.mT, 0, (3, 3))[..., None], (x.movedim(-1, 0) for x in (x1, x2))
     line1, line2 = (F[:, :2] * x2[:, None]).sum(0), (F[:2] * x1).sum(1)
     return (line1.square_().sum(0) + line2.square_().sum(0)).sqrt_()
-
-
-def _independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-    distance = R.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
-    determined: Tensor = distance > shift * torch.minimum(x1[..., 2], x2[..., 2]).amin(-1)
-    return determined

@@ -13,9 +13,12 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
-from kornia_learnnorm.geometry.minimal import solve_calibrated_samples
+from kornia_learnnorm.geometry.dlt import design_matrix
+from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.pose import in_front_of_best_pose
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2
+
+MIN_PIVOT = 1e-12  # of the largest one, of a sample of five correspondences that determine finitely many matrices
 
 
 class Essential(Fundamental):
@@ -58,8 +61,12 @@ class Essential(Fundamental):
         return Calibrated(axes, equal, self.C1.expand_as(E_mat), self.C2.expand_as(E_mat))
 
     def solve_samples(self, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-        """Return the matrices of samples of five, up to ten each."""
-        F_mat: Tensor = self.C2.mT @ solve_calibrated_samples(x1 @ self.C1.mT, x2 @ self.C2.mT) @ self.C1
+        """Return the matrices of samples of five, up to ten each; degenerate ones have none, five on one plane have."""
+        Q, R = torch.linalg.qr(design_matrix(x1 @ self.C1.mT, x2 @ self.C2.mT).mT, mode="complete")
+        E_mat, real = essential_in_span(torch.unflatten(Q[..., 5:].mT, -1, (3, 3)))
+        pivots = R.diagonal(dim1=-2, dim2=-1).abs()
+        E_mat = E_mat[real & (pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1))[:, None]]
+        F_mat: Tensor = self.C2.mT @ E_mat @ self.C1
         return F_mat
 
     def reweighted_fit(self, x1: Tensor, x2: Tensor, M: Tensor, losses: Sequence[Loss]) -> Fit | None:

@@ -131,27 +131,11 @@ class Homography(TwoViewModel):
         p, q = (w * y[..., :2, :] - uv * y[..., 2:, :]).unbind(-2)
         d11, d12, d13, _, d22, d23, _, _, d33 = (M[..., :2] @ M[..., :2].mT).flatten(-2).unbind(-1)
         zero = torch.zeros_like(d11)
-        rows = [
-            d11,
-            2 * d13,
-            zero,
-            d33,
-            zero,
-            zero,
-            d12,
-            d23,
-            d13,
-            zero,
-            d33,
-            zero,
-            d22,
-            zero,
-            2 * d23,
-            zero,
-            zero,
-            d33,
-        ]
-        a, b, c = (torch.unflatten(torch.stack(rows, -1), -1, (3, 6)) @ products).unbind(-2)
+        form_a = [d11, 2 * d13, zero, d33, zero, zero]
+        form_b = [d12, d23, d13, zero, d33, zero]
+        form_c = [d22, zero, 2 * d23, zero, zero, d33]
+        forms = torch.unflatten(torch.stack([*form_a, *form_b, *form_c], -1), -1, (3, 6))
+        a, b, c = (forms @ products).unbind(-2)
         trace = a + c
         floor = COVARIANCE_FLOOR**2 * trace.detach().mean(-1, keepdim=True) + torch.finfo(M.dtype).tiny
         z = z + floor

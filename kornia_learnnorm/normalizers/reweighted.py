@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import needs_gradient, safe_divisor
-from kornia_learnnorm.geometry.matrices import cofactors, smallest_right_singular_vector_3x3
+from kornia_learnnorm.geometry.matrices import cofactors, smallest_right_singular_vector
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental, whitening_from_moments
 from kornia_learnnorm.normalizers.normalizer import ProblemNormalizer
@@ -93,7 +93,8 @@ class ReweightedWhitening(ProblemNormalizer):
         # View 1's line of the rank-2 correction in the coordinates whitened with w.
         T = _whitening(points, w)
         F_hat = transform_fundamental(F0, *cofactors(T).mT)
-        b = normalize((T[0].mT @ smallest_right_singular_vector_3x3(F_hat)[..., None]).squeeze(-1), dim=-1)
+        v = smallest_right_singular_vector(F_hat)[0]
+        b = normalize((T[0].mT @ v[..., None]).squeeze(-1), dim=-1)
         a = _best_line(products[..., 1, :], w[:, 1], (inverse.mT @ b[..., None])[..., 0].mT, *indices)
         lines = torch.stack([b.mT, a], 1)
         for iteration in range(self.iterations):

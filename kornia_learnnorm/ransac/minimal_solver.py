@@ -29,7 +29,8 @@ def solve_minimal_samples(
             return M
         determined = torch.zeros_like(rows[:, 0], dtype=torch.bool)
     else:
-        determined = are_independent(model.rows(x1, x2), x1, x2, shift)
+        R = torch.linalg.qr(model.rows(x1, x2).mT, mode="r")[1]
+        determined = are_independent(R, x1, x2, shift)
     if bool(determined.any()):
         rows = rows[determined]
     elif any(_on_a_line(points, shift) for points in scorer.pixels):
