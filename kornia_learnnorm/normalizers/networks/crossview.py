@@ -83,23 +83,21 @@ class CrossViewNetwork(nn.Module):
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
             null_matrix: the DLT's unit null vectors there with shape :math:`(B, 3, 3)`; solved for when not given.
         """
-        views = self._views(points1, points2, weights, null_matrix)
-        point_features, set_features = (torch.cat(parts).to(self.dtype) for parts in zip(*views, strict=True))
+        points, sets = (part.to(self.dtype) for part in self._views(points1, points2, weights, null_matrix))
         doubled = None if weights is None else torch.cat([weights, weights]).to(self.dtype)
-        params = self.set_network(point_features, set_features, doubled).to(points1.dtype)
+        params = self.set_network(points, sets, doubled).to(points1.dtype)
         # Not `chunk`, which torch.export cannot trace with a dynamic batch.
         params1, params2 = torch.unflatten(self.bound * torch.tanh(params / self.bound), 0, (2, -1)).unbind(0)
         return params1, params2
 
     def _views(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, null_matrix: Tensor | None
-    ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Return the features of the points and of the set as each view sees them."""
+    ) -> tuple[Tensor, Tensor]:
+        """Return the features of points and sets as view 1 sees them and then as view 2 does, (2 B, N, C), (2 B, D)."""
         if self.features != "epipolar":
-            nothing = torch.ones_like(points1[:, 0, :1])
-            if self.features == "own":
-                return (points1, nothing), (points2, nothing)
-            return (torch.cat([points1, points2], -1), nothing), (torch.cat([points2, points1], -1), nothing)
+            own, other = torch.cat([points1, points2]), torch.cat([points2, points1])
+            points = own if self.features == "own" else torch.cat([own, other], -1)
+            return points, torch.ones_like(points[:, 0, :1])
         x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
         if null_matrix is None:
             null_matrix = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
@@ -108,9 +106,8 @@ class CrossViewNetwork(nn.Module):
         F = null_matrix * entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
         u, v = smallest_singular_vectors(F)
         own, other, doubled = torch.stack([x1, x2]), torch.stack([x2, x1]), torch.stack([F, F.mT])
-        features = _epipolar_features(own, other, doubled, torch.stack([v, u]), torch.stack([u, v]), weights)
-        points, sets = (part.unbind(0) for part in features)
-        return (points[0], sets[0]), (points[1], sets[1])
+        points, sets = _epipolar_features(own, other, doubled, torch.stack([v, u]), torch.stack([u, v]), weights)
+        return points.flatten(0, 1), sets.flatten(0, 1)
 
     @property
     def dtype(self) -> torch.dtype:
