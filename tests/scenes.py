@@ -37,6 +37,13 @@ def corner_error(M, H) -> float:
     return float((a[..., :2, :] / a[..., 2:, :] - b[..., :2, :] / b[..., 2:, :]).norm(dim=-2).max())
 
 
+def distorted(points: Tensor, K: Tensor, share: float) -> Tensor:
+    """Points (*, N, 2) moved away from the principal point, the farthest by a share of its distance."""
+    offsets = points - K[..., None, :2, 2]
+    squares = offsets.square().sum(-1, keepdim=True)
+    return points + share * squares / squares.amax(-2, keepdim=True) * offsets
+
+
 def store_of(points1, points2, offsets, names, size=(640, 480), ratio=0.5, **known) -> CorrespondenceStore:
     """A store of matches whose cameras, motions and matrices are not known unless they are given."""
     shapes = {"F": (3, 3), "K": (2, 3, 3), "R": (3, 3), "t": (3,)}
@@ -102,6 +109,16 @@ def shaken_estimator(seed: int = 0, **options) -> LearnedEightPoint:
                 for value in last.parameters():
                     value.normal_(0, 0.3)
     return layer.eval()
+
+
+def roughened(cls: type, **options) -> torch.nn.Module:
+    """A small learned layer in float64 whose weights all differ from one another, as after training."""
+    torch.manual_seed(0)
+    layer, generator = cls(**{"width": 16, "depth": 2, "stages": 2, "samples": 8} | options).double().eval(), seeded(1)
+    with torch.no_grad():
+        for parameter in layer.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype))
+    return layer
 
 
 LAYERS = {

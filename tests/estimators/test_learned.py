@@ -1,13 +1,25 @@
-"""The learned eight-point algorithm: invariances, small sets, scores, stages, files, errors."""
+"""The learned fundamental matrix, relative pose and homography: what they promise, small sets, files, errors.
+
+Of the learned fundamental matrix, masks, degenerate sets, gradients and compilation are also in test_eight_point.py.
+"""
+
+import json
+import pickle
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pairwise import pairwise
 from scenes import (
+    DTYPES,
     check_gradients,
+    check_refuses,
+    corner_error,
     correspondences,
+    plane,
     rewrite_weights,
+    roughened,
     scenes,
     seeded,
     shaken_estimator,
@@ -17,64 +29,145 @@ from scenes import (
 )
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.estimators import pose_stages
 from kornia_learnnorm.estimators.match_features import masked_median
 
+CLASSES = {"fundamental": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}
+LAYERS = {
+    "fundamental": lambda **options: shaken_estimator(**options).double(),
+    "pose": lambda **options: roughened(kln.LearnedRelativePose, **options),
+    "homography": lambda **options: roughened(kln.LearnedHomography, **options),
+}
+LEAST = {"fundamental": 8, "pose": 5, "homography": 4}  # correspondences
+MATRICES = {
+    "fundamental": {"F_mat": (3, 3)},
+    "pose": {"E_mat": (3, 3), "F_mat": (3, 3), "R": (3, 3), "t": (3,)},
+    "homography": {"H_mat": (3, 3)},
+}
+every = pytest.mark.parametrize("kind", LAYERS)
+siblings = pytest.mark.parametrize("kind", ["pose", "homography"])
 
-def shaken_double(**options) -> kln.LearnedEightPoint:
-    return shaken_estimator(**options).double()
+
+def inputs(kind: str, batch_size: int, num_points: int, seed: int = 0, scene: str = "handheld") -> list[torch.Tensor]:
+    """Points of scenes, or of planes with some noise, and the cameras of a pose."""
+    if kind == "homography":
+        return [*plane(batch_size, num_points, noise=0.2)[:2]]
+    found = scenes(scene, batch_size, num_points, seed)
+    return [found.points1, found.points2, *((found.K1, found.K2) if kind == "pose" else ())]
 
 
+@pairwise(kind=LAYERS, batch_size=[0, 1, 3], more=[0, 1, 3, 55], given=["", "weights", "mask", "scores"], dtype=DTYPES)
+def test_smoke(kind, batch_size, more, given, dtype, device):
+    num_points, layer = LEAST[kind] + more, LAYERS[kind]().to(device)
+    values = [value[:batch_size].to(device, dtype) for value in inputs(kind, max(batch_size, 1), num_points)]
+    rows = uniform(batch_size, num_points).to(device)
+    options = {"": {}, "mask": {"mask": rows > 0.1}}.get(given, {given: rows})
+    found = layer.estimate(*values, **options)
+    for name, shape in (MATRICES[kind] | {"gap": (), "weights": (num_points,)}).items():
+        value = getattr(found, name)
+        assert (value.shape, value.dtype) == ((batch_size, *shape), torch.float64 if name == "gap" else dtype)
+        assert value.isfinite().all()
+    assert len(found.stages) == 2
+    assert given == "mask" or torch.allclose(found.weights, found.stages[-1].logits.sigmoid())
+    assert torch.equal(layer(*values, **options), found[0])
+
+
+@every
 @settings(max_examples=5)
 @given(
-    num_points=st.sampled_from([8, 9, 40]),
+    more=st.sampled_from([0, 1, 35]),
     seed=st.integers(0, 2**20),
     factor=st.floats(1e-3, 1e3),
     shift=st.floats(-1e3, 1e3),
 )
 @torch.no_grad()
-def test_invariances(num_points, seed, factor, shift):
+def test_invariances(kind, more, seed, factor, shift):
     """To the order of the correspondences, a swap of the views, and one scale and translation of both images."""
-    layer, points = shaken_double(), correspondences("handheld", 4, num_points, seed=seed)
+    num_points, factor = (LEAST[kind] + more, factor) if kind != "pose" else (12 + more, 1.0)
+    layer, (points1, points2, *cameras) = LAYERS[kind](), inputs(kind, 4, num_points, seed)
     order = torch.randperm(num_points, generator=seeded(seed))
-    estimate, shuffled = layer.estimate(*points), layer.estimate(*(p[:, order] for p in points))
-    assert up_to_sign(shuffled.F_mat, estimate.F_mat) < 1e-6
-    assert torch.allclose(shuffled.weights, estimate.weights[:, order], atol=1e-8)
-    assert up_to_sign(layer(*points[::-1]).mT, estimate.F_mat) < 1e-6
-    moved = layer(*(factor * (p + shift) for p in points))
+    found = layer.estimate(points1, points2, *cameras)
+    shuffled = layer.estimate(points1[:, order], points2[:, order], *cameras)
+    assert up_to_sign(shuffled[0], found[0]) < 1e-5
+    assert torch.allclose(shuffled.weights, found.weights[:, order], atol=1e-6)
+    assert up_to_sign(layer.model.swap(layer(points2, points1, *cameras[::-1])), found[0]) < 1e-5
     T = torch.tensor([[factor, 0, factor * shift], [0, factor, factor * shift], [0, 0, 1]], dtype=torch.float64)
-    assert up_to_sign(T.mT @ moved @ T, estimate.F_mat) < 1e-5
+    moved = layer(factor * (points1 + shift), factor * (points2 + shift), *(T @ K for K in cameras))
+    assert up_to_sign(moved if kind == "pose" else layer.model.carry(moved, T, T), found[0]) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("kind", "number"),
+    [*(("fundamental", n) for n in (8, 9, 15, 16, 40)), ("pose", 12), *(("homography", n) for n in (7, 8, 40))],
+)
+def test_masked_rows_have_no_effect(kind, number):
+    """They may hold anything, and few present matches are not searched, however many rows there are."""
+    layer, (points1, points2, *cameras) = LAYERS[kind](), inputs(kind, 3, number)
+    scores, mask = uniform(3, number), torch.arange(number + 20).expand(3, -1) < number
+    tail = torch.full((3, 20, 2), torch.nan, dtype=torch.float64)
+    padded = [torch.cat([p, tail], 1).requires_grad_() for p in (points1, points2)]
+    found = layer(*padded, *cameras, mask=mask, scores=torch.cat([scores, tail[..., 0]], 1))
+    assert up_to_sign(found.detach(), layer(points1, points2, *cameras, scores=scores).detach()) < 1e-6
+    for gradient in torch.autograd.grad(signless(found).sum(), padded):
+        assert gradient.isfinite().all()
+        assert not gradient[~mask].any()
+
+
+@pytest.mark.parametrize("kind", ["fundamental", "homography"])
+@torch.no_grad()
+def test_samples_find_the_matrix_where_the_weights_do_not(kind):
+    """An untrained network gives all matches the same weight."""
+    if kind == "homography":
+        distance, (points1, points2, _) = kln.transfer_distance, plane(10, 200)
+    else:
+        distance, scene = kln.symmetric_epipolar_distance, scenes("handheld", 10, 200, noise=0.1)
+        points1, points2 = scene.points1, scene.points2
+    matched = torch.cat([600 * uniform(10, 60, 2, seed=3), points2[:, 60:]], 1)
+    errors = []
+    for samples in (0, 256):
+        torch.manual_seed(0)
+        layer = CLASSES[kind](width=16, depth=1, stages=1, samples=samples).double()
+        errors.append(distance(points1, points2, layer(points1, matched)).median(1).values)
+    assert (errors[1] < errors[0] / 4).double().mean() >= 0.8
+
+
+@pytest.mark.parametrize("kind", ["fundamental", "pose"])
+def test_sets_of_few_outliers_leave_stages_out(kind):
+    """A set that needs its stages, in the same batch, changes nothing but the time."""
+    layer, calls = CLASSES[kind].from_pretrained(), []
+    for network in layer.networks:
+        network.register_forward_hook(lambda *_: calls.append(1))
+    scene = scenes("handheld", 3, 200, noise=0.5)
+    points = (scene.points1, scene.points2) + ((scene.K1, scene.K2) if kind == "pose" else ())
+    points[1][2, :120] = uniform(120, 2, high=400.0)
+    layer(*points)
+    alone, numbers = [], [len(calls)]
+    for row in range(3):
+        calls.clear()
+        alone.append(layer(*(p[row : row + 1] for p in points)))
+        numbers.append(len(calls))
+    assert numbers == [len(layer.networks), 1, 1, len(layer.networks)]
+    assert up_to_sign(layer(*points).detach(), torch.cat(alone).detach()) < 1e-6
+    calls.clear()
+    layer.train()(*(p[:2] for p in points))
+    assert len(calls) == len(layer.networks)
 
 
 class TestSmallSets:
-    def test_eight_are_the_optimal_correction(self):
-        points, layer = correspondences("handheld", 5), shaken_double()
-        expected = kln.find_fundamental(*points, rank2="optimal")
-        assert up_to_sign(layer(*points).detach(), expected) < 1e-9
-        padded = [torch.cat([p, p[:, :3]], 1) for p in points]
-        mask = torch.arange(11).expand(5, 11) < 8
-        assert up_to_sign(layer(*padded, mask=mask).detach(), expected) < 1e-9
+    """Of fundamental matrices."""
 
-    def test_eight_with_outliers_are_hartleys_projection(self):
+    def test_eight_are_the_optimal_correction_or_with_outliers_hartleys_projection(self):
         points1, points2 = correspondences("handheld", 40)
-        points2 = points2 + 30 * torch.randn(points2.shape, generator=seeded(), dtype=points2.dtype)
+        points2[5:] += 30 * torch.randn(35, 8, 2, generator=seeded(), dtype=points2.dtype)
         optimal, hartley = (kln.find_fundamental(points1, points2, rank2=kind) for kind in ("optimal", "projection"))
         residual = kln.sampson_distance(points1, points2, optimal).square().mean(1).sqrt()
         both = torch.cat([points1, points2], 1)
         fits = residual < 0.01 * (both - both.mean(1, keepdim=True)).norm(dim=-1).mean(1)
-        assert 0 < fits.sum() < 40
-        found = shaken_double()(points1, points2).detach()
+        assert fits[:5].all()
+        assert 0 < fits[5:].sum() < 35
+        found = LAYERS["fundamental"]()(points1, points2).detach()
         assert up_to_sign(found[fits], optimal[fits]) < 1e-9
         assert up_to_sign(found[~fits], hartley[~fits]) < 1e-9
-
-    @pytest.mark.parametrize("options", [{}, {"rank2": "optimal"}, {"refine_steps": 0}])
-    @pytest.mark.parametrize("number", [8, 9])
-    def test_every_parameter_gets_a_gradient(self, number, options):
-        """Otherwise DistributedDataParallel waits for the gradients that are missing."""
-        layer = shaken_double(**options)
-        signless(layer(*correspondences("handheld", 3, number))).sum().backward()
-        gradients = torch.cat([parameter.grad.flatten() for parameter in layer.parameters()])
-        assert gradients.isfinite().all()
-        assert bool(gradients.any()) == (number > 8)
 
     def test_an_untrained_layer_is_hartleys(self):
         points = correspondences("handheld", 5, 20)
@@ -82,66 +175,189 @@ class TestSmallSets:
         assert up_to_sign(layer(*points).detach(), kln.find_fundamental(*points)) < 1e-6
 
 
-class TestSamples:
-    def test_find_the_matrix_where_the_weights_do_not(self):
-        """An untrained network gives all matches the same weight."""
-        scene = scenes("handheld", 10, 200, noise=0.1)
-        points2 = scene.points2.clone()
-        points2[:, :60] = 600 * uniform(10, 60, 2, seed=3)
-        errors = []
-        for samples in (0, 256):
-            torch.manual_seed(0)
-            layer = kln.LearnedEightPoint(width=16, depth=1, stages=1, samples=samples).double()
-            with torch.no_grad():
-                F_mat = layer(scene.points1, points2)
-            errors.append(kln.symmetric_epipolar_distance(scene.points1[:, 60:], scene.points2[:, 60:], F_mat))
-        without, found = (error.median(1).values for error in errors)
-        assert (found < without / 4).double().mean() >= 0.8
-
-    @pytest.mark.parametrize("number", [9, 15, 16, 40])
-    def test_padding_has_no_effect(self, number):
-        """Few present matches are not searched, however many rows there are."""
-        points, layer = correspondences("handheld", 3, number), shaken_double()
-        padded = [torch.cat([p, p[:, :1].expand(-1, 20, -1)], 1) for p in points]
-        mask = torch.arange(number + 20).expand(3, -1) < number
-        assert up_to_sign(layer(*padded, mask=mask).detach(), layer(*points).detach()) < 1e-6
-
-    def test_gradcheck(self):
-        """With many steps derivatives are those of the optimum, wherever the fit began."""
-        points, layer = correspondences("handheld", 1, 20), shaken_double(refine_steps=60)
-
-        def numbers(points1, points2, scores):
-            return signless(layer(points1, points2, scores=scores))
-
-        check_gradients(numbers, *points, uniform(1, 20), atol=1e-4, rtol=1e-2)
+def test_stages_without_refinement():
+    points, scores = correspondences("driving", 3, 30), torch.rand(3, 30)
+    refined, plain = (
+        shaken_estimator(stages=3, refine_steps=steps).estimate(*points, scores=scores) for steps in (10, 0)
+    )
+    assert up_to_sign(plain.F_mat.detach(), plain.stages[-1].F_mat.detach()) < 1e-3
+    assert torch.equal(plain.stages[0].F_mat, refined.stages[0].F_mat)
+    assert not torch.equal(plain.stages[1].F_mat, refined.stages[1].F_mat)  # it sees other residuals
+    assert plain.E_mat is None
 
 
-class TestEstimate:
-    def test_smoke(self, device, dtype):
-        layer = shaken_estimator(stages=3).to(device)
-        points = [p.to(device, dtype) for p in correspondences("driving", 3, 30)]
-        scores = torch.rand(3, 30)
-        estimate = layer.estimate(*points, scores=scores)
-        assert (estimate.F_mat.shape, estimate.F_mat.dtype) == ((3, 3, 3), dtype)
-        assert len(estimate.stages) == 3
-        unrefined = shaken_estimator(stages=3, refine_steps=0).to(device).estimate(*points, scores=scores)
-        assert up_to_sign(unrefined.F_mat.detach(), unrefined.stages[-1].F_mat.detach()) < 1e-3
-        assert torch.equal(unrefined.stages[0].F_mat, estimate.stages[0].F_mat)
-        assert not torch.equal(unrefined.stages[1].F_mat, estimate.stages[1].F_mat)  # it sees other residuals
-        assert torch.allclose(estimate.weights, estimate.stages[-1].logits.sigmoid())
-        assert estimate.E_mat is None
-        assert estimate.determined.all()
+@pytest.mark.parametrize("num_points", [4, 5, 50, 400])
+def test_finds_the_homography_without_noise(num_points):
+    points1, points2, H = plane(8, num_points)
+    layer = LAYERS["homography"](refine_steps=10)
+    for weights in (None, uniform(8, num_points, low=0.1)):
+        found = layer.estimate(points1, points2, weights=weights)
+        assert found.determined.all()
+        assert corner_error(found.H_mat, H) < 1e-4
+    padded = [torch.cat([p, 600 - p[:, :3]], 1) for p in (points1, points2)]
+    mask = torch.arange(num_points + 3).expand(8, -1) < num_points
+    assert corner_error(layer(*padded, mask=mask), H) < 1e-4
 
-    @pytest.mark.parametrize("number", [0, 5, 8])
-    def test_scores_of_few_matches_get_zero(self, number):
-        points1, points2 = correspondences("handheld", 2, 30)
-        matches = [torch.arange(number)[:, None].expand(number, 2)] * 2
-        scores = [torch.rand(number, requires_grad=True) for _ in range(2)]
-        estimate = shaken_estimator().from_matches(points1, points2, matches, scores)
-        for gradient in torch.autograd.grad(signless(estimate.F_mat).sum(), scores):
-            assert not gradient.any()
 
-    def test_wrong_scores(self):
+DEGENERATE = {
+    "coincident": lambda p: (p[:, :1].expand_as(p), p[:, :1].expand_as(p)),
+    "four places": lambda p: (p[:, torch.arange(12) % 4], p[:, torch.arange(12) % 4] + 5),
+    "collinear": lambda p: (p * torch.tensor([1, 0]).to(p), p * torch.tensor([1, 0]).to(p) + 3),
+    "no motion": lambda p: (p, p),
+    "zero": lambda p: (0 * p, 0 * p),
+    "unrelated": lambda p: (p, p.flip(1)),
+}
+DETERMINED = {"pose": ["no motion", "unrelated"], "homography": ["four places", "no motion", "unrelated"]}
+
+
+@siblings
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_finite_on_degenerate_sets(kind, name):
+    points = [p.clone().requires_grad_() for p in DEGENERATE[name](uniform(3, 12, 2, high=600))]
+    layer = LAYERS[kind]()
+    found = layer.estimate(*points, *inputs(kind, 3, 12)[2:])
+    assert found.determined.any() == (name in DETERMINED[kind])
+    matrices = [getattr(found, key) for key in MATRICES[kind]]
+    loss = signless(found[0]).sum() + sum(value.sum() for value in matrices[1:]) + found.weights.sum()
+    gradients = torch.autograd.grad(loss, [*points, *layer.parameters()], allow_unused=True)
+    for value in (*matrices, *(g for g in gradients if g is not None)):
+        assert value.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "scene", "number", "options"),
+    [
+        ("fundamental", "handheld", 20, {}),
+        ("pose", "orbit", 12, {"stages": 1, "samples": 0}),
+        ("homography", "", 12, {"stages": 1}),
+    ],
+)
+def test_gradients(kind, scene, number, options):
+    """With many steps derivatives are those of the optimum, wherever the fit began."""
+    layer = LAYERS[kind](refine_steps=60, **options)
+    points1, points2, *cameras = inputs(kind, 1, number, scene=scene)
+
+    def numbers(points1, points2, scores):
+        return signless(layer(points1, points2, *(K[0] for K in cameras), scores=scores))
+
+    # Numbers of a homography of pixels are tiny in its last row.
+    tolerances = {"eps": 1e-4, "atol": 1e-6} if kind == "homography" else {"eps": 1e-6, "atol": 1e-4}
+    check_gradients(numbers, points1, points2, uniform(*points1.shape[:2]), rtol=1e-2, **tolerances)
+
+
+@pytest.mark.parametrize(
+    ("kind", "number", "options"),
+    [
+        *(("fundamental", n, options) for n in (8, 9) for options in ({}, {"rank2": "optimal"}, {"refine_steps": 0})),
+        *(("pose", 20, {}), ("homography", 20, {})),
+    ],
+)
+def test_every_parameter_gets_a_gradient(kind, number, options):
+    """Otherwise DistributedDataParallel waits for the gradients that are missing."""
+    layer = LAYERS[kind](**options)
+    signless(layer(*inputs(kind, 3, number))).sum().backward()
+    gradients = torch.cat([parameter.grad.flatten() for parameter in layer.parameters()])
+    assert gradients.isfinite().all()
+    assert bool(gradients.any()) == (number > 8)
+
+
+@pytest.mark.parametrize(
+    ("kind", "few"), [*(("fundamental", n) for n in (0, 5, 8)), ("pose", 4), ("homography", 3), ("homography", 4)]
+)
+def test_scores_of_few_matches_get_a_gradient_of_zero(kind, few):
+    points1, points2, *cameras = inputs(kind, 2, 30)
+    matches = [torch.arange(number)[:, None].expand(number, 2) for number in (20, few)]
+    scores = [torch.rand(len(pairs), dtype=torch.float64, requires_grad=True) for pairs in matches]
+    found = LAYERS[kind]().from_matches(points1, points2, matches, scores, *cameras)
+    assert found.determined.tolist() == [True, few >= LEAST[kind]]
+    first, second = torch.autograd.grad(signless(found[0]).sum(), scores)
+    assert first.any()
+    assert not second.any()
+
+
+@siblings
+@pytest.mark.long
+def test_vmap_and_compile_agree(kind, monkeypatch):
+    """The traced graph is whole; how fast its code is, is another question. Export has a test of its own."""
+    monkeypatch.setattr(pose_stages, "LOCAL_STEPS", 1)
+    layer, values = LAYERS[kind](refine_steps=2), inputs(kind, 2, 20)
+    expected = layer(*values).detach()
+    mapped = torch.func.vmap(lambda *rows: layer(*(row[None] for row in rows))[0])(*values)
+    assert up_to_sign(mapped.detach(), expected) < 1e-6
+    traced = torch.compile(layer, backend="eager", fullgraph=True)
+    assert up_to_sign(traced(*values).detach(), expected) < 1e-6
+
+
+def test_autocast_leaves_the_solver_in_float64():
+    points1, points2, H = plane(2, 40)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = LAYERS["homography"](refine_steps=10).float()(points1, points2)
+    assert found.dtype == torch.float64
+    assert corner_error(found, H) < 1e-4
+
+
+class TestFiles:
+    @every
+    def test_round_trip(self, kind, tmp_path):
+        layer = LAYERS[kind](**{"learn_transforms": False, "rank2": "optimal"} if kind == "fundamental" else {})
+        layer.trained_on, file = ("one", "two@0:3"), tmp_path / "own.safetensors"
+        layer.save_pretrained(file)
+        loaded = type(layer).from_pretrained(file)
+        assert (loaded.trained_on, loaded.extra_repr(), loaded.training) == (
+            layer.trained_on,
+            layer.extra_repr(),
+            False,
+        )
+        values = inputs(kind, 2, 20)
+        for other in (loaded, pickle.loads(pickle.dumps(loaded))):
+            assert torch.equal(other(*values), layer(*values))
+        for other in CLASSES.values():
+            if other is not type(layer):
+                with pytest.raises(ValueError, match=f"model '{layer.model_name}', expected '{other.model_name}'"):
+                    other.from_pretrained(file)
+
+    @pytest.mark.parametrize("kind", ["fundamental", "homography"])
+    def test_of_an_earlier_version(self, kind, tmp_path):
+        """Before, there were no samples."""
+
+        def drop(_, metadata):
+            architecture = json.loads(metadata["architecture"])
+            del architecture["samples"]
+            metadata["architecture"] = json.dumps(architecture)
+
+        LAYERS[kind]().save_pretrained(tmp_path / "own.safetensors")
+        rewrite_weights(tmp_path / "own.safetensors", drop)
+        assert CLASSES[kind].from_pretrained(tmp_path / "own.safetensors").samples == 64
+
+    @pytest.mark.parametrize(
+        "architecture", ["", "[]", '{"widht": 3}', '{"width": 10000}', '{"stages": 0}', '{"rank2": "no"}']
+    )
+    def test_garbled_architecture(self, architecture, tmp_path):
+        shaken_estimator().save_pretrained(tmp_path / "own.safetensors")
+        rewrite_weights(tmp_path / "own.safetensors", lambda _, metadata: metadata.update(architecture=architecture))
+        with pytest.raises(ValueError, match=r"own\.safetensors describes no estimator of this version"):
+            kln.LearnedEightPoint.from_pretrained(tmp_path / "own.safetensors")
+
+    def test_weights_of_a_normaliser(self):
+        with pytest.raises(ValueError, match=r"crossview: .* LearnedEightPoint.* LearnedNormalizer"):
+            kln.LearnedEightPoint.from_pretrained("crossview")
+
+    @siblings
+    def test_starts_from_an_eight_point_estimator(self, kind):
+        eight = kln.LearnedEightPoint.from_pretrained("robust-tiny")
+        layer = CLASSES[kind].from_eight_point(eight).eval()
+        points1, points2, *cameras = inputs(kind, 2, 60)
+        scores = uniform(2, 60)
+        first = eight.estimate(points1, points2, scores=scores).stages[0].logits
+        found = layer.estimate(points1, points2, *cameras, scores=scores).stages[0].logits
+        assert torch.allclose(found, first, atol=1e-5)
+
+
+class TestExceptions:
+    @every
+    def test_correspondences_and_scores(self, kind):
+        layer, cameras, points = LAYERS[kind](), [torch.eye(3)] * 2 if kind == "pose" else [], torch.rand(2, 12, 2)
+        check_refuses(lambda *points: layer(*points[:2], *cameras, weights=points[2]), LEAST[kind])
         for scores, error, message in [
             (torch.rand(2, 9), ValueError, r"scores .*\[2, 12\], got \[2, 9\]"),
             (torch.full((2, 12), 1.5), ValueError, r"scores .* got 1\.5 to 1\.5"),
@@ -149,56 +365,30 @@ class TestEstimate:
             (torch.ones(2, 12, dtype=torch.int64), TypeError, r"scores .* got torch\.int64"),
         ]:
             with pytest.raises(error, match=message):
-                shaken_estimator()(*correspondences("handheld", 2, 12), scores=scores)
+                layer(points, points, *cameras, scores=scores)
 
-    def test_wrong_options(self):
-        for options, message in [
-            ({"stages": 0}, "stages must be .* 1, got 0"),
-            ({"refine_steps": -1}, "refine_steps must be .* 0, got -1"),
-            ({"width": 0}, "width must be"),
-            ({"samples": -1}, "samples must be .* 0, got -1"),
-            ({"depth": 1.5}, "depth must be .* got 1.5"),
-            ({"learn_transforms": "no"}, "learn_transforms must be .* got 'no'"),
-            ({"rank2": "no"}, "rank2 must be"),
+    def test_cameras(self):
+        points, K = torch.rand(2, 12, 2), torch.eye(3)
+        for cameras, message in [
+            ((None, K), "cameras K1 and K2 are needed"),
+            ((torch.zeros(3, 3), K), "K1 must be finite and invertible"),
+            ((K, K.expand(5, 3, 3)), "K2 must have shape"),
         ]:
             with pytest.raises(ValueError, match=message):
-                kln.LearnedEightPoint(**options)
+                LAYERS["pose"]()(points, points, *cameras)
 
-    def test_masked_scores_may_hold_anything(self):
-        points, layer = correspondences("handheld", 2, 12), shaken_double()
-        mask = torch.arange(12).expand(2, 12) < 10
-        scores = torch.where(mask, 0.5, torch.nan)
-        expected = layer(*(p[:, :10] for p in points), scores=scores[:, :10])
-        assert up_to_sign(layer(*points, mask=mask, scores=scores).detach(), expected.detach()) < 1e-6
-
-
-class TestFiles:
-    @pytest.fixture
-    def file(self, tmp_path):
-        path = tmp_path / "weights.safetensors"
-        layer = shaken_estimator(learn_transforms=False, rank2="optimal")
-        layer.trained_on = ("one", "two@0:3")
-        layer.save_pretrained(path)
-        return path
-
-    def test_round_trip(self, file):
-        layer, expected = kln.LearnedEightPoint.from_pretrained(file), shaken_estimator()
-        assert (layer.learn_transforms, layer.rank2, layer.trained_on) == (False, "optimal", ("one", "two@0:3"))
-        assert not layer.training
-        for key, value in expected.state_dict().items():
-            assert torch.equal(layer.state_dict()[key], value)
-
-    @pytest.mark.parametrize(
-        "architecture", ["", "[]", '{"widht": 3}', '{"width": 10000}', '{"stages": 0}', '{"rank2": "no"}']
-    )
-    def test_garbled_architecture(self, file, architecture):
-        rewrite_weights(file, lambda _, metadata: metadata.update(architecture=architecture))
-        with pytest.raises(ValueError, match=r"weights\.safetensors describes no estimator of this version"):
-            kln.LearnedEightPoint.from_pretrained(file)
-
-    def test_weights_of_a_normaliser(self):
-        with pytest.raises(ValueError, match=r"crossview: .* LearnedEightPoint.* LearnedNormalizer"):
-            kln.LearnedEightPoint.from_pretrained("crossview")
+    def test_options(self):
+        shared = [({"width": 0}, "width must be"), ({"samples": -1}, "samples must be .* 0, got -1")]
+        shared += [
+            ({"refine_steps": -1}, "refine_steps must be .* 0, got -1"),
+            ({"depth": 1.5}, "depth must be .* 1.5"),
+        ]
+        own = [({"stages": 0}, "stages must be .* 1, got 0"), ({"rank2": "no"}, "rank2 must be")]
+        own += [({"learn_transforms": "no"}, "learn_transforms must be .* got 'no'")]
+        for kind, cls in CLASSES.items():
+            for options, message in shared + own * (kind == "fundamental"):
+                with pytest.raises(ValueError, match=message):
+                    cls(**options)
 
 
 def test_median_of_the_present_rows():

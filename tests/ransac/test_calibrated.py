@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scenes import cross, homogeneous, one_scene, uniform, up_to_sign
+from scenes import cross, distorted, homogeneous, one_scene, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
@@ -39,21 +39,19 @@ def estimate(points, cameras, weights=None, **options):
     return RANSAC(seed=0, **options).estimate(*points, weights, *cameras)
 
 
-class TestSmoke:
-    @pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
-    def test_weights(self, sampler):
-        points, cameras, E, true = pair(outliers=0.7, seed=1)
-        weights = 0.1 + true + 0.5 * uniform(200)
-        found = estimate(points, cameras, weights, sampler=sampler)
-        assert found.num_samples < estimate(points, cameras).num_samples
-        assert up_to_sign(found.E_mat[None], E[None]) < 0.02
+@pytest.mark.parametrize("sampler", [ProsacSampler, WeightedSampler])
+def test_weights(sampler):
+    points, cameras, E, true = pair(outliers=0.7, seed=1)
+    weights = 0.1 + true + 0.5 * uniform(200)
+    found = estimate(points, cameras, weights, sampler=sampler)
+    assert found.num_samples < estimate(points, cameras).num_samples
+    assert up_to_sign(found.E_mat[None], E[None]) < 0.02
 
 
-class TestExceptions:
-    def test_failure(self):
-        """Five matches fit exactly: no other one confirms the matrix."""
-        found = estimate((uniform(5, 2), uniform(5, 2, seed=1)), (torch.eye(3), torch.eye(3)))
-        assert not any(value.any() for value in (found.E_mat, found.F_mat, found.inliers))
+def test_failure():
+    """Five matches fit exactly: no other one confirms the matrix."""
+    found = estimate((uniform(5, 2), uniform(5, 2, seed=1)), (torch.eye(3), torch.eye(3)))
+    assert not any(value.any() for value in (found.E_mat, found.F_mat, found.inliers))
 
 
 class TestAccuracy:
@@ -84,17 +82,6 @@ class TestAccuracy:
         assert optimum.cost_before <= 1.001 * optimum.cost
 
 
-def distorted(seed: int):
-    """Correspondences of a lens that moves the corners inwards by 3 %, and the cameras, E, R and t of a pinhole."""
-    scene = one_scene("handheld", 300, seed, noise=0.3, outliers=0.3)
-    points = []
-    for pixels, K in ((scene.points1, scene.K1), (scene.points2, scene.K2)):
-        offset = pixels - K[:2, 2]
-        square = offset.square().sum(-1, keepdim=True)
-        points.append(K[:2, 2] + offset * (1 - 0.03 * square / square.max()))
-    return points, (scene.K1, scene.K2), scene.R[None], scene.t[None]
-
-
 def error_of_pose(F_mat, points, cameras, R, t):
     near = kln.sampson_distance(*points, F_mat) <= 1
     return pose_error(*kln.relative_pose(*(v[None] for v in (F_mat, *cameras, *points, near))), R, t).item()
@@ -115,7 +102,9 @@ class TestInexactCameras:
         """The pose is better than that of the best essential matrix, and the essential matrix is the nearest one."""
         free, known = [], []
         for seed in range(5):
-            points, cameras, R, t = distorted(seed)
+            scene = one_scene("handheld", 300, seed, noise=0.3, outliers=0.3)
+            cameras, R, t = (scene.K1, scene.K2), scene.R[None], scene.t[None]
+            points = [distorted(p, K, -0.03) for p, K in zip((scene.points1, scene.points2), cameras, strict=True)]
             found = estimate(points, cameras)
             one = [v[None] for v in (*points, found.E_mat, *cameras)]
             fitted = kln.refine_essential(*one, loss=kln.GemanMcClure(0.7))
@@ -126,27 +115,25 @@ class TestInexactCameras:
         assert np.mean(free) < 0.8 * np.mean(known)
 
 
-class TestInFront:
-    """Matches that agree with the epipolar geometry but lie behind a camera."""
-
-    def test_do_not_count_in_the_fit(self):
-        points, cameras, E, _ = pair(noise=0.5, outliers=0.0)
-        points1, points2 = (p.clone() for p in points)
-        K1, K2 = cameras
-        F = of_pixels(E, K1, K2)[0]
-        R, t = kln.relative_pose(*(v[None] for v in (F, K1, K2, points1, points2)))
-        # Every fifth match moves along its own epipolar line to the other side of the epipole, half a pixel beside it.
-        epipole = torch.linalg.svd(F)[0][:, 2]
-        epipole = epipole[:2] / epipole[2]
-        moved = slice(None, None, 5)
-        offset = points2[moved] - epipole
-        normal = torch.stack([-offset[:, 1], offset[:, 0]], -1) / offset.norm(dim=-1, keepdim=True)
-        points2[moved] = epipole - 0.3 * offset + 0.7 * normal
-        front = in_front(R, t, *(v[None] for v in (K1, K2, points1, points2)))[0]
-        assert not front[moved].any()
-        found = estimate((points1, points2), cameras)
-        alone = estimate((points1[front], points2[front]), cameras)
-        assert up_to_sign(found.E_mat[None], alone.E_mat[None]) < 2e-3
+def test_matches_behind_a_camera_do_not_count_in_the_fit():
+    """They agree with the epipolar geometry."""
+    points, cameras, E, _ = pair(noise=0.5, outliers=0.0)
+    points1, points2 = (p.clone() for p in points)
+    K1, K2 = cameras
+    F = of_pixels(E, K1, K2)[0]
+    R, t = kln.relative_pose(*(v[None] for v in (F, K1, K2, points1, points2)))
+    # Every fifth match moves along its own epipolar line to the other side of the epipole, half a pixel beside it.
+    epipole = torch.linalg.svd(F)[0][:, 2]
+    epipole = epipole[:2] / epipole[2]
+    moved = slice(None, None, 5)
+    offset = points2[moved] - epipole
+    normal = torch.stack([-offset[:, 1], offset[:, 0]], -1) / offset.norm(dim=-1, keepdim=True)
+    points2[moved] = epipole - 0.3 * offset + 0.7 * normal
+    front = in_front(R, t, *(v[None] for v in (K1, K2, points1, points2)))[0]
+    assert not front[moved].any()
+    found = estimate((points1, points2), cameras)
+    alone = estimate((points1[front], points2[front]), cameras)
+    assert up_to_sign(found.E_mat[None], alone.E_mat[None]) < 2e-3
 
 
 @pytest.mark.parametrize(("distortion", "least", "most"), [(0.005, 0, 1), (0.1, 7, 8)])
@@ -155,9 +142,7 @@ def test_leaves_the_cameras_where_much_of_the_noise_speaks_against_them(distorti
     left = 0
     for seed in range(8):
         points, cameras, _, _ = pair(num_points=800, noise=0.3, outliers=0.2, seed=seed)
-        offsets = [p - K[:2, 2] for p, K in zip(points, cameras, strict=True)]
-        squares = [offset.square().sum(-1, keepdim=True) for offset in offsets]
-        moved = [p + distortion * s / s.max() * o for p, s, o in zip(points, squares, offsets, strict=True)]
+        moved = [distorted(p, K, distortion) for p, K in zip(points, cameras, strict=True)]
         values = torch.linalg.svdvals(cameras[1].mT @ estimate(moved, cameras).F_mat @ cameras[0])
         left += bool(values[1] < 0.9999 * values[0])
     assert least <= left <= most
