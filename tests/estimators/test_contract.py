@@ -20,23 +20,17 @@ from scenes import (
     in_hartley,
     numpy_hartley,
     numpy_whitening,
+    paper,
     scenes,
+    shaken,
     signless,
+    small,
     uniform,
     up_to_sign,
 )
 
 import kornia_learnnorm as kln
-from kornia_learnnorm import (
-    EightPoint,
-    Hartley,
-    Identity,
-    Whitening,
-    find_fundamental,
-    find_homography,
-    optimal_rank2,
-    refine_fundamental,
-)
+from kornia_learnnorm import Hartley, Whitening, find_fundamental, find_homography, optimal_rank2, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import squared_loss
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import transform_fundamental
@@ -207,21 +201,15 @@ EYE = torch.eye(3).expand(2, 3, 3)
 
 
 @pytest.mark.parametrize(
-    "estimate",
+    ("estimate", "least"),
     [
-        find_fundamental,
-        EightPoint(),
-        lambda *points: optimal_rank2(EYE, *points),
-        lambda points1, points2, weights: refine_fundamental(points1, points2, EYE, weights),
+        *((find_fundamental, 8), (kln.EightPoint(), 8), (find_homography, 4)),
+        (lambda *points: optimal_rank2(EYE, *points), 8),
+        (lambda points1, points2, weights: refine_fundamental(points1, points2, EYE, weights), 8),
     ],
-    ids=["find_fundamental", "EightPoint", "optimal_rank2", "refine_fundamental"],
 )
-def test_wrong_correspondences(estimate):
-    check_refuses(estimate)
-
-
-def test_wrong_correspondences_of_a_homography():
-    check_refuses(find_homography, least=4)
+def test_wrong_correspondences(estimate, least):
+    check_refuses(estimate, least)
 
 
 @pytest.mark.parametrize(("F_mat", "error", "message"), WRONG_MATRICES)
@@ -235,10 +223,15 @@ def test_wrong_matrices(F_mat, error, message):
 
 # Each normaliser with its independent computation.
 REFERENCES = {
-    "identity": (Identity(), lambda points, weights=None: np.broadcast_to(np.eye(3), (len(points), 3, 3))),
+    "identity": (kln.Identity(), lambda points, weights=None: np.broadcast_to(np.eye(3), (len(points), 3, 3))),
     "hartley": (Hartley(), numpy_hartley),
     "whitening": (Whitening(), numpy_whitening),
 }
+
+
+def scaling(a, *_):
+    """From a thousandth to a thousand times the size."""
+    return [[10 ** (6 * a), 0], [0, 10 ** (6 * a)]]
 
 
 class TestFindFundamental:
@@ -265,19 +258,31 @@ class TestFindFundamental:
         F_mat = find_fundamental(points1, points2)
         assert hartley_difference(F_mat, expected, points1, points2) < 2e-4  # eigenvectors of A^T A: half of the digits
 
-    @pytest.mark.parametrize("normalizer", [Hartley(), Whitening()])
-    @given(st.integers(0, 2**31), st.sampled_from([8, 15]), st.lists(st.floats(-1, 1), min_size=6, max_size=6))
-    def test_moves_with_similarities_or_affinities(self, normalizer, seed, num_points, entries):
-        points1, points2 = correspondences("handheld", 4, num_points, seed)
-        a, b, c, d, x, y = entries
-        linear = [[a, -b], [b, a]] if isinstance(normalizer, Hartley) else [[a, b], [c, d]]
-        S = torch.eye(3, dtype=torch.float64)
-        S[:2, :2] += 0.45 * torch.tensor(linear, dtype=torch.float64)
-        S[:2, 2] = 500 * torch.tensor([x, y], dtype=torch.float64)
-        moved = points2 @ S[:2, :2].mT + S[:2, 2]
-        F_mat = find_fundamental(points1, points2, normalizer=normalizer)
-        pulled_back = S.mT @ find_fundamental(points1, moved, normalizer=normalizer)
-        assert hartley_difference(F_mat, pulled_back, points1, points2) < 1e-6
+    @pytest.mark.parametrize(
+        ("make", "linear", "bound"),
+        [
+            (Hartley, lambda a, b, c, d: [[1 + a, -b], [b, 1 + a]], 1e-6),
+            (Whitening, lambda a, b, c, d: [[1 + a, b], [c, 1 + d]], 1e-6),
+            (lambda: kln.ReweightedWhitening(2), scaling, 1e-6),
+            (lambda: shaken(small()), scaling, 1e-4),
+            (lambda: shaken(paper().double()), scaling, 1e-6),
+        ],
+    )
+    @given(
+        seed=st.integers(0, 2**31),
+        num_points=st.sampled_from([8, 9, 20]),
+        entries=st.lists(st.tuples(*[st.floats(-0.45, 0.45)] * 6), min_size=2, max_size=2),
+    )
+    @torch.no_grad()
+    def test_moves_with_the_pixels(self, make, linear, bound, seed, num_points, entries):
+        """By a similarity of either view, an affinity, or a scale and a shift, as far as the normaliser follows."""
+        normalizer, points = make(), correspondences("handheld", 4, num_points, seed)
+        S = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
+        for k, (a, b, c, d, x, y) in enumerate(entries):
+            S[k, :2, :2], S[k, :2, 2] = torch.tensor(linear(a, b, c, d)), 1000 * torch.tensor([x, y])
+        moved = [p @ s[:2, :2].mT + s[:2, 2] for p, s in zip(points, S, strict=True)]
+        pulled_back = S[1].mT @ find_fundamental(*moved, normalizer=normalizer) @ S[0]
+        assert hartley_difference(pulled_back, find_fundamental(*points, normalizer=normalizer), *points) < bound
 
 
 @pytest.mark.parametrize("rank2", [None, True])

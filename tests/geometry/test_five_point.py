@@ -2,20 +2,17 @@
 
 import pytest
 import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
 from scenes import scenes, true_essential
 
 from kornia_learnnorm.geometry.five_point import essential_in_span
 
-pytestmark = pytest.mark.numerical
-
 
 def null_spaces(scene):
     """Bases (B, 4, 3, 3) of the matrices that five correspondences allow for."""
-    rays = [
-        torch.linalg.solve(K, torch.cat([p, torch.ones_like(p[..., :1])], -1).mT).mT
-        for p, K in ((scene.points1, scene.K1), (scene.points2, scene.K2))
-    ]
-    rows = (rays[1][..., :, None] * rays[0][..., None, :]).flatten(2)
+    views = (scene.points1, scene.K1), (scene.points2, scene.K2)
+    rays1, rays2 = (torch.linalg.solve(K, convert_points_to_homogeneous(p).mT).mT for p, K in views)
+    rows = (rays2[..., :, None] * rays1[..., None, :]).flatten(2)
     return torch.linalg.svd(rows)[2][:, 5:].unflatten(-1, (3, 3))
 
 

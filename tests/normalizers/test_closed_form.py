@@ -10,14 +10,8 @@ from pairwise import pairwise
 from scenes import SCENES, correspondences, mapped, numpy_hartley, numpy_whitening, uniform
 from torch.autograd import gradcheck
 
-from kornia_learnnorm import Hartley, Identity, PerView, Whitening
+from kornia_learnnorm import Hartley, PerView, Whitening
 from kornia_learnnorm.geometry.transforms import inverse_sqrt
-
-
-def test_identity(device, dtype):
-    for T in Identity()(*(uniform(2, 8, 2, seed=k).to(device, dtype) for k in (0, 1))):
-        assert torch.equal(T.cpu(), torch.eye(3, dtype=dtype).expand(2, 3, 3))
-
 
 CASES = {
     "hartley": (Hartley(), numpy_hartley, 1e-12, 1e-12),

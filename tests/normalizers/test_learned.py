@@ -6,15 +6,12 @@ import json
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
 from scenes import (
     DTYPES,
     correspondences,
     epipolar_distances,
-    hartley_difference,
     last_layer,
     mapped,
     paper,
@@ -101,36 +98,6 @@ class TestForward:
         for value in (*values, *normalizer.parameters()):
             assert torch.isfinite(value.grad).all()
             assert value.grad.count_nonzero() > 0
-
-
-class TestInvariances:
-    """Of the fundamental matrix, where all entries count; see also test_contract.py."""
-
-    @pytest.mark.parametrize(
-        ("make", "tolerance"),
-        [
-            (lambda: shaken(small()), 1e-4),
-            (lambda: shaken(paper().double()), 1e-6),
-            (lambda: kln.ReweightedWhitening(2), 1e-6),
-        ],
-    )
-    @settings(max_examples=10)
-    @given(
-        seed=st.integers(0, 2**31),
-        num_points=st.sampled_from([8, 9, 20]),
-        log_scales=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
-        shifts=st.tuples(*[st.floats(-2e3, 2e3)] * 4),
-    )
-    def test_scale_and_shift_of_either_view(self, make, tolerance, seed, num_points, log_scales, shifts):
-        normalizer, points = make(), correspondences("driving", 3, num_points, seed)
-        S = torch.eye(3).double().repeat(2, 1, 1)
-        S[:, 0, 0] = S[:, 1, 1] = 10 ** torch.tensor(log_scales).double()
-        S[:, :2, 2] = S[:, :1, 0] * torch.tensor(shifts).double().view(2, 2)
-        moved = [p @ s[:2, :2] + s[:2, 2] for p, s in zip(points, S, strict=True)]
-        with torch.no_grad():
-            pulled_back = S[1].mT @ find_fundamental(*moved, normalizer=normalizer) @ S[0]
-            expected = find_fundamental(*points, normalizer=normalizer)
-        assert hartley_difference(pulled_back, expected, *points) < tolerance
 
 
 class TestFiles:

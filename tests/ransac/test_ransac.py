@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.geometry import ransac as kornia_ransac
 from kornia.geometry.linalg import transform_points
-from scenes import epipolar_distances, one_scene, scenes, shaken, uniform, up_to_sign
+from scenes import epipolar_distances, one_scene, shaken, uniform, up_to_sign
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
@@ -309,14 +309,11 @@ class TestHardInput:
     @pytest.mark.parametrize("planes", [1, 2])
     def test_planes(self, planes):
         """Two planes determine the matrix, one does not."""
-        scene = scenes("handheld", 1, 400, noise=0.0, outliers=0.0)
-        points1, K1, K2, R, t = (value[0] for value in (scene.points1, scene.K1, scene.K2, scene.R, scene.t))
-        normals = torch.tensor([[0.02, 0.18, 0.06], [0.01, -0.01, 0.07]], dtype=torch.float64)
-        H = [K2 @ (R + torch.outer(t, normal)) @ torch.linalg.inv(K1) for normal in normals[:planes]]
-        points2 = torch.cat(
-            [transform_points(h[None], x[None])[0] for h, x in zip(H, points1.chunk(planes), strict=True)]
-        )
-        F_mat, inliers = RANSAC(seed=0)(points1, points2)
+        scene = one_scene("handheld", 400, noise=0.0, outliers=0.0)
+        normals = torch.tensor([[0.02, 0.18, 0.06], [0.01, -0.01, 0.07]], dtype=torch.float64)[:planes]
+        H = scene.K2 @ (scene.R + scene.t[:, None] * normals[:, None]) @ torch.linalg.inv(scene.K1)
+        points2 = transform_points(H, torch.stack(scene.points1.chunk(planes))).flatten(0, 1)
+        F_mat, inliers = RANSAC(seed=0)(scene.points1, points2)
         assert F_mat.isfinite().all()
         assert inliers.all()
 

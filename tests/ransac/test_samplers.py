@@ -99,22 +99,22 @@ def test_zero_is_never_drawn(sampler, size, generator):
     assert (rows.sort(-1).values.diff(dim=-1) > 0).all()
 
 
-class TestHitRate:
-    ROWS = torch.arange(100)
+ROWS = torch.arange(100)
 
-    @pytest.mark.parametrize("size", [5, 8])
-    def test_uniform(self, size):
-        assert UniformSampler(100, CPU, size).hit_rate(self.ROWS < 50, self.ROWS) == 0.5**size
 
-    @pytest.mark.parametrize(("best", "share"), [(100, 1), (50, 1), (26, 1), (10, 10 / 26)])
-    def test_prosac_looks_at_the_best_but_not_at_few(self, best, share):
-        sampler = ProsacSampler(torch.linspace(1, 0.1, 100))
-        assert sampler.hit_rate(best > self.ROWS, self.ROWS) == pytest.approx(share**8)
+@pytest.mark.parametrize(
+    ("sampler", "inliers", "expected"),
+    [
+        *((UniformSampler(100, CPU, size), ROWS < 50, 0.5**size) for size in (5, 8)),
+        *((ProsacSampler(torch.linspace(1, 0.1, 100)), best > ROWS, 1) for best in (100, 50, 26)),
+        (ProsacSampler(torch.linspace(1, 0.1, 100)), ROWS < 10, (10 / 26) ** 8),  # it looks at the best but not at few
+        (WeightedSampler(torch.where(ROWS < 10, 9.0, 1.0)), ROWS < 10, 0.5**8),
+    ],
+)
+def test_hit_rate(sampler, inliers, expected):
+    assert sampler.hit_rate(inliers, ROWS) == pytest.approx(expected)
 
-    def test_prosac_does_not_see_what_it_never_draws(self):
-        sampler, inliers = ProsacSampler(torch.cat([torch.ones(100), torch.zeros(2000)])), torch.arange(2100) < 100
-        assert [sampler.hit_rate(inliers[rows], rows) for rows in (slice(None), slice(100, None))] == [1, 0]
 
-    def test_weighted(self):
-        weights = torch.where(self.ROWS < 10, 9.0, 1.0)
-        assert WeightedSampler(weights).hit_rate(self.ROWS < 10, self.ROWS) == pytest.approx(0.5**8)
+def test_hit_rate_of_prosac_does_not_see_what_it_never_draws():
+    sampler, inliers = ProsacSampler(torch.cat([torch.ones(100), torch.zeros(2000)])), torch.arange(2100) < 100
+    assert [sampler.hit_rate(inliers[rows], rows) for rows in (slice(None), slice(100, None))] == [1, 0]
