@@ -131,14 +131,12 @@ def test_samples_find_the_matrix_where_the_weights_do_not(kind):
     assert (errors[1] < errors[0] / 4).double().mean() >= 0.8
 
 
-@pytest.mark.parametrize("kind", ["fundamental", "pose"])
+@every
 def test_sets_of_few_outliers_leave_stages_out(kind):
     """A set that needs its stages, in the same batch, changes nothing but the time."""
-    layer, calls = CLASSES[kind].from_pretrained(), []
+    layer, calls, points = CLASSES[kind].from_pretrained(), [], inputs(kind, 3, 200)
     for network in layer.networks:
         network.register_forward_hook(lambda *_: calls.append(1))
-    scene = scenes("handheld", 3, 200, noise=0.5)
-    points = (scene.points1, scene.points2) + ((scene.K1, scene.K2) if kind == "pose" else ())
     points[1][2, :120] = uniform(120, 2, high=400.0)
     layer(*points)
     alone, numbers = [], [len(calls)]
