@@ -9,7 +9,7 @@ from kornia_learnnorm import find_fundamental
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import Truncated, squared_loss
 from kornia_learnnorm.geometry.constrained_fit import constrained_fit
-from kornia_learnnorm.geometry.distances import sampson_scale, symmetric_scale
+from kornia_learnnorm.geometry.distances import DISTANCE_SCALES
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import PairScorer
 
@@ -17,9 +17,6 @@ from kornia_learnnorm.ransac.scoring import PairScorer
 @pytest.fixture(params=["driving", "handheld", "orbit"])
 def scene(request):
     return scenes(request.param, 1, 200, noise=0.5, outliers=0.2)
-
-
-NAMES = {sampson_scale: "sampson", symmetric_scale: "symmetric"}
 
 
 def begin(scene, number: int = 3):
@@ -31,15 +28,15 @@ def begin(scene, number: int = 3):
     return scorer, scorer.from_pixels(find_fundamental(*(p[rows] for p in points)))
 
 
-@pytest.mark.parametrize("factor", [sampson_scale, symmetric_scale])
+@pytest.mark.parametrize(("kind", "factor"), DISTANCE_SCALES.items())
 class TestSteps:
-    def test_ends_at_the_optimum(self, scene, factor):
+    def test_ends_at_the_optimum(self, scene, kind, factor):
         """From there Levenberg-Marquardt does not lower the cost."""
         scorer, F0 = begin(scene, 8)
         loss = Truncated(2.0)
         fit = constrained_fit(scorer.x1, scorer.x2, F0, 40 * [loss], factor)
         start = scorer.to_pixels(fit.F_mat)
-        refined = refine_fundamental(*scene[:2], start, None, NAMES[factor], loss, tolerance=1e-5)
+        refined = refine_fundamental(*scene[:2], start, None, kind, loss, tolerance=1e-5)
         np.testing.assert_allclose(refined.cost_before, refined.cost, rtol=1e-6)
         np.testing.assert_allclose(fit.cost, refined.cost, rtol=1e-6)
         values = torch.linalg.svdvals(fit.F_mat)
@@ -48,7 +45,7 @@ class TestSteps:
         assert fit.gain.max() < 1e-10
 
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
-    def test_gain(self, name, factor):
+    def test_gain(self, name, kind, factor):
         """Close to the optimum of least squares a step is to take away what is there above it."""
         scorer, F0 = begin(scenes(name, 1, 200, noise=0.5), 8)
         near, optimum = (constrained_fit(scorer.x1, scorer.x2, F0, n * [squared_loss], factor) for n in (4, 30))
@@ -56,7 +53,7 @@ class TestSteps:
 
 
 class TestResults:
-    @pytest.mark.parametrize("factor", [sampson_scale, symmetric_scale])
+    @pytest.mark.parametrize("factor", DISTANCE_SCALES.values())
     def test_a_point_on_the_epipole_does_not_outweigh_the_others(self, factor):
         epipole = torch.full((2,), 300.0, dtype=torch.float64)
         points1 = uniform(200, 2, high=600)

@@ -104,11 +104,6 @@ def test_float32_is_solved_in_float64(name):
     torch.testing.assert_close(normalizer(*points), expected, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("name", CLOSED_FORM)
-def test_has_no_state(name):
-    assert not ALL[name]().state_dict()
-
-
 @pairwise(
     name=["hartley", "whitening"],
     num_points=[8, 9, 100],
