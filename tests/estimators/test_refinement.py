@@ -268,8 +268,7 @@ class TestGradients:
             found = refine_fundamental(*values, F0, max_iterations=60)
             assert found.converged.all()
             gradients.append([g.sum(0) for g in torch.autograd.grad(signless(found.F_mat).sum(), values)])
-        for one, many in zip(*gradients, strict=True):
-            torch.testing.assert_close(one, many, rtol=1e-4, atol=1e-8)
+        torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-8)
 
     def test_without_gradients_the_result_is_the_same(self):
         points1, points2 = correspondences("orbit", 5, 12)
