@@ -14,7 +14,7 @@ from kornia_learnnorm.estimators.linear import essential_matrix, prepare_problem
 from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
-from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, run_stages
+from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, in_pieces, run_stages
 from kornia_learnnorm.geometry.checks import (
     check_cameras,
     check_tensor,
@@ -141,8 +141,8 @@ class LearnedLayer(MatchLayer):
         def solve(problem: LinearProblem, rows: Tensor | None) -> tuple[Tensor, ...]:
             given = scores if scores is None or rows is None else scores[rows]
             with inference_mode():
-                found = self._run(problem, given)
-            return found if torch.is_grad_enabled() else tuple(map(Tensor.clone, found))
+                pieces = [self._run(*piece) for piece in in_pieces(problem, given)]
+            return tuple(map(torch.cat, zip(*pieces, strict=True)))
 
         def solve_rest(problem: LinearProblem) -> tuple[Tensor, ...]:
             number = self.stages if self.detach_stages else self.stages + 1

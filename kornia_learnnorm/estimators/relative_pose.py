@@ -16,6 +16,7 @@ from kornia_learnnorm.estimators.pose_stages import (
     POSE_RESIDUAL_FEATURES,
     run_pose_stages,
 )
+from kornia_learnnorm.estimators.stages import in_pieces
 from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, inference_mode, is_known_true
 from kornia_learnnorm.geometry.dlt import MIN_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
@@ -236,7 +237,12 @@ class LearnedRelativePose(LearnedLayer):
         settle = self.samples > 0 and not (self.training or self.detach_stages)
         options = self.refine_steps, self.samples, self.detach_stages, settle
         with inference_mode():
-            states, logits = run_pose_stages(self.networks, solved, C1, C2, scores, *options)
+            pieces = [
+                run_pose_stages(self.networks, part, part_C1, part_C2, part_scores, *options)
+                for part, part_C1, part_C2, part_scores in in_pieces(solved, C1, C2, scores)
+            ]
+        all_states, all_logits = zip(*pieces, strict=True)
+        states = [Calibrated(*map(torch.cat, zip(*stage, strict=True))) for stage in zip(*all_states, strict=True)]
         preferred = eye.new_tensor(self.model.preferred).view(1, 3, 3)
         sideways = Essential(eye[None], eye[None]).calibrated(preferred)
         states = [
@@ -246,7 +252,7 @@ class LearnedRelativePose(LearnedLayer):
             )
             for state in states
         ]
-        logits = [torch.where(rows, logit, 0.0) for logit in logits]
+        logits = [torch.where(rows, torch.cat(stage), 0.0) for stage in zip(*all_logits, strict=True)]
         return problem, (K1, K2), determined, gap, states, logits
 
 

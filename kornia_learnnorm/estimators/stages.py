@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -17,7 +18,7 @@ from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform
 from kornia_learnnorm.models.contract import TwoViewModel
 
-__all__ = ["TRANSFORM_PARAMS", "Refinement", "few_outliers", "run_stages"]
+__all__ = ["TRANSFORM_PARAMS", "Refinement", "few_outliers", "in_pieces", "run_stages"]
 
 EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
 MAX_MINIMAL_DISTANCE = 0.01  # of the frame's unit; quadratic mean that the best fit of `min_points` inliers leaves
@@ -25,6 +26,7 @@ MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
 MIN_SETTLED, SETTLED = 16, 0.7  # matches, and their mean probability, from which on the first stage is enough
 TRANSFORM_PARAMS = 5  # of each view's SPD transform
+MAX_MATCHES = 8192  # at once, whose features fit into a processor's cache
 
 
 def run_stages(
@@ -76,6 +78,16 @@ def run_stages(
     matrices, all_logits = zip(*found, strict=True)
     T = frame.T[:, None]
     return unit_matrix(model.carry(torch.stack(matrices, 1), T, T)), torch.stack(all_logits, 1)
+
+
+def in_pieces(problem: LinearProblem, *values: Tensor | None) -> list[tuple[Any, ...]]:
+    """Return a problem and values of its sets in pieces that a processor is fast on; in one piece with gradients."""
+    number, size = problem.x1.shape[0], max(1, MAX_MATCHES // max(1, problem.x1.shape[1]))
+    whole = torch.is_grad_enabled() or torch.compiler.is_compiling() or problem.x1.device.type != "cpu"
+    if whole or number <= size:
+        return [(problem, *values)]
+    pieces = [slice(start, start + size) for start in range(0, number, size)]
+    return [(problem.select(rows), *[None if v is None else v[rows] for v in values]) for rows in pieces]
 
 
 def _solve_weighted(

@@ -101,8 +101,8 @@ class LinearProblem:
         x1, x2 = (torch.stack([T1, T2]) @ rows).mT
         return self._solve_between(x1, x2)[:2]
 
-    def select(self, rows: Tensor) -> Self:
-        """Return the problem of some of the sets, by their indices or a mask (B,); solved if this one is."""
+    def select(self, rows: Tensor | slice) -> Self:
+        """Return the problem of some of the sets, by their indices, a mask (B,) or a slice; solved if this one is."""
         return self._map(lambda value: value[rows])
 
     def detach(self, rows: Tensor) -> Self:

@@ -56,3 +56,17 @@ def test_vmap_without_gradient_agrees():
     with torch.no_grad():
         found = torch.vmap(lambda *points: layer(*(p[None] for p in points))[0])(points1, points2)
         torch.testing.assert_close(found, layer(points1, points2))
+
+
+@pytest.mark.parametrize("name", ["fundamental", "essential", "homography"])
+def test_large_batches_are_those_in_pieces(name, monkeypatch):
+    layer, given = LAYERS[name](), inputs(name)
+    points = [p.repeat(5, 1, 1) for p in given[:2]]
+    scores = torch.linspace(0, 1, 40).expand(10, -1)
+    with torch.no_grad():
+        expected = layer.estimate(*points, *given[2:], scores=scores)
+        monkeypatch.setattr("kornia_learnnorm.estimators.stages.MAX_MATCHES", 120)
+        found = layer.estimate(*points, *given[2:], scores=scores)
+    for value, other in zip(pytree.tree_leaves(found), pytree.tree_leaves(expected), strict=True):
+        if other is not None:
+            torch.testing.assert_close(value, other)
