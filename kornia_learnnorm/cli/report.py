@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from kornia_learnnorm.cli.evaluate import add_json_argument, json_tables
-from kornia_learnnorm.evaluation.report.pages import print_summary, print_tables, write_report
+from kornia_learnnorm.evaluation.report.pages import print_tables, write_report
 
 EXAMPLES = """\
 learnnorm evaluate store.h5 --out run && learnnorm report run
@@ -24,7 +24,8 @@ def run(args: argparse.Namespace) -> int:
         report = write_report(args.folder)
         tables += report.tables
         if args.json != "-":
-            print_summary(report.summary)
+            for text in report.summary:
+                print(text.replace("**", "").replace("`", ""), end="\n\n")
             print_tables(report.tables, args.folder / "report.html")
     if report.missing:
         print(f"not there yet, so left out: {'; '.join(report.missing)}", file=sys.stderr)

@@ -154,7 +154,7 @@ def _accuracy(cell: RunCell) -> Table:
         row += numbers.pose_numbers(*(angle.nan_to_num(math.inf)[posed] for angle in angles))
         row += [median_number(p[key], ".4g") for key in ("condition_number", "rho", "distance1", "distance2")]
         rows.append([*row, median_number(100 * p["rank2_share"], "z.0f")])
-    truth = int(_with_truth(cell).sum())
+    truth = int((~cell.predictions[BASELINE]["truth"].isnan()).sum())
     known = "without truth"
     if truth:
         known = f"of which {truth} have ground-truth inliers and {int(posed.sum())} a ground-truth pose"
@@ -197,11 +197,6 @@ def _consensus(cell: RunCell, run: Run) -> Table:
     return Table(f"Inliers{' and F1' * truth}: {cell.title}", text, header, rows)
 
 
-def _with_truth(cell: RunCell) -> Tensor:
-    """Return a mask of the samples whose pair has ground-truth inliers, (S,)."""
-    return ~cell.predictions[BASELINE]["truth"].isnan()
-
-
 def _tests(cell: RunCell) -> Table:
     quantities, baseline = {"own": "fit", "heldout": "held out", "truth": "truth"}, cell.predictions[BASELINE]
     header = ["method", *(f"{name}: change %, p" for name in quantities.values())]
@@ -211,7 +206,7 @@ def _tests(cell: RunCell) -> Table:
             logs = ([q[key].clamp(min=numbers.MIN_DISTANCE).log() for key in quantities] for q in (p, baseline))
             both = zip(*logs, strict=True)
             rows.append([name, *(numbers.paired_change(a, b, cell.pair, logarithms=True) for a, b in both)])
-    truth = cell.pair[_with_truth(cell)]
+    truth = cell.pair[~baseline["truth"].isnan()]
     used, known = (f"{len(pair)} samples of {len(torch.unique(pair))} pairs" for pair in (cell.pair, truth))
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "

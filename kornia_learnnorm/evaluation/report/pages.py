@@ -143,12 +143,6 @@ def _anchor(title: str) -> str:
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
-def print_summary(summary: Sequence[str]) -> None:
-    """Print a summary as plain text."""
-    for text in summary:
-        print(text.replace("**", "").replace("`", ""), end="\n\n")
-
-
 def print_tables(tables: Sequence[Table], elsewhere: Path) -> None:
     """Print the tables that fit the terminal, and the titles of those that do not, which are in ``elsewhere``."""
     columns, wide = shutil.get_terminal_size().columns, []
