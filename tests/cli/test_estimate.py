@@ -88,9 +88,6 @@ class TestOnePair:
         assert (content["model"], content["warnings"]) == ("homography", [])
         true = K @ (R + np.outer(t, [0, 0, 1]) / 4) @ np.linalg.inv(K)
         assert np.allclose(content["H"], true / np.linalg.norm(true), atol=2e-3)
-        assert np.allclose(content["R"], R, atol=0.02)
-        assert np.dot(content["t"], t / np.linalg.norm(t)) > np.cos(np.radians(5))
-        assert content["n"][2] > np.cos(np.radians(5))
         assert cv2.imread("pair.png").shape[1] == 1200
 
     def test_mask_camera_and_json_to_standard_output(self, command, result, capsys):

@@ -121,11 +121,6 @@ class TestEstimateMatches:
         found = kln.estimate_matches(*matches, K1=SCENE.K1[0], K2=SCENE.K2[0])
         assert (found.R, found.t, found.front, codes(found)) == (None, None, None, ["no_pose"])
 
-    def test_the_learned_layer(self, matches):
-        found = kln.estimate_matches(*matches, layer=TINY)
-        assert found.estimator == "LearnedEightPoint"
-        assert found.weights[found.inliers].mean() > found.weights[~found.inliers].mean() + 0.3
-
     def test_order_has_no_effect(self, matches):
         scores, order = uniform(200, seed=1), torch.randperm(200, generator=seeded(2))
         first, second = (kln.estimate_matches(*(x[o] for x in (*matches, scores))) for o in (slice(None), order))
