@@ -41,7 +41,7 @@ def find_camera_doubt(
     misfit, log_chance = camera_misfit(points1, points2, F_mat, threshold, cameras)
     if misfit < MIN_MISFIT * float(points2.max()) or log_chance > MAX_LOG_CHANCE:
         return ()
-    text = f"the matches contradict K1 and K2, which add {misfit:.2f} px to their distances"
+    text = f"the matches contradict K1 and K2, which add {misfit:.2f} px to their epipolar distances"
     return (PairWarning("cameras", text),)
 
 
