@@ -14,7 +14,7 @@ from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.reliability import MEDIAN_SQUARE, MIN_NOISE, PairWarning
 
-MIN_MISFIT = 8e-5  # of the longer image side; the distortion of photographs that are called undistorted adds up to 7e-5
+MIN_MISFIT = 5e-5  # of the longer image side; lenses of photographs that are called undistorted add up to 3e-5
 MAX_LOG_CHANCE = -3.0  # log10 of the probability that noise alone adds as much
 MAX_OFFSET = 0.2  # of both sides of an image; a principal point is closer to the centre
 
@@ -56,18 +56,23 @@ def camera_misfit(
 ) -> tuple[float, float]:
     """Return the root mean square distance that cameras add to matches (N, 2), pixels, and log10 of its probability.
 
-    It is that between the essential and the fundamental matrix next to F_mat (3, 3), over the inliers. Noise alone
-    makes the likelihood ratio of both twice an F-distributed number of 2, for as many more parameters, and :math:`m`
-    degrees of freedom: it is above :math:`2x` with probability :math:`(1 + 2x / m)^{-m / 2}`.
+    It is the difference between the essential matrix next to F_mat (3, 3) and the fundamental matrix next to it. Only
+    matches that agree with the cameras count, and the median must grow as much as the mean: false matches may agree on
+    another matrix. Noise alone makes the likelihood ratio of both matrices twice an F-distributed number of 2, for as
+    many more parameters, and :math:`m` degrees of freedom: it is above :math:`2x` with probability
+    :math:`(1 + 2x / m)^{-m / 2}`.
     """
     x1, x2, loss = points1[None], points2[None], GemanMcClure(FINAL_LOSS_SCALE * threshold)
-    free = refine_fundamental(x1, x2, F_mat[None], loss=loss)
-    tied = refine_essential(x1, x2, (cameras[1].mT @ F_mat @ cameras[0])[None], *cameras, loss=loss)
-    squares = sampson_distance(x1, x2, free.F_mat)[0].square()
-    inlying = squares[squares < threshold**2]
-    freedom = len(inlying) - Fundamental.dof
-    if freedom < 1:
+    E_mat = (cameras[1].mT @ F_mat @ cameras[0])[None]
+    near = sampson_distance(x1, x2, refine_essential(x1, x2, E_mat, *cameras, loss=loss).F_mat)[0] < threshold
+    freedom = int(near.sum()) - Fundamental.dof
+    if freedom < 2:
         return 0.0, 0.0
+    x1, x2 = x1[:, near], x2[:, near]
+    tied = refine_essential(x1, x2, E_mat, *cameras, loss=loss)
+    free = refine_fundamental(x1, x2, tied.F_mat, loss=loss)
+    median1, median2 = (float(sampson_distance(x1, x2, F)[0].square().median()) for F in (tied.F_mat, free.F_mat))
     added = max(0.0, float(tied.cost - free.cost)) / freedom
-    noise = max(float(inlying.median()) / MEDIAN_SQUARE, (MIN_NOISE * threshold) ** 2)
-    return math.sqrt(added), -freedom / 2 * math.log10(1 + added / noise)
+    noise = max(median2 / MEDIAN_SQUARE, (MIN_NOISE * threshold) ** 2)
+    misfit = min(added, max(0.0, median1 - median2) / MEDIAN_SQUARE)
+    return math.sqrt(misfit), -freedom / 2 * math.log10(1 + added / noise)
