@@ -16,6 +16,7 @@ from kornia_learnnorm.two_view.reliability import MEDIAN_SQUARE, MIN_NOISE, Pair
 
 MIN_MISFIT = 5e-5  # of the longer image side; lenses of photographs that are called undistorted add up to 3e-5
 MAX_LOG_CHANCE = -3.0  # log10 of the probability that noise alone adds as much
+CONTRADICTION = "the matches contradict K1 and K2"
 MAX_OFFSET = 0.2  # of both sides of an image; a principal point is closer to the centre
 
 
@@ -41,8 +42,12 @@ def find_camera_doubt(
     misfit, log_chance = camera_misfit(points1, points2, F_mat, threshold, cameras)
     if misfit < MIN_MISFIT * float(points2.max()) or log_chance > MAX_LOG_CHANCE:
         return ()
-    text = f"the matches contradict K1 and K2, which add {misfit:.2f} px to their epipolar distances"
-    return (PairWarning("cameras", text),)
+    return (PairWarning("cameras", f"{CONTRADICTION}, which add {misfit:.2f} px to their epipolar distances"),)
+
+
+def drop_contradiction(warnings: tuple[PairWarning, ...]) -> tuple[PairWarning, ...]:
+    """Return the warnings without that of matches that contradict their cameras."""
+    return tuple(warning for warning in warnings if not warning.text.startswith(CONTRADICTION))
 
 
 def is_of_other_size(K: Tensor, size: Size) -> bool:

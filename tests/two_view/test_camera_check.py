@@ -8,7 +8,12 @@ from scenes import seeded
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
-from kornia_learnnorm.two_view.camera_check import camera_misfit, find_camera_doubt, is_of_other_size
+from kornia_learnnorm.two_view.camera_check import (
+    camera_misfit,
+    drop_contradiction,
+    find_camera_doubt,
+    is_of_other_size,
+)
 
 SCENE = handheld(1, 300, seeded(), noise=0.3)
 K, F_MAT, POINTS = SCENE.K1[0], SCENE.F_mat[0], (SCENE.points1[0], SCENE.points2[0])
@@ -34,6 +39,7 @@ def test_warnings_of_an_estimate(camera, text):
     warned = [warning.text for warning in found.warnings if warning.code == "cameras"]
     assert len(warned) == (text is not None)
     assert text is None or text in warned[0]
+    assert len(drop_contradiction(found.warnings)) == len(found.warnings) - ("contradict" in str(text))
 
 
 @pytest.mark.parametrize(
