@@ -92,7 +92,8 @@ def estimate_matches(
     else:
         fields, error, doubts = _answer_fundamental(solver, cast(Solution, found), size1, size2)
     if cameras is not None:
-        doubts += find_camera_doubt(cameras, given, points1, points2, F_mat, threshold)
+        posed = fields["F_mat"] if "E_mat" in fields else None
+        doubts += find_camera_doubt(cameras, given, points1, points2, posed, threshold)
     elif choice.model == "fundamental" and choice.parallax is not None and choice.parallax.planar:
         doubts += (PairWarning("planar", choice.parallax.describe(threshold)),)
     about = points1, points2, fields["inliers"], threshold, size2, error.angle
