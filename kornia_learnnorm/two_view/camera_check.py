@@ -30,7 +30,7 @@ def find_camera_doubt(
 ) -> tuple[PairWarning, ...]:
     """Return at most one warning: of a camera that is not of its image's size, or that matches (N, 2) contradict.
 
-    Sizes are None where they are not known, F_mat (3, 3) where there is no pose.
+    Sizes are None where they are not known, F_mat (3, 3) where the matches may be those of a plane.
     """
     for name, K, size in zip(("K1", "K2"), cameras, sizes, strict=True):
         if size is not None and is_of_other_size(K, size):

@@ -91,10 +91,10 @@ def estimate_matches(
         fields, error, doubts = _answer_homography(solver, cast(Tensor, H_mat), F_mat)
     else:
         fields, error, doubts = _answer_fundamental(solver, cast(Solution, found), size1, size2)
-    if cameras is not None:
-        posed = fields["F_mat"] if "E_mat" in fields else None
-        doubts += find_camera_doubt(cameras, given, points1, points2, posed, threshold)
-    elif choice.model == "fundamental" and choice.parallax is not None and choice.parallax.planar:
+    relief = choice.model == "fundamental" and choice.parallax is not None and not choice.parallax.planar
+    if cameras is not None:  # a plane contradicts no cameras
+        doubts += find_camera_doubt(cameras, given, points1, points2, F_mat if relief else None, threshold)
+    elif choice.model == "fundamental" and choice.parallax is not None and not relief:
         doubts += (PairWarning("planar", choice.parallax.describe(threshold)),)
     about = points1, points2, fields["inliers"], threshold, size2, error.angle
     return PairEstimate(
