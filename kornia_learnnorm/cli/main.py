@@ -75,7 +75,11 @@ def main(args: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if args is None else args)
     try:
         try:
-            return _run(words)
+            if not words or words[0] not in TRAINING:
+                return _run_tool(words)
+            if {"-h", "--help"} & {*words}:
+                return _run_tool([words[0], "--help"])
+            return _run_training(words)
         finally:
             sys.stdout.flush()  # what is not written yet fails here instead of when Python ends
     except KeyboardInterrupt:
@@ -87,14 +91,6 @@ def main(args: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError) as error:
         print(f"learnnorm {words[0]}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-
-
-def _run(words: list[str]) -> int:
-    if not words or words[0] not in TRAINING:
-        return _run_tool(words)
-    if {"-h", "--help"} & {*words}:
-        return _run_tool([words[0], "--help"])
-    return _run_training(words)
 
 
 def make_parser(names: Collection[str] = (*TRAINING, *TOOLS)) -> argparse.ArgumentParser:
