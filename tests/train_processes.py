@@ -1,7 +1,4 @@
-"""Train on one or several processes and write what came of it.
-
-python -m torch.distributed.run --nproc-per-node=PROCESSES train_processes.py PROCESSES FOLDER CASE...
-"""
+"""Train on this process, or on those of ``torchrun --nproc-per-node=N train_processes.py N FOLDER CASE...``."""
 
 import contextlib
 import json
