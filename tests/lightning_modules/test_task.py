@@ -167,7 +167,7 @@ def test_a_training_without_an_end_has_no_cycle(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("estimator", "kind"), [(kln.Hartley(), "learned layer"), (kln.EightPoint(), "LearnedNormalizer")]
+    ("estimator", "kind"), [(kln.Hartley(), "LearnedLayer"), (kln.EightPoint(), "LearnedNormalizer")]
 )
 def test_estimators_that_learn_nothing_are_refused(estimator, kind):
     with pytest.raises(TypeError, match=f"expected a {kind} .*, got Hartley"):
