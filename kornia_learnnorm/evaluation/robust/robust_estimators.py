@@ -177,7 +177,13 @@ def identify_estimator(name: str) -> str:
 
 def estimator_names(names: Sequence[str]) -> dict[str, str]:
     """Return short names of estimators for tables and files; raise ValueError if two are equal."""
-    return names_of(names, lambda name: "".join((_split(name)[0], short_name_of(_split(name)[1]))), "estimators")
+
+    def shorten(name: str) -> str:
+        kind, method = _split(name)
+        weights = _weights_of(method)
+        return kind + short_name_of(weights) + method.removeprefix(weights)
+
+    return names_of(names, shorten, "estimators")
 
 
 def _weights_of(method: str) -> str:
