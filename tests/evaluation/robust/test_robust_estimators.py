@@ -106,8 +106,14 @@ def test_unknown(name, error, message):
 
 def test_names(tmp_path):
     path = str(tmp_path / "mine" / "weights.safetensors")
-    names = [f"learned:{path}", f"learned:{path}+scores", f"RANSAC:{path}", "RANSAC", "poselib", "RANSAC:kornia_learnnorm:Whitening"]
-    short = ["learned:mine", "learned:mine+scores", "RANSAC:mine", "RANSAC", "poselib", "RANSAC:kornia_learnnorm:Whitening"]
+    names = [
+        f"learned:{path}",
+        f"learned:{path}+scores",
+        f"RANSAC:{path}",
+        "poselib",
+        "RANSAC:kornia_learnnorm:Whitening",
+    ]
+    short = ["learned:mine", "learned:mine+scores", "RANSAC:mine", "poselib", "RANSAC:kornia_learnnorm:Whitening"]
     assert [*robust_estimators.estimator_names(names).values()] == short
     with pytest.raises(ValueError, match="same name"):
         robust_estimators.estimator_names(["RANSAC", "RANSAC"])
