@@ -86,7 +86,7 @@ test-cpus: $(VENV)/.ready
 			--hypothesis-profile few -m "numerical and not slow and not long" || exit 1; \
 	done
 
-CORE_TESTS = tests/geometry tests/models tests/normalizers tests/estimators tests/ransac tests/metrics tests/test_losses.py tests/test_files.py
+CORE_TESTS = tests/geometry tests/models tests/normalizers tests/estimators tests/ransac tests/metrics tests/test_training_losses.py tests/test_files.py
 
 # Only what the core requires is installed: no filters for warnings of the extras, and no stores to read.
 test-oldest: export OMP_NUM_THREADS = 1

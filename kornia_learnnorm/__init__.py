@@ -23,7 +23,6 @@ from kornia_learnnorm.geometry.distances import (
 )
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.rank2 import optimal_rank2
-from kornia_learnnorm.losses import BoundedEpipolarLoss, EpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.normalizers.networks.crossview import CrossViewNetwork
@@ -31,6 +30,13 @@ from kornia_learnnorm.normalizers.networks.paper import PaperNetwork
 from kornia_learnnorm.normalizers.normalizer import PerView
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.ransac.ransac import RANSAC
+from kornia_learnnorm.training_losses import (
+    BoundedEpipolarLoss,
+    EpipolarLoss,
+    InlierLoss,
+    LogEpipolarLoss,
+    LogEssentialLoss,
+)
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
 from kornia_learnnorm.two_view.result import NoReliableMatrixError

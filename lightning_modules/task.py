@@ -18,10 +18,10 @@ from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
 from kornia_learnnorm.metrics.statistics import comparable
 from kornia_learnnorm.normalizers.closed_form import Hartley, Whitening
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
+from kornia_learnnorm.training_losses import BoundedEpipolarLoss, InlierLoss, LogEpipolarLoss, LogEssentialLoss
 
 __all__ = ["EstimatorTask", "Median", "SetLoss", "adamw", "cameras_of"]
 
