@@ -17,7 +17,6 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental, transfor
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
-from kornia_learnnorm.two_view.camera_check import drop_contradiction
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
 from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, check_whole, read_cameras
 from kornia_learnnorm.two_view.repeated_texture import mutual_share, resolve_ambiguity
@@ -128,7 +127,6 @@ class MatchedPair:
         if first.model == "fundamental":
             unique = mutual_share(self.points1, self.points2, self.mutual, first.matrix, threshold)
         if unique < MIN_MUTUAL_SHARE:
-            first = replace(first, warnings=drop_contradiction(first.warnings))  # it may be that of false matches
             false = self.points1[~self.mutual], self.points2[~self.mutual]
             matches = first.points1, first.points2, first.scores
             found = resolve_ambiguity(first, *false, lambda kept: solve("fundamental", *(x[kept] for x in matches)))

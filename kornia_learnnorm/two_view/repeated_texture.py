@@ -15,6 +15,7 @@ from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
+from kornia_learnnorm.two_view.camera_check import drop_contradiction
 from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX, find_main_plane, parallax, parallax_evidence
 from kornia_learnnorm.two_view.reliability import MIN_INLIERS, PairWarning
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
@@ -60,6 +61,13 @@ def resolve_ambiguity(
     plane = find_main_plane(*matches, first.threshold)
     if plane is None:
         return _with_doubt(first, "few matches move like their neighbours")
+    kept = drop_contradiction(first.warnings)
+    if kept != first.warnings:  # false matches may contradict cameras that the coherent ones do not
+        with suppress(NoReliableMatrixError):
+            without_false = again(coherent).warnings
+            first = replace(
+                first, warnings=kept if drop_contradiction(without_false) == without_false else first.warnings
+            )
 
     def fitting(F_mat: Tensor) -> list[float]:  # shares of the false and of the coherent matches off the plane
         return [fitting_share(*x, plane, F_mat, first.threshold) for x in ((false1, false2), matches)]
