@@ -64,10 +64,9 @@ def resolve_ambiguity(
     kept = drop_contradiction(first.warnings)
     if kept != first.warnings:  # false matches may contradict cameras that the coherent ones do not
         with suppress(NoReliableMatrixError):
-            without_false = again(coherent).warnings
-            first = replace(
-                first, warnings=kept if drop_contradiction(without_false) == without_false else first.warnings
-            )
+            doubts = again(coherent).warnings
+            if drop_contradiction(doubts) == doubts:
+                first = replace(first, warnings=kept)
 
     def fitting(F_mat: Tensor) -> list[float]:  # shares of the false and of the coherent matches off the plane
         return [fitting_share(*x, plane, F_mat, first.threshold) for x in ((false1, false2), matches)]
