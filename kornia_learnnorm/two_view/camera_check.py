@@ -12,7 +12,8 @@ from kornia_learnnorm.geometry.distances import sampson_distance
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.two_view.inputs import Cameras
-from kornia_learnnorm.two_view.reliability import MEDIAN_SQUARE, MIN_NOISE, PairWarning
+from kornia_learnnorm.two_view.pair_warnings import PairWarning
+from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
 
 MIN_MISFIT = 5e-5  # of the longer image side; lenses of photographs that are called undistorted add up to 3e-5
 MAX_LOG_CHANCE = -3.0  # log10 of the probability that noise alone adds as much

@@ -28,7 +28,7 @@ from kornia_learnnorm.protocol import RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.two_view.inputs import check_settings, read_cameras
-from kornia_learnnorm.two_view.reliability import MAX_LOG_FALSE_ALARMS, log_false_alarms
+from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms
 from kornia_learnnorm.two_view.solver import MIN_SCORE
 
 CORNER = 0.5  # pixels from the corner of the first pixel to its centre

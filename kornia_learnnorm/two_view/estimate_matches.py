@@ -18,12 +18,13 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
-from kornia_learnnorm.two_view import reliability
+from kornia_learnnorm.two_view import predicted_error
 from kornia_learnnorm.two_view.camera_check import find_camera_doubt
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.model_choice import choose_model
+from kornia_learnnorm.two_view.pair_warnings import PairWarning, find_warnings
 from kornia_learnnorm.two_view.plane_pose import angle_between, plane_poses
-from kornia_learnnorm.two_view.reliability import CAMERA_ERROR, PairWarning, PredictedError
+from kornia_learnnorm.two_view.predicted_error import CAMERA_ERROR, PredictedError
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
@@ -106,7 +107,7 @@ def estimate_matches(
         points2=points2,
         scores=scores,
         predicted_error=min(math.hypot(error.distance, CAMERA_ERROR * max(size2)), float(max(size2))),
-        warnings=(*reliability.find_warnings(*about), *doubts),
+        warnings=(*find_warnings(*about), *doubts),
         size1=size1,
         size2=size2,
         ratio=None,
@@ -133,8 +134,8 @@ def _usable(points1: Tensor, points2: Tensor, scores: Tensor, threshold: float) 
 
 def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, size2: Size) -> Answer:
     F_mat, inliers, matches = found.matrix, solver.inliers(found.matrix), (solver.points1, solver.points2)
-    cameras = solver.cameras or (reliability.nominal_camera(size1), reliability.nominal_camera(size2))
-    error = reliability.predict_error(found.parts, found.part_size, *matches, F_mat, inliers, *cameras)
+    cameras = solver.cameras or (predicted_error.nominal_camera(size1), predicted_error.nominal_camera(size2))
+    error = predicted_error.predict_error(found.parts, found.part_size, *matches, F_mat, inliers, *cameras)
     weights = inliers.double() if solver.layer is None else found.weights
     fields: dict[str, Any] = {"F_mat": F_mat, "inliers": inliers, "weights": weights}
     if solver.cameras is None:
@@ -154,12 +155,12 @@ def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | Non
     about = found.parts, found.part_size, solver.points1, H_mat, inliers
     fields: dict[str, Any] = {"F_mat": F_mat, "inliers": inliers, "weights": found.weights}
     if cameras is None:
-        return fields, reliability.predict_transfer_error(*about), ()
+        return fields, predicted_error.predict_transfer_error(*about), ()
     seen = (*cameras, *(points[inliers] for points in matches))
     poses = plane_poses(H_mat, *seen)
     if not poses:
         text = "no plane in front of both cameras has this homography"
-        return fields, reliability.predict_transfer_error(*about), (PairWarning("no_pose", text),)
+        return fields, predicted_error.predict_transfer_error(*about), (PairWarning("no_pose", text),)
     if len(poses) > 1:  # matches off the plane agree with the true pose alone
         support = solver.support(torch.stack([pose.fundamental(*cameras) for pose in poses]))
         poses = [poses[row] for row in support.argsort(descending=True, stable=True).tolist()]
@@ -170,4 +171,4 @@ def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | Non
         front = in_front(R[None], t[None], *(value[None] for value in (*cameras, *matches)))[0]
         fields |= {"F_mat": poses[0].fundamental(*cameras), "E_mat": poses[0].essential(), "t": t, "n": n}
         fields |= {"front": front, "other_pose": others[0] if others else None}
-    return fields, reliability.predict_transfer_error(*about, angles), ()
+    return fields, predicted_error.predict_transfer_error(*about, angles), ()

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.two_view.camera_check import drop_contradiction
+from kornia_learnnorm.two_view.pair_warnings import MIN_INLIERS, PairWarning
 from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX, find_main_plane, parallax, parallax_evidence
-from kornia_learnnorm.two_view.reliability import MIN_INLIERS, PairWarning
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
 NUM_NEIGHBOURS = 48  # matches nearest to a match in an image

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.statistics import median
+from kornia_learnnorm.two_view.pair_warnings import PairWarning
 from kornia_learnnorm.two_view.parallax import Parallax, parallax
 from kornia_learnnorm.two_view.plane_pose import PlanePose
-from kornia_learnnorm.two_view.reliability import PairWarning
 
 CONVENTION = "x2^T F x1 = 0, x2 ~ H x1, x = (column, row, 1) in pixels, X2 = R X1 + t; F, H and E have unit norm"
 

@@ -21,6 +21,7 @@ from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view.inputs import Cameras
+from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
 from kornia_learnnorm.two_view.parallax import (
     MAX_LOG_CHANCE_PARALLAX,
     MIN_PLANAR_SHARE,
@@ -29,13 +30,7 @@ from kornia_learnnorm.two_view.parallax import (
     parallax,
     parallax_evidence,
 )
-from kornia_learnnorm.two_view.reliability import (
-    MAX_LOG_FALSE_ALARMS,
-    drop_failed_parts,
-    log_false_alarms,
-    log_false_samples,
-    random_parts,
-)
+from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 MIN_MATCHES = 9  # eight are explained by some matrix whatever they are

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from kornia_learnnorm.two_view.drawing import draw_line, draw_pair, import_matplotlib
-from kornia_learnnorm.two_view.reliability import PairWarning
+from kornia_learnnorm.two_view.pair_warnings import PairWarning
 from kornia_learnnorm.two_view.result import ModelChoice, PairEstimate
 
 image_module = pytest.importorskip("matplotlib.image")  # Matplotlib may not be installed

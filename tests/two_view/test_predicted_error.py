@@ -10,11 +10,9 @@ from scenes import epipolar_distances
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
-from kornia_learnnorm.two_view.reliability import (
+from kornia_learnnorm.two_view.pair_warnings import find_warnings, log_false_alarms, log_false_samples
+from kornia_learnnorm.two_view.predicted_error import (
     drop_failed_parts,
-    find_warnings,
-    log_false_alarms,
-    log_false_samples,
     predict_error,
     predict_transfer_error,
     random_parts,
