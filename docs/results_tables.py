@@ -110,9 +110,9 @@ def read_json(name: str) -> Any:
 
 
 def cross_table(corner: str, cells: dict[tuple[str, str], str]) -> Markdown:
-    """Return a table of cells by the names of their row and column."""
+    """Return a table of cells by the names of their row and column; those that were not measured have a dash."""
     names, columns = (dict.fromkeys(key[k] for key in cells) for k in (0, 1))
-    rows = [[name, *(cells[name, column] for column in columns)] for name in names]
+    rows = [[name, *(cells.get((name, column), "-") for column in columns)] for name in names]
     return Markdown(format_table([corner, *columns], rows))
 
 
