@@ -21,13 +21,9 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
-from kornia_learnnorm.normalizers.closed_form import Hartley
-from kornia_learnnorm.normalizers.normalizer import (
-    Normalizer,
-    ProblemNormalizer,
-    check_normalizer,
-    normalizing_transforms,
-)
+from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
+from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer, normalizing_transforms
+from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
 __all__ = [
     "EightPoint",
@@ -40,6 +36,8 @@ __all__ = [
     "solve_linear",
     "solve_undetermined",
 ]
+
+CLOSED_FORMS = (Identity, Hartley, Whitening, ReweightedWhitening)
 
 
 def find_fundamental(
@@ -99,14 +97,11 @@ def find_fundamental(
 
 
 def _inference_mode(normalizer: Normalizer | None) -> AbstractContextManager[object]:
-    """Return inference mode where it can be and a normaliser keeps nothing of it, which would be of no use in training.
+    """Return inference mode where gradients are disabled; not for others than closed forms.
 
-    Those of the package without parameters keep nothing.
+    What they may keep of it would be of no use in training.
     """
-    own = normalizer is None or (
-        isinstance(normalizer, ProblemNormalizer) and next(normalizer.parameters(), None) is None
-    )
-    return inference_mode() if own else nullcontext()
+    return inference_mode() if normalizer is None or type(normalizer) in CLOSED_FORMS else nullcontext()
 
 
 def solve_linear(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
