@@ -86,11 +86,12 @@ def test_invariances(kind, more, seed, factor, shift):
     num_points, factor = (LEAST[kind] + more, factor) if kind != "pose" else (12 + more, 1.0)
     layer, (points1, points2, *cameras) = LAYERS[kind](), inputs(kind, 4, num_points, seed)
     order = torch.randperm(num_points, generator=seeded(seed))
+    bound, least = (1e-5, 1e-6) if kind == "pose" else (1e-6, 1e-8)
     found = layer.estimate(points1, points2, *cameras)
     shuffled = layer.estimate(points1[:, order], points2[:, order], *cameras)
-    assert up_to_sign(shuffled[0], found[0]) < 1e-5
-    assert torch.allclose(shuffled.weights, found.weights[:, order], atol=1e-6)
-    assert up_to_sign(layer.model.swap(layer(points2, points1, *cameras[::-1])), found[0]) < 1e-5
+    assert up_to_sign(shuffled[0], found[0]) < bound
+    assert torch.allclose(shuffled.weights, found.weights[:, order], atol=least)
+    assert up_to_sign(layer.model.swap(layer(points2, points1, *cameras[::-1])), found[0]) < bound
     T = torch.tensor([[factor, 0, factor * shift], [0, factor, factor * shift], [0, 0, 1]], dtype=torch.float64)
     moved = layer(factor * (points1 + shift), factor * (points2 + shift), *(T @ K for K in cameras))
     assert up_to_sign(moved if kind == "pose" else layer.model.carry(moved, T, T), found[0]) < 1e-5
