@@ -15,7 +15,7 @@ from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.pair_warnings import PairWarning
 from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
 
-MIN_MISFIT = 5e-5  # of the longer image side; lenses of photographs that are called undistorted add up to 3e-5
+MIN_MISFIT = 5e-5  # of the largest coordinate, about the longer side; photographs called undistorted have up to 3e-5
 MAX_LOG_CHANCE = -3.0  # log10 of the probability that noise alone adds as much
 CONTRADICTION = "the matches contradict K1 and K2"
 MAX_OFFSET = 0.2  # of both sides of an image; a principal point is closer to the centre
