@@ -5,6 +5,7 @@ All operations are invariant or equivariant under permutations of the correspond
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import adaptive_max_pool1d
 
 from kornia_learnnorm.normalizers.networks.crossview import set_maximum
 
@@ -67,10 +68,16 @@ class AttentiveContextBlock(nn.Module):
         """Return the features after the block with shape :math:`(B, N, C)`."""
         z = self.norm(hidden)
         mean, deviation, maximum = set_statistics(z, self.attention(z), absent)
-        # In place: for large batches, new memory costs more than the sums. Not the last one: under autocast, `out` has
-        # half the precision of `hidden`.
-        update = self.point(torch.cat([z, (z - mean) / deviation], -1)).add_(self.context(maximum)).relu_()
-        out: Tensor = hidden + self.out(update)
+        context = self.context(maximum)
+        if z.shape[1] > z.shape[2] and not torch.compiler.is_compiling():
+            # The statistics go into a layer of each set, which then reads half as many numbers.
+            own, relative = self.point.weight.chunk(2, 1)
+            relative = relative / deviation
+            bias = self.point.bias + context - mean @ relative.mT
+            update = torch.baddbmm(bias, z, (own + relative).mT)
+        else:
+            update = self.point(torch.cat([z, (z - mean) / deviation], -1)).add_(context)
+        out: Tensor = hidden + self.out(update.relu_())  # not in place: under autocast, `out` has half the precision
         return out
 
 
@@ -82,7 +89,7 @@ def set_statistics(features: Tensor, logits: Tensor, absent: Tensor | None) -> t
     features = features.to(logits.dtype)
     absent = None if absent is None else absent[..., None]
     if absent is None and not features.requires_grad:
-        maximum = features.amax(1, keepdim=True)
+        maximum = adaptive_max_pool1d(features.mT, 1).mT  # much faster than `amax` over the middle dimension
     else:
         maximum = set_maximum(features, absent, 1, keepdim=True)
     if absent is not None:
