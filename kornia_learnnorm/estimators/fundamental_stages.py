@@ -1,5 +1,7 @@
 r"""Refinement of the learned fundamental matrix, and the search among minimal samples before its last fit."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -8,6 +10,7 @@ from kornia_learnnorm.estimators.moments import (
     descend,
     draw_samples,
     evenly_ranked,
+    fit_samples,
     geometric_scale,
     least_cost,
     pick,
@@ -22,14 +25,13 @@ __all__ = ["FundamentalRefinement"]
 COMPARED_SCALE, FIT_SCALE = 2.2, 3.0  # of comparisons and of fits on moments, in geometric means of the distances
 LAST_FLOOR = 0.002  # of the frame's unit, about half a pixel, added to the last scale
 LAST_POWER = 0.2  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
-FIRST_STEPS, LOCAL_STEPS = 2, 3  # reweightings of the first fit of settled sets, and of candidates
-DAMPED_STEPS = 3  # of Levenberg-Marquardt before a search, where sets may settle
+FIRST_STEPS, LOCAL_STEPS = 1, 3  # reweightings of the network's matrix before the search, and of candidates
 SEARCH_STEPS = 5  # of the last stage's steps that a search takes the place of
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
 SAMPLE_SIZE = 7
 MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
-SHORTLIST = 4  # matrices of minimal samples that are compared on all matches
+SHORTLIST = 6  # matrices of minimal samples that are compared on all matches
 # Matches, and the sum of their probabilities, from which samples are drawn: among few, some fit most of them by chance.
 MIN_MATCHES, MIN_INLIERS = 16, 8
 
@@ -37,9 +39,10 @@ MIN_MATCHES, MIN_INLIERS = 16, 8
 class FundamentalRefinement(Refinement):
     r"""The refinement of a stage's fundamental matrices, and in the last stage a search among minimal samples.
 
-    Sets of at least 16 matches, eight of which are to be inliers, are searched: the refined matrix competes with those
-    of minimal samples that are drawn by the probabilities of inliers. The one of least cost of all matches, whatever
-    their probabilities, is fitted to them by reweighted least squares.
+    Sets of at least 16 matches, eight of which are to be inliers, are searched: the network's matrix competes with
+    those of samples that are drawn by the probabilities of inliers, minimal ones and larger ones, which average the
+    noise. The one of least cost of all matches, whatever their probabilities, is fitted to them by reweighted least
+    squares.
     """
 
     min_searched = MIN_MATCHES
@@ -53,22 +56,12 @@ class FundamentalRefinement(Refinement):
             return super().optimize(M, probability, steps, last)
         weights = probability if self.weights is None else probability * self.weights
         evidence, mean = Evidence.from_points(self.x1, self.x2), geometric_scale(weights, self.model.dof, SQUARE_FLOOR)
-        present = weights > 0
-        few = (present.sum(1) < MIN_MATCHES) | ((probability * present).sum(1) < MIN_INLIERS)
-        own = M
-        if self.few_outliers is not None and not is_known_true(~self.few_outliers.any()):
-            with torch.no_grad():
-                state, square = self.model.state(M), FIT_SCALE**2
-                own = descend(evidence, state, weights[:, None], lambda s: square * mean(s), FIRST_STEPS).matrix()
-        if self.few_outliers is None or not is_known_true(self.few_outliers.all()):
-            damped = super().optimize(M, probability, min(DAMPED_STEPS, steps) if self.settle else steps, last)
-            if self.settle and not is_known_true(~few.any()):
-                damped = torch.where(few[:, None, None], super().optimize(M, probability, steps, last), damped)
-            own = damped if self.few_outliers is None else torch.where(self.few_outliers[:, None, None], own, damped)
         with torch.no_grad():
-            square_mean = mean(evidence.squares(own[:, None])[0])
-            best = self._most_consistent(evidence, torch.stack([own, M], 1), weights, COMPARED_SCALE**2 * square_mean)
-        state = Rank2(best.axes + 0.0 * own[:, None], best.A)
+            own = descend(
+                evidence, self.model.state(M), weights[:, None], lambda s: FIT_SCALE**2 * mean(s), FIRST_STEPS
+            ).matrix()
+            best = self._most_consistent(evidence, torch.stack([own, M], 1), weights, mean)
+        state = Rank2(best.axes + 0.0 * M[:, None], best.A)
         power = probability.clamp(min=torch.finfo(M.dtype).tiny) ** LAST_POWER
         power = power if self.weights is None else power * self.weights
 
@@ -76,21 +69,31 @@ class FundamentalRefinement(Refinement):
             """Return a scale that moves along, so that derivatives don't depend on where the fit began."""
             return FIT_SCALE**2 * mean(squares) + LAST_FLOOR**2
 
-        steps = max(1, steps - SEARCH_STEPS)
-        fitted = descend(evidence, state, power[:, None], square_scale, steps, RELAXATION).matrix()
-        return torch.where(few[:, None, None], own, fitted)
+        fit_steps = max(1, steps - SEARCH_STEPS)
+        fitted: Tensor = descend(evidence, state, power[:, None], square_scale, fit_steps, RELAXATION).matrix()
+        present = weights > 0
+        few = (present.sum(1) < MIN_MATCHES) | ((probability * present).sum(1) < MIN_INLIERS)
+        if is_known_true(~few.any()):
+            return fitted
+        return torch.where(few[:, None, None], super().optimize(M, probability, steps, last), fitted)
 
-    def _most_consistent(self, evidence: Evidence, M: Tensor, weights: Tensor, square_scale: Tensor) -> Rank2:
-        """Return the states of least cost of all matches among matrices (B, S, 3, 3) and those of minimal samples."""
+    def _most_consistent(
+        self, evidence: Evidence, M: Tensor, weights: Tensor, mean: Callable[[Tensor], Tensor]
+    ) -> Rank2:
+        """Return the states of least cost of all matches among matrices (B, S, 3, 3) and those of minimal samples.
+
+        The scale of the cost is that of the matrix with the least mean distance: weights may be poor.
+        """
         present = (weights > 0).to(weights)
         # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
         order = weights.argsort(dim=1, descending=True, stable=True)
-        basis, determined = draw_samples(evidence, weights, order, self.samples, SAMPLE_SIZE)
-        drawn, real = fundamental_in_span(basis)
-        drawn = drawn.view(-1, 3 * self.samples, 3, 3)
-        real = (real & determined[:, None]).view(-1, 3 * self.samples)
+        drawn, real = self._draw(evidence, weights, order)
         some = evenly_ranked(order, MAX_SCORED)
-        losses = evidence.single().select(some).losses(drawn.float(), square_scale)
+        squares = evidence.single().select(some).squares(drawn.float())[0]
+        means = geometric_scale(weights.gather(1, some).to(squares), self.model.dof, LAST_FLOOR**2)(squares)[..., 0]
+        least = torch.where(real & means.isfinite(), means, torch.inf).amin(1)[:, None, None].to(M)
+        square_scale = COMPARED_SCALE**2 * mean(evidence.squares(M)[0]).amin(1, keepdim=True).minimum(least)
+        losses = squares.div_(squares + square_scale.to(squares))  # of Geman and McClure
         M = torch.cat([M, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
         state, number = self.model.state(M.flatten(0, 1)), M.shape[1]
         state = descend(
@@ -99,3 +102,20 @@ class FundamentalRefinement(Refinement):
         losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square_scale)
         best: Rank2 = pick(state, (losses @ present[..., None])[..., 0].argmin(1), number)
         return best
+
+    def _draw(self, evidence: Evidence, weights: Tensor, order: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the matrices of samples, (B, S, 3, 3), and which of them are real.
+
+        Those of large samples, a third, and those of minimal ones unless a set has few outliers.
+        """
+        large = self.model.constrain(fit_samples(evidence, weights, order, -(-self.samples // 3)))
+        real = torch.ones_like(large[..., 0, 0], dtype=torch.bool)
+        if self.few_outliers is not None and is_known_true(self.few_outliers.all()):
+            return large, real
+        basis, determined = draw_samples(evidence, weights, order, self.samples, SAMPLE_SIZE)
+        drawn, singular = fundamental_in_span(basis.flatten(0, 1))
+        shape = -1, 3 * self.samples
+        singular = singular.view(shape) & determined.repeat_interleave(3, 1)
+        if self.few_outliers is not None:
+            singular = singular & ~self.few_outliers[:, None]
+        return torch.cat([large, drawn.view(*shape, 3, 3)], 1), torch.cat([real, singular], 1)

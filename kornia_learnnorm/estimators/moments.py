@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS, choose
+from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "draw_matches",
     "draw_samples",
     "evenly_ranked",
+    "fit_samples",
     "geometric_scale",
     "least_cost",
     "normal_equations",
@@ -30,6 +31,7 @@ __all__ = [
 
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
 MIN_PIVOT = 1e-6  # of the largest one, of a minimal sample that is not degenerate, such as by drawing a match twice
+LARGE_SAMPLE = 20  # matches of a sample that averages their noise: most are right in sets of few outliers
 DAMPING = 1e-9  # of the mean diagonal of the normal matrix, added to it
 
 
@@ -62,12 +64,14 @@ class Evidence(NamedTuple):
         """
         e = F_mat.mT.flatten(2)
         forms = (e[..., None] * e[..., None, :]).flatten(2) @ _FORMS.mT.to(e)
-        factor = (forms @ self.products + torch.finfo(e.dtype).tiny).reciprocal()
-        return (e @ self.rows).square() * factor, factor
+        # In place: for large batches, new memory costs more than the arithmetic.
+        factor = (forms @ self.products).add_(torch.finfo(e.dtype).tiny).reciprocal_()
+        return (e @ self.rows).square().mul_(factor), factor
 
     def losses(self, F_mat: Tensor, square_scale: Tensor) -> Tensor:
         """Return Geman and McClure's loss (B, S, N) under matrices (B, S, 3, 3), of a squared scale (B, S or 1, 1)."""
-        return UNROLLED_LOSS(self.squares(F_mat)[0] / square_scale.to(F_mat))[0]
+        squares = self.squares(F_mat)[0]
+        return squares.div_(squares + square_scale.to(F_mat))
 
     def forms(self, share: Tensor, squares: Tensor) -> tuple[Tensor, Tensor]:
         """Return the matrices M and M - X of a step (:func:`descend`) over the trace of M, each (B S, 9, 9).
@@ -152,7 +156,7 @@ def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float) -> Callabl
     factor = number / (number - dof)
 
     def square_scale(squares: Tensor) -> Tensor:
-        return factor * (share * (squares + floor).log()).sum(2, keepdim=True).exp()
+        return factor * ((squares + floor).log_() @ share.mT).exp()
 
     return square_scale
 
@@ -172,16 +176,26 @@ def pick(state: Any, index: Tensor, number: int) -> Any:
 
 
 def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int) -> tuple[Tensor, Tensor]:
-    """Return the null spaces (B S, 9 - size, 3, 3) of minimal samples, and which have no larger one, (B S,) bool.
+    """Return the null spaces (B, S, 9 - size, 3, 3) of minimal samples, and which have no larger one, (B, S) bool.
 
     Samples are those of :func:`draw_matches`.
     """
-    rows = evidence.select(draw_matches(weights, order, number, size)).rows
-    rows = torch.unflatten(rows, 2, (number, size)).transpose(1, 2).flatten(0, 1)  # (B S, 9, size)
-    Q, R = torch.linalg.qr(rows, mode="complete")
+    Q, R = torch.linalg.qr(_sample_rows(evidence, weights, order, number, size), mode="complete")
     pivots = R.diagonal(dim1=-2, dim2=-1).abs()
     determined = pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1)
     return torch.unflatten(Q[..., size:].mT, -1, (3, 3)).mT, determined
+
+
+def fit_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int) -> Tensor:
+    """Return the likeliest matrices of samples of 20 matches, (B, S, 3, 3)."""
+    rows = _sample_rows(evidence, weights, order, number, LARGE_SAMPLE)
+    return torch.unflatten(torch.linalg.eigh(rows @ rows.mT)[1][..., 0], -1, (3, 3)).mT
+
+
+def _sample_rows(evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int) -> Tensor:
+    """Return the design rows of samples, (B, S, 9, size)."""
+    rows = evidence.select(draw_matches(weights, order, number, size)).rows
+    return torch.unflatten(rows, 2, (number, size)).permute(0, 2, 1, 3)
 
 
 def draw_matches(weights: Tensor, order: Tensor, number: int, size: int) -> Tensor:
@@ -206,7 +220,7 @@ def evenly_ranked(order: Tensor, most: int) -> Tensor:
     return order[:, torch.arange(few, device=order.device) * number // few]
 
 
-EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.0969815577985598}
+EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.0969815577985598, 20: 1.034397396133807}
 
 
 def _normal_forms() -> Tensor:

@@ -227,7 +227,6 @@ def _sample_spans(
     """Return the null spaces of minimal samples, (B, S, 4, 3, 3), and which of them are not larger, (B, S) bool."""
     spans, determined = draw_samples(evidence, weights, order, number, Essential.sample_size)
     inverse1, inverse2 = (torch.linalg.inv_ex(C)[0][:, None, None] for C in (model.C1, model.C2))
-    spans, determined = (torch.unflatten(value, 0, (order.shape[0], number)) for value in (spans, determined))
     return inverse2.mT @ spans @ inverse1, determined
 
 

@@ -69,7 +69,7 @@ class AttentiveContextBlock(nn.Module):
         z = self.norm(hidden)
         mean, deviation, maximum = set_statistics(z, self.attention(z), absent)
         context = self.context(maximum)
-        if z.shape[1] > z.shape[2] and not torch.compiler.is_compiling():
+        if not torch.compiler.is_compiling() and z.shape[1] > z.shape[2]:
             # The statistics go into a layer of each set, which then reads half as many numbers.
             own, relative = self.point.weight.chunk(2, 1)
             relative = relative / deviation
