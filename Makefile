@@ -12,7 +12,7 @@
 # make wheel  build wheel and sdist in dist/, the same bytes for the same commit, and print the wheel's size; make check-wheel checks their metadata
 # make check-extras   install the wheel with each extra in an empty environment and use it; EXTRAS="core hub" for some. Takes long
 # make ablations DATA=<folder>, make table1 DATA=<folder>   train what is not trained yet, print the tables; -j 2 for two at once
-# make layer-ablations DATA=<folder>, make pose-ablations, make refiner-ablations   those of one part alone
+# make layer-ablations DATA=<folder>, make size-ablations, pose-ablations, refiner-ablations   those of one part alone
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -29,7 +29,7 @@ OLDEST := .venv-oldest
 NEWEST := .venv-newest
 TORCH ?= $$(grep '^torch==' requirements.lock)
 
-.PHONY: bench weights demo test test-cpus test-oldest test-newest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations pose-ablations refiner-ablations table1
+.PHONY: bench weights demo test test-cpus test-oldest test-newest lint docs audit wheel check-wheel check-extras clean ablations layer-ablations size-ablations pose-ablations refiner-ablations table1
 
 # The lock pins everything. torch goes first and alone, so that no other package's range can choose another build.
 $(VENV)/.ready: requirements.lock pyproject.toml
@@ -139,9 +139,10 @@ RUNS_OF = $(patsubst configs/%.yaml,runs/%/weights.safetensors,$(wildcard config
 LAYER_RUNS := $(call RUNS_OF,layer)
 POSE_RUNS := $(call RUNS_OF,pose)
 REFINER_RUNS := $(call RUNS_OF,refiner)
-.PRECIOUS: $(ABLATION_RUNS) $(TABLE1_RUNS) $(LAYER_RUNS) $(POSE_RUNS) $(REFINER_RUNS)
+SIZE_RUNS := $(call RUNS_OF,size)
+.PRECIOUS: $(ABLATION_RUNS) $(TABLE1_RUNS) $(LAYER_RUNS) $(POSE_RUNS) $(REFINER_RUNS) $(SIZE_RUNS)
 
-ablations: layer-ablations pose-ablations refiner-ablations $(VENV)/.ready $(ABLATION_RUNS)
+ablations: layer-ablations size-ablations pose-ablations refiner-ablations $(VENV)/.ready $(ABLATION_RUNS)
 	OMP_NUM_THREADS=1 $(BIN)/learnnorm evaluate $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
 		--methods $(CLOSED_FORMS) $(ABLATION_RUNS) paper crossview searched --out runs/ablations/run
 	$(BIN)/learnnorm report runs/ablations/run
@@ -159,6 +160,10 @@ layer-ablations: $(VENV)/.ready $(LAYER_RUNS)
 		--methods RANSAC $(addprefix learned:,$(LAYER_RUNS)) \
 		$(patsubst %,learned:runs/ablations/layer/%/weights.safetensors+scores,base scoreless)
 
+size-ablations: $(VENV)/.ready $(SIZE_RUNS)
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/sizes.py $(STORES)/kitti_06.h5 $(STORES)/tum_fr3_office.h5 \
+		--sizes 64 512 --protocols unfiltered --methods $(addprefix learned:,$(SIZE_RUNS)) --json runs/ablations/size.json
+
 TESTED = $(foreach name,photographs kitti_06 tum_fr3_office,$(STORES)/$(name)_xfeat_$(1).h5 $(STORES)/$(name)_aliked_$(1).h5)
 pose-ablations: $(VENV)/.ready $(POSE_RUNS)
 	$(BIN)/python benchmarks/poses.py $(call TESTED,lightglue) $(call TESTED,nearest) --csv runs/ablations/pose.csv \
@@ -172,6 +177,9 @@ refiner-ablations: $(VENV)/.ready $(REFINER_RUNS)
 CHANGED = --config configs/ablations/$(1)/base.yaml --config configs/ablations/$(1)/$*.yaml $(INTO)
 runs/ablations/layer/%/weights.safetensors: | $(VENV)/.ready
 	$(FIT) --config configs/robust.yaml $(call CHANGED,layer)
+
+runs/ablations/size/%/weights.safetensors: | $(VENV)/.ready
+	$(FIT) --config configs/robust-synthetic.yaml $(call CHANGED,size)
 
 runs/ablations/pose/%/weights.safetensors: | $(VENV)/.ready
 	$(FIT) --config configs/robust-pose.yaml $(call CHANGED,pose)

@@ -15,6 +15,7 @@ import re
 import sys
 from collections.abc import Sequence
 from io import StringIO
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,7 @@ TIMED = {
     "learned:robust-tiny": (BLUE, "D", ":"),
     "learned:robust-tiny+bfloat16": (BLUE, "v", ""),
 }
+MARKS = "osv^<>PXD"  # of methods that have none above, in their order
 ESTIMATORS = {name: (colour, line) for name, (colour, _, line) in TIMED.items() if line}
 COMPARED = {  # in the picture of the landing page and the README, each divided by PoseLib's: name, colour and line
     "opencv-usac-magsac": ("OpenCV MAGSAC", PURPLE, "-"),
@@ -311,13 +313,16 @@ def _label_errors(figure: Figure, axes: Any, xlabel: str) -> None:
 
 
 def time_plot(name: str) -> HTML:
-    """Draw the median error against the time of a set of unfiltered matches, a row for each size of sets."""
+    """Draw the median error against the time of a set of unfiltered matches, a row for each of two sizes of sets."""
     with plt.rc_context(PLAIN):
         found = read_json(name)
-        figure, axes = plt.subplots(2, 2, figsize=(6, 6.4), layout="constrained", sharex=True)
-        cells = [(size, store) for size in ("128", "512") for store in STORES]
+        methods = found[f"{next(iter(STORES))}, unfiltered"]
+        styles = {method: TIMED.get(method, (BLUE, mark, "")) for method, mark in zip(methods, cycle(MARKS))}
+        sizes = [*next(iter(methods.values()))]
+        figure, axes = plt.subplots(len(sizes), 2, figsize=(6, 6.4), layout="constrained", sharex=True)
+        cells = [(size, store) for size in sizes for store in STORES]
         for (size, store), ax in zip(cells, axes.flat, strict=True):
-            for method, (colour, mark, _) in TIMED.items():
+            for method, (colour, mark, _) in styles.items():
                 error, milliseconds = found[f"{store}, unfiltered"][method][size]
                 ax.plot(milliseconds, error, mark, color=colour, label=method, markersize=6)
             ax.set(title=f"{_words(f'{store}, unfiltered')}, N = {size}", xscale="log", yscale="log")
@@ -325,7 +330,8 @@ def time_plot(name: str) -> HTML:
             ax.yaxis.set_major_formatter("{x:g}")
             ax.grid(visible=True)
         _label_errors(figure, axes, "ms per set")
-        return show(figure, "Median error against time, on KITTI and TUM, unfiltered, sets of 128 and of 512 matches")
+        of = " and of ".join(sizes)
+        return show(figure, f"Median error against time, on KITTI and TUM, unfiltered, sets of {of} matches")
 
 
 def _draw_dots(ax: Axes, rows: Sequence[Sequence[str]], column: int, offset: float, **style: str) -> None:

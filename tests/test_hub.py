@@ -38,7 +38,7 @@ def test_a_layer_returns_from_a_folder(layer_class, name, tmp_path):
 
 def test_the_card_names_the_class_and_the_training_data(folder):
     card = folder / "README.md"
-    for part in ("library_name: kornia_learnnorm", "`LearnedEightPoint`", "kitti_00@0:160, "):
+    for part in ("library_name: kornia_learnnorm", "`LearnedEightPoint`", "synthetic scenes"):
         assert part in card.read_text(encoding="utf-8")
     card.write_text("my own", encoding="utf-8")
     hub.HubModel.from_pretrained(folder).save_pretrained(folder)

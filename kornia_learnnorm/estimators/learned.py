@@ -189,13 +189,14 @@ class LearnedEightPoint(LearnedLayer):
 
     (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds an
     SPD transform and Hartley's is that of the weighted points. A few robust steps of Levenberg-Marquardt on the Sampson
-    distances, weighted by :math:`\sigma(l_i)`, end each stage
+    distances, weighted by :math:`\sigma(l_i)`, end each stage unless a search does
     (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`).
 
-    In the last stage of sets of 16 correspondences and more, with :math:`\sum_i \sigma(l_i) \ge 8`, minimal samples of
-    seven are drawn by :math:`\sigma(l_i)`. Of their matrices and the network's, the one of least robust cost over all
-    correspondences is fitted to all of them, weighted by :math:`\sigma(l_i)^{0.2}`. In evaluation, those of them with a
-    mean :math:`\sigma(l_i)` above 0.7 in the first stage leave the other stages out: they hold what the first gives.
+    In the last stage of sets of 16 correspondences and more, with :math:`\sum_i \sigma(l_i) \ge 8`, samples are drawn
+    by :math:`\sigma(l_i)`: minimal ones of seven, and a third as many of 20, which average the noise. Of their matrices
+    and the network's, the one of least robust cost over all correspondences is fitted to all of them, weighted by
+    :math:`\sigma(l_i)^{0.2}`. In evaluation, those of them with a mean :math:`\sigma(l_i)` above 0.7 in the first stage
+    leave the other stages and the minimal samples out.
 
     Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
     their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
@@ -214,7 +215,8 @@ class LearnedEightPoint(LearnedLayer):
             networks get no gradient (``find_unused_parameters=True`` of DistributedDataParallel).
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
         refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
-        samples: minimal samples in the last stage; without (0), the last fit is that of the other stages.
+        samples: minimal samples in the last stage; without (0), there are none of 20 either, and the last fit is that
+            of the other stages.
 
     Attributes:
         detach_stages: send no gradient from a stage into the one before and don't refine the last, as when the layer
@@ -240,11 +242,11 @@ class LearnedEightPoint(LearnedLayer):
         self,
         width: int = 48,
         depth: int = 4,
-        stages: int = 3,
+        stages: int = 2,
         learn_transforms: bool = True,
         rank2: Literal["projection", "optimal"] = "projection",
         refine_steps: int = 10,
-        samples: int = 64,
+        samples: int = 96,
     ) -> None:
         super().__init__(Fundamental(rank2), width, depth, stages, learn_transforms, refine_steps)
         check_whole_number("samples", samples, 0)

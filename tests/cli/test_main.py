@@ -49,7 +49,7 @@ ABLATIONS = runs("ablations/*", "ablations/base")
 ABLATIONS |= runs("ablations/loss-[as]*", *PAPER_BASE, prefix="paper-")
 ABLATIONS |= runs("ablations/reduction-log", *PAPER_BASE, prefix="paper-", but=())
 SHORTER = {}  # ablations of longer trainings
-for part, whole in {"layer": "robust", "pose": "robust-pose", "refiner": "refiner"}.items():
+for part, whole in {"layer": "robust", "size": "robust-synthetic", "pose": "robust-pose", "refiner": "refiner"}.items():
     SHORTER |= runs(f"ablations/{part}/*", whole, f"ablations/{part}/base", prefix=f"{part}-")
 TABLE1 = runs("table1/*", "crossview") | runs("table1/paper*", "paper-short")
 RUNS = runs("*", but=(*OF_SETS, "own")) | runs("ablations/base", but=()) | ABLATIONS | TABLE1
