@@ -3,10 +3,12 @@ r"""The learned eight-point algorithm: a network weighs the correspondences and 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.fundamental_stages import FundamentalRefinement
@@ -14,22 +16,34 @@ from kornia_learnnorm.estimators.linear import essential_matrix, prepare_problem
 from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
-from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, in_pieces, run_stages
+from kornia_learnnorm.estimators.stages import MIN_SETTLED, TRANSFORM_PARAMS, Refinement, in_pieces, run_stages
 from kornia_learnnorm.geometry.checks import (
     check_cameras,
     check_tensor,
     check_whole_number,
     inference_mode,
     read_condition,
+    weighted_mean,
 )
 from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
-__all__ = ["LearnedEightPoint", "LearnedEstimate", "LearnedLayer", "StageEstimate", "check_scores"]
+__all__ = [
+    "LearnedEightPoint",
+    "LearnedEstimate",
+    "LearnedLayer",
+    "StageEstimate",
+    "check_scores",
+    "inlier_probability",
+]
 
 FORMAT = "kornia_learnnorm.eight_point.v1"
+# By the number of components, of a normal variable's variance over the geometric mean of its squared length.
+VARIANCE = {1: 3.562, 2: 0.8905}
+LOG_RANGE = math.log(4 / math.sqrt(2 * math.pi))  # outliers are four of the frame's units wide
+SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
 
 
 class StageEstimate(NamedTuple):
@@ -133,8 +147,8 @@ class LearnedLayer(MatchLayer):
 
     def _estimate(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, mask: Tensor | None, scores: Tensor | None
-    ) -> tuple[LinearProblem, tuple[StageEstimate, ...], Tensor]:
-        """Return the problem, what each stage gives and the final estimate, and the probabilities of inliers."""
+    ) -> tuple[LinearProblem, tuple[StageEstimate, ...]]:
+        """Return the problem, what each stage gives and the final estimate."""
         problem = prepare_problem(self.model, points1, points2, weights, mask)
         scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
 
@@ -150,11 +164,7 @@ class LearnedLayer(MatchLayer):
             return M.expand(number, -1, -1, -1).transpose(0, 1), logits.expand(number, -1, -1).transpose(0, 1)
 
         M, logits = solve_where_determined(problem, solve, solve_rest)
-        stages = tuple(map(StageEstimate, M.to(points1.dtype).unbind(1), logits.to(points1.dtype).unbind(1)))
-        probability = stages[-1].logits.sigmoid()
-        if problem.weights is not None:
-            probability = torch.where(problem.weights > 0, probability, 0.0)
-        return problem, stages, probability
+        return problem, tuple(map(StageEstimate, M.to(points1.dtype).unbind(1), logits.to(points1.dtype).unbind(1)))
 
     def _run(self, problem: LinearProblem, scores: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return matrices (B, S, 3, 3) and logits (B, S, N) of stages and final estimate, of determined sets."""
@@ -172,8 +182,8 @@ class LearnedEstimate(NamedTuple):
     E_mat: Tensor | None  # K2^T F K1 with unit Frobenius norm, (B, 3, 3), or None without cameras
     determined: Tensor  # whether the correspondences determine a matrix, (B,) bool; see TwoViewEstimate
     gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
-    # Probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that do not
-    # determine their matrix.
+    # Probability of each correspondence to be an inlier of the matrix, (B, N); zero for absent ones, one half in sets
+    # that do not determine their matrix.
     weights: Tensor
     stages: tuple[StageEstimate, ...]  # what each stage gives, before its refinement, the last one last
 
@@ -309,11 +319,33 @@ class LearnedEightPoint(LearnedLayer):
             ValueError: if the scores do not have the shape of the matches, or one is outside of 0 to 1.
 
         """
-        problem, stages, probability = self._estimate(points1, points2, weights, mask, scores)
+        problem, stages = self._estimate(points1, points2, weights, mask, scores)
         check_cameras(K1, K2, points1.shape[0])
-        F_mat = stages[-1].F_mat
+        F_mat, logits = stages[-1]
+        probability = inlier_probability(self.model, problem, F_mat, logits, problem.determined).to(F_mat.dtype)
         E_mat = essential_matrix(F_mat, K1, K2)
         return LearnedEstimate(F_mat, E_mat, problem.determined, problem.gap, probability, stages[: self.stages])
+
+
+def inlier_probability(
+    model: TwoViewModel, problem: LinearProblem, M: Tensor, logits: Tensor, determined: Tensor
+) -> Tensor:
+    """Return the probabilities (B, N) of inliers of matrices (B, 3, 3) in pixels, with logits (B, N) before them.
+
+    By Bayes' rule: distances of inliers are normally distributed, those of outliers uniformly over the image. The
+    logits alone decide in sets of fewer than 16 correspondences, which a matrix may fit by chance, and in undetermined
+    ones.
+    """
+    present = torch.ones_like(problem.x1[..., 0]) if problem.present is None else problem.present
+    frame = CommonFrame.from_points(problem.points1, problem.points2, problem.present)
+    x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT
+    M, prior = model.carry(M.to(x1), frame.inverse, frame.inverse), logits.to(x1)
+    squares = model.squares(model.residual(M / torch.linalg.matrix_norm(M, keepdim=True), x1, x2))
+    mean = weighted_mean((squares + SQUARE_FLOOR)[..., None].log(), prior.sigmoid() * present).exp()
+    variance = mean * VARIANCE[model.components]
+    evidence = model.components * (LOG_RANGE - variance.log() / 2) - squares / (2 * variance)
+    enough = determined & (present.sum(1) >= MIN_SETTLED)
+    return torch.where(enough[:, None], prior + evidence, prior).sigmoid() * (present > 0)
 
 
 def check_scores(scores: Tensor, points1: Tensor, mask: Tensor | None) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.homography_stages import HomographyRefinement
-from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer, inlier_probability
 from kornia_learnnorm.estimators.match_features import CommonFrame
 from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.checks import check_whole_number
@@ -32,8 +32,8 @@ class HomographyEstimate(NamedTuple):
     H_mat: Tensor  # of unit Frobenius norm, map homogeneous pixels of image 1 to image 2, (B, 3, 3)
     determined: Tensor  # whether the correspondences determine an invertible matrix, (B,) bool
     gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
-    # Probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that do not
-    # determine their matrix.
+    # Probability of each correspondence to be an inlier of the matrix, (B, N); zero for absent ones, one half in sets
+    # that do not determine their matrix.
     weights: Tensor
     stages: tuple[HomographyStage, ...]  # what each stage gives, before its refinement, the last one last
 
@@ -150,8 +150,9 @@ class LearnedHomography(LearnedLayer):
                 weight is negative, or a score is outside of 0 to 1.
 
         """
-        problem, found, probability = self._estimate(points1, points2, weights, mask, scores)
+        problem, found = self._estimate(points1, points2, weights, mask, scores)
         stages = tuple(HomographyStage(*stage) for stage in found)
+        probability = inlier_probability(self.model, problem, *found[-1], problem.determined).to(points1.dtype)
         number = self.stages
         return HomographyEstimate(stages[-1].H_mat, problem.determined, problem.gap, probability, stages[:number])
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer, check_scores
+from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer, check_scores, inlier_probability
 from kornia_learnnorm.estimators.linear import prepare_problem
 from kornia_learnnorm.estimators.pose_stages import (
     POSE_OUTPUTS,
@@ -23,6 +23,7 @@ from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.pose import choose_pose
 from kornia_learnnorm.geometry.problem import LinearProblem, generic_points
 from kornia_learnnorm.models.essential import Calibrated, Essential
+from kornia_learnnorm.models.fundamental import Fundamental
 
 __all__ = ["LearnedRelativePose", "PoseStage", "RelativePoseEstimate"]
 
@@ -43,8 +44,8 @@ class RelativePoseEstimate(NamedTuple):
     t: Tensor  # translations of unit length, (B, 3)
     determined: Tensor  # whether the correspondences allow for finitely many matrices, (B,) bool
     gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
-    # Probability of each correspondence to be an inlier, (B, N); zero for absent ones, one half in sets that do not
-    # determine their matrix.
+    # Probability of each correspondence to be an inlier of the matrix, (B, N); zero for absent ones, one half in sets
+    # that do not determine their matrix.
     weights: Tensor
     stages: tuple[PoseStage, ...]  # the last one holds the result
 
@@ -197,11 +198,9 @@ class LearnedRelativePose(LearnedLayer):
             PoseStage(unit_matrix(state.essential()).to(dtype), logit.to(dtype))
             for state, logit in zip(states, logits, strict=True)
         )
-        probability = logits[-1].sigmoid()
-        if problem.weights is not None:
-            probability = torch.where(problem.weights > 0, probability, 0.0)
         state, (inverse1, inverse2) = states[-1], (torch.linalg.inv_ex(K)[0] for K in cameras)
         F_mat = unit_matrix(inverse2.mT @ state.essential() @ inverse1)
+        probability = inlier_probability(Fundamental(), problem, F_mat, logits[-1], determined)
         R, t = choose_pose(*state.poses(), problem.points1, problem.points2, *cameras, probability.detach())
         probability = probability.to(dtype)
         return RelativePoseEstimate(

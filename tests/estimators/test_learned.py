@@ -6,6 +6,7 @@ Of the learned fundamental matrix, masks, degenerate sets, gradients and compila
 import json
 import pickle
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -17,6 +18,7 @@ from scenes import (
     check_refuses,
     corner_error,
     correspondences,
+    numpy_sampson,
     plane,
     rewrite_weights,
     roughened,
@@ -68,7 +70,6 @@ def test_smoke(kind, batch_size, more, given, dtype, device):
         assert (value.shape, value.dtype) == ((batch_size, *shape), torch.float64 if name == "gap" else dtype)
         assert value.isfinite().all()
     assert len(found.stages) == 2
-    assert given == "mask" or torch.allclose(found.weights, found.stages[-1].logits.sigmoid())
     assert torch.equal(layer(*values, **options), found[0])
 
 
@@ -112,6 +113,25 @@ def test_masked_rows_have_no_effect(kind, number):
     for gradient in torch.autograd.grad(signless(found).sum(), padded):
         assert gradient.isfinite().all()
         assert not gradient[~mask].any()
+
+
+@pytest.mark.parametrize("number", [15, 40])
+def test_weights_by_the_rule_of_bayes(number):
+    """Normal distances of inliers, outliers uniform over the image; with few matches the logits alone."""
+    points = inputs("fundamental", 3, number)
+    points[1] = torch.cat([600 * uniform(3, 5, 2), points[1][:, 5:]], 1)
+    with torch.no_grad():
+        found = LAYERS["fundamental"]().estimate(*points)
+    logits = found.stages[-1].logits.numpy()
+    prior = 1 / (1 + np.exp(-logits))
+    both = torch.cat(points, 1).numpy()
+    unit = np.linalg.norm(both - both.mean(1, keepdims=True), axis=-1).mean(1)[:, None]
+    squares = (numpy_sampson(*points, found.F_mat) / unit) ** 2
+    mean = np.exp((prior * np.log(squares + 1e-10)).sum(1, keepdims=True) / prior.sum(1, keepdims=True))
+    variance = 3.562 * mean
+    ratio = 4 * np.exp(-squares / (2 * variance)) / np.sqrt(2 * np.pi * variance) if number >= 16 else 1.0
+    expected = prior * ratio / (prior * ratio + 1 - prior)
+    np.testing.assert_allclose(found.weights, expected, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["fundamental", "homography"])
