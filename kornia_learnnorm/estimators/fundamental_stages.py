@@ -1,4 +1,4 @@
-r"""Refinement of the learned fundamental matrix, and the search among minimal samples before its last fit."""
+r"""Refinement of the learned fundamental matrix, and the search among samples before its last fit."""
 
 from collections.abc import Callable
 
@@ -30,14 +30,14 @@ SEARCH_STEPS = 5  # of the last stage's steps that a search takes the place of
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
 SAMPLE_SIZE = 7
-MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
-SHORTLIST = 6  # matrices of minimal samples that are compared on all matches
+MAX_SCORED = 256  # matches by which the matrices of samples are compared first
+SHORTLIST = 6  # matrices of samples that are compared on all matches
 # Matches, and the sum of their probabilities, from which samples are drawn: among few, some fit most of them by chance.
 MIN_MATCHES, MIN_INLIERS = 16, 8
 
 
 class FundamentalRefinement(Refinement):
-    r"""The refinement of a stage's fundamental matrices, and in the last stage a search among minimal samples.
+    r"""The refinement of a stage's fundamental matrices, and in the last stage a search among samples.
 
     Sets of at least 16 matches, eight of which are to be inliers, are searched: the network's matrix competes with
     those of samples that are drawn by the probabilities of inliers, minimal ones and larger ones, which average the
@@ -80,7 +80,7 @@ class FundamentalRefinement(Refinement):
     def _most_consistent(
         self, evidence: Evidence, M: Tensor, weights: Tensor, mean: Callable[[Tensor], Tensor]
     ) -> Rank2:
-        """Return the states of least cost of all matches among matrices (B, S, 3, 3) and those of minimal samples.
+        """Return the states of least cost of all matches among matrices (B, S, 3, 3) and those of samples.
 
         The scale of the cost is that of the matrix with the least mean distance: weights may be poor.
         """

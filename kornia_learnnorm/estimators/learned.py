@@ -11,12 +11,12 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.fundamental_stages import FundamentalRefinement
+from kornia_learnnorm.estimators.fundamental_stages import SQUARE_FLOOR, FundamentalRefinement
 from kornia_learnnorm.estimators.linear import essential_matrix, prepare_problem, solve_undetermined
 from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
-from kornia_learnnorm.estimators.stages import MIN_SETTLED, TRANSFORM_PARAMS, Refinement, in_pieces, run_stages
+from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, in_pieces, run_stages
 from kornia_learnnorm.geometry.checks import (
     check_cameras,
     check_tensor,
@@ -40,10 +40,10 @@ __all__ = [
 ]
 
 FORMAT = "kornia_learnnorm.eight_point.v1"
-# By the number of components, of a normal variable's variance over the geometric mean of its squared length.
+# A normal variable's variance over the geometric mean of its squared length, by its number of components.
 VARIANCE = {1: 3.562, 2: 0.8905}
 LOG_RANGE = math.log(4 / math.sqrt(2 * math.pi))  # outliers are four of the frame's units wide
-SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
+MIN_JUDGED = 16  # matches of a set whose distances tell inliers: a matrix fits fewer by chance
 
 
 class StageEstimate(NamedTuple):
@@ -340,11 +340,14 @@ def inlier_probability(
     frame = CommonFrame.from_points(problem.points1, problem.points2, problem.present)
     x1, x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT
     M, prior = model.carry(M.to(x1), frame.inverse, frame.inverse), logits.to(x1)
+    swapped = frame.swapped[:, None, None]  # distances of a homography are not the same both ways
+    M = torch.where(swapped, model.swap(M), M)
+    x1, x2 = torch.where(swapped, x2, x1), torch.where(swapped, x1, x2)
     squares = model.squares(model.residual(M / torch.linalg.matrix_norm(M, keepdim=True), x1, x2))
     mean = weighted_mean((squares + SQUARE_FLOOR)[..., None].log(), prior.sigmoid() * present).exp()
     variance = mean * VARIANCE[model.components]
     evidence = model.components * (LOG_RANGE - variance.log() / 2) - squares / (2 * variance)
-    enough = determined & (present.sum(1) >= MIN_SETTLED)
+    enough = determined & (present.sum(1) >= MIN_JUDGED)
     return torch.where(enough[:, None], prior + evidence, prior).sigmoid() * (present > 0)
 
 

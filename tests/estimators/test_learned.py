@@ -29,10 +29,15 @@ from scenes import (
     uniform,
     up_to_sign,
 )
+from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators import pose_stages
+from kornia_learnnorm.estimators.learned import inlier_probability
 from kornia_learnnorm.estimators.match_features import masked_median
+from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.homography import Homography
 
 CLASSES = {"fundamental": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}
 LAYERS = {
@@ -132,6 +137,21 @@ def test_weights_by_the_rule_of_bayes(number):
     ratio = 4 * np.exp(-squares / (2 * variance)) / np.sqrt(2 * np.pi * variance) if number >= 16 else 1.0
     expected = prior * ratio / (prior * ratio + 1 - prior)
     np.testing.assert_allclose(found.weights, expected, rtol=1e-5, atol=1e-9)
+
+
+@every
+def test_weights_when_views_are_swapped(kind):
+    layer, (points1, points2, *cameras) = LAYERS[kind](), inputs(kind, 3, 40)
+    found, swapped = layer.estimate(points1, points2, *cameras), layer.estimate(points2, points1, *cameras[::-1])
+    assert torch.allclose(swapped.weights, found.weights, atol=1e-4)
+
+
+@pytest.mark.parametrize("model", [Fundamental(), Homography()])
+def test_gradients_of_probabilities(model):
+    points1, points2 = inputs(model.name, 2, 20)
+    problem = LinearProblem.from_points(points1, points2, None, model)
+    M, logits = uniform(2, 3, 3).requires_grad_(), uniform(2, 20).requires_grad_()
+    assert gradcheck(lambda *given: inlier_probability(model, problem, *given, problem.determined), (M, logits))
 
 
 @pytest.mark.parametrize("kind", ["fundamental", "homography"])
