@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
+from kornia_learnnorm.geometry.dlt import null_space
 
 __all__ = [
     "Evidence",
@@ -180,10 +181,9 @@ def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int
 
     Samples are those of :func:`draw_matches`.
     """
-    Q, R = torch.linalg.qr(_sample_rows(evidence, weights, order, number, size), mode="complete")
-    pivots = R.diagonal(dim1=-2, dim2=-1).abs()
+    basis, pivots = null_space(_sample_rows(evidence, weights, order, number, size).mT)
     determined = pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1)
-    return torch.unflatten(Q[..., size:].mT, -1, (3, 3)).mT, determined
+    return torch.unflatten(basis.mT, -1, (3, 3)).mT, determined
 
 
 def fit_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int) -> Tensor:

@@ -26,6 +26,7 @@ MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 BOUND = 2.0  # the parameters of the transforms stay within plus and minus this
 MIN_SETTLED, SETTLED = 16, 0.7  # matches, and their mean probability, from which on the first stage is enough
 TRANSFORM_PARAMS = 5  # of each view's SPD transform
+MAX_SETS_ON_GPU = 2000  # that are searched at once: PyTorch cannot decompose the matrices of 65,536 samples with CUDA
 MAX_MATCHES = 8192  # at once, whose features fit into a processor's cache
 
 
@@ -81,10 +82,10 @@ def run_stages(
 
 
 def in_pieces(problem: LinearProblem, *values: Tensor | None) -> list[tuple[Any, ...]]:
-    """Return a problem and values of its sets in pieces that a processor is fast on; in one piece with gradients."""
-    number, size = problem.x1.shape[0], max(1, MAX_MATCHES // max(1, problem.x1.shape[1]))
-    whole = torch.is_grad_enabled() or torch.compiler.is_compiling() or problem.x1.device.type != "cpu"
-    if whole or number <= size:
+    """Return a problem and values of its sets in pieces, on a CPU those that it is fast on, in one with gradients."""
+    number, on_cpu = problem.x1.shape[0], problem.x1.device.type == "cpu"
+    size = max(1, MAX_MATCHES // max(1, problem.x1.shape[1])) if on_cpu else MAX_SETS_ON_GPU
+    if torch.compiler.is_compiling() or (on_cpu and torch.is_grad_enabled()) or number <= size:
         return [(problem, *values)]
     pieces = [slice(start, start + size) for start in range(0, number, size)]
     return [(problem.select(rows), *[None if v is None else v[rows] for v in values]) for rows in pieces]

@@ -118,6 +118,22 @@ def _eliminate(A: Tensor) -> tuple[Tensor, Tensor]:
     return normalize(h, dim=-1), pivots[..., :8]
 
 
+def null_space(A: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return bases :math:`(*, 9, 9 - M)` of the null spaces of M rows, M < 9, and the magnitudes of M pivots.
+
+    The LU factorisation :math:`A^\top = P L U` gives :math:`P\,(-L_2 L_1^{-1}\;\; I)^\top`, of the first M rows
+    :math:`L_1` of :math:`L` and the others, which is not orthonormal.
+    """
+    number = A.shape[-2]
+    square = torch.cat([A, A.new_zeros(*A.shape[:-2], 9 - number, 9)], -2).mT  # a GPU factorises these all at once
+    LU, permutation, _ = torch.linalg.lu_factor_ex(square)
+    L1, L2 = LU[..., :number, :number], LU[..., number:, :number]
+    upper = -torch.linalg.solve_triangular(L1.mT, L2.mT, upper=True, unitriangular=True)
+    lower = torch.eye(9 - number, dtype=A.dtype, device=A.device).expand(*A.shape[:-2], -1, -1)
+    P, _, _ = torch.lu_unpack(LU, permutation, unpack_data=False)
+    return P @ torch.cat([upper, lower], -2), LU.diagonal(dim1=-2, dim2=-1)[..., :number].abs()
+
+
 @torch.no_grad()
 def nearest_null_vector(A: Tensor, preferred: Tensor) -> Tensor:
     """Return the unit vectors :math:`(*, 9)` of the null spaces nearest to a preferred one, for dependent rows.

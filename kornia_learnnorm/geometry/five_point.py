@@ -26,7 +26,9 @@ def _monomial_table() -> Tensor:
     return table
 
 
+_FIRST, _SECOND = torch.triu_indices(4, 4)
 _TABLE = _monomial_table()
+_PAIRS = _TABLE.view(16, 4, 20)[4 * _FIRST + _SECOND].flatten(0, 1)  # of products of two coefficients, each once
 _TIMES_X = [MONOMIALS.index((a + 1, b, c)) for a, b, c in MONOMIALS[10:]]  # each of the others times x
 _SOLUTION = [MONOMIALS.index(m) - 10 for m in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))]
 
@@ -38,21 +40,29 @@ def essential_in_span(basis: Tensor) -> tuple[Tensor, Tensor]:
     They are (B, 10, 3, 3) of unit Frobenius norm; those that are not real are some finite matrices. The last matrix of
     the basis should be the most likely: solutions without a share of it are not found. No gradient.
     """
-    G = basis[:, :, None] @ basis[:, None].mT  # E_i E_j^T
-    G = G - torch.diag_embed(G.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).expand(*G.shape[:-1]) / 2)
-    cubic = (G[:, :, :, None] @ basis[:, None, None]).flatten(-2)  # (B, 4, 4, 4, 9)
-    first, second, third = basis.unbind(-2)
-    crossed = torch.linalg.cross(second[:, :, None], third[:, None])
-    determinant = (first[:, :, None, None] * crossed[:, None]).sum(-1, keepdim=True)
-    rows = torch.cat([cubic, determinant], -1).flatten(1, 3).mT @ _TABLE.to(basis)  # (B, 10, 20)
+    rows = _constraints(basis)
     reduced = -torch.linalg.solve_ex(rows[..., :10], rows[..., 10:])[0]
     reduced = torch.where(reduced.isfinite().flatten(1).all(1)[:, None, None], reduced, 0.0)
     known = torch.eye(10, dtype=basis.dtype, device=basis.device).expand(basis.shape[0], -1, -1)
     action = torch.cat([reduced, known], 1)[:, _TIMES_X]
-    values, vectors = torch.linalg.eig(action)
+    values, vectors = (value.to(basis.device) for value in torch.linalg.eig(action.cpu()))  # on a GPU one after another
     solutions = vectors.mT[..., _SOLUTION]
     solutions = solutions / torch.where(solutions[..., 3:] == 0, 1.0, solutions[..., 3:])
     real = (values.imag.abs() <= MAX_IMAGINARY * (1 + values.abs())) & (vectors[:, _SOLUTION[3]].abs() > 0)
     E_mat = torch.einsum("bsk,bkij->bsij", solutions.real, basis)
     norm = torch.linalg.matrix_norm(E_mat, keepdim=True)
     return E_mat / torch.where(norm > 0, norm, 1.0), real
+
+
+def _constraints(basis: Tensor) -> Tensor:
+    """Return the coefficients of ten cubic polynomials in the monomials, (B, 10, 20)."""
+    products = basis[:, _FIRST] @ basis[:, _SECOND].mT  # E_i E_j^T
+    products = products + (_FIRST != _SECOND)[:, None, None].to(basis) * products.mT
+    half_trace = products.diagonal(dim1=2, dim2=3).sum(2)[..., None, None] / 2
+    products = products - half_trace * torch.eye(3, dtype=basis.dtype, device=basis.device)
+    cubic = products.flatten(1, 2) @ basis.transpose(1, 2).flatten(2)  # (B, 10 3, 4 3)
+    cubic = cubic.view(-1, 10, 3, 4, 3).permute(0, 2, 4, 1, 3).flatten(3).flatten(1, 2) @ _PAIRS.to(basis)
+    first, second, third = basis.unbind(2)
+    crossed = torch.linalg.cross(second[:, :, None], third[:, None]).flatten(1, 2)
+    determinant = (first @ crossed.mT).flatten(1) @ _TABLE.to(basis)
+    return torch.cat([cubic, determinant[:, None]], 1)

@@ -3,8 +3,14 @@
 import torch
 from torch import Tensor
 
-MAX_IMAGINARY = 1e-6  # relative imaginary part of a real solution
-MIN_LEADING = 1e-12  # of the cubic's largest coefficient, at which its leading one is held
+from kornia_learnnorm.geometry.matrices import determinant
+
+_ANGLES = torch.arange(4, dtype=torch.float64) * torch.pi / 4
+_TURNS = 2 * torch.pi / 3 * torch.arange(3, dtype=torch.float64)
+_ROTATIONS = torch.stack([-_ANGLES.sin(), _ANGLES.cos(), _ANGLES.cos(), _ANGLES.sin()], 1).view(4, 2, 2)
+# From the values of a cubic form at these angles to its coefficients by powers of the cotangent.
+_FORM = torch.stack([_ANGLES.cos() ** k * _ANGLES.sin() ** (3 - k) for k in range(4)])
+_COEFFICIENTS = torch.linalg.inv(_FORM).contiguous()
 
 
 @torch.no_grad()
@@ -14,18 +20,33 @@ def fundamental_in_span(basis: Tensor) -> tuple[Tensor, Tensor]:
     They are (B, 3, 3, 3) of unit Frobenius norm, the roots of a cubic; those that are not real are some finite
     matrices. No gradient.
     """
-    first, second = basis.unbind(1)
-    values = torch.linalg.det(first[:, None] + _X.to(basis)[:, None, None] * second[:, None])
-    coefficients = values @ _INTERPOLATION.to(basis)
-    least = MIN_LEADING * coefficients.abs().amax(1, keepdim=True) + torch.finfo(basis.dtype).tiny
-    leading = torch.where(coefficients[:, 3:].abs() < least, least, coefficients[:, 3:])
-    shift = torch.eye(3, dtype=basis.dtype, device=basis.device)[:, 1:].expand(basis.shape[0], 3, 2)
-    roots = torch.linalg.eigvals(torch.cat([shift, -(coefficients[:, :3] / leading)[..., None]], 2))
-    real = roots.imag.abs() <= MAX_IMAGINARY * (1 + roots.abs())
-    M = first[:, None] + roots.real[..., None, None] * second[:, None]
-    return M / torch.linalg.matrix_norm(M, keepdim=True), real
+    flat, rotations = basis.flatten(2), _ROTATIONS.to(basis)
+    values = determinant(torch.unflatten(rotations[:, 1] @ flat, 2, (3, 3)))  # at four angles
+    # The angle of the largest determinant gives the matrix of the leading coefficient.
+    angle = values.abs().argmax(1)
+    turned = torch.cat([values, -values], 1).gather(1, angle[:, None] + torch.arange(4, device=basis.device))
+    leading = turned[:, :1]
+    monic = turned @ _COEFFICIENTS.to(basis)[:, :3] / torch.where(leading == 0, torch.inf, leading)
+    roots, real = _roots(*monic.unbind(1))
+    first, second = (rotations[angle] @ flat).unbind(1)
+    M = first[:, None] + roots[..., None] * second[:, None]
+    M = M / torch.linalg.vector_norm(M, dim=2, keepdim=True)
+    return torch.unflatten(M, 2, (3, 3)), real
 
 
-_X = torch.tensor([-1.0, 0.0, 1.0, 2.0], dtype=torch.float64)
-# From det(first + x second) at these x to the coefficients.
-_INTERPOLATION = torch.linalg.inv(torch.stack([_X**k for k in range(4)])).contiguous()
+def _roots(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the roots (B, 3) of cubics x^3 + c x^2 + b x + a by Cardano and Viete, and which of them are real."""
+    middle = c / 3
+    p, q = b / 3 - middle.square(), middle**3 + (a - middle * b) / 2  # y^3 + 3 p y + 2 q, x = y - middle
+    discriminant = p**3 + q.square()
+    alone = discriminant > 0
+    root = discriminant.abs().sqrt()
+    u = -torch.copysign((q.abs() + root) ** (1 / 3), q)
+    single = u - p / torch.where(u == 0, torch.inf, u)
+    three = 2 * (-p).clamp(min=0).sqrt()[:, None] * torch.cos((torch.atan2(root, -q) / 3)[:, None] + _TURNS.to(p))
+    y = torch.where(alone[:, None], single[:, None], three)
+    x = y - middle[:, None]
+    a, b, c = a[:, None], b[:, None], c[:, None]
+    slope = (3 * x + 2 * c) * x + b
+    x = x - (((x + c) * x + b) * x + a) / torch.where(slope == 0, torch.inf, slope)
+    return x, torch.stack([torch.ones_like(alone), ~alone, ~alone], 1)
