@@ -30,7 +30,7 @@ SEARCH_STEPS = 5  # of the last stage's steps that a search takes the place of
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
 SAMPLE_SIZE = 7
-MAX_SCORED = 256  # matches by which the matrices of samples are compared first
+MAX_SCORED = 128  # matches by which the matrices of samples are compared first
 SHORTLIST = 6  # matrices of samples that are compared on all matches
 # Matches, and the sum of their probabilities, from which samples are drawn: among few, some fit most of them by chance.
 MIN_MATCHES, MIN_INLIERS = 16, 8

@@ -67,7 +67,9 @@ class Evidence(NamedTuple):
         forms = (e[..., None] * e[..., None, :]).flatten(2) @ _FORMS.mT.to(e)
         # In place: for large batches, new memory costs more than the arithmetic.
         factor = (forms @ self.products).add_(torch.finfo(e.dtype).tiny).reciprocal_()
-        return (e @ self.rows).square().mul_(factor), factor
+        residual = e @ self.rows
+        squares = residual.square() if torch.is_grad_enabled() else residual.mul_(residual)
+        return squares.mul_(factor), factor
 
     def losses(self, F_mat: Tensor, square_scale: Tensor) -> Tensor:
         """Return Geman and McClure's loss (B, S, N) under matrices (B, S, 3, 3), of a squared scale (B, S or 1, 1)."""
@@ -88,7 +90,8 @@ class Evidence(NamedTuple):
 
     def moments(self, weights: Tensor) -> Tensor:
         """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9)."""
-        return (self.rows[:, None] * weights[:, :, None]) @ self.rows.mT[:, None]
+        products = (self.rows[:, None] * weights[:, :, None]).flatten(1, 2) @ self.rows.mT
+        return products.view(*weights.shape[:2], 9, 9)
 
 
 def descend(
