@@ -81,7 +81,7 @@ class Evidence(NamedTuple):
 
         Of weights times gradient factors, and of squared distances, both (B, S, N).
         """
-        M = self.moments(share).flatten(0, 1)
+        M = self.moments(share)
         trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
         scale = (trace + (trace == 0)).reciprocal()
         M = M * scale
@@ -89,9 +89,8 @@ class Evidence(NamedTuple):
         return M, M - torch.unflatten(points @ _FORMS.to(M), 2, (9, 9))[:, 0]
 
     def moments(self, weights: Tensor) -> Tensor:
-        """Return the second moments of the design rows under weights (B, S, N), (B, S, 9, 9)."""
-        products = (self.rows[:, None] * weights[:, :, None]).flatten(1, 2) @ self.rows.mT
-        return products.view(*weights.shape[:2], 9, 9)
+        """Return the second moments of the design rows under weights (B, S, N), (B S, 9, 9)."""
+        return ((self.rows[:, None] * weights[:, :, None]).flatten(1, 2) @ self.rows.mT).view(-1, 9, 9)
 
 
 def descend(

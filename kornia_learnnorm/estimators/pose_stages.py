@@ -217,7 +217,8 @@ def _moment_spans(evidence: Evidence, model: Essential, weights: Tensor) -> Tens
     """Return the four likeliest matrices of moments under weights (B, S, N), (B, S, 4, 3, 3), the likeliest last."""
     carry = torch.einsum("bik,bjl->bklij", model.C1, model.C2)  # of the entries of E to those of F
     carry = carry.flatten(3, 4).flatten(1, 2)[:, None]
-    basis = torch.linalg.eigh(carry.mT @ evidence.moments(weights) @ carry)[1][..., :4].flip(-1).mT
+    moments = torch.unflatten(evidence.moments(weights), 0, weights.shape[:2])
+    basis = torch.linalg.eigh(carry.mT @ moments @ carry)[1][..., :4].flip(-1).mT
     return torch.unflatten(basis, -1, (3, 3)).mT
 
 

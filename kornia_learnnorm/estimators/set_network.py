@@ -74,7 +74,7 @@ class AttentiveContextBlock(nn.Module):
             own, relative = self.point.weight.chunk(2, 1)
             relative = relative / deviation
             bias = self.point.bias + context - mean @ relative.mT
-            update = (z @ (own + relative).mT).add_(bias)
+            update = torch.baddbmm(bias, z, (own + relative).mT)
         else:
             update = self.point(torch.cat([z, (z - mean) / deviation], -1)).add_(context)
         out: Tensor = hidden + self.out(update.relu_())  # not in place: under autocast, `out` has half the precision
