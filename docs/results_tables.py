@@ -98,6 +98,7 @@ LOSSES = {  # of the rows that train the network of Fan et al. with each of them
     "paper-reduction-log": "symmetric epipolar, mean logarithm",
 }
 CASES = ("1 x 8", "64 x 8", "1 x 128", "32 x 128", "1 x 512", "32 x 512")  # batch x correspondences
+GPU_CASES = ("1 x 8", "2048 x 8", "65536 x 8", "32 x 128", "32 x 512")
 
 
 def read_rows(name: str) -> list[list[str]]:
@@ -126,19 +127,20 @@ def table(name: str) -> Markdown:
 
 def _on(machine: dict[str, object]) -> str:
     """Return the machine of a measurement as a line below its table."""
-    words = "; ".join(f"{name}: {machine[name]}" for name in ("processor", "threads", "load", "torch"))
+    words = "; ".join(f"{name}: {machine[name]}" for name in ("processor", "device", "threads", "load", "torch"))
     return f"\n\nMeasured with {words}."
 
 
-def layer_times() -> Markdown:
+def layer_times(name: str = "speed") -> Markdown:
     """Return the milliseconds of one forward and backward pass of the layers, and their ratios to Kornia's solver."""
-    found, rows = read_json("speed"), []
-    for name, (method, parts) in LAYERS.items():
+    found, rows = read_json(name), []
+    columns = CASES if name == "speed" else GPU_CASES
+    for layer, (method, parts) in LAYERS.items():
         both = [found[f"{part}, forward and backward"] for part in parts]
         times = {case: row for part in both for case, row in part.items() if method in row}
         cells = {case: f"{row[method]:.3g} ({row[method] / row['kornia']:.1f})" for case, row in times.items()}
-        rows.append([name, *(cells.get(case, "-") for case in CASES)])
-    return Markdown(format_table(["ms (ratio to Kornia's)", *CASES], rows) + _on(found["machine"]))
+        rows.append([layer, *(cells.get(case, "-") for case in columns)])
+    return Markdown(format_table(["ms (ratio to Kornia's)", *columns], rows) + _on(found["machine"]))
 
 
 def compile_times() -> Markdown:
