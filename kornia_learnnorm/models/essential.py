@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
-from kornia_learnnorm.geometry.dlt import design_matrix, null_space
+from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.pose import in_front_of_best_pose
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2
@@ -57,13 +57,14 @@ class Essential(Fundamental):
     def calibrated(self, E_mat: Tensor) -> "Calibrated":
         """Return the nearest essential matrices of unit norm to matrices of directions (B, 3, 3)."""
         axes, A = Fundamental().state(E_mat)
-        equal = torch.eye(2, dtype=A.dtype, device=A.device).expand_as(A) * 0.5**0.5
+        equal = torch.eye(2).to(A).expand_as(A) * 0.5**0.5
         return Calibrated(axes, equal, self.C1.expand_as(E_mat), self.C2.expand_as(E_mat))
 
     def solve_samples(self, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
         """Return the matrices of samples of five, up to ten each; degenerate ones have none, five on one plane have."""
-        basis, pivots = null_space(design_matrix(x1 @ self.C1.mT, x2 @ self.C2.mT))
-        E_mat, real = essential_in_span(torch.unflatten(basis.mT, -1, (3, 3)))
+        Q, R = torch.linalg.qr(design_matrix(x1 @ self.C1.mT, x2 @ self.C2.mT).mT, mode="complete")
+        E_mat, real = essential_in_span(torch.unflatten(Q[..., 5:].mT, -1, (3, 3)))
+        pivots = R.diagonal(dim1=-2, dim2=-1).abs()
         E_mat = E_mat[real & (pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1))[:, None]]
         F_mat: Tensor = self.C2.mT @ E_mat @ self.C1
         return F_mat
@@ -126,5 +127,5 @@ class Calibrated(NamedTuple):
 
 def nearest_essential(E_mat: Tensor) -> Tensor:
     """Return the nearest essential matrices, scaled to unit norm, to matrices (B, 3, 3)."""
-    eye = torch.eye(3, dtype=E_mat.dtype, device=E_mat.device)[None]
+    eye = torch.eye(3).to(E_mat)[None]
     return Essential(eye, eye).calibrated(E_mat).essential()
