@@ -43,41 +43,11 @@ from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "RANSAC",
-    "BoundedEpipolarLoss",
-    "Cauchy",
-    "CrossViewNetwork",
-    "EightPoint",
-    "EpipolarLoss",
-    "GemanMcClure",
-    "Hartley",
-    "Huber",
-    "Identity",
-    "InlierLoss",
-    "LearnedEightPoint",
-    "LearnedHomography",
-    "LearnedNormalizer",
-    "LearnedRelativePose",
-    "LogEpipolarLoss",
-    "LogEssentialLoss",
-    "MatchRefiner",
-    "NoReliableMatrixError",
-    "PaperNetwork",
-    "PerView",
-    "ReweightedWhitening",
-    "Truncated",
-    "Whitening",
-    "algebraic_distance",
-    "estimate_matches",
-    "estimate_pair",
-    "find_fundamental",
-    "find_homography",
-    "optimal_rank2",
-    "refine_essential",
-    "refine_fundamental",
-    "relative_pose",
-    "sampson_distance",
-    "symmetric_epipolar_distance",
-    "transfer_distance",
-]
+__all__ = ["RANSAC", "EightPoint", "LearnedEightPoint", "LearnedHomography", "LearnedRelativePose", "MatchRefiner"]
+__all__ += ["Hartley", "Identity", "LearnedNormalizer", "PerView", "ReweightedWhitening", "Whitening"]
+__all__ += ["CrossViewNetwork", "PaperNetwork"]
+__all__ += ["BoundedEpipolarLoss", "EpipolarLoss", "InlierLoss", "LogEpipolarLoss", "LogEssentialLoss"]
+__all__ += ["Cauchy", "GemanMcClure", "Huber", "Truncated"]
+__all__ += ["find_fundamental", "find_homography", "optimal_rank2", "refine_essential", "refine_fundamental"]
+__all__ += ["algebraic_distance", "sampson_distance", "symmetric_epipolar_distance", "transfer_distance"]
+__all__ += ["NoReliableMatrixError", "estimate_matches", "estimate_pair", "relative_pose"]
