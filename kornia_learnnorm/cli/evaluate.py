@@ -114,7 +114,7 @@ def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> No
             own = torch.stack([errors["own"] for errors in cell.predictions.values()])
             if infinite := int(own.isinf().any(0).sum()):
                 text += f"; {infinite} with a point on an epipole, not in the means"
-            table = Table(cell.title, text, [*HEADER], method_rows(cell.predictions)).known_parts()
+            table = Table(cell.title, text, HEADER, method_rows(cell.predictions)).known_parts()
             if table is not None:
                 tables.append(table)
                 if args.json != "-":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,6 @@ from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.two_view.drawing import import_matplotlib
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 INK = "#010203"  # placeholder that _make_picture replaces by the text colour of the page
@@ -38,6 +38,7 @@ SETTINGS: dict[str, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "report",
 }
+Colors = dict[str, str]  # by the method
 DOTS: dict[str, Any] = {"marker": "o", "markersize": 3}
 MAX_FRAMES = 20  # image pairs on the axis of Figure 4a
 RHO_WINDOW = 100  # successive samples in a mean of Figure 13
@@ -59,18 +60,20 @@ def report_figures(run: Run) -> list[ReportPicture]:
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
     hues = HUES.split()
     colors = {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(run.about["methods"])}
-    draws = [_per_frame, _distribution, _distances, _conditions, *[_rho] * (len(cell.pair) >= RHO_WINDOW)]
+    papers, pictures = papers_data(run.about["stores"][cell.store]), []
     with import_matplotlib().rc_context(SETTINGS):
-        pictures = [draw(cell, colors) for draw in draws]
-    if papers_data(run.about["stores"][cell.store]):  # of Fan et al., whose numbers are then in the titles
-        pictures = [p._replace(title=f"{p.title} (Figure {p.name.removeprefix('figure-')})") for p in pictures]
+        for number, (title, draw) in DRAWINGS.items():
+            if draw is not _rho or len(cell.pair) >= RHO_WINDOW:
+                figure = import_matplotlib().figure.Figure(figsize=SIZE, layout="constrained")
+                text, svg = draw(figure, cell, colors), _to_svg(figure, f"figure-{number}")
+                title += f" (Figure {number})" * bool(papers)  # of Fan et al.
+                pictures.append(ReportPicture(f"figure-{number}", title, text, svg))
     return pictures
 
 
-def _per_frame(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
+def _per_frame(figure: Figure, cell: RunCell, colors: Colors) -> str:
     chosen = _present(cell, "Hartley", "paper", "crossview", "Hartley+LM", "crossview+LM")
-    figure, (axes,) = _make_figure(1)
-    pair = cell.pair.numpy()
+    axes, pair = figure.subplots(), cell.pair.numpy()
     frames = np.unique(pair)[:MAX_FRAMES]
     for name in chosen:
         own = cell.predictions[name]["own"].numpy()
@@ -80,27 +83,22 @@ def _per_frame(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     axes.set(xlabel="image pair", ylabel="mean error of a pair's samples, px", yscale="log")
     axes.locator_params(axis="x", integer=True)
     text = f"Mean symmetric epipolar distance of a pair's samples, first {len(frames)} image pairs of {cell.store}."
-    if any(name.endswith(REFINED) for name in chosen):
-        text += " Dashed: with non-linear refinement."
-    return _make_picture(figure, "figure-4a", "Error by frame", text)
+    return text + " Dashed: with non-linear refinement." * any(name.endswith(REFINED) for name in chosen)
 
 
-def _distribution(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
-    figure, (axes,) = _make_figure(1)
-    names = _present(cell, *NORMALISATIONS, "Hartley+optimal")
+def _distribution(figure: Figure, cell: RunCell, colors: Colors) -> str:
+    axes, names = figure.subplots(), _present(cell, *NORMALISATIONS, "Hartley+optimal")
     for name in names:
         own = np.sort(cell.predictions[name]["own"].numpy())
         axes.plot(own, np.arange(1, len(own) + 1) / len(own), _line_style(name), color=colors[name], label=name)
     axes.set(xlabel="symmetric epipolar distance of a sample, px", ylabel="share of samples below", xscale="log")
     axes.set(xlim=(0.01, 60), ylim=(0, 1))
     text = f"Distribution of the errors of {len(cell.pair)} samples of eight correspondences of {cell.title}."
-    text += _dashes(names)
-    return _make_picture(figure, "figure-4b", "Distribution of errors", text)
+    return text + _dashes(names)
 
 
-def _distances(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
-    figure, views = _make_figure(2)
-    bins = np.geomspace(0.7, 30, 60).tolist()
+def _distances(figure: Figure, cell: RunCell, colors: Colors) -> str:
+    views, bins = figure.subplots(1, 2), np.geomspace(0.7, 30, 60).tolist()
     for view, axes in enumerate(views, 1):
         for name in _present(cell, "reweighted", "paper", "crossview", "searched"):
             values = cell.predictions[name][f"distance{view}"].numpy()
@@ -110,13 +108,11 @@ def _distances(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
         axes.set_xticks([1, 2, 5, 10, 20], ["1", "2", "5", "10", "20"])
         axes.minorticks_off()
     views[0].set_ylabel("samples")
-    text = f"Mean distances of the normalised points from the origin, {cell.title}. Hartley's is the square root of 2."
-    return _make_picture(figure, "figure-5", "Normalised distances", text)
+    return f"Mean distances of the normalised points from the origin, {cell.title}. Hartley's is the square root of 2."
 
 
-def _conditions(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
-    figure, (axes,) = _make_figure(1)
-    names = _present(cell, *NORMALISATIONS)[::-1]
+def _conditions(figure: Figure, cell: RunCell, colors: Colors) -> str:
+    axes, names = figure.subplots(), _present(cell, *NORMALISATIONS)[::-1]
     for place, name in enumerate(names):
         low, middle, high = np.nanquantile(cell.predictions[name]["condition_number"].numpy(), [0.25, 0.5, 0.75])
         axes.plot([low, high], [place, place], color=colors[name], linewidth=6, solid_capstyle="round", alpha=0.5)
@@ -125,24 +121,30 @@ def _conditions(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
     axes.set_yticks(range(len(names)), names)
     axes.set(xscale="log", xlabel="condition number of the design matrix (no unit)")
     axes.set_ylim(-0.6, len(names) - 0.2)
-    text = f"Largest over eighth singular value of the design matrix. Dot: median; bar: quartiles. {cell.title}."
-    return _make_picture(figure, "figure-12", "Condition numbers", text, legend=False)
+    return f"Largest over eighth singular value of the design matrix. Dot: median; bar: quartiles. {cell.title}."
 
 
-def _rho(cell: RunCell, colors: dict[str, str]) -> ReportPicture:
-    figure, (axes,) = _make_figure(1)
-    names = _present(cell, "Hartley", "whitening", "paper", "crossview")
+def _rho(figure: Figure, cell: RunCell, colors: Colors) -> str:
+    axes, names = figure.subplots(), _present(cell, "Hartley", "whitening", "paper", "crossview")
     for name in names:
         rho = cell.predictions[name]["rho"].numpy()
         means = [np.mean(rho[i : i + RHO_WINDOW]) for i in range(0, len(rho) - RHO_WINDOW + 1, RHO_WINDOW)]
         places = np.arange(len(means)) * RHO_WINDOW
         axes.plot(places, means, _line_style(name), color=colors[name], label=name, **DOTS)
     axes.set(yscale="log", xlabel="sample", ylabel=f"mean rho of {RHO_WINDOW} samples (no unit)")
-    text = (
+    return (
         "Second over third singular value of the normalised matrix before the projection to rank 2, which changes the "
         f"less the larger it is. Means of {RHO_WINDOW} successive samples, {cell.title}.{_dashes(names)}"
     )
-    return _make_picture(figure, "figure-13", "Singularity ratio", text)
+
+
+DRAWINGS: dict[str, tuple[str, Callable[[Figure, RunCell, Colors], str]]] = {
+    "4a": ("Error by frame", _per_frame),
+    "4b": ("Distribution of errors", _distribution),
+    "5": ("Normalised distances", _distances),
+    "12": ("Condition numbers", _conditions),
+    "13": ("Singularity ratio", _rho),
+}
 
 
 def _dashes(names: list[str]) -> str:
@@ -160,18 +162,13 @@ def _line_style(name: str) -> str:
     return "-" if base_name(name) in CLOSED_FORMS or ":" in name else "--"
 
 
-def _make_figure(columns: int) -> tuple[Figure, list[Axes]]:
-    figure = import_matplotlib().figure.Figure(figsize=SIZE, layout="constrained")
-    return figure, figure.subplots(1, columns, squeeze=False).flatten().tolist()
-
-
-def _make_picture(figure: Figure, name: str, title: str, text: str, legend: bool = True) -> ReportPicture:
+def _to_svg(figure: Figure, name: str) -> str:
     """Return a figure as SVG, with one legend of all axes above it."""
-    if legend:
-        entries: dict[str, Any] = {}
-        for axes in figure.axes:
-            handles, labels = axes.get_legend_handles_labels()
-            entries |= dict(zip(labels, handles, strict=True))
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    if entries:
         figure.legend([*entries.values()], [*entries], loc="outside upper center", ncols=5)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
@@ -179,5 +176,4 @@ def _make_picture(figure: Figure, name: str, title: str, text: str, legend: bool
     svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
     # The pictures share a page, so their identifiers must differ.
     svg = re.sub(r'id="([^"]+)"', rf'id="{name}-\1"', svg)
-    svg = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)
-    return ReportPicture(name, title, text, svg)
+    return re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)

@@ -17,8 +17,8 @@ from kornia_learnnorm.metrics.statistics import better_rate, comparable
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
 # Columns of the table that learnnorm evaluate prints.
-HEADER: tuple[str, ...] = ("method", "better than Hartley %", "than whitening %", "mean px", "median px")
-HEADER += ("truth: median px", "truth: better than Hartley %")
+HEADER = ["method", "better than Hartley %", "than whitening %", "mean px", "median px"]
+HEADER += ["truth: median px", "truth: better than Hartley %"]
 
 # Fan et al., Table 1: better than Hartley % by training set, on the data of PAPERS_DATA.
 PRINTED: dict[str, dict[str, float]] = {

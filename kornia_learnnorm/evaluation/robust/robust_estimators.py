@@ -80,9 +80,8 @@ def find_estimator(name: str) -> Estimator:
 
             - a name in :data:`~kornia_learnnorm.evaluation.robust.peers.PEERS`;
             - ``learned:WEIGHTS``, a :class:`~kornia_learnnorm.LearnedEightPoint`, or a
-              :class:`~kornia_learnnorm.LearnedRelativePose` with the cameras of the store; ``learned:WEIGHTS+scores``
-              reads the scores of the matches; ``learned:WEIGHTS+LM`` is refined with Geman and McClure's loss at the
-              threshold;
+              :class:`~kornia_learnnorm.LearnedRelativePose` with the cameras of the store; ``+scores`` behind it reads
+              the scores of the matches, ``+LM`` refines with Geman and McClure's loss at the threshold;
             - ``guided:WEIGHTS``, RANSAC with the probabilities of the learned estimator as weights of the matches;
             - ``RANSAC``, :class:`~kornia_learnnorm.RANSAC` with its defaults;
             - ``RANSAC-calibrated``, RANSAC with the cameras of the store;
@@ -98,12 +97,11 @@ def find_estimator(name: str) -> Estimator:
         return partial(_ransac, {}, name != DEFAULTS)
     if kind == LEARNED and method:
         weights = _weights_of(method)
-        if weights_model(weights) == Essential.name:
-            if method.endswith(REFINED):
-                raise ValueError(f"relative poses are refined by themselves: expected {weights!r}, got {method!r}")
-            return partial(_relative_pose, LearnedRelativePose.from_pretrained(weights), method.endswith(SCORED))
-        layer = LearnedEightPoint.from_pretrained(weights)
-        return partial(_learned, layer, method.endswith(REFINED), method.removesuffix(REFINED).endswith(SCORED))
+        calibrated = weights_model(weights) == Essential.name
+        if calibrated and method.endswith(REFINED):
+            raise ValueError(f"relative poses are refined by themselves: expected {weights!r}, got {method!r}")
+        layer = (LearnedRelativePose if calibrated else LearnedEightPoint).from_pretrained(weights)
+        return partial(_learned, layer, method)
     if kind == GUIDED and method:
         return partial(_guided, LearnedEightPoint.from_pretrained(method))
     if kind and method:
@@ -137,22 +135,19 @@ def _ransac(
 
 
 def _learned(
-    layer: LearnedEightPoint, refined: bool, scored: bool, pair: EvaluatedPair, seed: int, threshold: float
+    layer: LearnedEightPoint | LearnedRelativePose, method: str, pair: EvaluatedPair, seed: int, threshold: float
 ) -> Found:
     points1, points2 = pair.points1[None], pair.points2[None]
-    F_mat = layer(points1, points2, scores=pair.scores[None] if scored else None)
-    if refined:
+    scores = pair.scores[None] if method.removesuffix(REFINED).endswith(SCORED) else None
+    if isinstance(layer, LearnedRelativePose):
+        if not bool(pair.K.isfinite().all()):
+            return None, math.nan
+        inverse1, inverse2 = torch.linalg.inv_ex(pair.K)[0]
+        return inverse2.mT @ layer(points1, points2, *pair.K, scores=scores)[0] @ inverse1, math.nan
+    F_mat = layer(points1, points2, scores=scores)
+    if method.endswith(REFINED):
         F_mat = refine_fundamental(points1, points2, F_mat, loss=GemanMcClure(threshold)).F_mat
     return F_mat[0], math.nan
-
-
-def _relative_pose(layer: LearnedRelativePose, scored: bool, pair: EvaluatedPair, seed: int, threshold: float) -> Found:
-    if not bool(pair.K.isfinite().all()):
-        return None, math.nan
-    scores = pair.scores[None] if scored else None
-    E_mat = layer(pair.points1[None], pair.points2[None], pair.K[0], pair.K[1], scores=scores)[0]
-    inverse1, inverse2 = torch.linalg.inv_ex(pair.K)[0]
-    return inverse2.mT @ E_mat @ inverse1, math.nan
 
 
 def _guided(layer: LearnedEightPoint, pair: EvaluatedPair, seed: int, threshold: float) -> Found:

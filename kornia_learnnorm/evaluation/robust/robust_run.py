@@ -4,6 +4,7 @@ The folder may also hold a run of ``learnnorm evaluate``.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -73,7 +74,10 @@ def record_robust(
     if unknown := {*redo} - {*estimators}:
         raise ValueError(f"--redo {' '.join(sorted(unknown))}: not among the estimators of this command")
     names = robust_estimators.estimator_names(estimators)
-    found = {names[name]: _find(name) for name in estimators}
+    found: dict[str, Estimator | None] = dict.fromkeys(names.values())
+    for name in estimators:
+        with suppress(ImportError):  # its package is not installed
+            found[names[name]] = robust_estimators.find_estimator(name)
     read = {name: read_store(path) for name, path in stores.items()}
     identities = {names[name]: found[names[name]] and robust_estimators.identify_estimator(name) for name in estimators}
     about: About = {"estimators": identities, **options, "threads": torch.get_num_threads()}
@@ -84,14 +88,6 @@ def record_robust(
     if failed := results_store.record(folder, "robust", read, about, jobs, total, redone, command):
         raise ValueError(f"{failed}. All others are in {folder}")
     return [name for name, estimator in found.items() if estimator is None]
-
-
-def _find(name: str) -> Estimator | None:
-    """Return an estimator; None if its package is not installed."""
-    try:
-        return robust_estimators.find_estimator(name)
-    except ImportError:
-        return None
 
 
 def _jobs(
@@ -140,15 +136,14 @@ def measure(pair: EvaluatedPair, F_mat: Tensor, threshold: float) -> dict[str, f
     x1, x2 = pair.points1, pair.points2
     near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD
     pose = relative_pose(F_mat[None], pair.K[:1], pair.K[1:], x1[None], x2[None], near[None])
-    known = bool((rotation_error(pair.R, pair.R) + translation_error(pair.t, pair.t)).isfinite())
-    found = rotation_error(pose[0][0], pair.R), translation_error(pose[1][0], pair.t)
+    known = (rotation_error(pair.R, pair.R) + translation_error(pair.t, pair.t)).isfinite()
     results = {
         "inliers": inlier_share(x1, x2, F_mat, threshold),
         "f1": f1_score(x1, x2, F_mat, pair.F_mat, threshold),
         "error": epipolar_error(x1, x2, F_mat, pair.F_mat),
+        "rotation_error": rotation_error(pose[0][0], pair.R).nan_to_num(torch.inf).where(known, torch.nan),
+        "translation_error": translation_error(pose[1][0], pair.t).nan_to_num(torch.inf).where(known, torch.nan),
     }
-    for name, angle in zip(("rotation_error", "translation_error"), found, strict=True):
-        results[name] = angle.nan_to_num(nan=torch.inf) if known else angle * torch.nan
     return {name: float(value) for name, value in results.items()}
 
 
@@ -169,11 +164,10 @@ def read_robust(folder: str | Path) -> RobustRun | None:
         for name, identity in about["estimators"].items():
             paths = {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
             if all(path.is_file() for path in paths.values()):
-                cells[-1].estimates[name] = {threshold: _results(path) for threshold, path in paths.items()}
+                cells[-1].estimates[name] = {
+                    threshold: {key: torch.from_numpy(value).double() for key, value in read_arrays(path).items()}
+                    for threshold, path in paths.items()
+                }
             elif identity is not None:  # its package is installed
                 missing.append(f"{name} ({store}, {protocol})")
     return RobustRun(about, cells, missing)
-
-
-def _results(path: Path) -> Results:
-    return {key: torch.from_numpy(value).double() for key, value in read_arrays(path).items()}
