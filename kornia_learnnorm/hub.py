@@ -51,9 +51,8 @@ class HubModel(nn.Module, PyTorchModelHubMixin, library_name="kornia_learnnorm",
     ``config.json``, which names the class of the layer, and a model card, ``README.md``, unless there is one already.
 
     Args:
-        layer: a :class:`~kornia_learnnorm.LearnedEightPoint`, :class:`~kornia_learnnorm.LearnedRelativePose`,
-            :class:`~kornia_learnnorm.LearnedHomography`, :class:`~kornia_learnnorm.LearnedNormalizer` or
-            :class:`~kornia_learnnorm.MatchRefiner`; TypeError for others. The attribute ``layer`` has it.
+        layer: a learned layer for F, E or H, :class:`~kornia_learnnorm.LearnedNormalizer` or
+            :class:`~kornia_learnnorm.MatchRefiner`, kept as the attribute ``layer``; TypeError for others.
 
     Example:
         >>> import tempfile

@@ -60,21 +60,17 @@ def export_layer(
 ) -> ExportedProgram:
     r"""Return the program of a layer, which ``torch.export.save`` writes and any PyTorch process runs.
 
-    The program takes ``points1`` and ``points2`` with shape :math:`(B, N, 2)`, float32, any batch size, and by name the
-    tensors of ``inputs``. It returns a tuple of the matrices ``F_mat`` (B, 3, 3), ``determined`` (B,) and, of a
-    :class:`~kornia_learnnorm.LearnedEightPoint`, ``weights`` (B, N), as the layer's ``estimate``. That of a
-    :class:`~kornia_learnnorm.LearnedRelativePose` takes the cameras ``K1`` and ``K2`` (B, 3, 3) after the points, and
-    returns ``E_mat``, ``R`` and ``t`` in the place of ``F_mat``; that of a :class:`~kornia_learnnorm.LearnedHomography`
-    returns ``H_mat``. Values are not checked: points must be finite but where masked, weights not negative.
+    The program takes ``points1`` and ``points2``, :math:`(B, N, 2)` float32, the cameras ``K1`` and ``K2`` (B, 3, 3)
+    for a :class:`~kornia_learnnorm.LearnedRelativePose`, and by name the tensors of ``inputs``. It returns a tuple of
+    fields of the layer's ``estimate``: ``F_mat``, ``H_mat``, or ``E_mat``, ``R`` and ``t``, then ``determined`` and, of
+    learned layers, ``weights``. Values are not checked: points must be finite but where masked, weights not negative.
 
     Args:
         layer: the layer; the program runs on its device.
-        inputs: further inputs: ``"weights"``, ``"mask"`` and, for learned layers, ``"scores"``. They are then no longer
-            optional.
+        inputs: required further inputs: ``"weights"``, ``"mask"`` and, for learned layers, ``"scores"``.
         num_points: number of correspondences :math:`N`, at least eight; without it, any number from nine on, up to the
             normaliser's ``max_points`` where there is one. With a mask, sets of eight and less fit in nine rows.
-        gradients: keep what derivatives need, as for training the network before the layer. Without, the outputs
-            carry no gradient.
+        gradients: keep what derivatives need, as for training the network before the layer.
 
     TypeError for another layer; ValueError if it has no such input, or ``num_points`` is less than eight.
 
@@ -111,14 +107,11 @@ def export_layer(
 def export_networks(layer: EightPoint | LearnedLayer) -> dict[str, Any]:
     """Return the networks of a layer as ONNX programs, without the steps around them.
 
-    The networks of learned layers map ``features`` (B, N, C) and ``absent`` (B, N) to ``logits`` (B, N) and ``params``
-    (B, P); the features of a :class:`~kornia_learnnorm.LearnedEightPoint` are those of
-    :mod:`kornia_learnnorm.estimators.match_features`. The network of a learned normaliser maps ``points1`` and
-    ``points2`` (B, N, 2) in the base's coordinates, and ``null_matrix`` (B, 3, 3) where it needs one, to ``params1``
-    and ``params2`` (B, P).
-
-    Returns one ``torch.onnx.ONNXProgram`` for each network, by name: ``stage1`` and so on, or ``network``. ImportError
-    if onnx or onnxscript is not installed, ValueError if the layer has no network.
+    The networks of learned layers, ``stage1`` and so on, map ``features`` (B, N, C), see
+    :mod:`kornia_learnnorm.estimators.match_features`, and ``absent`` (B, N) to ``logits`` (B, N) and ``params`` (B, P).
+    The ``network`` of a learned normaliser maps ``points1`` and ``points2`` (B, N, 2) in the base's coordinates, and
+    ``null_matrix`` (B, 3, 3) where it needs one, to ``params1`` and ``params2`` (B, P). ImportError if onnx or
+    onnxscript is not installed, ValueError if the layer has no network.
     """
     import_extra("onnx", "onnx", "ONNX export")
     import_extra("onnxscript", "onnx", "ONNX export")

@@ -1,7 +1,6 @@
 """Files of trained weights: tensors, architecture and training data in one safetensors file.
 
-A file names the parts to build. Those of this package are found by their names; a part of your own is named by its
-import path, and only a module that the caller names is imported.
+A file names the parts to build, one of your own by its import path; only a module that the caller names is imported.
 """
 
 import importlib

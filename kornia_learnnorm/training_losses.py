@@ -1,8 +1,4 @@
-r"""Losses of a fundamental matrix.
-
-:class:`EpipolarLoss` is the paper's self-supervision of samples. Sets of matches with outliers have
-:class:`BoundedEpipolarLoss` without labels, :class:`LogEpipolarLoss` and :class:`InlierLoss` with ground truth.
-"""
+"""Losses of matrices: of samples, of matches with outliers without labels, and with ground truth."""
 
 from collections.abc import Callable
 
@@ -20,7 +16,7 @@ MAX_DISTANCE = 1e4  # pixels; larger distances count as this and send no gradien
 
 
 class EpipolarLoss(nn.Module):
-    r"""Residuals on the sample's own points and on held-out ones, mixed and reduced.
+    r"""Residuals on the sample's own points and on held-out ones, the paper's self-supervision.
 
     With ``log=False``, the mean residual of a sample is averaged over the batch (Fan et al., Eq. 7). With ``log=True``,
     its logarithm is, so that a few bad samples do not outweigh the rest. Held-out correspondences enter one by one.
@@ -89,8 +85,7 @@ class EpipolarLoss(nn.Module):
         return ((1 - self.heldout_weight) * loss + self.heldout_weight * heldout).to(F_mat.dtype)
 
     def _residuals(self, points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-        # In float64: next to an epipole, the square of a line's normal leaves the range of float32, and what is zero
-        # above the ceiling would be zero times infinity below.
+        # In float64: next to an epipole, the square of a line's normal leaves the range of float32.
         dtype = solve_dtype(F_mat.device)
         return self.residual(points1.to(dtype), points2.to(dtype), F_mat.to(dtype)).clamp(max=self.ceiling)
 

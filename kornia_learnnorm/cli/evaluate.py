@@ -101,11 +101,11 @@ def run(args: argparse.Namespace) -> int:
 def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> None:
     """Print the tables of a run, without columns that have no number, and append them to a list."""
     limit, trained_on = run.about["max_residual"], run.about["trained_on"]
+    show = print if args.json != "-" else lambda *_, **__: None
     for store, about in run.about["stores"].items():
-        if args.json != "-":
-            print(f"\n{store}: {about}{'' if _has_truth(run, store) else '; without ground truth'}")
-            if known := [name for name in run.about["methods"] if was_trained_on(store, trained_on[name])]:
-                print(f"trained on pairs of this store: {', '.join(known)}")
+        show(f"\n{store}: {about}{'' if _has_truth(run, store) else '; without ground truth'}")
+        if known := [name for name in run.about["methods"] if was_trained_on(store, trained_on[name])]:
+            show(f"trained on pairs of this store: {', '.join(known)}")
         for cell in run.cells:
             if cell.store != store or not cell.predictions:
                 continue
@@ -117,12 +117,10 @@ def _print_tables(args: argparse.Namespace, run: Run, tables: list[Table]) -> No
             table = Table(cell.title, text, HEADER, method_rows(cell.predictions)).known_parts()
             if table is not None:
                 tables.append(table)
-                if args.json != "-":
-                    print(f"\n{text}\n\n{format_table(table.header, table.rows)}", flush=True)
-    if args.json != "-":
-        print(f"\n{LEGEND}")
-        if any(_has_truth(run, store) for store in run.about["stores"]):
-            print(TRUTH)
+                show(f"\n{text}\n\n{format_table(table.header, table.rows)}", flush=True)
+    show(f"\n{LEGEND}")
+    if any(_has_truth(run, store) for store in run.about["stores"]):
+        show(TRUTH)
 
 
 def _has_truth(run: Run, store: str) -> bool:

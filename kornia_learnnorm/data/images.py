@@ -190,9 +190,8 @@ def reduced_size(size: Size, max_size: int | None) -> Size:
 
 def resize_image(image: NDArray[np.uint8], max_size: int | None) -> NDArray[np.uint8]:
     """Return grey values (H, W) or colours (H, W, 3) reduced as by :func:`read_image`; a small image as it is."""
-    size = (image.shape[1], image.shape[0])
-    small = reduced_size(size, max_size)
-    return image if small == size else np.array(_reduce(import_pillow().fromarray(image), small))
+    size = reduced_size((image.shape[1], image.shape[0]), max_size)
+    return image if size == image.shape[1::-1] else np.array(_reduce(import_pillow().fromarray(image), size))
 
 
 def scaling(size_from: Size, size_to: Size) -> Tensor:
@@ -227,11 +226,11 @@ def content_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
     """Return which pixels are inside of a black frame, (H, W) bool; None without one, or if all pixels are black.
 
     The frame is made of the outermost rows and columns with grey values of at most 2, of which 95 % or more are equal;
-    those of a dark photograph have noise. Other arrays than grey values in uint8 are a TypeError or a ValueError.
+    those of a dark photograph have noise. Errors are those of :func:`check_grey`.
     """
     check_grey(image)
     inside = [np.flatnonzero(~_black_rows(lines)) for lines in (image, image.T)]
-    if any(len(kept) == 0 for kept in inside):
+    if not all(map(len, inside)):
         return None
     (top, bottom), (left, right) = ((kept[0], kept[-1] + 1) for kept in inside)
     mask = np.zeros(image.shape, bool)

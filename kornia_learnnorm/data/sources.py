@@ -1,7 +1,6 @@
-"""Sources of samples for training: stores on disk and synthetic scenes.
+"""Sources of samples for training, stores on disk and synthetic scenes, drawn block by block.
 
-The samples of an epoch, a draw, are made in blocks; one block is in memory at once. A block depends only on the seed of
-the draw and its own number, so blocks can be drawn in any order, by any process.
+A block depends only on the seed of the draw and its own number, so any process can draw it.
 """
 
 import os
@@ -23,7 +22,7 @@ SEEDS_PER_RUN = 1_000_003  # seeds that a run can draw from: one for each epoch
 
 
 class Block(NamedTuple):
-    """Numbers of samples, and of image pairs with a sample, of a block before samples are filtered."""
+    """Numbers of samples, and of image pairs with a sample, of a block before the filter on the residual."""
 
     samples: int
     pairs: int

@@ -1,7 +1,6 @@
 r"""Stores: correspondences of many image pairs in one HDF5 file of ragged arrays.
 
-Pair ``i`` owns the rows ``offsets[i]:offsets[i + 1]`` of ``points1``, ``points2``, ``ratio`` and ``score``. A file
-without scores, as of earlier versions, has 1 minus the ratio. Where a command or a configuration takes a store,
+A file without scores, as of earlier versions, has 1 minus the ratio. Where a command or a configuration takes a store,
 ``file.h5@3:10`` means the pairs 3 to 9 of the file.
 """
 
@@ -94,9 +93,8 @@ def read_store(path: str | Path) -> CorrespondenceStore:
 class StoreReader:
     """A store on disk that is read a few pairs at a time, with the paths and the errors of :func:`read_store`.
 
-    The file is open only during a call, so that a reader can be pickled and sent to other processes. ``offsets``, (P +
-    1,) int64, are those of the pairs of ``path``: pair ``i`` has ``offsets[i + 1] - offsets[i]`` correspondences.
-    The values of points and scores are checked by :meth:`read`.
+    The file is open only during a call, so that a reader can be pickled. ``offsets``, (P + 1,) int64, are those of the
+    pairs of ``path``. The values of points and scores are checked by :meth:`read`.
     """
 
     def __init__(self, path: str | Path) -> None:

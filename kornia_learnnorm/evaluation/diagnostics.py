@@ -35,8 +35,7 @@ class Diagnostics(NamedTuple):
 def diagnose(points1: Tensor, points2: Tensor, normalizer: Normalizer) -> Diagnostics:
     r"""Compute the diagnostics of a normaliser on samples, pixels :math:`(B, N, 2)` with :math:`N \ge 8`, float64.
 
-    Reference:
-        Fan et al., sections 3 and 4, and their figures of normalised distances, condition numbers and :math:`\rho`.
+    They are those of Fan et al., sections 3 and 4.
 
     Example:
         >>> from kornia_learnnorm import Hartley

@@ -29,7 +29,7 @@ class SearchedNormalizer(ProblemNormalizer):
 
     Args:
         base: normaliser to start from; :class:`~kornia_learnnorm.ReweightedWhitening` when not given.
-        steps: steps of the search.
+        steps: number of steps.
     """
 
     min_points = 8

@@ -35,9 +35,8 @@ def read_cambridge(root: str | Path, split: str | None = None) -> list[Frame]:
             if name in frames:
                 raise ValueError(f"{path}, line {line.number}: {name} is listed twice")
             size = image_size(root / line.image(name))
-            focal = focals.get(name.rsplit(".", 1)[0], np.nan) if size != (0, 0) else np.nan
-            K = np.full((3, 3), np.nan)
-            if focal > 0:
+            focal, K = focals.get(name.rsplit(".", 1)[0]), np.full((3, 3), np.nan)
+            if focal and size != (0, 0):
                 K = camera_matrix(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
             pose = rigid_motion(line.quaternion(row[3:]) * [1, -1, -1, -1], row[:3])  # the inverse rotation
             frames[name] = Frame(root / name, name, name.rpartition("/")[0], size, K, pose)

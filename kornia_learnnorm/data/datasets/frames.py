@@ -142,7 +142,6 @@ def choose_sequences(dataset: str, root: str | Path, sequences: Sequence[str] | 
     names = list(found if sequences is None else sequences)
     if not names or len(set(names)) < len(names):
         raise ValueError(f"sequences must be one name or more, each once, got {names}")
-    for name in names:
-        if name not in found:
-            raise ValueError(f"no sequence {name!r} at {root}, there are {', '.join(found)}")
+    if unknown := [name for name in names if name not in found]:
+        raise ValueError(f"no sequence {unknown[0]!r} at {root}, there are {', '.join(found)}")
     return {name: found[name] for name in names}

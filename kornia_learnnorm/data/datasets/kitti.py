@@ -4,13 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import Frame, choose_sequences
-from kornia_learnnorm.data.datasets.textfiles import rigid_motion, text_lines
+from kornia_learnnorm.data.datasets.textfiles import Array, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
-
-Array = NDArray[np.float64]
 
 
 def read_kitti(root: str | Path, sequences: Sequence[str] | None = None, camera: str = "image_0") -> list[Frame]:
@@ -60,7 +57,6 @@ def _images(folder: Path) -> list[tuple[int, Path]]:
     images = list(folder.glob("*.png"))
     if not images:
         raise FileNotFoundError(f"no images *.png in {folder}")
-    for image in images:
-        if not (image.stem.isascii() and image.stem.isdecimal()):
-            raise ValueError(f"{image}: an image's name must be its frame's number, as in 000000.png")
+    if wrong := [image for image in images if not (image.stem.isascii() and image.stem.isdecimal())]:
+        raise ValueError(f"{wrong[0]}: an image's name must be its frame's number, as in 000000.png")
     return sorted((int(image.stem), image) for image in images)

@@ -40,8 +40,7 @@ def pair_frames(frames: Iterable[Frame], gap: int = 1) -> Iterator[FramePair]:
         raise ValueError(f"the gap between the frames of a pair must be at least 1, got {gap}")
     for _, group in groupby(frames, key=lambda frame: frame.sequence):
         members = list(group)
-        for frame1, frame2 in zip(members, members[gap:], strict=False):
-            yield FramePair(frame1, frame2)
+        yield from map(FramePair, members, members[gap:])
 
 
 def listed_pairs(frames: Sequence[Frame], path: str | Path) -> Iterator[FramePair]:

@@ -26,8 +26,7 @@ def read_folder(root: str | Path) -> list[Frame]:
     """
     root = Path(root)
     paths = [path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()]
-    names = [path.relative_to(root).as_posix() for path in paths]
-    names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
+    names = [name for name in (path.relative_to(root).as_posix() for path in paths) if "/." not in f"/{name}"]
     if not names:
         raise FileNotFoundError(f"no images ({', '.join(sorted(SUFFIXES))}) in {root}")
     names.sort(key=lambda name: (name.rpartition("/")[0], name))
@@ -66,9 +65,7 @@ def read_dataset(dataset: str, root: str | Path, **options: Any) -> list[Frame]:
 def missing_ground_truth(dataset: str, root: str | Path, frames: Sequence[Frame]) -> list[str]:
     """Return a line for each file and camera that a dataset lacks, without which pairs have no ground truth."""
     root = Path(root)
-    sequences = {frame.sequence: frame for frame in frames}
-    wanted: dict[str, Path] = {}
-    lines = []
+    sequences, wanted, lines = {frame.sequence: frame for frame in frames}, dict[str, Path](), list[str]()
     if dataset == "kitti":
         wanted = {f"pose known for sequence {name}": root / "poses" / f"{name}.txt" for name in sequences}
     elif dataset == "tum":

@@ -5,13 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kornia_learnnorm.data.datasets.frames import Frame, choose_sequences
-from kornia_learnnorm.data.datasets.textfiles import camera_matrix, rigid_motion, text_lines
+from kornia_learnnorm.data.datasets.textfiles import Array, camera_matrix, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
-
-Array = NDArray[np.float64]
 
 # fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3 of the three Kinects; https://cvg.cit.tum.de/data/datasets/rgbd-dataset,
 # file formats, calibration of the colour camera. The images of the third are already undistorted.

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,7 +25,7 @@ from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Fea
 from kornia_learnnorm.data.matching.matchers import check_methods, match_lightglue, match_nearest, one_to_one
 from kornia_learnnorm.data.matching.workers import Workers, open_workers, restart_crashed
 from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test
-from kornia_learnnorm.data.writer import StoreWriter, check_target
+from kornia_learnnorm.data.writer import StoreWriter
 from kornia_learnnorm.files import exclusive
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import MAX_FILTERED, RATIO
@@ -115,7 +116,6 @@ def collect_matches(
     options, about = options or MatchOptions(), about or {}
     if not pairs:
         raise ValueError("no pairs of frames to match: one pair or more expected, got none")
-    check_target(path)
     with nullcontext() if Path(path).exists() else exclusive(path):
         writer = StoreWriter(path, {**about, **asdict(options), **METHOD, "frames": _digest(pairs)})
         if writer.complete:
@@ -135,11 +135,10 @@ def collect_matches(
 def _digest(pairs: Sequence[FramePair]) -> str:
     """Return a hash of the pairs: names, sizes, cameras and poses."""
     digest = sha256()
-    for pair in pairs:
-        for frame in pair:
-            digest.update(f"{frame.name}\n{frame.size} {frame.matched_size} {frame.distortion}\n".encode())
-            for array in (frame.camera, frame.pose):  # rounded: another machine may differ in the last digit
-                digest.update((array.round(6) + 0.0).tobytes())
+    for frame in chain(*pairs):
+        digest.update(f"{frame.name}\n{frame.size} {frame.matched_size} {frame.distortion}\n".encode())
+        for array in (frame.camera, frame.pose):  # rounded: another machine may differ in the last digit
+            digest.update((array.round(6) + 0.0).tobytes())
     return digest.hexdigest()
 
 
@@ -218,7 +217,7 @@ class FeatureCache:
 
     def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
         self.folder = folder
-        self.uses = Counter(frame.name for pair in pairs for frame in pair)
+        self.uses = Counter(frame.name for frame in chain(*pairs))
         self.held: dict[str, Path | str] = {}  # by the frame's name: a file, or the reason why there are no features
 
     def put(self, frame: Frame, found: Found) -> None:

@@ -1,7 +1,6 @@
 """A rendered image pair with an exact fundamental matrix: two views of a room made of textured planes.
 
-For a first run without a data set; use real images to compare methods. A back wall, a floor and slanted boards are
-warped into each view by the homographies of their planes, from back to front. OpenCV is imported on use.
+It is for a first run without a data set; use real images to compare methods.
 """
 
 import json
@@ -84,8 +83,7 @@ def write_pair(folder: str | Path, pair: RenderedPair) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     height, width = pair.image1.shape
     truth = {name: getattr(pair, name).tolist() for name in ("K", "R", "t", "F_mat")}
-    if np.isnan(pair.F_mat).any():
-        truth["F_mat"] = None
+    truth |= {"F_mat": None} if np.isnan(pair.F_mat).any() else {}
     for name in ("image1", "image2"):
         with atomic_write(folder / f"{name}.png") as temporary:
             temporary.write_bytes(cv2.imencode(".png", getattr(pair, name))[1].tobytes())

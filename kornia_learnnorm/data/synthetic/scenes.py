@@ -1,9 +1,8 @@
 r"""Synthetic two-view scenes with exact ground truth: varied ones for training, named ones for tests and examples.
 
-Every scene is made in the same steps. Candidate points of the first image get depths, and the second camera gets a few
-candidate motions. The scene keeps a motion and points that the second image shows: depths are positive in both views
-and points lie in both images. Noise and gross outliers come last. All steps are vectorised over the batch, in float64
-on the generator's device, and depend only on the arguments and the generator's state.
+Candidate points of the first image get depths, and the second camera gets a few candidate motions. The scene keeps a
+motion and points that lie in both images and before both cameras. Noise and gross outliers come last. All is in float64
+on the generator's device and depends only on the arguments and the generator's state.
 """
 
 import math
@@ -71,15 +70,13 @@ def random_views(batch_size: int, num_points: int, generator: Generator) -> TwoV
 def forward_driving(
     batch_size: int, num_points: int, generator: Generator, noise: float = 0.5, outliers: float = 0.0
 ) -> TwoViewScene:
-    """Draw scenes of a car that drives forward: KITTI's camera, a road, about a metre between the images; in metres.
-
-    A. Geiger, P. Lenz, R. Urtasun, Are we ready for autonomous driving? The KITTI benchmark suite, CVPR 2012.
+    """Draw scenes of a car that drives forward: KITTI's camera (A. Geiger et al., CVPR 2012), a road, steps of a metre.
 
     Args:
         batch_size: number of scenes :math:`B`.
         num_points: correspondences per scene :math:`N`.
         generator: source of all randomness; a TypeError for anything but a ``torch.Generator``.
-        noise: standard deviation of the Gaussian noise, pixels per coordinate, in both views.
+        noise: standard deviation of the Gaussian noise, pixels, of each coordinate in both views.
         outliers: share of gross outliers, whose second point is uniform in the image.
 
     Example:
@@ -215,22 +212,19 @@ def synthetic_store(
     """Return a store of synthetic scenes, ``pairs`` of each kind; the ratio test of 0.8 keeps half of the outliers."""
     if pairs < 1 or points < 8:
         raise ValueError(f"at least 1 pair of each scene and 8 points are needed, got {pairs} and {points}")
-    unknown = set(scenes) - set(SCENES)
-    if unknown or not scenes:
+    if set(scenes) - set(SCENES) or not scenes:
         raise ValueError(f"scenes must be among {', '.join(SCENES)}, got {', '.join(scenes) or 'none'}")
     generator = torch.Generator().manual_seed(seed)
     made = [SCENES[kind](pairs, points, generator, noise, outliers) for kind in scenes]
     scene = TwoViewScene(*map(torch.cat, zip(*made, strict=True)))
-    number = len(scene.points1)
-    low = torch.where(scene.inliers, 0.3, 0.6)
-    high = torch.where(scene.inliers, 0.8, 1.0)
+    low, high = torch.where(scene.inliers, 0.3, 0.6), torch.where(scene.inliers, 0.8, 1.0)
     ratio = low + (high - low) * torch.rand(low.shape, generator=generator)
     names = [(f"{kind}/{i:04d}-1", f"{kind}/{i:04d}-2") for kind in scenes for i in range(pairs)]
     return CorrespondenceStore(
         points1=scene.points1.flatten(0, 1).numpy().astype(np.float32),
         points2=scene.points2.flatten(0, 1).numpy().astype(np.float32),
         ratio=ratio.flatten().numpy().astype(np.float32),
-        offsets=np.arange(number + 1, dtype=np.int64) * points,
+        offsets=np.arange(len(names) + 1, dtype=np.int64) * points,
         image_size=scene.image_size[:, None].expand(-1, 2, -1).int().numpy(),
         names=names,
         F=scene.F_mat.numpy(),

@@ -1,7 +1,4 @@
-"""Report of a run as Markdown, as a self-contained HTML page and in the terminal; reads results and runs no model.
-
-It begins with what won, and has no table, column or row without a number.
-"""
+"""Report of a run as Markdown, as a self-contained HTML page and in the terminal; reads results and runs no model."""
 
 import re
 import shutil

@@ -1,7 +1,4 @@
-"""Results of robust estimators on stores, computed once and kept in a folder: what ``learnnorm robust`` makes.
-
-The folder may also hold a run of ``learnnorm evaluate``.
-"""
+"""Results of robust estimators on stores, kept in a folder: what ``learnnorm robust`` makes."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress

@@ -1,7 +1,4 @@
-"""Predictions of methods on stores, computed once and kept in a folder: what ``learnnorm evaluate`` makes.
-
-Each store has a folder with, for each protocol, the samples and a file per method.
-"""
+"""Predictions of methods on stores, kept in a folder a store: what ``learnnorm evaluate`` makes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

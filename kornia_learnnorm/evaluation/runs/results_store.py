@@ -1,7 +1,6 @@
-"""The results of a run, kept in a folder, which is the only thing that recording and reporting share.
+"""The results of a run, kept in a folder: NumPy archives, each computed once, and ``run.json``.
 
-``run.json`` says what the run was computed from, in a section for ``evaluate`` and one for ``robust``; NumPy archives
-hold its arrays. A file that exists is not computed again.
+The latter says what the run was computed from, in a section for ``evaluate`` and one for ``robust``.
 """
 
 import importlib.metadata
