@@ -3,7 +3,7 @@
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -52,20 +52,18 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
 def json_tables(args: argparse.Namespace, inputs: Sequence[str] = ()) -> Iterator[list[Table]]:
     """Give a list for the tables of a command, written as ``--json`` says when the block ends; inputs stay."""
     tables: list[Table] = []
-    with ExitStack() as stack:
-        if args.json not in (None, "-"):
-            taken = {Path(part).resolve() for name in inputs for part in (name, name.rpartition("@")[0])}
-            if not args.json or Path(args.json).resolve() in taken:
-                raise ValueError(f"--json {args.json}: expected a new file or -")
-            beside = stack.enter_context(atomic_write(args.json))
+    if args.json in (None, "-"):
         yield tables
-        text = tables_as_json(args.command_line, tables) + "\n"
-        if args.json == "-":
-            print(text, end="")
-        elif args.json is not None:
-            beside.write_text(text, encoding="utf-8")
-    if args.json not in (None, "-"):
-        print(f"\nwrote {args.json}")
+        if args.json:
+            print(tables_as_json(args.command_line, tables))
+        return
+    taken = {Path(part).resolve() for name in inputs for part in (name, name.rpartition("@")[0])}
+    if not args.json or Path(args.json).resolve() in taken:
+        raise ValueError(f"--json {args.json}: expected a new file or -")
+    with atomic_write(args.json) as beside:
+        yield tables
+        beside.write_text(tables_as_json(args.command_line, tables) + "\n", encoding="utf-8")
+    print(f"\nwrote {args.json}")
 
 
 def run(args: argparse.Namespace) -> int:

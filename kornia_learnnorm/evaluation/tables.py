@@ -1,4 +1,4 @@
-"""Tables of numbers, which are rounded where they are shown: in Markdown, in the terminal and in JSON."""
+"""Tables of numbers, with intervals and p-values, which are rounded where they are shown; empty where unknown."""
 
 import importlib.metadata
 import json
@@ -6,10 +6,18 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self
 
+import torch
+from torch import Tensor
+
 from kornia_learnnorm.files import short_name
+from kornia_learnnorm.metrics.poses import mean_average_accuracy, pose_auc
+from kornia_learnnorm.metrics.statistics import bootstrap_interval, median, paired_bootstrap
 from kornia_learnnorm.optional import import_extra
 
+RESAMPLES = 2000  # bootstrap resamples of a paired test
 MIN_P_VALUE = 1e-3  # the smallest p-value that the resamples of a report can resolve
+MIN_BOOTSTRAP_PAIRS = 8  # image pairs; a bootstrap over fewer is too narrow: no interval, no p-value
+POSE_HEADER = ("AUC@5", "AUC@10", "AUC@20", "mAA(10)")
 
 
 class Number(NamedTuple):
@@ -45,6 +53,58 @@ class Number(NamedTuple):
 
 
 Cell = str | int | Number
+
+
+def percent_change(log_ratio: float) -> float:
+    """Return the change of a geometric mean in % from the mean difference of logarithms."""
+    return 100 * math.expm1(log_ratio)
+
+
+def number(value: float, spec: str = ".3f") -> Cell:
+    """Return a number, unknown if it is NaN."""
+    return "" if math.isnan(value) else Number(value, spec)
+
+
+def median_number(values: Tensor, spec: str = ".3f") -> Cell:
+    """Return the median of the values that are not NaN."""
+    return number(median(values.flatten()).item(), spec)
+
+
+def mean_share(values: Tensor, pair: Tensor) -> Cell:
+    """Return the mean of shares (S,) with its 95 % bootstrap interval over enough image pairs, %; NaN is left out."""
+    values, pair = values[~values.isnan()], pair[~values.isnan()]
+    if len(values) == 0:
+        return ""
+    found = Number(100 * values.mean().item(), ".1f")
+    if len(torch.unique(pair)) < MIN_BOOTSTRAP_PAIRS:
+        return found
+    low, high = bootstrap_interval(values, pair)
+    return found._replace(interval=(100 * low, 100 * high))
+
+
+def paired_change(values: Tensor, baseline: Tensor, pair: Tensor | None = None, *, logarithms: bool = False) -> Cell:
+    """Return the mean difference of two methods with its 95 % interval and p-value, from a paired bootstrap over pairs.
+
+    Differences of ``logarithms`` become changes of the geometric mean, %; the mean stands alone if pairs are too few.
+    """
+    pair = torch.arange(len(values)) if pair is None else pair
+    valid = (values - baseline).isfinite()
+    if not valid.any():
+        return ""
+    show, spec = (percent_change, "+.1f") if logarithms else (float, "+.3f")
+    if len(torch.unique(pair[valid])) < MIN_BOOTSTRAP_PAIRS:
+        return Number(show((values - baseline)[valid].mean().item()), spec)
+    found = paired_bootstrap(values[valid], baseline[valid], pair[valid], draws=RESAMPLES)
+    return Number(show(found.mean), spec, (show(found.low), show(found.high)), found.p_value)
+
+
+def pose_numbers(rotation_error: Tensor, translation_error: Tensor) -> list[Cell]:
+    """Return AUC at 5, 10 and 20 degrees and mAA(10) of errors in degrees, %; unknown if no true pose is known."""
+    error = torch.maximum(rotation_error, translation_error)
+    error = error[~error.isnan()]
+    if len(error) == 0:
+        return [""] * len(POSE_HEADER)
+    return [Number(100 * value, ".1f") for value in (*pose_auc(error), mean_average_accuracy(error))]
 
 
 class Table(NamedTuple):

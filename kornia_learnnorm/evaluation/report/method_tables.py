@@ -9,13 +9,14 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report import numbers
-from kornia_learnnorm.evaluation.report.numbers import BASELINE, better_share, median_number
+from kornia_learnnorm.evaluation import tables
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
-from kornia_learnnorm.evaluation.tables import Cell, Number, Table
+from kornia_learnnorm.evaluation.tables import Cell, Number, Table, median_number
 from kornia_learnnorm.metrics.statistics import better_rate, comparable
 from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
 
+BASELINE = "Hartley"  # the method that all others are compared with
+MIN_DISTANCE = 1e-6  # pixels; smaller distances are clamped before the logarithm
 # Columns of the table that learnnorm evaluate prints.
 HEADER = ["method", "better than Hartley %", "than whitening %", "mean px", "median px"]
 HEADER += ["truth: median px", "truth: better than Hartley %"]
@@ -46,11 +47,11 @@ def with_baseline(run: Run) -> Run:
 
 def rate_tables(run: Run) -> list[Table]:
     """Return the tables of rates against Hartley and, where the run has it, whitening."""
-    tables = []
+    made = []
     for baseline, protocol in product((BASELINE, "whitening"), PROTOCOLS):
         if cells := [cell for cell in run.cells if cell.protocol == protocol and baseline in cell.predictions]:
-            tables.append(_better_rates(run, cells, baseline))
-    return tables
+            made.append(_better_rates(run, cells, baseline))
+    return made
 
 
 def papers_data(description: str) -> str:
@@ -97,6 +98,13 @@ def _rate(cell: RunCell, name: str, baseline: str, trained_on: Iterable[str]) ->
     return rate._replace(trained_on=was_trained_on(cell.store, trained_on)) if isinstance(rate, Number) else rate
 
 
+def better_share(cell: RunCell, name: str, baseline: str, quantity: str) -> Cell:
+    """Return a better rate against a baseline with its interval, %."""
+    value, other = cell.predictions[name][quantity], cell.predictions[baseline][quantity]
+    valid = comparable(value, other)
+    return tables.mean_share((value < other)[valid].double(), cell.pair[valid])
+
+
 def was_trained_on(store: str, trained_on: Iterable[str]) -> bool:
     """Return whether image pairs of a store are in the training data, going by names such as ``tum@0:9``."""
     name, first, stop = _pairs_of(store)
@@ -133,15 +141,15 @@ def method_rows(predictions: Mapping[str, Mapping[str, Tensor]]) -> list[list[Ce
 
 def report_tables(run: Run) -> list[Table]:
     """Return all tables of a run with Hartley's normalisation; numbers without a ground truth are empty cells."""
-    tables = rate_tables(run)
+    made = rate_tables(run)
     for cell in run.cells:
-        tables += [_accuracy(cell), _consensus(cell, run), _tests(cell)]
-    return tables
+        made += [_accuracy(cell), _consensus(cell, run), _tests(cell)]
+    return made
 
 
 def _accuracy(cell: RunCell) -> Table:
     header = ["method", "fit px", "held out px", "truth px", f"truth: better than {BASELINE} %"]
-    header += ["rotation deg", "translation deg", *numbers.POSE_HEADER, "condition number", "rho"]
+    header += ["rotation deg", "translation deg", *tables.POSE_HEADER, "condition number", "rho"]
     header += ["distance 1", "distance 2", "error due to rank 2 %"]
     errors = torch.stack([p["translation_error"] for p in cell.predictions.values()])
     # Samples whose pair has a ground-truth pose: any method has an error on any of them.
@@ -151,7 +159,7 @@ def _accuracy(cell: RunCell) -> Table:
         row = [name, *(median_number(p[key]) for key in ("own", "heldout", "truth"))]
         row.append("-" if name == BASELINE else better_share(cell, name, BASELINE, "truth"))
         row += [median_number(angle, ".2f") for angle in angles]
-        row += numbers.pose_numbers(*(angle.nan_to_num(math.inf)[posed] for angle in angles))
+        row += tables.pose_numbers(*(angle.nan_to_num(math.inf)[posed] for angle in angles))
         row += [median_number(p[key], ".4g") for key in ("condition_number", "rho", "distance1", "distance2")]
         rows.append([*row, median_number(100 * p["rank2_share"], "z.0f")])
     truth = int((~cell.predictions[BASELINE]["truth"].isnan()).sum())
@@ -179,7 +187,7 @@ def _consensus(cell: RunCell, run: Run) -> Table:
     for name, prediction in cell.predictions.items():
         row: list[Cell] = [name]
         for (place, keep), key in product(enumerate(kept.T), ("inliers", "f1")):
-            row.append(numbers.mean_share(prediction[key][keep, place], cell.pair[keep]))
+            row.append(tables.mean_share(prediction[key][keep, place], cell.pair[keep]))
         rows.append(row)
     truth = bool(known.any())
     dropped = " and ".join(f"{int((~keep).sum())} at {t:g} px" for t, keep in zip(THRESHOLDS, known.T, strict=True))
@@ -203,14 +211,14 @@ def _tests(cell: RunCell) -> Table:
     rows = list[list[Cell]]()
     for name, p in cell.predictions.items():
         if name != BASELINE:
-            logs = ([q[key].clamp(min=numbers.MIN_DISTANCE).log() for key in quantities] for q in (p, baseline))
+            logs = ([q[key].clamp(min=MIN_DISTANCE).log() for key in quantities] for q in (p, baseline))
             both = zip(*logs, strict=True)
-            rows.append([name, *(numbers.paired_change(a, b, cell.pair, logarithms=True) for a, b in both)])
+            rows.append([name, *(tables.paired_change(a, b, cell.pair, logarithms=True) for a, b in both)])
     truth = cell.pair[~baseline["truth"].isnan()]
     used, known = (f"{len(pair)} samples of {len(torch.unique(pair))} pairs" for pair in (cell.pair, truth))
     text = (
         f"Change of the geometric mean of each distance against {BASELINE}, with the 95 % interval and two-sided "
-        f"p-value of a paired bootstrap of {numbers.RESAMPLES:,} resamples. Negative is better. `fit` and "
+        f"p-value of a paired bootstrap of {tables.RESAMPLES:,} resamples. Negative is better. `fit` and "
         f"`held out` use {used}{f', `truth` uses {known}' if len(truth) else ''}."
     )
     return Table(f"Paired tests: {cell.title}", text, header, rows)

@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 
 from kornia_learnnorm.evaluation.report.figures import ReportPicture, report_figures
 from kornia_learnnorm.evaluation.report.method_tables import papers_data, report_tables, with_baseline
-from kornia_learnnorm.evaluation.report.numbers import MIN_BOOTSTRAP_PAIRS
 from kornia_learnnorm.evaluation.report.robust_tables import robust_tables
 from kornia_learnnorm.evaluation.report.run_summary import robust_summary, run_summary
 from kornia_learnnorm.evaluation.robust.robust_run import RobustRun, read_robust
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, read_run
 from kornia_learnnorm.evaluation.runs.results_store import read_section
-from kornia_learnnorm.evaluation.tables import MIN_P_VALUE, Table, format_table
+from kornia_learnnorm.evaluation.tables import MIN_BOOTSTRAP_PAIRS, MIN_P_VALUE, Table, format_table
 from kornia_learnnorm.files import write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO

@@ -2,12 +2,11 @@
 
 from torch import Tensor
 
-from kornia_learnnorm.evaluation.report import numbers
+from kornia_learnnorm.evaluation import tables
 from kornia_learnnorm.evaluation.report.method_tables import papers_data
-from kornia_learnnorm.evaluation.report.numbers import median_number
 from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
-from kornia_learnnorm.evaluation.tables import Cell, Number, Table
+from kornia_learnnorm.evaluation.tables import Cell, Number, Table, median_number
 from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
 
 MAX_ERROR = MAX_RESIDUAL  # pixels; larger errors are clamped
@@ -31,14 +30,14 @@ SCALES = {"inliers": 100.0, "f1": 100.0, "error": 1.0}  # shares are printed in 
 
 def robust_tables(run: RobustRun) -> list[Table]:
     """Return all tables of robust estimators of a run; numbers without a ground truth are empty cells."""
-    tables = []
+    made = []
     for cell in run.cells:
         if cell.estimates:
             known = any(bool(pairs_with_truth(cell, threshold).any()) for threshold in THRESHOLDS)
             estimates = {name: found for name, found in cell.estimates.items() if known or name != TRUTH}
             known_cell = cell._replace(estimates=estimates)
-            tables += [_agreement(known_cell, run), _pose_and_time(known_cell), *_tests(known_cell)]
-    return tables
+            made += [_agreement(known_cell, run), _pose_and_time(known_cell), *_tests(known_cell)]
+    return made
 
 
 def pairs_with_truth(cell: RobustCell, threshold: float) -> Tensor:
@@ -96,15 +95,15 @@ def _mean(values: Tensor, digits: int) -> Cell:
 
 
 def _pose_and_time(cell: RobustCell) -> Table:
-    names = (*numbers.POSE_HEADER, "ms", "samples")
+    names = (*tables.POSE_HEADER, "ms", "samples")
     header = ["estimator", *(f"{name} @{threshold:g} px" for threshold in THRESHOLDS for name in names)]
     rows: list[list[Cell]] = []
     for name, by_threshold in cell.estimates.items():
         cells: list[Cell] = []
         for results in by_threshold.values():
-            cells += numbers.pose_numbers(results["rotation_error"], results["translation_error"])
+            cells += tables.pose_numbers(results["rotation_error"], results["translation_error"])
             cells.append(median_number(1000 * results["seconds"], ".1f"))
-            cells.append(numbers.number(results["samples"].mean().item(), ".0f"))
+            cells.append(tables.number(results["samples"].mean().item(), ".0f"))
         rows.append([name, *cells])
     posed = any(row[1] for row in rows)
     poses = (
@@ -134,4 +133,4 @@ def _tests(cell: RobustCell) -> list[Table]:
 def _test(cell: RobustCell, name: str, threshold: float, key: str) -> Cell:
     both = [cell.estimates[n][threshold][key][_kept(cell, threshold)] for n in (name, BASELINE)]
     runs = min(values.shape[1] for values in both)
-    return numbers.paired_change(*(values[:, :runs].clamp(max=MAX_ERROR).mean(1) * SCALES[key] for values in both))
+    return tables.paired_change(*(values[:, :runs].clamp(max=MAX_ERROR).mean(1) * SCALES[key] for values in both))

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.evaluation.methods import SHIPPED, base_name
-from kornia_learnnorm.evaluation.report import numbers
-from kornia_learnnorm.evaluation.report.numbers import BASELINE, MIN_BOOTSTRAP_PAIRS, median_number
+from kornia_learnnorm.evaluation.report.method_tables import BASELINE, MIN_DISTANCE
 from kornia_learnnorm.evaluation.report.robust_tables import MAX_ERROR, pairs_with_truth
 from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
+from kornia_learnnorm.evaluation.tables import MIN_BOOTSTRAP_PAIRS, RESAMPLES, median_number, percent_change
 from kornia_learnnorm.metrics.statistics import PairedDifference, median, paired_bootstrap
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, THRESHOLDS
 
@@ -54,7 +54,7 @@ def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> 
     pair = pair[valid]
     pairs = len(torch.unique(pair))
     against = {
-        name: paired_bootstrap(scores[winner][valid], scores[name][valid], pair, draws=numbers.RESAMPLES)
+        name: paired_bootstrap(scores[winner][valid], scores[name][valid], pair, draws=RESAMPLES)
         for name in others
         if pairs >= MIN_BOOTSTRAP_PAIRS
     }
@@ -64,7 +64,7 @@ def _rank(values: dict[str, float], scores: dict[str, Tensor], pair: Tensor) -> 
 def _about_methods(cell: RunCell, own: list[str]) -> str:
     """Return which method has the smallest median error, as the table shows it, beside others: the user's own too."""
     key = next((key for key in ERRORS if not cell.predictions[BASELINE][key].isnan().all()), "own")
-    logs = {name: p[key].clamp(min=numbers.MIN_DISTANCE).log() for name, p in cell.predictions.items()}
+    logs = {name: p[key].clamp(min=MIN_DISTANCE).log() for name, p in cell.predictions.items()}
     ranking = _rank({name: median(p[key]).item() for name, p in cell.predictions.items()}, logs, cell.pair)
     winner, best = ranking.winner, cell.predictions[ranking.winner]
     text = f"**{cell.title}** ({ranking.samples:,} samples of {ranking.pairs} image pairs): "
@@ -92,7 +92,7 @@ def _compared(cell: RunCell, ranking: _Ranking, key: str) -> str:
     text = f"; next is `{other}` with {error} px" if won else f"; {other} has {error} px"
     if found := ranking.against.get(other):
         logs = (-found.mean, -found.high, -found.low) if won else (found.mean, found.low, found.high)
-        mean, low, high = map(numbers.percent_change, logs)
+        mean, low, high = map(percent_change, logs)
         text += f" (change of the geometric mean {mean:+.1f} % [{low:+.1f}, {high:+.1f}])"
     return text
 
