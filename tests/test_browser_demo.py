@@ -61,9 +61,8 @@ class TestSolve:
         found = demo.solve(*demo.example_files(), camera_files=[tmp_path / "camera.txt"]).estimate
         torch.testing.assert_close(found.R, result.estimate.R)
 
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
+    def test_options(self):
+        for options, message in [
             ({"image2": None}, "two images expected, image 2 is missing"),
             ({"detector": "orb"}, "detector must be one of sift, .*, got 'orb'"),
             ({"matcher": "lightglue"}, "needs detector .*, got sift"),
@@ -74,12 +73,10 @@ class TestSolve:
             ({"cameras": ";".join([K] * 3)}, "one or two expected, typed or as files, got 3 and 0"),
             ({"cameras": __file__}, "_demo.py: expected fx,fy,cx,cy in pixels, or exif"),  # not read
             ({"cameras": "exif"}, "camera exif: image1.png has no focal length"),
-        ],
-    )
-    def test_options(self, options, message):
-        given = dict(zip(("image1", "image2"), demo.example_files(), strict=True)) | options
-        with pytest.raises(ValueError, match=message):
-            demo.solve(**given)
+        ]:
+            given = dict(zip(("image1", "image2"), demo.example_files(), strict=True)) | options
+            with pytest.raises(ValueError, match=message):
+                demo.solve(**given)
 
     def test_files_are_named_without_their_folder(self, monkeypatch, tmp_path):
         (tmp_path / "none.png").touch()

@@ -140,19 +140,16 @@ class TestSyntheticSets:
 
 
 class TestRandomSets:
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
+    def test_wrong_options(self):
+        for arguments, message in [
             ({"sources": []}, "sources is empty"),
             ({"shares": [1.0, 2.0]}, "one non-negative number for each of 1 sources"),
             ({"shares": [0.0]}, "one non-negative number for each"),
             ({"sizes": (3, 9)}, "at least 4 matches"),
             ({"batches": 0}, "at least 1, got 0"),
-        ],
-    )
-    def test_wrong_options(self, arguments, message):
-        with pytest.raises(ValueError, match=message):
-            RandomSets(**{"sources": [SyntheticSets()]} | arguments)
+        ]:
+            with pytest.raises(ValueError, match=message):
+                RandomSets(**{"sources": [SyntheticSets()]} | arguments)
 
 
 class TestAugment:

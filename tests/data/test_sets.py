@@ -42,17 +42,14 @@ def test_filter_agrees_with_numpy(store, monkeypatch):
     np.testing.assert_allclose(plain_residual(*samples[:2]).numpy()[near], expected[near], rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_bad_arguments(store):
+    for arguments, message in [
         ({"size": 7}, "size=7"),
         ({"max_ratio": 0.1}, "no pair of the store"),
         ({"size": 96, "max_ratio": None, "num_heldout": 4}, "held-out correspondences: a pair has only"),
-    ],
-)
-def test_bad_arguments(store, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        draw_samples(store, seeded(), **arguments)
+    ]:
+        with pytest.raises(ValueError, match=message):
+            draw_samples(store, seeded(), **arguments)
 
 
 def test_too_few_to_hold_out(store):

@@ -133,15 +133,12 @@ def test_bad_sources(sources, arguments):
         sources(**arguments)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+@pytest.mark.parametrize("kind", [StoreSamples, StoreSets])
+def test_draws_that_cannot_be(sources, kind):
+    for arguments, message in [
         ({"num_heldout": -1}, "num_heldout must be 0 or more, got -1"),
         ({"max_ratios": [0.8, 2.0]}, "max_ratios must be above 0 and at most 1, or null for no limit, got 2"),
         ({"max_ratios": [0.0]}, "max_ratios must be above 0 and at most 1, or null for no limit, got 0"),
-    ],
-)
-@pytest.mark.parametrize("kind", [StoreSamples, StoreSets])
-def test_draws_that_cannot_be(sources, arguments, message, kind):
-    with pytest.raises(ValueError, match=message):
-        kind(sources().paths, **arguments)
+    ]:
+        with pytest.raises(ValueError, match=message):
+            kind(sources().paths, **arguments)

@@ -323,19 +323,16 @@ WRONG_OF_ESSENTIAL = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("refine", "wrong", "error", "message"),
-    [
+def test_wrong_arguments():
+    """Of the points, weights and matrices that refine_fundamental gets see test_contract.py."""
+    for refine, wrong, error, message in [
         *((refine, *case) for refine in (refine_fundamental, refine_essential) for case in WRONG_OPTIONS),
         *((refine_essential, *case) for case in WRONG_OF_ESSENTIAL),
-    ],
-)
-def test_wrong_arguments(refine, wrong, error, message):
-    """Of the points, weights and matrices that refine_fundamental gets see test_contract.py."""
-    start = {"F_mat": EYE.repeat(2, 1, 1)} if refine is refine_fundamental else {"E_mat": EYE.repeat(2, 1, 1)}
-    cameras = {} if refine is refine_fundamental else {"K1": EYE, "K2": EYE}
-    with pytest.raises(error, match=message):
-        refine(**{"points1": POINTS, "points2": POINTS, **start, **cameras} | wrong)
+    ]:
+        start = {"F_mat": EYE.repeat(2, 1, 1)} if refine is refine_fundamental else {"E_mat": EYE.repeat(2, 1, 1)}
+        cameras = {} if refine is refine_fundamental else {"K1": EYE, "K2": EYE}
+        with pytest.raises(error, match=message):
+            refine(**{"points1": POINTS, "points2": POINTS, **start, **cameras} | wrong)
 
 
 def refine_weighted(x1, x2, F_mat, weights, steps):

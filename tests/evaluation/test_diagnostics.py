@@ -43,19 +43,16 @@ def test_gradcheck(function, shapes):
     assert gradcheck(function, [uniform(*shape, low=-1, seed=k).requires_grad_() for k, shape in enumerate(shapes)])
 
 
-@pytest.mark.parametrize(
-    ("function", "shapes", "error", "message"),
-    [
+def test_wrong_shapes():
+    for function, shapes, error, message in [
         (condition_number, [(2, 7, 9)], ValueError, r"at least eight rows, got shape \[2, 7, 9\]"),
         (condition_number, [(2, 8, 8)], ShapeError, "2, 8, 8"),
         (singularity_ratio, [(2, 3, 4)], ShapeError, "3, 4"),
         (normalized_distance, [(2, 8, 3), (2, 3, 3)], ShapeError, "8, 3"),
         (normalized_distance, [(2, 8, 2), (2, 2, 2)], ShapeError, "2, 2"),
-    ],
-)
-def test_wrong_shapes(function, shapes, error, message):
-    with pytest.raises(error, match=message):
-        function(*map(torch.rand, shapes))
+    ]:
+        with pytest.raises(error, match=message):
+            function(*map(torch.rand, shapes))
 
 
 @given(st.integers(0, 2**31), st.sampled_from([1e-6, -3.0, 1e6]))

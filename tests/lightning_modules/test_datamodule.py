@@ -34,18 +34,15 @@ def test_batches_depend_on_seed_and_position_alone(source, size):
         assert torch.equal(torch.cat([batch.pair for batch in ordered]), torch.arange(300))
 
 
-@pytest.mark.parametrize(
-    ("size", "options", "message"),
-    [
+def test_wrong_sizes_of_batches():
+    for size, options, message in [
         (64, {}, "a batch takes 64 samples, the source gives 10"),
         (11, {"by_pair": True}, "a batch takes 11 image pairs, the source gives 10"),
         (0, {}, "a batch must hold at least one sample for each process, got 0"),
         (1, {"rank": 0, "world_size": 2}, "at least one sample for each process, got 1"),
-    ],
-)
-def test_wrong_sizes_of_batches(size, options, message):
-    with pytest.raises(ValueError, match=message):
-        BatchLoader(SyntheticSamples(number=10, max_residual=None), size, seed=0, shuffle=True, **options)
+    ]:
+        with pytest.raises(ValueError, match=message):
+            BatchLoader(SyntheticSamples(number=10, max_residual=None), size, seed=0, shuffle=True, **options)
 
 
 def test_validation_shares_no_sample_with_training_and_can_be_missing():

@@ -89,19 +89,16 @@ class TestAll:
         points1, points2, F, true = pairs()
         assert METRICS[name](points1[:, :0], points2[:, :0], F, true, 1.0).isnan().all()
 
-    @pytest.mark.parametrize(
-        ("change", "error", "message"),
-        [
+    def test_exceptions(self, name):
+        for change, error, message in [
             (lambda a, b, F, true: (a.float(), b, F, true), TypeError, "."),
             (lambda a, b, F, true: (a[:, :-1], b, F, true), ValueError, "."),
             (lambda a, b, F, true: (a, b, F[:, :2], true[:, :2]), ShapeError, "."),
             *((lambda *p, t=t: (*p, t), ValueError, f"must be positive, got {t}") for t in (0.0, -1.0, NAN)),
-        ],
-    )
-    def test_exceptions(self, name, change, error, message):
-        points1, points2, F, true, *rest = change(*pairs())
-        with pytest.raises(error, match=message):
-            METRICS[name](points1, points2, F, true, *(rest or [1.0]))
+        ]:
+            points1, points2, F, true, *rest = change(*pairs())
+            with pytest.raises(error, match=message):
+                METRICS[name](points1, points2, F, true, *(rest or [1.0]))
 
 
 class TestByRows:

@@ -175,9 +175,9 @@ def test_no_matrix(points1, shift, code):
     assert caught.value.code == code
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
+def test_wrong_arguments():
+    points = dict(zip(("points1", "points2"), torch.rand(2, 9, 2) * 100, strict=True))
+    for changes, error, message in [
         ({"points1": torch.zeros(9, 3)}, ValueError, "shape"),
         ({"points2": torch.zeros(8, 2)}, ValueError, "shape"),
         ({"scores": torch.full((9,), 2.0)}, ValueError, "from 0 to 1, got 9 others, the first 2"),
@@ -194,9 +194,6 @@ def test_no_matrix(points1, shift, code):
         ({"size2": (640,)}, ValueError, r"size2 must be a positive width and height, got \(640,\)"),
         ({"K1": torch.eye(3)}, ValueError, "given together"),
         ({"K1": torch.eye(3), "K2": torch.eye(3)[None]}, ValueError, r"K2 must have .* got \[1, 3, 3\]"),
-    ],
-)
-def test_wrong_arguments(changes, error, message):
-    points = dict(zip(("points1", "points2"), torch.rand(2, 9, 2) * 100, strict=True))
-    with pytest.raises(error, match=message):
-        kln.estimate_matches(**{**points, **changes})
+    ]:
+        with pytest.raises(error, match=message):
+            kln.estimate_matches(**{**points, **changes})

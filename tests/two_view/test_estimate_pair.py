@@ -127,9 +127,9 @@ class TestErrors:
         assert caught.value.code == code
         assert "\n" not in str(caught.value)
 
-    @pytest.mark.parametrize(
-        ("options", "error", "message"),
-        [
+    def test_options_are_checked_before_the_work(self, monkeypatch):
+        monkeypatch.setattr(pair_module.images, "read_image", lambda *_: pytest.fail("an image was read"))
+        for options, error, message in [
             ({"K1": K, "K2": K * np.nan}, ValueError, "K2 must be finite and invertible"),
             ({"threshold": np.nan}, ValueError, "threshold must be positive"),
             ({"ratio": "x"}, TypeError, "ratio must be a number, got 'x'"),
@@ -139,12 +139,9 @@ class TestErrors:
             ({"detector": "surf"}, ValueError, "detector must be one of sift, .*, got 'surf'"),
             ({"matcher": "lightglue"}, ValueError, "lightglue needs detector .*, keynet, got sift"),
             ({"detector": "disk", "matcher": "lightglue", "ratio": 0.7}, ValueError, "0.7 is for matcher nearest"),
-        ],
-    )
-    def test_options_are_checked_before_the_work(self, options, error, message, monkeypatch):
-        monkeypatch.setattr(pair_module.images, "read_image", lambda *_: pytest.fail("an image was read"))
-        with pytest.raises(error, match=message):
-            estimate_pair("left.png", "right.png", **options)
+        ]:
+            with pytest.raises(error, match=message):
+                estimate_pair("left.png", "right.png", **options)
 
     def test_wrong_masks(self, images):
         with pytest.raises(TypeError, match="a mask must be an array of bool, got uint8"):
@@ -152,18 +149,15 @@ class TestErrors:
         with pytest.raises(ValueError, match=r"shape of its image, \(240, 320\), got \(320, 240\)"):
             match_two_images(*images, mask1=np.ones((WIDTH, HEIGHT), bool))
 
-    @pytest.mark.parametrize(
-        ("image", "error", "message"),
-        [
+    def test_what_is_no_image(self, planes, images):
+        for image, error, message in [
             *((values, (TypeError, ValueError), "an image must") for values in (np.zeros((8, 8)), 3)),
             (np.zeros((8, 8, 4), np.uint8), ValueError, "an image must"),
             ("no.png", FileNotFoundError, r"no\.png does not exist"),
             ("half.png", ValueError, r"half\.png.*truncated or corrupt"),
-        ],
-    )
-    def test_what_is_no_image(self, planes, images, image, error, message):
-        with pytest.raises(error, match=message):
-            estimate_pair(images[0], planes / image if isinstance(image, str) else image)
+        ]:
+            with pytest.raises(error, match=message):
+                estimate_pair(images[0], planes / image if isinstance(image, str) else image)
 
 
 @pytest.mark.parametrize(

@@ -52,17 +52,14 @@ class TestReadColmap:
         pixels = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), frame.K, coefficients)[0][:, 0]
         assert np.allclose(pixels, expected, atol=1e-6)
 
-    @pytest.mark.parametrize(
-        ("camera", "message"),
-        [
+    def test_wrong_camera(self, colmap):
+        for camera, message in [
             ("OPENCV_FISHEYE 160 120 130 130 80 60 0 0 0 0", r"one/0\.png must be one of .* got OPENCV_FISHEYE"),
             ("PINHOLE 320 240 130 130 160 120", r"0\.png must have its camera's size, 320 x 240 .* got 160 x 120"),
-        ],
-    )
-    def test_wrong_camera(self, colmap, camera, message):
-        set_camera(colmap, camera)
-        with pytest.raises(ValueError, match=message):
-            read(colmap)
+        ]:
+            set_camera(colmap, camera)
+            with pytest.raises(ValueError, match=message):
+                read(colmap)
 
     def test_missing_and_unreadable_images(self, colmap):
         (colmap / "images/one/1.png").write_bytes(b"")

@@ -88,13 +88,10 @@ class TestReadFrame:
         reach = int(14 * max(size[0] / 240, size[1] / 180))
         assert np.abs(centroids(image, want, reach) - want).max() < 0.05
 
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
+    def test_does_not_fit_its_camera(self, tmp_path):
+        for change, message in [
             ({"size": (640, 480)}, r"a\.png has 240 x 180 pixels, its camera 640 x 480"),
             ({"distortion": DISTORTION}, "a distortion, but no camera matrix"),
-        ],
-    )
-    def test_does_not_fit_its_camera(self, tmp_path, change, message):
-        with pytest.raises(ValueError, match=message):
-            read_frame(replace(frame_of(tmp_path / "a.png", texture()), **change))
+        ]:
+            with pytest.raises(ValueError, match=message):
+                read_frame(replace(frame_of(tmp_path / "a.png", texture()), **change))

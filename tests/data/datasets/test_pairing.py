@@ -35,16 +35,13 @@ class TestListedPairs:
         pairs = listed_pairs(numbered("x", "y"), str(tmp_path / "pairs.txt"))
         assert names(pairs) == [("x/3.png", "x/0.png"), ("x/1.png", "y/2.png")]
 
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
+    def test_malformed(self, tmp_path):
+        for text, message in [
             ("x/0.png x/1.png\nx/0.png\n", r"pairs\.txt, line 2: two names of two images expected, got 'x/0\.png'"),
             ("x/0.png x/0.png", r"line 1: two names of two images expected"),
             ("x/0.png x/1.png\nx/1.png x/0.png\n\nx/0.png  x/1.png", r"line 4: .* is in line 1 already"),
             ("\nx/0.png 7.png", r"line 2: no frame '7\.png' among 4, such as 'x/0\.png'"),
-        ],
-    )
-    def test_malformed(self, tmp_path, text, message):
-        (tmp_path / "pairs.txt").write_text(text)
-        with pytest.raises(ValueError, match=message):
-            list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))
+        ]:
+            (tmp_path / "pairs.txt").write_text(text)
+            with pytest.raises(ValueError, match=message):
+                list(listed_pairs(numbered("x"), tmp_path / "pairs.txt"))

@@ -119,9 +119,8 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
         read_dataset(dataset, root)
 
 
-@pytest.mark.parametrize(
-    ("dataset", "root", "arguments", "error", "message"),
-    [
+def test_wrong_arguments(written):
+    for dataset, root, arguments, error, message in [
         ("kitti", "kitti", {"sequences": ["07"]}, ValueError, r"no sequence '07' at .*, there are 00, 06, 11"),
         ("kitti", "kitti", {"sequences": "00"}, TypeError, "a list of names, got the string '00'"),
         ("kitti", "kitti", {"camera": "image_4"}, ValueError, "image_0 to image_3, got 'image_4'"),
@@ -134,11 +133,9 @@ def test_malformed(written, tmp_path, file, line, text, message, error):
         ("kitti", "kitti", {"split": "val"}, ValueError, "a split of kitti must be one of train, test, got 'val'"),
         ("tum", f"tum/{FR3}", {"split": "train"}, FileNotFoundError, f"expected others than {FR3}, got {FR3}"),
         ("tum", f"tum/{FR1}", {"split": "val"}, FileNotFoundError, f"no val sequence of tum .*: expected {FR3}, got"),
-    ],
-)
-def test_wrong_arguments(written, dataset, root, arguments, error, message):
-    with pytest.raises(error, match=message):
-        read_dataset(dataset, written / root, **arguments)
+    ]:
+        with pytest.raises(error, match=message):
+            read_dataset(dataset, written / root, **arguments)
 
 
 def test_a_folder_within_does_not_part_its_sequence(tmp_path):

@@ -91,17 +91,14 @@ def test_what_fails_is_a_failure(monkeypatch, matches):
     assert run_estimator(find_estimator("RANSAC"), few, 0, 1.0).F_mat.isnan().all()
 
 
-@pytest.mark.parametrize(
-    ("name", "error", "message"),
-    [
+def test_unknown():
+    for name, error, message in [
         *((name, ValueError, "no estimator") for name in ("nothing", "learned:", "guided:", "RANSAC:")),
         ("RANSAC:Hartley+LM", ValueError, "refines by itself"),
         ("RANSAC:nothing", FileNotFoundError, "no weights 'nothing'"),
-    ],
-)
-def test_unknown(name, error, message):
-    with pytest.raises(error, match=message):
-        find_estimator(name)
+    ]:
+        with pytest.raises(error, match=message):
+            find_estimator(name)
 
 
 def test_names(tmp_path):
