@@ -92,16 +92,13 @@ class TestEpipolarLoss:
         points = points if heldout_weight else points[:2]
         assert gradcheck(lambda F_mat, a, b, *rest: loss(a, b, F_mat, *rest), [F_mat, *points])
 
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
+    def test_exceptions(self):
+        for name, value in [
             *(("heldout_weight", value) for value in (-0.1, 1.1, math.nan)),
             *((name, value) for name in ("floor", "heldout_floor", "ceiling") for value in (0.0, -1.0)),
-        ],
-    )
-    def test_exceptions(self, name, value):
-        with pytest.raises(ValueError, match=f"must be .* got .*{value}"):
-            EpipolarLoss(**{name: value})
+        ]:
+            with pytest.raises(ValueError, match=f"must be .* got .*{value}"):
+                EpipolarLoss(**{name: value})
 
     @pytest.mark.parametrize("heldout", [(), (None, None), (torch.zeros(1, 3, 2), None), (torch.zeros(1, 0, 2),) * 2])
     def test_heldout_points_are_needed_only_with_a_weight(self, heldout):

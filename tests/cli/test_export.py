@@ -33,17 +33,14 @@ def test_networks_as_onnx(tmp_path, monkeypatch, networks):
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == expected
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
+def test_what_cannot_be_written(refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for words, message in [
         (["rubust", "--format", "pt2", "--out", "a.pt2"], "no weights 'rubust': expected a .safetensors file or one"),
         (["robust", "--format", "pt2", "--out", "a.onnx"], "--format pt2 is written to a .pt2 file, got 'a.onnx'"),
         (["robust", "--format", "onnx", "--out", "a.onnx", "--points", "8"], "--points belong to --format pt2"),
         (["crossview", "--format", "pt2", "--out", "a.pt2", "--inputs", "scores"], "are weights, mask, got scores"),
         (["robust", "--format", "pt2", "--out", "none/a.pt2"], "the folder none does not exist"),
-    ],
-)
-def test_what_cannot_be_written(words, message, refused, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    refused(["export", *words], message)
-    assert [*tmp_path.iterdir()] == []
+    ]:
+        refused(["export", *words], message)
+        assert [*tmp_path.iterdir()] == []

@@ -134,19 +134,16 @@ def test_an_ablation_changes_one_thing(name):
     assert len(changed) == 1 + (name in TWO), changed
 
 
-@pytest.mark.parametrize(
-    ("commands", "options", "message"),
-    [
+def test_missing_and_wrong_checkpoints(trained, monkeypatch, refused):
+    monkeypatch.chdir(trained[0])
+    for commands, options, message in [
         ("validate predict", [], "give the checkpoint by --ckpt_path"),
         ("fit", ["--ckpt_path=weights.safetensors"], "weights.safetensors is not a checkpoint of a training run"),
         ("test", ["--ckpt_path=none.ckpt"], "no checkpoint at none.ckpt"),
         ("test", ["--ckpt_path=checkpoints/last.ckpt", f"--{NETWORK}.width=32"], "holds another network than the one"),
-    ],
-)
-def test_missing_and_wrong_checkpoints(trained, monkeypatch, refused, commands, options, message):
-    monkeypatch.chdir(trained[0])
-    for command in commands.split():
-        refused([command, *trained[1], *options], message)
+    ]:
+        for command in commands.split():
+            refused([command, *trained[1], *options], message)
 
 
 # The console script in a process where importing torch is interrupted.

@@ -60,20 +60,17 @@ def test_resized_images_and_cameras_agree(written, tmp_path):
     assert store.K[0, 0, 0, 0] == 260  # twice the focal length
 
 
-@pytest.mark.parametrize(
-    ("reader", "args", "message"),
-    [
+def test_errors_are_one_line(written, tmp_path, refused):
+    for reader, args, message in [
         ("folder", ["--sequences", "06"], "sequences is for kitti and tum, got folder"),
         ("kitti", ["--sequences", "06", "--split", "test"], "exclude each other"),
         ("kitti", ["--gap", "9"], "no pairs of frames to match (frames 9 apart) among 12 frames"),
         ("kitti", ["--matcher", "lightglue"], "needs detector rootsift, aliked, disk, xfeat, keynet, got sift"),
         ("kitti", ["--min-points", "5"], "min_points 5 needs a COLMAP model, got none"),
         ("colmap", [], "colmap needs a model"),
-    ],
-)
-def test_errors_are_one_line(written, tmp_path, refused, reader, args, message):
-    refused(command(reader, written / reader, tmp_path / "s.h5", *args), message)
-    assert not (tmp_path / "s.h5").exists()
+    ]:
+        refused(command(reader, written / reader, tmp_path / "s.h5", *args), message)
+        assert not (tmp_path / "s.h5").exists()
 
 
 def test_rerun_says_that_the_store_exists(written, tmp_path, capsys):
@@ -108,18 +105,15 @@ def test_missing_ground_truth_is_named(written, tmp_path, capsys, monkeypatch, r
     assert lines == [expected.format(root)]
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
+def test_options_are_checked_before_images_are_read(written, tmp_path, refused, monkeypatch):
+    monkeypatch.setattr(match, "read_dataset", None)
+    for args, message in [
         (["--jobs", "-7"], "jobs must be a number of processes"),
         (["--max-matches", "7"], "max_matches must be at least 8, or None (a command's 0) for all, got 7"),
         (["--out", "none/s.h5"], "cannot write none/s.h5: the folder none does not exist"),
         (["--out", "own.txt"], "own.txt: expected the name of a store, which ends in .h5 or .hdf5"),
-    ],
-)
-def test_options_are_checked_before_images_are_read(written, tmp_path, refused, monkeypatch, args, message):
-    monkeypatch.setattr(match, "read_dataset", None)
-    refused(command("kitti", written / "kitti", tmp_path / "s.h5", *args), message)
+    ]:
+        refused(command("kitti", written / "kitti", tmp_path / "s.h5", *args), message)
 
 
 @pytest.mark.parametrize(

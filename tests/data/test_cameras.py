@@ -25,9 +25,8 @@ COLMAP = {  # the centre of the top left pixel is (0.5, 0.5)
 HEADER = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "expected"),
-    [
+def test_files(tmp_path):
+    for name, text, expected in [
         ("four.txt", "700 710\n320 240\n", [700, 710, 320, 240]),
         ("nine.txt", "700 0 320\n0 710 240\n0 0 1\n", [700, 710, 320, 240]),
         ("calib.txt", KITTI.format("0: 718.856") + KITTI.format("1: 700"), [718.856, 718.856, 607.1928, 185.2157]),
@@ -37,16 +36,14 @@ HEADER = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL,
         ("0000.jpg.camera", STRECHA.format(0), [2700, 2710, 1500, 1000]),
         ("0000.jpg.camera", STRECHA.format(0.1), r"no distortion expected, got \[0\.1, "),
         *(("cameras.txt", f"{HEADER}{line}\n", expected) for line, expected in COLMAP.items()),
-    ],
-)
-def test_files(tmp_path, name, text, expected):
-    (tmp_path / name).write_bytes(text.encode("latin-1"))
-    if isinstance(expected, str):
-        with pytest.raises(ValueError, match=expected):
-            read_camera(str(tmp_path / name))
-    else:
-        fx, fy, cx, cy = expected
-        assert read_camera(str(tmp_path / name)).tolist() == [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+    ]:
+        (tmp_path / name).write_bytes(text.encode("latin-1"))
+        if isinstance(expected, str):
+            with pytest.raises(ValueError, match=expected):
+                read_camera(str(tmp_path / name))
+        else:
+            fx, fy, cx, cy = expected
+            assert read_camera(str(tmp_path / name)).tolist() == [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
 
 
 @pytest.mark.parametrize("text", ["700,710,320,240", " 700, 710, 320, 240"])

@@ -18,22 +18,19 @@ from kornia_learnnorm.pretrained import WEIGHTS
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
-@pytest.mark.parametrize(
-    ("name", "normalizer"),
-    [
+def test_estimates_are_those_of_the_normalizer():
+    points = correspondences("handheld", 3, 9)
+    for name, normalizer in [
         ("Hartley", kln.Hartley()),
         ("crossview", kln.LearnedNormalizer.from_pretrained()),
         ("kornia_learnnorm:Whitening", kln.Whitening()),
-    ],
-)
-def test_estimates_are_those_of_the_normalizer(name, normalizer):
-    points = correspondences("handheld", 3, 9)
-    assert torch.equal(find_method(name).estimate(*points), kln.find_fundamental(*points, normalizer=normalizer))
+    ]:
+        assert torch.equal(find_method(name).estimate(*points), kln.find_fundamental(*points, normalizer=normalizer))
 
 
-@pytest.mark.parametrize(
-    ("name", "error", "message"),
-    [
+def test_unknown():
+    before = [*sys.path]
+    for name, error, message in [
         ("nothing", FileNotFoundError, "no weights 'nothing'"),
         ("robust", ValueError, "robust STORE --out RUN --estimators learned:robust evaluates them"),
         ("hartley+LM", FileNotFoundError, r"expected none, Hartley, .*paper, .*module:Name, .*\+LM or \+optimal"),
@@ -42,13 +39,10 @@ def test_estimates_are_those_of_the_normalizer(name, normalizer):
         ("runs/own/checkpoints/last.ckpt", FileNotFoundError, "is a checkpoint: learnnorm fit writes"),
         ("no.such.module:Thing", ValueError, "no normaliser at"),
         ("kornia_learnnorm:__version__", ValueError, "cannot be called"),
-    ],
-)
-def test_unknown(name, error, message):
-    before = [*sys.path]
-    with pytest.raises(error, match=message):
-        find_method(name)
-    assert sys.path == before
+    ]:
+        with pytest.raises(error, match=message):
+            find_method(name)
+        assert sys.path == before
 
 
 def test_names(tmp_path):
@@ -89,14 +83,11 @@ class TestTrainedOn:
         for name in ("kornia_learnnorm:Whitening", f"{tmp_path / 'new.safetensors'}+LM"):
             assert find_method(name).trained_on == ("not known",)
 
-    @pytest.mark.parametrize(
-        ("store", "trained_on", "expected"),
-        [
+    def test_a_store_of_some_pairs(self):
+        for store, trained_on, expected in [
             ("b@5:9", ["a", "b@3:6"], True),
             ("b@6:9", ["a", "b@3:6"], False),
             ("tum", ["tum@0:9"], True),
             ("a", ["not known"], False),
-        ],
-    )
-    def test_a_store_of_some_pairs(self, store, trained_on, expected):
-        assert was_trained_on(store, trained_on) == expected
+        ]:
+            assert was_trained_on(store, trained_on) == expected

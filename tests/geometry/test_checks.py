@@ -39,19 +39,16 @@ class TestCameras:
         assert torch.func.vmap(focal_length)(torch.stack([K, K.T])).tolist() == [700.0, 700.0]
 
 
-@pytest.mark.parametrize(
-    ("points", "shape", "hint"),
-    [
+def test_a_wrong_shape_names_what_to_write():
+    for points, shape, hint in [
         (torch.rand(9, 2), ["B", "N", "2"], r"for one pair write points1\[None\]"),
         (torch.rand(1, 9, 2), ["N", "2"], r"this takes one pair, points1\[0\]"),
         (torch.rand(9), ["B", "N", "2"], r"^points1 must have shape \(B, N, 2\), got \[9\]$"),
-    ],
-)
-def test_a_wrong_shape_names_what_to_write(points, shape, hint):
-    with pytest.raises(ShapeError, match=hint):
-        check_tensor("points1", points, shape)
-    with pytest.raises(TypeError, match=r"numpy.ndarray.*torch.from_numpy\(points1\)"):
-        check_tensor("points1", points.numpy(), shape)
+    ]:
+        with pytest.raises(ShapeError, match=hint):
+            check_tensor("points1", points, shape)
+        with pytest.raises(TypeError, match=r"numpy.ndarray.*torch.from_numpy\(points1\)"):
+            check_tensor("points1", points.numpy(), shape)
 
 
 def test_solve_dtype():

@@ -9,18 +9,15 @@ from train_processes import Stop, make_data, make_trainer, normaliser_task
 from lightning_modules.callbacks import AgainstStart, Checkpoints
 
 
-@pytest.mark.parametrize(
-    ("last", "expected"),
-    [
+def test_summary():
+    found = AgainstStart()
+    for last, expected in [
         ((0.1, 0.2), "better than at the start: a 0.100, at the start 0.300; b 0.200, at the start 0.400"),
         ((0.1, 0.5), "better in 1 of 2 errors than at the start: a 0.100"),
         ((0.3, float("nan")), "not better than at the start: a 0.300, at the start 0.300; b nan"),
-    ],
-)
-def test_summary(last, expected):
-    found = AgainstStart()
-    found.start, found.last = {"a": 0.3, "b": 0.4}, dict(zip("ab", last, strict=True))
-    assert found.summary().startswith(expected)
+    ]:
+        found.start, found.last = {"a": 0.3, "b": 0.4}, dict(zip("ab", last, strict=True))
+        assert found.summary().startswith(expected)
 
 
 def test_the_start_is_the_untrained_estimator_also_after_a_resumed_run(tmp_path):

@@ -70,9 +70,8 @@ class TestPoseError:
         t = torch.stack([radians.sin(), 0 * radians, radians.cos()], -1)
         assert pose_error(R, t, R_true, t_true).tolist() == pytest.approx([10, 20, 180])
 
-    @pytest.mark.parametrize(
-        ("R", "t", "R_true", "t_true", "expected"),
-        [
+    def test_failures_and_unknown_truth(self):
+        for R, t, R_true, t_true, expected in [
             (1.0, 1.0, 1.0, 1.0, 0.0),
             (NAN, 1.0, 1.0, 1.0, INF),
             (1.0, NAN, 1.0, 1.0, INF),
@@ -81,11 +80,9 @@ class TestPoseError:
             (1.0, 1.0, 1.0, NAN, NAN),
             (1.0, 1.0, 1.0, 0.0, NAN),
             (NAN, NAN, 1.0, 0.0, NAN),  # a failure on a pair that cannot be measured is no failure
-        ],
-    )
-    def test_failures_and_unknown_truth(self, R, t, R_true, t_true, expected):
-        found = pose_error(R * torch.eye(3), t * torch.ones(3), R_true * torch.eye(3), t_true * torch.ones(3))
-        assert found.item() == pytest.approx(expected, abs=1e-4, nan_ok=True)
+        ]:
+            found = pose_error(R * torch.eye(3), t * torch.ones(3), R_true * torch.eye(3), t_true * torch.ones(3))
+            assert found.item() == pytest.approx(expected, abs=1e-4, nan_ok=True)
 
 
 ERRORS = st.lists(st.one_of(st.floats(0, 30), st.integers(0, 12), st.just(INF)), min_size=1, max_size=30)
@@ -125,16 +122,15 @@ class TestMeanAverageAccuracy:
 
 
 @pytest.mark.parametrize("summary", [pose_auc, maa])
-@pytest.mark.parametrize(
-    ("errors", "message"),
-    [
+def test_exceptions(summary):
+    for errors, message in [
         (torch.rand(0), r"at least one pair, got shape \[0\]"),
         (torch.rand(3, 1), r"a \(P,\) tensor of at least one pair, got shape \[3, 1\]"),
         (torch.tensor([1.0, NAN, -1.0]), "got 2 NaN or negative ones"),
-    ],
-)
-def test_exceptions(summary, errors, message):
-    with pytest.raises(ValueError, match=message):
-        summary(errors)
-    with pytest.raises(ValueError, match="thresholds must be positive" if summary is pose_auc else "limit must be one"):
-        summary(torch.ones(3), (5, -1) if summary is pose_auc else 0)
+    ]:
+        with pytest.raises(ValueError, match=message):
+            summary(errors)
+        with pytest.raises(
+            ValueError, match="thresholds must be positive" if summary is pose_auc else "limit must be one"
+        ):
+            summary(torch.ones(3), (5, -1) if summary is pose_auc else 0)

@@ -102,17 +102,14 @@ def test_zero_is_never_drawn(sampler, size, generator):
 ROWS = torch.arange(100)
 
 
-@pytest.mark.parametrize(
-    ("sampler", "inliers", "expected"),
-    [
+def test_hit_rate():
+    for sampler, inliers, expected in [
         *((UniformSampler(100, CPU, size), ROWS < 50, 0.5**size) for size in (5, 8)),
         *((ProsacSampler(torch.linspace(1, 0.1, 100)), best > ROWS, 1) for best in (100, 50, 26)),
         (ProsacSampler(torch.linspace(1, 0.1, 100)), ROWS < 10, (10 / 26) ** 8),  # it looks at the best but not at few
         (WeightedSampler(torch.where(ROWS < 10, 9.0, 1.0)), ROWS < 10, 0.5**8),
-    ],
-)
-def test_hit_rate(sampler, inliers, expected):
-    assert sampler.hit_rate(inliers, ROWS) == pytest.approx(expected)
+    ]:
+        assert sampler.hit_rate(inliers, ROWS) == pytest.approx(expected)
 
 
 def test_hit_rate_of_prosac_does_not_see_what_it_never_draws():

@@ -47,21 +47,18 @@ def picture(draw):
     return draw(*make_pair())
 
 
-@pytest.mark.parametrize(
-    ("line", "ends"),
-    [
+def test_draw_line_from_border_to_border():
+    for line, ends in [
         ((0, 1, -5), [(-0.5, 5), (19.5, 5)]),  # y = 5
         ((1e-9, 0, -3e-9), [(3, -0.5), (3, 9.5)]),  # x = 3
         ((-2, 2, 0), [(-0.5, -0.5), (9.5, 9.5)]),  # y = x
-    ],
-)
-def test_draw_line_from_border_to_border(line, ends):
-    axes = import_matplotlib().figure.Figure().add_subplot(xlim=(-0.5, 19.5), ylim=(9.5, -0.5))
-    drawn = draw_line(axes, np.array(line, float))
-    found = (drawn.get_transform() - axes.transData).transform([(0, 0), (1, 1)])
-    assert np.allclose(sorted(map(tuple, found)), ends)
-    assert draw_line(axes, np.array([0.0, 0.0, 1.0])) is None  # at infinity
-    assert len(axes.lines) == 1
+    ]:
+        axes = import_matplotlib().figure.Figure().add_subplot(xlim=(-0.5, 19.5), ylim=(9.5, -0.5))
+        drawn = draw_line(axes, np.array(line, float))
+        found = (drawn.get_transform() - axes.transData).transform([(0, 0), (1, 1)])
+        assert np.allclose(sorted(map(tuple, found)), ends)
+        assert draw_line(axes, np.array([0.0, 0.0, 1.0])) is None  # at infinity
+        assert len(axes.lines) == 1
 
 
 class TestDrawPair:

@@ -76,16 +76,13 @@ def points() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class TestFindWarnings:
-    @pytest.mark.parametrize(
-        ("inliers", "options", "found"),
-        [
+    def test_of_numbers(self, points):
+        for inliers, options, found in [
             (MOST, {}, []),
             (torch.arange(100) < 12, {}, ["few_inliers", "chance"]),
             (MOST, {"angle": 20.0}, ["unstable"]),
-        ],
-    )
-    def test_of_numbers(self, points, inliers, options, found):
-        assert codes(*points, inliers, **options) == found
+        ]:
+            assert codes(*points, inliers, **options) == found
 
     def test_clustered(self, points):
         assert codes(points[0] * torch.tensor([1.0, 0.01]), points[1], ALL) == ["clustered"]

@@ -4,7 +4,6 @@ import json
 import re
 
 import numpy as np
-import pytest
 import torch
 
 from kornia_learnnorm.evaluation.report.method_tables import papers_data, rate_tables, report_tables
@@ -35,19 +34,16 @@ def without_truth(run, robust):
     return run, robust
 
 
-@pytest.mark.parametrize(
-    ("description", "name"),
-    [
+def test_the_papers_data():
+    for description, name in [
         ("KITTI odometry 06, 10", "KITTI"),
         ("KITTI odometry 00, 06", ""),
         ("TUM RGB-D freiburg3_long_office_household, frames about 1 s apart, resized to 1226x370", "TUM"),
         ("TUM RGB-D freiburg3_long_office_household, frames about 1 s apart", ""),
         ("TUM RGB-D freiburg1_desk, resized to 1226x370", ""),
         ("images of kitti_06", ""),
-    ],
-)
-def test_the_papers_data(description, name):
-    assert papers_data(f"{description}, 51 pairs, 1000 matches") == name
+    ]:
+        assert papers_data(f"{description}, 51 pairs, 1000 matches") == name
 
 
 def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_run):

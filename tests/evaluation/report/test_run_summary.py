@@ -32,9 +32,8 @@ def summary_of(scales, pair=PAIR, key="truth", **about):
     return text
 
 
-@pytest.mark.parametrize(
-    ("scales", "facts"),
-    [
+def test_the_smallest_error_wins_and_what_is_level_is_named():
+    for scales, facts in [
         (
             {"best": 0.5, "close": 0.503 * NOISE, "bad": 3.0},
             ["`best` has", "median 3.250 px; Hartley has 6.500 px", "-50.0 % [-50.0, -50.0]", "Level with it: `close`"],
@@ -44,12 +43,10 @@ def summary_of(scales, pair=PAIR, key="truth", **about):
         # The median decides, and a smaller geometric mean is named.
         ({"Hartley": 4.0, "exact": FEW, "steady": 1.0}, ["`steady` has", "median 6.500 px", "smaller for `exact`"]),
         ({}, ["nothing to test it against"]),
-    ],
-)
-def test_the_smallest_error_wins_and_what_is_level_is_named(scales, facts):
-    text = summary_of(scales)
-    assert "**a, filtered** (60 samples of 12 image pairs)" in text
-    assert [fact for fact in facts if fact not in text] == []
+    ]:
+        text = summary_of(scales)
+        assert "**a, filtered** (60 samples of 12 image pairs)" in text
+        assert [fact for fact in facts if fact not in text] == []
 
 
 def test_weights_of_ones_own_are_named_where_another_method_wins():
@@ -81,11 +78,8 @@ def test_few_pairs_are_not_tested(pairs, scale):
 )
 def test_robust_estimators(truth, facts):
     found, some = {}, torch.ones(8, 2)
-    for name, error, inliers, seconds in (
-        ("exact", 0.2, 0.5, 0.01),
-        ("greedy", 0.4, 0.9, 0.02),
-        ("ground-truth", 0, 1, 0),
-    ):
+    cases = ("exact", 0.2, 0.5, 0.01), ("greedy", 0.4, 0.9, 0.02), ("ground-truth", 0, 1, 0)
+    for name, error, inliers, seconds in cases:
         known = some if truth else some * math.nan
         found[name] = {1.0: {"f1": known, "error": known * error, "inliers": some * inliers, "seconds": some * seconds}}
     (line,) = robust_summary(RobustRun({}, [RobustCell("a", "filtered", found), RobustCell("b", "filtered", {})], []))

@@ -126,23 +126,20 @@ class TestOwnCode:
         methods = ["own_normaliser:Mine", "Hartley"]
         return main(["evaluate", str(store), "--out", "run", "--methods", *methods, "--max-samples", "40"])
 
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
+    def test_one_that_is_no_normaliser(self):
+        for text, message in [
             ("def Mine(a, b):\n    pass", "Mine() takes 2 positional arguments"),
             ("def Mine(a, b, c):\n    return 1", "must return two transforms of shape"),
             ("def Mine(a, b, c):\n    return 2 * [float('nan') * a.new_ones(len(a), 3, 3)]", "are not finite"),
             ("class Mine:\n    def __init__(self, size):\n        pass", "cannot be made without arguments"),
             ("Mine = (", "SyntaxError"),
             ("1 / 0", "ZeroDivisionError"),
-        ],
-    )
-    def test_one_that_is_no_normaliser(self, text, message):
-        self.write(text)
-        before = [*sys.path]
-        with pytest.raises(ValueError, match=re.escape(message)):
-            find_method("own_normaliser:Mine").estimate(*torch.rand(2, 3, 8, 2, dtype=torch.float64))
-        assert sys.path == before
+        ]:
+            self.write(text)
+            before = [*sys.path]
+            with pytest.raises(ValueError, match=re.escape(message)):
+                find_method("own_normaliser:Mine").estimate(*torch.rand(2, 3, 8, 2, dtype=torch.float64))
+            assert sys.path == before
 
     def test_one_that_fails_is_left_out(self, store, capsys):
         assert self.evaluate(store, "def Mine(a, b, c):\n    raise RuntimeError('boom')") == 2
@@ -182,22 +179,19 @@ def test_pairs_with_few_matches_have_nothing_held_out(tmp_path):
     assert main(["report", str(tmp_path / "run")]) == 0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_options_that_are_refused(store, tmp_path, monkeypatch, refused):
+    monkeypatch.chdir(tmp_path)
+    Path("FILE").touch()
+    for options, message in [
         (["--out", ""], "--out is empty: expected a folder"),
         (["--out", "FILE"], "FILE is a file: expected a folder"),
         (["--out", "RUN", "--max-samples", "-1"], "--max-samples must be 0, for all, or more, got -1"),
         (["--out", "RUN", "--max-residual", "-1"], "--max-residual must be 0 or more, inf for all, got -1"),
         (["--out", "RUN", "--size", "7"], "a sample needs at least 8 correspondences, got size=7"),
         (["--max-residual", "0"], "scenes, filtered: none of "),
-    ],
-)
-def test_options_that_are_refused(store, tmp_path, monkeypatch, refused, options, message):
-    monkeypatch.chdir(tmp_path)
-    Path("FILE").touch()
-    refused(["evaluate", store, "--methods", "none", *options], message)
-    assert not Path("RUN").exists()
+    ]:
+        refused(["evaluate", store, "--methods", "none", *options], message)
+        assert not Path("RUN").exists()
 
 
 def test_names_become_different_files():
