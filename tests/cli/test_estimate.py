@@ -101,9 +101,11 @@ class TestOnePair:
         assert np.array(content["points2"])[:, 0].max() < WIDTH // 2
         assert 8 <= content["num_matches"] < result.num_matches
 
-    @pytest.mark.parametrize(
-        ("arguments", "error", "message"),
-        [
+    def test_bad_options_are_refused_before_the_work(self, command, planes, monkeypatch):
+        Path("list.txt").write_text(f"{planes}/left.png {planes}/right.png\n")
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: pytest.fail("the work was begun"))
+        for arguments, error, message in [
             (["--out", "pair.txt"], ValueError, r"--out pair\.txt: expected a name that ends in one of \.png"),
             (["--json", "none/F.json"], FileNotFoundError, "folder none does not exist"),
             (["--out", "IMAGE"], ValueError, r"--out .*left\.png: would overwrite"),
@@ -121,16 +123,11 @@ class TestOnePair:
             ([*MANY, "--out", "o", "--estimator", "learned", "--weights", "no"], OSError, "no"),
             ([*MANY, "--out", "o", "--K", "none.txt"], FileNotFoundError, r"camera none\.txt"),
             ([*MANY, "--out", "o", "--exhaustive"], ValueError, r"--gap and --exhaustive are for a folder of images"),
-        ],
-    )
-    def test_bad_options_are_refused_before_the_work(self, command, planes, arguments, error, message, monkeypatch):
-        Path("list.txt").write_text(f"{planes}/left.png {planes}/right.png\n")
-        monkeypatch.setitem(sys.modules, "matplotlib", None)
-        monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: pytest.fail("the work was begun"))
-        words = (f"{planes}/left.png" if text == "IMAGE" else text for text in arguments)
-        with pytest.raises(error, match=message):
-            command(*words, images=() if arguments[:2] == MANY else ("left", "right"))
-        assert [*Path().iterdir()] == [Path("list.txt")]
+        ]:
+            words = (f"{planes}/left.png" if text == "IMAGE" else text for text in arguments)
+            with pytest.raises(error, match=message):
+                command(*words, images=() if arguments[:2] == MANY else ("left", "right"))
+            assert [*Path().iterdir()] == [Path("list.txt")]
 
 
 class TestManyPairs:

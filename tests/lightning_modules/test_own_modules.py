@@ -113,31 +113,25 @@ def test_evaluate_shows_them(weights, capsys, refused):
     refused(["evaluate", "s.h5", "--methods", "Hartley", weights], "own_modules.PointNetwork is not of this package")
 
 
-@pytest.mark.parametrize(
-    ("network", "message"),
-    [
+def test_what_cannot_be_saved_is_refused_before_the_first_step(run, tmp_path, monkeypatch, refused):
+    monkeypatch.chdir(run)
+    for network, message in [
         ("broken_modules.Forgets", "must keep 'width' as an attribute"),
         ("broken_modules.Listed", "sizes is [1], not a number or a text"),
         ("broken_modules.Constant", "a tensor that state_dict does not hold"),
         ("broken_modules.make", "cannot be imported by its name"),
         ("gone_modules.Network", "No module named 'gone_modules'"),
-    ],
-)
-def test_what_cannot_be_saved_is_refused_before_the_first_step(network, message, run, tmp_path, monkeypatch, refused):
+    ]:
+        options = [*SMALL, f"--trainer.default_root_dir={tmp_path}", f"{NETWORK}={network}"]
+        refused(["fit", "--config", "own", *options], message)
+        assert not [*tmp_path.rglob("*.safetensors"), *tmp_path.rglob("*.ckpt")]
+
+
+def test_what_returns_another_shape_is_named(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(run)
-    options = [*SMALL, f"--trainer.default_root_dir={tmp_path}", f"{NETWORK}={network}"]
-    refused(["fit", "--config", "own", *options], message)
-    assert not [*tmp_path.rglob("*.safetensors"), *tmp_path.rglob("*.ckpt")]
-
-
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
+    for option, message in [
         (f"{NETWORK}=broken_modules.Single", "must return (params1, params2), got <class 'torch.Tensor'>"),
         ("--model.loss=broken_modules.ThreeSets", "sets, got [3]"),
-    ],
-)
-def test_what_returns_another_shape_is_named(option, message, run, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(run)
-    assert main(["fit", "--config", "own", *SMALL, f"--trainer.default_root_dir={tmp_path}", option]) == 2
-    assert message in capsys.readouterr().err
+    ]:
+        assert main(["fit", "--config", "own", *SMALL, f"--trainer.default_root_dir={tmp_path}", option]) == 2
+        assert message in capsys.readouterr().err

@@ -134,20 +134,17 @@ class TestEstimateMatches:
         assert torch.equal(found.F_mat, result.F_mat)
         assert (found.num_matches, found.size1) == (result.num_matches, result.size1)
 
-    @pytest.mark.parametrize(
-        "convert",
-        [
+    def test_arrays_of_any_number_type(self, matches, monkeypatch):
+        points = [x.round().numpy() for x in matches]
+        for convert in [
             lambda points: points.astype(np.int32),
             lambda points: points[::-1, ::-1].copy()[::-1, ::-1],
             lambda points: torch.from_numpy(points).int(),
             lambda points: torch.from_numpy(points).requires_grad_(),
-        ],
-    )
-    def test_arrays_of_any_number_type(self, matches, convert, monkeypatch):
-        points = [x.round().numpy() for x in matches]
-        read = module.read_matches(*map(convert, points), None)
-        assert all(torch.equal(found, torch.from_numpy(x)) for found, x in zip(read, points, strict=False))
-        assert not any(found.requires_grad for found in read)
+        ]:
+            read = module.read_matches(*map(convert, points), None)
+            assert all(torch.equal(found, torch.from_numpy(x)) for found, x in zip(read, points, strict=False))
+            assert not any(found.requires_grad for found in read)
 
     def test_what_stands_still_is_left_out(self):
         overlay = uniform(60, 2, high=400)

@@ -67,19 +67,16 @@ class TestResolveAmbiguity:
         assert board_error(found) < 0.3
         assert found.warnings == ()
 
-    @pytest.mark.parametrize(
-        ("false", "solvable", "replaced"),
-        [
+    def test_doubt(self, first, again):
+        for false, solvable, replaced in [
             (one_way(kind=1), True, False),  # those that fit the matrix of the coherent matches
             ([points[:9] for points in one_way()], True, True),  # too few that fit
             (one_way(), False, False),  # without the false matches, nothing is determined
             (uniform(2, 100, 2, high=480), True, False),  # neither they nor the coherent matches fit
-        ],
-    )
-    def test_doubt(self, first, again, false, solvable, replaced):
-        found = resolve_ambiguity(first, *false, again if solvable else fail)
-        assert [warning.code for warning in found.warnings] == ["ambiguous"]
-        assert (found.F_mat is first.F_mat) != replaced
+        ]:
+            found = resolve_ambiguity(first, *false, again if solvable else fail)
+            assert [warning.code for warning in found.warnings] == ["ambiguous"]
+            assert (found.F_mat is first.F_mat) != replaced
 
     def test_no_doubt_where_the_coherent_matches_say_the_same(self, first, again):
         """Although all of the others fit too: the board alone, of which there are two draws."""
