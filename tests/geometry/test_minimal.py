@@ -1,12 +1,15 @@
-"""Minimal samples solved many at once against the solver that takes any, and samples that determine nothing."""
+"""Minimal samples: of eight against a loop, of seven against OpenCV, of five against the truth, degenerate ones."""
 
 import numpy as np
 import pytest
 import torch
-from scenes import SCENES, correspondences, plane, up_to_sign
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from scenes import SCENES, correspondences, plane, scenes, true_essential, up_to_sign
 
 from kornia_learnnorm.geometry.dlt import design_matrix
+from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.minimal import are_independent, solve_samples
+from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import PairScorer
 
@@ -68,3 +71,47 @@ def test_degenerate_samples(kind):
         points2[:, 7] += 20
     x1, x2 = coordinates(points1, points2)
     assert not are_independent(torch.linalg.qr(design_matrix(x1, x2).mT, mode="r")[1], x1, x2, 0.01).any()
+
+
+def null_spaces(x1, x2):
+    """Bases (B, 9 - N, 3, 3) of the matrices that fit N correspondences (B, N, 3) exactly."""
+    rows = (x2[..., :, None] * x1[..., None, :]).flatten(2)
+    return torch.linalg.svd(rows)[2][:, x1.shape[1] :].unflatten(-1, (3, 3))
+
+
+@pytest.mark.parametrize("kind", ["orbit", "handheld", "driving"])
+def test_five_points_find_the_truth(kind):
+    scene = scenes(kind, 100, 5, noise=0.0)
+    views = (scene.points1, scene.K1), (scene.points2, scene.K2)
+    rays = (torch.linalg.solve(K, convert_points_to_homogeneous(p).mT).mT for p, K in views)
+    found, real = essential_in_span(null_spaces(*rays))
+    assert found.shape == (100, 10, 3, 3)
+    assert torch.allclose(found.flatten(2).norm(dim=-1), torch.ones(100, 10, dtype=found.dtype))
+    known = torch.where(real[..., None, None], found, torch.inf)
+    gaps = torch.stack([(known - sign * true_essential(scene)[:, None]).flatten(2).norm(dim=-1) for sign in (1, -1)])
+    assert (gaps.amin((0, 2)) < 1e-5).double().mean() > 0.97  # not where an image point is next to an epipole
+    values = torch.linalg.svdvals(found[real])
+    assert (values[:, :2] - 0.5**0.5).abs().median() < 1e-9
+    assert values[:, 2].median() < 1e-9
+
+
+def test_degenerate_spans_are_finite():
+    same = torch.eye(3, dtype=torch.float64).expand(1, 4, 3, 3)
+    for basis in (same, 0 * same, torch.zeros(0, 4, 3, 3, dtype=torch.float64)):
+        found, real = essential_in_span(basis)
+        assert found.isfinite().all()
+        assert real.shape == found.shape[:2]
+
+
+def test_seven_points_agree_with_opencv():
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+    points1, points2 = ((p - 300) / 200 for p in correspondences("handheld", 20, 7))
+    found, real = fundamental_in_span(null_spaces(*map(convert_points_to_homogeneous, (points1, points2))))
+    assert torch.linalg.det(found[real]).abs().max() < 1e-12
+    for k in range(20):
+        expected = torch.from_numpy(cv2.findFundamentalMat(points1[k].numpy(), points2[k].numpy(), cv2.FM_7POINT)[0])
+        expected = torch.unflatten(expected, 0, (-1, 3))
+        expected = expected / torch.linalg.matrix_norm(expected, keepdim=True)
+        assert len(expected) == real[k].sum()
+        for F_mat in expected:
+            assert min(up_to_sign(own[None], F_mat[None]) for own in found[k, real[k]]) < 1e-5
