@@ -64,10 +64,8 @@ class TestSolve:
     def test_options(self):
         for options, message in [
             ({"image2": None}, "two images expected, image 2 is missing"),
-            ({"detector": "orb"}, "detector must be one of sift, .*, got 'orb'"),
             ({"matcher": "lightglue"}, "needs detector .*, got sift"),
             ({"ratio": None}, "ratio must be a number, got None"),
-            ({"threshold": 0}, "threshold must be positive and finite, got 0 px"),
             ({"estimator": "learned", "model": "homography"}, "leave it out with model homography"),
             ({"cameras": "576,576"}, "camera 576,576: expected fx,fy,cx,cy in pixels, or exif"),
             ({"cameras": ";".join([K] * 3)}, "one or two expected, typed or as files, got 3 and 0"),

@@ -91,13 +91,10 @@ def test_tables_are_those_of_the_results(page):
         assert [row for row in rows if row not in expected] == [], (name, group)
 
 
-def test_the_readme_has_poses_of_the_results():
+def test_the_readme_has_poses_and_the_picture_of_the_results():
+    """If not, run python docs/results_tables.py docs/images/sizes.svg."""
     tables = re.findall(r"^(?:\|.*\n)+", TEXTS["README.md"], flags=re.MULTILINE)
     assert read_table(results_tables.poses_summary().data) in [*map(read_table, tables)]
-
-
-def test_the_picture_of_the_readme_is_of_the_results():
-    """If not, run python docs/results_tables.py docs/images/sizes.svg."""
     source = hashlib.sha256((DOCS / "results/sizes.json").read_bytes()).hexdigest()
     assert source in (DOCS / "images/sizes.svg").read_text(encoding="utf-8")
 

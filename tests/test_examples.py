@@ -105,20 +105,12 @@ def gluefactory(monkeypatch):
         def __call__(self, data):
             return self._forward(data)
 
-    class Pose:
-        def __init__(self, R, t):
-            self.R, self.t = R, t
-
-        @classmethod
-        def from_Rt(cls, R, t):  # noqa: N802
-            return cls(R, t)
-
-        @classmethod
-        def from_4x4mat(cls, T):
-            return cls(T[:3, :3], T[:3, 3])
+    class Pose(SimpleNamespace):
+        from_Rt = classmethod(lambda cls, R, t: cls(R=R, t=t))  # noqa: N815
+        from_4x4mat = classmethod(lambda cls, T: cls(R=T[:3, :3], t=T[:3, 3]))
 
         def to(self, other):
-            return Pose(self.R.to(other), self.t.to(other))
+            return Pose(R=self.R.to(other), t=self.t.to(other))
 
     for name in ("gluefactory", "gluefactory.geometry", "gluefactory.robust_estimators"):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))

@@ -54,15 +54,12 @@ def test_a_folder_without_a_layer_of_this_package_is_refused(config, folder):
         hub.HubModel.from_pretrained(folder)
 
 
-def test_weights_of_another_class_or_none_are_refused(folder):
+def test_weights_of_another_class_or_none_and_other_modules_are_refused(folder):
     (folder / "config.json").write_text(json.dumps({"class_name": "LearnedNormalizer"}))
     with pytest.raises(ValueError, match=r"LearnedNormalizer.* LearnedEightPoint"):
         hub.HubModel.from_pretrained(folder)
     (folder / "model.safetensors").unlink()
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors"):
         hub.HubModel.from_pretrained(folder)
-
-
-def test_other_modules_are_refused():
     with pytest.raises(TypeError, match=r"LearnedEightPoint, LearnedRelativePose, .*, MatchRefiner, got EightPoint"):
         hub.HubModel(kln.EightPoint())

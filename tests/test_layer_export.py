@@ -6,7 +6,8 @@ import sys
 
 import pytest
 import torch
-from scenes import correspondences, plane, scenes, shaken, shaken_estimator, signless, up_to_sign
+from references import signless, up_to_sign
+from scenes import correspondences, plane, scenes, shaken, shaken_estimator
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators import fundamental_stages, pose_stages
@@ -45,6 +46,10 @@ def sets(batch_size: int, num_points: int, device="cpu") -> list[torch.Tensor]:
 def calibrated_sets(batch_size: int, num_points: int) -> list[torch.Tensor]:
     scene = scenes("handheld", batch_size, num_points)
     return [value.float() for value in (scene.points1, scene.points2, scene.K1, scene.K2)]
+
+
+def planes(batch_size: int, num_points: int) -> list[torch.Tensor]:
+    return [points.float() for points in plane(batch_size, num_points, noise=1.0)[:2]]
 
 
 @torch.no_grad()
@@ -97,29 +102,19 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
     assert not any(value.requires_grad for value in run(points[0].requires_grad_(), points[1], **given))
 
 
-def test_relative_pose(monkeypatch):
+@pytest.mark.parametrize(
+    ("kind", "draw"), [(kln.LearnedRelativePose, calibrated_sets), (kln.LearnedHomography, planes)]
+)
+def test_siblings(kind, draw, monkeypatch):
     for name in ("EARLY_STEPS", "LOCAL_STEPS"):
         monkeypatch.setattr(pose_stages, name, 1)
-    layer = kln.LearnedRelativePose(width=8, depth=1, refine_steps=1, samples=4)
+    layer = kind(width=8, depth=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()
     for size in SIZES:
-        check(program, layer, *calibrated_sets(*size), scores=torch.rand(size))
+        check(program, layer, *draw(*size), scores=torch.rand(size))
 
 
-def test_homography():
-    layer = kln.LearnedHomography(width=8, depth=1, refine_steps=1)
-    program = export_layer(layer, ["scores"]).module()
-    for batch_size, num_points in SIZES:
-        points = [p.float() for p in plane(batch_size, num_points, noise=1.0)[:2]]
-        check(program, layer, *points, scores=torch.rand(batch_size, num_points))
-
-
-def test_gradients_of_sets():
-    layer = kln.EightPoint(kln.Whitening())
-    check_gradients_of_program(export_layer(layer, gradients=True).module(), layer, *sets(3, 20))
-
-
-def test_eights_with_weights_mask_and_gradients():
+def test_weights_mask_and_gradients():
     network = kln.CrossViewNetwork(width=8, depth=1)
     layer, points = kln.EightPoint(shaken(kln.LearnedNormalizer(kln.Whitening(), network))), sets(4, 8)
     points[0][2] = points[0][2, :1]  # coincident
@@ -130,6 +125,8 @@ def test_eights_with_weights_mask_and_gradients():
     determined, given = [p[:2] for p in points], {"mask": mask[:2], "weights": weights[:2]}
     check(program, layer, *determined, **given)
     check_gradients_of_program(program, layer, *determined, **given)
+    layer = kln.EightPoint(kln.Whitening())  # of larger sets
+    check_gradients_of_program(export_layer(layer, gradients=True).module(), layer, *sets(3, 20))
 
 
 @pytest.mark.slow
@@ -212,9 +209,8 @@ def test_wrong_arguments():
 
 
 def test_load_layer():
-    assert isinstance(load_layer("robust-tiny"), kln.LearnedEightPoint)
-    assert isinstance(load_layer("robust-pose"), kln.LearnedRelativePose)
-    assert isinstance(load_layer("robust-homography"), kln.LearnedHomography)
+    kinds = {"tiny": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}
+    assert all(isinstance(load_layer(f"robust-{name}"), kind) for name, kind in kinds.items())
     assert load_layer("crossview").normalizer.max_points == 12
     with pytest.raises(FileNotFoundError, match=r"'rubust'.* crossview.* robust"):
         load_layer("rubust")

@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import epipolar_distances, scenes, uniform
+from pairwise import pairwise
+from references import epipolar_distances
+from scenes import scenes, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
@@ -29,8 +31,7 @@ class TestEpipolarLoss:
         assert (loss.shape, loss.dtype) == ((), dtype)
         assert loss.item() == pytest.approx((3 + 3) / 2)  # distances 2, 4 and 6, 0
 
-    @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-    @pytest.mark.parametrize("log", [False, True])
+    @pairwise(share=[0.0, 0.25, 1.0], log=[False, True])
     def test_log_and_heldout_part(self, share, log):
         assert EpipolarLoss()(*rows([0.0] * 8)).item() == pytest.approx(math.log(1e-3))  # the default floor
         points1, points2, F_mat = rows([1.0, 2.0], [4.0, 0.0], dtype=torch.float64)
@@ -52,8 +53,7 @@ class TestEpipolarLoss:
         expected = (residual or epipolar_distances)(*values).mean().item()
         assert EpipolarLoss(**options, log=False)(*values).item() == pytest.approx(expected)
 
-    @pytest.mark.parametrize("log", [False, True])
-    @pytest.mark.parametrize("where", ["own", "heldout"])
+    @pairwise(log=[False, True], where=["own", "heldout"])
     def test_infinite_residual_counts_as_the_ceiling_and_sends_no_gradient(self, log, where):
         # x2^T F x1 = v x - u y; a point at the origin is on the epipole.
         F_mat, points2 = ORIGIN[None].double().requires_grad_(), torch.tensor([[[3.0, 4.0], [2.0, 1.0]]]).double()
@@ -83,8 +83,7 @@ class TestEpipolarLoss:
         for value in (loss, *torch.autograd.grad(loss, [F_mat, points1])):
             assert torch.isfinite(value).all()
 
-    @pytest.mark.parametrize("log", [False, True])
-    @pytest.mark.parametrize("heldout_weight", [0.0, 0.5])
+    @pairwise(log=[False, True], heldout_weight=[0.0, 0.5])
     def test_gradcheck(self, log, heldout_weight):
         points = [uniform(2, 5, 2, low=-1, seed=k).requires_grad_() for k in range(4)]
         loss = EpipolarLoss(log=log, heldout_weight=heldout_weight)
@@ -110,17 +109,12 @@ class TestEpipolarLoss:
 class TestLossesOfSets:
     """One number a set, against hand computation."""
 
-    def test_bounded(self):
-        found = BoundedEpipolarLoss(2.0)(*rows([1.0, 0.0], [2.0, 50.0], dtype=torch.float64))
+    def test_by_hand(self):
+        values = rows([1.0, 0.0], [2.0, 50.0], dtype=torch.float64)
         expected = [(4 / 8 + 0) / 2, (16 / 20 + 10_000 / 10_004) / 2]
-        assert found.tolist() == pytest.approx(expected)
-
-    def test_log(self):
-        found = LogEpipolarLoss(0.5)(*rows([1.0, 0.0], [2.0, 50.0], dtype=torch.float64))
+        assert BoundedEpipolarLoss(2.0)(*values).tolist() == pytest.approx(expected)
         expected = [(math.log(2.5) + math.log(0.5)) / 2, (math.log(4.5) + math.log(100.5)) / 2]
-        assert found.tolist() == pytest.approx(expected)
-
-    def test_inliers(self):
+        assert LogEpipolarLoss(0.5)(*values).tolist() == pytest.approx(expected)
         logits = torch.tensor([[0.0, 2.0, -1.0], [1.0, 1.0, 1.0]])
         inliers = torch.tensor([[1.0, 0.0, torch.nan], [torch.nan] * 3])
         expected = [(math.log(2) + math.log(1 + math.exp(2))) / 2, 0.0]
@@ -147,8 +141,7 @@ class TestLossesOfSets:
         (gradient,) = torch.autograd.grad(loss(E_mat, -E_mat.detach()).sum(), E_mat)
         assert gradient.abs().max() < 1e-6
 
-    @pytest.mark.parametrize("loss", [BoundedEpipolarLoss, LogEpipolarLoss, kln.LogEssentialLoss])
-    @pytest.mark.parametrize("number", [0.0, -1.0, math.nan])
+    @pairwise(loss=[BoundedEpipolarLoss, LogEpipolarLoss, kln.LogEssentialLoss], number=[0.0, -1.0, math.nan])
     def test_exceptions(self, loss, number):
         with pytest.raises(ValueError, match="must be positive, got"):
             loss(number)

@@ -5,12 +5,9 @@ import socket
 import pytest
 
 
-@pytest.mark.parametrize("port", [0, -1, 65536])
-def test_a_port_out_of_range(refused, port):
-    refused(["demo", f"--port={port}"], f"from 1 to 65535 expected, got {port}")
-
-
-def test_a_matcher_without_its_detector(refused):
+def test_wrong_options(refused):
+    for port in (0, -1, 65536):
+        refused(["demo", f"--port={port}"], f"from 1 to 65535 expected, got {port}")
     refused(["demo", "--matcher", "lightglue"], "keynet, got sift")
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from scenes import epipolar_distances
+from references import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main

@@ -357,11 +357,8 @@ def test_help_fits_a_screen_and_ends_with_examples_that_parse(command, monkeypat
         assert parser.parse_args(words[1:]).command == words[1]
 
 
-def test_help_lists_all_options():
+def test_help_of_a_training_lists_all_options_or_needs_no_extra(monkeypatch):
     assert "--trainer.gradient_clip_val" in help_of("fit", "--help-all")
-
-
-def test_help_of_a_training_needs_no_extra(monkeypatch):
     for module in ("lightning_modules.training", "pytorch_lightning", "jsonargparse", "yaml"):
         monkeypatch.setitem(sys.modules, module, None)
     assert "--help-all" in help_of("fit", "--config", "crossview", "-h")

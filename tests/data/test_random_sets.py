@@ -123,33 +123,31 @@ class TestStoreSets:
         assert_equal(source.draw(4, 20, seeded(1)), source.draw(4, 20, seeded(1)))
 
 
-class TestSyntheticSets:
-    def test_without_labels_further_matches_supervise(self):
-        sets = SyntheticSets(200, labels=False).draw(8, 100, seeded(3))
-        assert sets.points1.shape == (8, 100, 2)
-        assert sets.heldout2.shape == (8, 200, 2)
-        assert not sets.labelled.any()
-        assert sets.inliers.isnan().all()
-        exact = SyntheticSets(200).draw(8, 100, seeded(3))
-        F_mat = kln.find_fundamental(exact.heldout1.double(), exact.heldout2.double(), rank2="optimal")
-        found, exact = (
-            kln.symmetric_epipolar_distance(s.heldout1.double(), s.heldout2.double(), F_mat) for s in (sets, exact)
-        )
-        assert exact.median() < 0.1
-        assert (found > 5).double().mean() > 0.1  # outliers are among them
+def test_without_labels_further_matches_supervise():
+    sets = SyntheticSets(200, labels=False).draw(8, 100, seeded(3))
+    assert sets.points1.shape == (8, 100, 2)
+    assert sets.heldout2.shape == (8, 200, 2)
+    assert not sets.labelled.any()
+    assert sets.inliers.isnan().all()
+    exact = SyntheticSets(200).draw(8, 100, seeded(3))
+    F_mat = kln.find_fundamental(exact.heldout1.double(), exact.heldout2.double(), rank2="optimal")
+    found, exact = (
+        kln.symmetric_epipolar_distance(s.heldout1.double(), s.heldout2.double(), F_mat) for s in (sets, exact)
+    )
+    assert exact.median() < 0.1
+    assert (found > 5).double().mean() > 0.1  # outliers are among them
 
 
-class TestRandomSets:
-    def test_wrong_options(self):
-        for arguments, message in [
-            ({"sources": []}, "sources is empty"),
-            ({"shares": [1.0, 2.0]}, "one non-negative number for each of 1 sources"),
-            ({"shares": [0.0]}, "one non-negative number for each"),
-            ({"sizes": (3, 9)}, "at least 4 matches"),
-            ({"batches": 0}, "at least 1, got 0"),
-        ]:
-            with pytest.raises(ValueError, match=message):
-                RandomSets(**{"sources": [SyntheticSets()]} | arguments)
+def test_wrong_options():
+    for arguments, message in [
+        ({"sources": []}, "sources is empty"),
+        ({"shares": [1.0, 2.0]}, "one non-negative number for each of 1 sources"),
+        ({"shares": [0.0]}, "one non-negative number for each"),
+        ({"sizes": (3, 9)}, "at least 4 matches"),
+        ({"batches": 0}, "at least 1, got 0"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            RandomSets(**{"sources": [SyntheticSets()]} | arguments)
 
 
 class TestAugment:

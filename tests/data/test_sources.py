@@ -5,7 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from scenes import eight_point, epipolar_distances, seeded
+from references import eight_point, epipolar_distances
+from scenes import seeded
 
 from kornia_learnnorm.data import sets
 from kornia_learnnorm.data.random_sets import StoreSets

@@ -1,17 +1,24 @@
-"""Stores: what is written comes back, some pairs of it, and what a broken file says."""
+"""Stores: what is written comes back, some pairs of it, parts of a store, and what a broken file says."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import store_of
 
 from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, StoreReader, read_store
-from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.data.writer import StoreWriter, write_store
 
 
 @pytest.fixture
-def path(uneven, tmp_path):
+def stored(uneven, tmp_path):
     write_store(tmp_path / "store.h5", uneven)
     return tmp_path / "store.h5"
 
@@ -20,25 +27,25 @@ def same(got, expected):
     np.testing.assert_equal(vars(got), vars(expected))
 
 
-def test_round_trip(uneven, path):
-    got = read_store(path)
+def test_round_trip(uneven, stored):
+    got = read_store(stored)
     same(got, uneven)
     assert len(got) == 6
-    with h5py.File(path) as file:
+    with h5py.File(stored) as file:
         assert (file.attrs["format"], file.attrs["version"]) == ("correspondences", 1)
         dtypes = {name: data.dtype for name, data in file.items()}
     assert all(getattr(got, name).dtype == getattr(uneven, name).dtype == dtypes[name] for name in ("offsets", *LAYOUT))
-    assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
+    assert [file.name for file in stored.parent.iterdir()] == ["store.h5"]
 
 
-def test_a_file_without_scores_has_one_minus_the_ratio(uneven, path):
-    with h5py.File(path, "r+") as file:
+def test_a_file_without_scores_has_one_minus_the_ratio(uneven, stored):
+    with h5py.File(stored, "r+") as file:
         del file["score"]
-    same(read_store(path), uneven)
-    with h5py.File(path, "r+") as file:
+    same(read_store(stored), uneven)
+    with h5py.File(stored, "r+") as file:
         file["ratio"][:3] = np.nan
     with pytest.raises(ValueError, match="ratio holds NaN or infinite"):
-        read_store(path)
+        read_store(stored)
 
 
 def test_matches_without_a_ratio_pass_every_ratio_test(uneven, tmp_path):
@@ -75,9 +82,9 @@ LAYOUT_OF_RATIO[:] = h5py.VirtualSource("other.h5", "ratio", (180,))
         ("version", 2, r"expected format='correspondences', version=1, got .*version=.*2"),
     ],
 )
-def test_inconsistent_arrays_and_links_to_others(path, name, value, message):
-    path.with_name("other.h5").write_bytes(path.read_bytes())
-    with h5py.File(path, "r+") as file:
+def test_inconsistent_arrays_and_links_to_others(stored, name, value, message):
+    stored.with_name("other.h5").write_bytes(stored.read_bytes())
+    with h5py.File(stored, "r+") as file:
         if name == "version":
             file.attrs[name] = value
         else:
@@ -87,21 +94,21 @@ def test_inconsistent_arrays_and_links_to_others(path, name, value, message):
         elif value is not None:
             file[name] = value
     with pytest.raises(ValueError, match=message):
-        read_store(path)
+        read_store(stored)
 
 
-def test_a_failed_write_leaves_the_old_file(uneven, path):
-    before = path.read_bytes()
+def test_a_failed_write_leaves_the_old_file(uneven, stored):
+    before = stored.read_bytes()
     broken = CorrespondenceStore(**{**vars(uneven), "K": "not an array"})
     with pytest.raises(ValueError, match="could not convert"):
-        write_store(path, broken)
-    assert path.read_bytes() == before
-    assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
+        write_store(stored, broken)
+    assert stored.read_bytes() == before
+    assert [file.name for file in stored.parent.iterdir()] == ["store.h5"]
 
 
 @pytest.mark.parametrize(("first", "stop"), [(0, 1), (2, 5), (0, 6)])
-def test_some_pairs(uneven, path, first, stop):
-    part = read_store(f"{path}@{first}:0{stop}")
+def test_some_pairs(uneven, stored, first, stop):
+    part = read_store(f"{stored}@{first}:0{stop}")
     assert part.names == uneven.names[first:stop]
     for new, old in enumerate(range(first, stop)):
         np.testing.assert_equal(part.matches(new), uneven.matches(old))
@@ -121,6 +128,133 @@ def test_matches_of_a_pair(uneven):
 
 
 @pytest.mark.parametrize(("first", "stop"), [(0, 0), (4, 2), (0, 7)])
-def test_pairs_that_are_not_there(path, first, stop):
+def test_pairs_that_are_not_there(stored, first, stop):
     with pytest.raises(ValueError, match=f"pairs {first}:{stop} were asked for, the store has 0:6"):
-        read_store(f"{path}@{first}:{stop}")
+        read_store(f"{stored}@{first}:{stop}")
+
+
+OPTIONS = {"detector": "sift", "num_features": 200, "max_matches": None}
+
+
+def pair(number: int) -> CorrespondenceStore:
+    points = np.full((number + 1, 2), number, np.float32)
+    return store_of(points, points + 1, [0, number + 1], [(f"{number}a", f"{number}b")])
+
+
+@settings(max_examples=8)
+@given(order=st.permutations(range(3)), stop=st.integers(0, 3))
+def test_order_and_stops_leave_no_trace(tmp_path_factory, order, stop):
+    path = tmp_path_factory.mktemp("store") / "store.h5"
+    for places in (order[:stop], order[stop:]):
+        writer = StoreWriter(path, OPTIONS)
+        assert writer.done().isdisjoint(places)
+        for place in places:
+            writer.add(place, pair(place))
+    writer.finish({"by": "a test"})
+    store = read_store(path)
+    assert store.names == [(f"{i}a", f"{i}b") for i in range(3)]
+    assert store.points1[:, 0].tolist() == [i for i in range(3) for _ in range(i + 1)]
+    assert store.provenance == {"by": "a test", "options": OPTIONS}
+    assert [file.name for file in path.parent.iterdir()] == ["store.h5"]
+    assert StoreWriter(path, OPTIONS).complete
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "store.h5"
+
+
+class TestParts:
+    @pytest.mark.parametrize("size", [0, 100, 5000])
+    def test_broken_part_is_made_again(self, path, size):
+        writer = StoreWriter(path, OPTIONS)
+        for place in range(3):
+            writer.add(place, pair(place))
+        part = writer.folder / "00000001.h5"
+        part.write_bytes(part.read_bytes()[:size])
+        assert StoreWriter(path, OPTIONS).done() == {0, 2}
+        assert not part.exists()
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"num_features": 300}, r"store\.h5\.parts was made .* num_features was 200 and is 300"),
+            ({"frames": "3500"}, r"other data, remove .* the images, .* have changed since$"),
+            ({"frames": "3500", "num_features": 300}, r": num_features was 200 and is 300$"),  # without the digests
+        ],
+    )
+    def test_of_other_options_or_images(self, path, options, message):
+        StoreWriter(path, {**OPTIONS, "frames": "48af"}).add(0, pair(0))
+        with pytest.raises(ValueError, match=message):
+            StoreWriter(path, {**OPTIONS, "frames": "48af", **options})
+
+    def test_folder_goes_if_nothing_is_in_it(self, path):
+        writer = StoreWriter(path, OPTIONS)
+        writer.close()
+        assert list(path.parent.iterdir()) == []
+
+    @pytest.mark.parametrize("text", ["[1]", '{"num_feat'])
+    def test_without_readable_options(self, path, text):
+        writer = StoreWriter(path, OPTIONS)
+        writer.add(0, pair(0))
+        (writer.folder / "options.json").write_text(text)
+        with pytest.raises(ValueError, match=r"store\.h5\.parts exists, but was not made by this command"):
+            StoreWriter(path, OPTIONS)
+
+    def test_wrong_arguments(self, path):
+        writer = StoreWriter(path, OPTIONS)
+        with pytest.raises(ValueError, match="got 1 pairs and place -1"):
+            writer.add(-1, pair(0))
+        with pytest.raises(ValueError, match="no pairs to write"):
+            writer.finish({})
+
+
+NO_PROC = pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "error", "message"),
+    [
+        (lambda path: path.write_bytes(b"\x89HDF"), "store.h5", ValueError, r"store\.h5 is not a readable HDF5 file"),
+        (lambda path: write_store(path, pair(0)), "store.h5", ValueError, "exists, but was not made by this command"),
+        (lambda path: path.mkdir(), "store.h5", ValueError, "not a regular file"),
+        (lambda path: path.with_name("store.h5.parts").touch(), "store.h5", ValueError, "parts, which is not a folder"),
+        (id, "nothing/store.h5", FileNotFoundError, r"the folder .*nothing does not exist"),
+        pytest.param(id, "/proc/out.h5", OSError, r"^cannot write /proc/out\.h5: ", marks=NO_PROC),
+    ],
+)
+def test_places_that_are_refused(tmp_path, make, name, error, message):
+    make(tmp_path / name)
+    with pytest.raises(error, match=message):
+        StoreWriter(tmp_path / name, OPTIONS)
+
+
+FULL_DISK = """
+import resource, signal, sys
+sys.path.append(sys.argv[1])
+from test_store import OPTIONS, StoreWriter, pair
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+for limit, rows in ((20_000, 0), (700_000, 20_000)):  # a part, the store of three
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    writer = StoreWriter(f"{limit}.h5", OPTIONS)
+    try:
+        for place in range(3):
+            writer.add(place, pair(place + rows))
+        writer.finish({})
+    except OSError as error:
+        print("one line:", error)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="limits are POSIX's")
+def test_full_disk(tmp_path):
+    command = [sys.executable, "-c", FULL_DISK, str(Path(__file__).parent)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.count("one line: ") == 2, done.stderr
+    assert not list(tmp_path.glob("*.h5"))
+    assert not list(tmp_path.rglob(".*"))  # nothing half-written stays
+    writer = StoreWriter(tmp_path / "700000.h5", OPTIONS)
+    assert writer.done() == {0, 1, 2}
+    writer.finish({})
+    assert len(read_store(writer.path)) == 3

@@ -9,25 +9,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
-from scenes import (
-    DTYPES,
-    SCENES,
+from references import (
     WRONG_MATRICES,
     check_refuses,
-    correspondences,
     eight_point,
     hartley_difference,
     in_hartley,
     numpy_hartley,
     numpy_whitening,
-    paper,
-    scenes,
-    shaken,
     signless,
-    small,
-    uniform,
     up_to_sign,
 )
+from scenes import DTYPES, SCENES, correspondences, paper, scenes, shaken, small, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import Hartley, Whitening, find_fundamental, find_homography, optimal_rank2, refine_fundamental

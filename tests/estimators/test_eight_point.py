@@ -7,20 +7,8 @@ import numpy as np
 import pytest
 import torch
 from pairwise import pairwise
-from scenes import (
-    LAYERS,
-    check_gradients,
-    correspondences,
-    derivative,
-    in_hartley,
-    scenes,
-    shaken,
-    signless,
-    true_essential,
-    uniform,
-    unit,
-    up_to_sign,
-)
+from references import check_gradients, derivative, in_hartley, signless, true_essential, unit, up_to_sign
+from scenes import LAYERS, correspondences, scenes, shaken, uniform
 from torch.func import grad, jacrev, vmap
 from torch.utils.checkpoint import checkpoint
 

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
-from scenes import DTYPES, check_gradients, rewrite_weights, seeded, uniform
+from references import check_gradients
+from scenes import DTYPES, rewrite_weights, seeded, uniform
 from torch import Tensor
 
 import kornia_learnnorm as kln

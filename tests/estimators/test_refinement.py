@@ -9,10 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pairwise import pairwise
-from scenes import (
-    SCENES,
+from references import (
     check_gradients,
-    correspondences,
     cross,
     epipolar_distances,
     homogeneous,
@@ -20,13 +18,12 @@ from scenes import (
     least_squares,
     numpy_hartley,
     numpy_sampson,
-    scenes,
     signless,
     true_essential,
-    uniform,
     unit,
     up_to_sign,
 )
+from scenes import SCENES, correspondences, scenes, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
@@ -116,8 +113,7 @@ def test_agrees_with_numpy(name, kind, num_points, calibrated):
 
 
 @both
-@pytest.mark.parametrize("kind", DISTANCES)
-@pytest.mark.parametrize("loss", LOSSES)
+@pairwise(kind=DISTANCES, loss=LOSSES)
 def test_costs_are_those_of_the_matrices(calibrated, kind, loss):
     refine, (points, cameras), start = problem(calibrated, batch_size=10, num_points=15)
     weights = uniform(10, 15)
@@ -138,8 +134,7 @@ def test_essential_matrices():
     assert not any(value.requires_grad for value in found)
 
 
-@pytest.mark.parametrize("kind", DISTANCES)
-@pytest.mark.parametrize("loss", LOSSES)
+@pairwise(kind=DISTANCES, loss=LOSSES)
 def test_nothing_near_the_optimum_costs_less(kind, loss):
     _, (points, _), start = problem(False, "orbit", 10, 30)
     found = refine_fundamental(*points, start, None, kind, loss, 300)
@@ -242,8 +237,7 @@ def test_returns_the_start_where_no_step_is_possible():
 
 
 class TestGradients:
-    @pytest.mark.parametrize("kind", DISTANCES)
-    @pytest.mark.parametrize("loss", [squared_loss, Cauchy(0.3)])
+    @pairwise(kind=DISTANCES, loss=[squared_loss, Cauchy(0.3)])
     def test_at_the_optimum(self, kind, loss):
         scene = scenes("orbit", 1, 14, noise=1.0)
         points = [(points / 300 - 1).requires_grad_() for points in scene[:2]]

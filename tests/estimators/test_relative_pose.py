@@ -4,7 +4,8 @@ import pytest
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import essential_from_Rt
-from scenes import distorted, roughened, scenes, seeded, true_essential, uniform, up_to_sign
+from references import true_essential, up_to_sign
+from scenes import distorted, roughened, scenes, seeded, uniform
 from torch.nn.functional import normalize
 
 import kornia_learnnorm as kln

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from pairwise import pairwise
-from scenes import SCENES, correspondences, epipolar_distances, homogeneous, null_matrices, uniform
+from references import epipolar_distances, homogeneous, null_matrices
+from scenes import SCENES, correspondences, uniform
 from torch.autograd import gradcheck
 
 from kornia_learnnorm import Hartley, Identity, ReweightedWhitening, Whitening

@@ -6,7 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
-from scenes import SCENES, correspondences, eight_point, epipolar_distances, shaken, uniform
+from references import eight_point, epipolar_distances
+from scenes import SCENES, correspondences, shaken, uniform
 
 from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening
 from kornia_learnnorm.evaluation.search import SearchedNormalizer

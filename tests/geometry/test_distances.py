@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from scenes import SCENES, correspondences, epipolar_distances, homogeneous, numpy_sampson, plane, scenes, uniform
+from references import epipolar_distances, homogeneous, numpy_sampson
+from scenes import SCENES, correspondences, plane, scenes, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln

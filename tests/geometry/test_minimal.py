@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
-from scenes import SCENES, correspondences, plane, scenes, true_essential, up_to_sign
+from references import true_essential, up_to_sign
+from scenes import SCENES, correspondences, plane, scenes
 
 from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.five_point import essential_in_span

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.geometry.epipolar import essential_from_fundamental, motion_from_essential_choose_solution
-from scenes import SCENES, cross, scenes, uniform
+from references import cross
+from scenes import SCENES, scenes, uniform
 
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error

@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from scenes import mapped, uniform
+from references import mapped
+from scenes import uniform
 from torch.autograd import gradcheck, gradgradcheck
 
 from kornia_learnnorm.geometry.transforms import affine_transform, paper_transform, spd_transform

@@ -1,4 +1,4 @@
-"""Checkpoints and interruption: a training that goes on ends with the weights of one that was not cut."""
+"""Checkpoints, interruption and the start: a training that goes on ends with the weights of one that was not cut."""
 
 import functools
 import signal
@@ -8,7 +8,7 @@ import torch
 from train_processes import SAMPLES, Blocks, Interrupt, Pairs, Stop, Watch, make_data, make_trainer, normaliser_task
 
 from kornia_learnnorm.data.random_sets import RandomSets, SyntheticSets
-from lightning_modules.callbacks import Checkpoints
+from lightning_modules.callbacks import AgainstStart, Checkpoints
 
 BLOCKS = Blocks(96, (96, 96, 96))  # so that workers have something to draw
 RANDOM = RandomSets([SyntheticSets(16)], sizes=(9, 64), correspondences=256, batches=9)
@@ -63,3 +63,32 @@ def test_a_second_interrupt_ends_the_run_at_once(tmp_path):
     with pytest.raises(SystemExit):
         make_trainer(tmp_path, [Checkpoints(), Interrupt(4, times=2)], max_steps=20).fit(normaliser_task(), make_data())
     assert not (tmp_path / "checkpoints/last.ckpt").exists()
+
+
+def test_summary():
+    found = AgainstStart()
+    for last, expected in [
+        ((0.1, 0.2), "better than at the start: a 0.100, at the start 0.300; b 0.200, at the start 0.400"),
+        ((0.1, 0.5), "better in 1 of 2 errors than at the start: a 0.100"),
+        ((0.3, float("nan")), "not better than at the start: a 0.300, at the start 0.300; b nan"),
+    ]:
+        found.start, found.last = {"a": 0.3, "b": 0.4}, dict(zip("ab", last, strict=True))
+        assert found.summary().startswith(expected)
+
+
+def test_the_start_is_the_untrained_estimator_also_after_a_resumed_run(tmp_path):
+    (expected,) = make_trainer(tmp_path).validate(normaliser_task(), make_data(), verbose=False)
+    found, options = AgainstStart(), {"max_epochs": 1, "num_sanity_val_steps": -1}
+    with pytest.raises(InterruptedError):
+        make_trainer(tmp_path, [AgainstStart(), Checkpoints(2), Stop(3)], **options).fit(normaliser_task(), make_data())
+    trainer = make_trainer(tmp_path, [found, Checkpoints(2)], **options)
+    trainer.fit(normaliser_task(), make_data(), ckpt_path=tmp_path / "checkpoints/last.ckpt")
+    assert found.start == {"val/log_sed": pytest.approx(expected["val/log_sed"])}
+    assert found.last["val/log_sed"] != found.start["val/log_sed"]
+    assert found.step == trainer.global_step > 3
+
+
+def test_a_part_of_the_validation_is_not_compared(tmp_path):
+    found = AgainstStart()
+    make_trainer(tmp_path, [found], max_steps=2, num_sanity_val_steps=1).fit(normaliser_task(), make_data())
+    assert found.start == {}

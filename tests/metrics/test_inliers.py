@@ -6,7 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
-from scenes import epipolar_distances, scenes
+from references import epipolar_distances
+from scenes import scenes
 
 from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
 
@@ -49,9 +50,7 @@ class TestAll:
         points1, points2 = (torch.rand(*shape, 5, 2, device=device, dtype=dtype) for _ in range(2))
         F, true = (torch.rand(*shape, 3, 3, device=device, dtype=dtype) for _ in range(2))
         found = METRICS[name](points1, points2, F, true, 100.0)
-        assert found.shape == shape
-        assert found.dtype == dtype
-        assert found.device.type == device.type
+        assert (found.shape, found.dtype, found.device.type) == (shape, dtype, device.type)
 
     @pytest.mark.parametrize("threshold", [0.1, 1.0, 5.0])
     def test_by_hand(self, name, threshold):
@@ -101,26 +100,18 @@ class TestAll:
                 METRICS[name](points1, points2, F, true, *(rest or [1.0]))
 
 
-class TestByRows:
-    """Epipolar lines are rows and the distance is twice the difference of y."""
+def test_by_rows():
+    """Epipolar lines are rows and the distance is twice the difference of y; at the threshold is outside."""
 
-    def points(self, *differences):
+    def points(*differences):
         points1 = torch.tensor([[[5.0, 7.0]] * len(differences)], dtype=torch.float64)
-        offset = torch.tensor([[[3.0, d / 2] for d in differences]], dtype=torch.float64)
-        return points1, points1 + offset
+        return points1, points1 + torch.tensor([[[3.0, d / 2] for d in differences]], dtype=torch.float64)
 
-    def test_at_the_threshold_is_outside(self):
-        assert inlier_share(*self.points(0.5, 1.0, 1.5, 3.0), ROWS, 1.0).item() == 0.25
-
-    def test_sets_that_do_not_meet(self):
-        estimate = ROWS + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        points = self.points(0.0, 2.0)
-        assert f1_score(*points, estimate, ROWS, 1.0).item() == 0.0
-        assert f1_score(*points, ROWS, estimate, 1.0).item() == 0.0
-        assert f1_score(*points, ROWS, ROWS, 1.0).item() == 1.0
-        assert epipolar_error(*points, estimate, ROWS).item() == 2.0
-
-    def test_error_is_over_the_inliers_below_one_pixel(self):
-        points = self.points(0.0, 0.5, 0.75, 1.0, 40.0)
-        assert epipolar_error(*points, ROWS, ROWS).item() == pytest.approx(1.25 / 3)
-        assert epipolar_error(*points, ROWS, ROWS, threshold=1.5).item() == pytest.approx(2.25 / 4)
+    assert inlier_share(*points(0.5, 1.0, 1.5, 3.0), ROWS, 1.0).item() == 0.25
+    estimate, apart = ROWS + torch.tensor([0.0, 0, 1]).diag(), points(0.0, 2.0)  # sets that do not meet
+    matrices = (estimate, ROWS), (ROWS, estimate), (ROWS, ROWS)
+    assert [f1_score(*apart, *pair, 1.0).item() for pair in matrices] == [0.0, 0.0, 1.0]
+    assert epipolar_error(*apart, estimate, ROWS).item() == 2.0
+    near = points(0.0, 0.5, 0.75, 1.0, 40.0)  # the error is over inliers below one pixel
+    assert epipolar_error(*near, ROWS, ROWS).item() == pytest.approx(1.25 / 3)
+    assert epipolar_error(*near, ROWS, ROWS, threshold=1.5).item() == pytest.approx(2.25 / 4)

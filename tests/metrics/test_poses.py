@@ -49,9 +49,7 @@ class TestAngles:
     def test_smoke(self, device, dtype):
         R, t = torch.eye(3, device=device, dtype=dtype).repeat(2, 5, 1, 1), torch.rand(2, 5, 3, device=device).to(dtype)
         for found in (rotation_error(R, R), translation_error(t, t), pose_error(R, t, R, t)):
-            assert found.shape == (2, 5)
-            assert found.dtype == dtype
-            assert found.device.type == device.type
+            assert (found.shape, found.dtype, found.device.type) == ((2, 5), dtype, device.type)
             assert (found < 1e-3).all()
 
     def test_exceptions(self):

@@ -114,6 +114,9 @@ def test_exceptions():
         (paired_bootstrap, (VALUES[None], VALUES[None], VALUES), r"two \(S,\) tensors, got \[1, 3\]"),
         (paired_bootstrap, (VALUES, VALUES, torch.arange(4)), r"got \[3\] and \[4\]"),
         (paired_bootstrap, (torch.tensor([1.0, NAN, INF]), VALUES, VALUES), "2 NaN or infinite ones of 3"),
+        (better_rate, (torch.rand(3), torch.rand(4)), r"two \(S,\) tensors, got \[3\] and \[4\]"),
+        (better_rate, (torch.rand(3, 2), torch.rand(3, 2)), r"two \(S,\) tensors, got \[3, 2\] and \[3, 2\]"),
+        (better_rate, (torch.rand(0), torch.rand(0)), "none of 0 samples can be compared"),
     ]:
         with pytest.raises(ValueError, match=message):
             function(*arguments)
@@ -140,29 +143,19 @@ def test_of_nothing_is_nan():
 NUMBERS = st.sampled_from([0.0, 0.5, 1.0, 2.0, INF, NAN])
 
 
-class TestBetterRate:
-    @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=30))
-    def test_counts(self, pairs):
-        """Ties are not better, one infinite residual is worse than any other, two and NaN are left out."""
-        finite = [(a, b) for a, b in pairs if a == a and b == b and not a == b == INF]
-        residual, baseline = torch.tensor(pairs).unbind(-1)
-        if not finite:
-            with pytest.raises(ValueError, match=f"none of {len(pairs)} samples can be compared"):
-                better_rate(residual, baseline)
-            return
-        found = better_rate(residual, baseline)
-        assert found.rate == sum(a < b for a, b in finite) / len(finite)
-        assert found.ties == sum(a == b for a, b in finite)
-        assert found.degenerate == len(pairs) - len(finite)
-        assert found.compared == len(finite)
-        reverse = better_rate(baseline, residual)
-        assert found.rate + reverse.rate + found.ties / found.compared == pytest.approx(1)
-
-    def test_exceptions(self):
-        for residual, baseline, message in [
-            (torch.rand(3), torch.rand(4), r"two \(S,\) tensors, got \[3\] and \[4\]"),
-            (torch.rand(3, 2), torch.rand(3, 2), r"two \(S,\) tensors, got \[3, 2\] and \[3, 2\]"),
-            (torch.rand(0), torch.rand(0), "none of 0 samples can be compared"),
-        ]:
-            with pytest.raises(ValueError, match=message):
-                better_rate(residual, baseline)
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=30))
+def test_counts(pairs):
+    """Ties are not better, one infinite residual is worse than any other, two and NaN are left out."""
+    finite = [(a, b) for a, b in pairs if a == a and b == b and not a == b == INF]
+    residual, baseline = torch.tensor(pairs).unbind(-1)
+    if not finite:
+        with pytest.raises(ValueError, match=f"none of {len(pairs)} samples can be compared"):
+            better_rate(residual, baseline)
+        return
+    found = better_rate(residual, baseline)
+    assert found.rate == sum(a < b for a, b in finite) / len(finite)
+    assert found.ties == sum(a == b for a, b in finite)
+    assert found.degenerate == len(pairs) - len(finite)
+    assert found.compared == len(finite)
+    reverse = better_rate(baseline, residual)
+    assert found.rate + reverse.rate + found.ties / found.compared == pytest.approx(1)

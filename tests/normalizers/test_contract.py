@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
-from scenes import DTYPES, check_refuses, correspondences, paper, shaken, uniform
+from references import check_refuses
+from scenes import DTYPES, correspondences, paper, shaken, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.evaluation.search import SearchedNormalizer

@@ -8,19 +8,8 @@ import pytest
 import torch
 from kornia.geometry.epipolar import normalize_points
 from pairwise import pairwise
-from scenes import (
-    DTYPES,
-    correspondences,
-    epipolar_distances,
-    last_layer,
-    mapped,
-    paper,
-    rewrite_weights,
-    shaken,
-    signless,
-    small,
-    uniform,
-)
+from references import epipolar_distances, mapped, signless
+from scenes import DTYPES, correspondences, last_layer, paper, rewrite_weights, shaken, small, uniform
 from torch import nn
 
 import kornia_learnnorm as kln

@@ -11,11 +11,14 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from kornia.geometry import ransac as kornia_ransac
 from kornia.geometry.linalg import transform_points
-from scenes import epipolar_distances, one_scene, shaken, uniform, up_to_sign
+from pairwise import pairwise
+from references import epipolar_distances, up_to_sign
+from scenes import one_scene, shaken, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import RANSAC
 from kornia_learnnorm.data.store import read_store
+from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.metrics.inliers import f1_score
 from kornia_learnnorm.ransac.samplers import WeightedSampler
 
@@ -59,8 +62,7 @@ class TestResult:
             assert values == pytest.approx([0.5**0.5, 0.5**0.5, 0.0], abs=1e-6)
             assert torch.equal(inliers, kln.sampson_distance(*points, F_mat) <= 1)
 
-    @pytest.mark.parametrize("normalizer", [None, kln.Whitening(), shaken()])
-    @pytest.mark.parametrize("rank2", [None, "projection", "optimal"])
+    @pairwise(normalizer=[None, kln.Whitening(), shaken()], rank2=[None, "projection", "optimal"])
     def test_any_normalizer(self, normalizer, rank2):
         points1, points2, F_true, _ = pair(num_points=200)
         F_mat, _ = RANSAC(normalizer, rank2=rank2, seed=0)(points1, points2)
@@ -145,8 +147,7 @@ class TestAccuracy:
         if num_points > 7:  # of fewer, others fit within the threshold
             assert up_to_sign(found.F_mat[None], scene.F_mat[None]) < (1e-6 if calibrated else 1e-8)
 
-    @pytest.mark.parametrize("name", NAMED)
-    @pytest.mark.parametrize("options", [{}, {"distance": "symmetric", "inl_th": 2.0}])
+    @pairwise(name=NAMED, options=[{}, {"distance": "symmetric", "inl_th": 2.0}])
     def test_finds_the_inliers(self, name, options):
         points1, points2, _, true = pair(name)
         _, inliers = RANSAC(seed=0, **options)(points1, points2)
@@ -167,20 +168,17 @@ class TestAccuracy:
         assert ours > theirs - 0.01
 
 
-class TestSeeds:
-    def test_seeded_calls_repeat_exactly_and_leave_the_global_generator(self):
-        points, ransac, state = pair()[:2], RANSAC(seed=3), torch.get_rng_state()
-        torch.testing.assert_close(ransac(*points), ransac(*points), rtol=0, atol=0)
-        assert torch.equal(state, torch.get_rng_state())
-
-    def test_seeds_of_numpy_and_other_default_dtypes(self):
-        points = [p.float() for p in pair(num_points=50)[:2]]
-        first = RANSAC(seed=3)(*points)[0]
-        torch.set_default_dtype(torch.float64)
-        try:
-            assert torch.equal(RANSAC(seed=np.int64(3))(*points)[0], first)
-        finally:
-            torch.set_default_dtype(torch.float32)
+def test_seeded_calls_repeat_exactly_and_leave_the_global_generator():
+    """Also by seeds of NumPy and under another default dtype."""
+    points, ransac, state = [p.float() for p in pair()[:2]], RANSAC(seed=3), torch.get_rng_state()
+    first = ransac(*points)
+    torch.testing.assert_close(ransac(*points), first, rtol=0, atol=0)
+    torch.set_default_dtype(torch.float64)
+    try:
+        torch.testing.assert_close(RANSAC(seed=np.int64(3))(*points), first, rtol=0, atol=0)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(state, torch.get_rng_state())
 
 
 class TestContexts:
@@ -249,8 +247,7 @@ class TestHardInput:
         assert F_mat.isfinite().all()
         assert failed((F_mat, inliers)) or (inliers.all() if value is not None else inliers.float().mean() < 0.5)
 
-    @pytest.mark.parametrize("normalizer", [None, kln.ReweightedWhitening()])
-    @pytest.mark.parametrize("value", [1e10, -1e150, 1e300])
+    @pairwise(normalizer=[None, kln.ReweightedWhitening()], value=[1e10, -1e150, 1e300])
     def test_points_that_are_far_away(self, normalizer, value):
         points1, points2, _, true = pair(num_points=200)
         points1[:3], points2[2:4] = value, -value
@@ -281,8 +278,7 @@ class TestHardInput:
         points2 = points1 + 150 / uniform(2**16, 1, low=4, high=8) + 0.1 * uniform(2**16, 2, low=-1, seed=1)
         assert RANSAC(seed=0)(points1.float(), points2.float())[1].float().mean() > 0.99
 
-    @pytest.mark.parametrize("distance", ["sampson", "symmetric"])
-    @pytest.mark.parametrize("number", [100, 1000])
+    @pairwise(distance=["sampson", "symmetric"], number=[100, 1000])
     def test_match_on_the_epipole(self, number, distance):
         epipole = torch.full((2,), 300.0, dtype=torch.float64)
         points1 = uniform(number, 2, high=600)
@@ -336,3 +332,36 @@ def test_invariances(calibrated, scale, x, y, order):
         assert (found == expected).float().mean() > 0.95
     errors = [epipolar_distances(*(p[inliers] for p in points), F).mean() for F in (F_mat, swapped.mT)]
     assert errors[0] == pytest.approx(errors[1], rel=0.05, abs=1e-3)
+
+
+def test_mask_by_hand():
+    """Zeros of both signs are equal; equal coordinates in another order are not."""
+    points1 = torch.tensor([[0.0, 1], [-0.0, 1], [1, 0], [7, 7], [8, 8]])
+    points2 = torch.tensor([[2.0, 3], [4, 5], [5, 4], [5, 4], [7, 7]])
+    assert distinct_points(points1, points2).tolist() == [True, False, True, False, True]
+    assert distinct_points(points1, points2, torch.arange(5)).tolist() == [False, True, False, True, True]
+
+
+class TestSharedPoints:
+    @pytest.mark.parametrize("cameras", [False, True])
+    def test_copies_are_absent(self, cameras):
+        scene = one_scene("handheld", 200, noise=0.3, outliers=0.3)
+        points, known = scene[:2], (scene.K1, scene.K2) if cameras else ()
+        found = RANSAC(seed=0).estimate(*points, None, *known)
+        again = RANSAC(seed=0).estimate(*(torch.cat([x, x[:50]]) for x in points), None, *known)
+        assert torch.equal(found.F_mat, again.F_mat)
+        assert torch.equal(torch.cat([found.inliers, torch.zeros(50, dtype=torch.bool)]), again.inliers)
+
+    def test_the_weights_decide_which_counts(self):
+        scene = one_scene("handheld", 200, noise=0.3, outliers=0.0)
+        points2 = torch.cat([uniform(200, 2, high=600), scene.points2])
+        weights = torch.tensor([0.1, 0.2]).repeat_interleave(200)
+        _, inliers = RANSAC(seed=0)(scene.points1.repeat(2, 1), points2, weights)
+        assert inliers[200:].float().mean() > 0.9
+        assert not inliers[:200].any()
+
+    def test_rows_that_are_not_finite_hide_no_match(self):
+        points1, points2, *_ = one_scene("handheld", 100, noise=0.3, outliers=0.0)
+        _, inliers = RANSAC(seed=0)(points1, points2)
+        _, more = RANSAC(seed=0)(points1.repeat(2, 1), torch.cat([points2 * torch.nan, points2]))
+        assert torch.equal(more, torch.cat([torch.zeros(100, dtype=torch.bool), inliers]))

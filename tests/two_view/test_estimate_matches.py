@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 import torch
-from scenes import epipolar_distances, seeded, uniform
+from references import epipolar_distances
+from scenes import seeded, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld

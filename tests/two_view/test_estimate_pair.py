@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scenes import epipolar_distances
+from references import epipolar_distances
 
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scenes import epipolar_distances
+from references import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import orbit

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import epipolar_distances
+from references import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
@@ -69,36 +69,23 @@ def codes(points1, points2, inliers, angle=0.1) -> list[str]:
     return [warning.code for warning in found]
 
 
-@pytest.fixture
-def points() -> tuple[torch.Tensor, torch.Tensor]:
+def test_warnings():
     rng = np.random.default_rng(0)
-    return tuple(torch.from_numpy(rng.uniform([0, 0], SIZE, (100, 2))) for _ in range(2))
+    points1, points2 = (torch.from_numpy(rng.uniform([0, 0], SIZE, (100, 2))) for _ in range(2))
+    assert codes(points1, points2, MOST) == []
+    assert codes(points1, points2, torch.arange(100) < 12) == ["few_inliers", "chance"]
+    assert codes(points1, points2, MOST, angle=20.0) == ["unstable"]
+    assert codes(points1 * torch.tensor([1.0, 0.01]), points2, ALL) == ["clustered"]
 
 
-class TestFindWarnings:
-    def test_of_numbers(self, points):
-        for inliers, options, found in [
-            (MOST, {}, []),
-            (torch.arange(100) < 12, {}, ["few_inliers", "chance"]),
-            (MOST, {"angle": 20.0}, ["unstable"]),
-        ]:
-            assert codes(*points, inliers, **options) == found
+def test_support_that_chance_would_give():
+    """By hand for 12 of 100 in 1226 x 370: 10^(15.0 + 2.9 + 2.0 - 5 * 2.25) models expected, far more than one.
 
-    def test_clustered(self, points):
-        assert codes(points[0] * torch.tensor([1.0, 0.01]), points[1], ALL) == ["clustered"]
-
-
-@pytest.mark.parametrize(("inliers", "chance"), [(12, True), (16, True), (29, False), (60, False)])
-def test_support_that_chance_would_give(inliers, chance):
-    """By hand for 12 of 100 in 1226 x 370: 10^(15.0 + 2.9 + 2.0 - 5 * 2.25) models expected, far more than one."""
-    found = log_false_alarms(100, inliers, 1.0, (1226, 370))
-    assert (found > -2) == chance
-    if inliers == 12:
-        assert found == pytest.approx(15.02 + 2.90 + 1.97 - 5 * 2.248, abs=0.02)
-
-
-def test_homographies_by_chance():
-    """By hand for 9 of 100 in 640 x 480: 10^(12.3 + 2.1 + 2.0 - 5 * 4.99) homographies from four matches expected."""
+    For 9 of 100 in 640 x 480, 10^(12.3 + 2.1 + 2.0 - 5 * 4.99) homographies from four matches are expected.
+    """
+    found = [log_false_alarms(100, inliers, 1.0, (1226, 370)) for inliers in (12, 16, 29, 60)]
+    assert [value > -2 for value in found] == [True, True, False, False]
+    assert found[0] == pytest.approx(15.02 + 2.90 + 1.97 - 5 * 2.248, abs=0.02)
     found = log_false_alarms(100, 9, 1.0, SIZE, "homography")
     assert found == pytest.approx(12.28 + 2.10 + 1.98 - 5 * 4.990, abs=0.02)
 

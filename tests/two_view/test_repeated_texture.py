@@ -5,8 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from references import epipolar_distances
 from rendered import render_kind
-from scenes import epipolar_distances, repeated_wall, uniform
+from scenes import repeated_wall, uniform
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.metrics.poses import pose_error

@@ -68,10 +68,6 @@ def frame_of(path: Path, image: np.ndarray, **known) -> Frame:
 class TestReadFrame:
     GRID = np.stack(np.meshgrid(np.arange(40.0, 210, 40), np.arange(40.0, 150, 33)), -1).reshape(-1, 2)
 
-    def test_wrong_size(self):
-        with pytest.raises(ValueError, match="positive width and height, got 5 x -1"):
-            resize_frames([], (5, -1))
-
     def test_undistortion_moves_points_as_opencv_says(self, tmp_path):
         frame = frame_of(tmp_path / "a.png", blobs(self.GRID), camera=SMALL_CAMERA, distortion=DISTORTION)
         want = cv2.undistortPoints(self.GRID[:, None], SMALL_CAMERA, np.array(DISTORTION), P=SMALL_CAMERA)[:, 0]
@@ -88,7 +84,9 @@ class TestReadFrame:
         reach = int(14 * max(size[0] / 240, size[1] / 180))
         assert np.abs(centroids(image, want, reach) - want).max() < 0.05
 
-    def test_does_not_fit_its_camera(self, tmp_path):
+    def test_wrong_size_or_camera(self, tmp_path):
+        with pytest.raises(ValueError, match="positive width and height, got 5 x -1"):
+            resize_frames([], (5, -1))
         for change, message in [
             ({"size": (640, 480)}, r"a\.png has 240 x 180 pixels, its camera 640 x 480"),
             ({"distortion": DISTORTION}, "a distortion, but no camera matrix"),

@@ -138,20 +138,14 @@ def test_wrong_arguments(written):
             read_dataset(dataset, written / root, **arguments)
 
 
-def test_a_folder_within_does_not_part_its_sequence(tmp_path):
-    for name in ("s/1.png", "s/2/1.png", "s/3.png", "s-1/1.png"):
+def test_a_folder_within_does_not_part_its_sequence_and_hidden_files_are_none(tmp_path):
+    for name in ("s/1.png", "s/2/1.png", "s/3.png", "s-1/1.png", "s/.thumbs/1.png", "s/._1.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
         (tmp_path / name).touch()
-    pairs = pair_frames(read_folder(str(tmp_path)))
-    assert names(pairs) == [("s/1.png", "s/3.png")]
-
-
-def test_hidden_files(tmp_path):
-    for name in (".thumbs/1.png", "._1.png", "1.png"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    frames = read_folder(tmp_path)
+    assert names(pair_frames(read_folder(str(tmp_path)))) == [("s/1.png", "s/3.png")]
+    frames = read_folder(tmp_path / "s-1")
     assert [(frame.name, frame.size) for frame in frames] == [("1.png", (0, 0))]
+    assert len(read_folder(tmp_path)) == 4
 
 
 def numbered(*sequences: str) -> list[Frame]:
@@ -164,11 +158,9 @@ class TestPairFrames:
         expected = [(f"{s}/{n}.png", f"{s}/{n + gap}.png") for s in "xy" for n in range(4 - gap)]
         assert names(pair_frames(numbered("x", "y"), gap)) == expected
 
-    def test_wrong_gap(self):
+    def test_all_pairs_and_a_wrong_gap(self):
         with pytest.raises(ValueError, match="at least 1, got 0"):
             list(pair_frames(numbered("x"), 0))
-
-    def test_all_pairs(self):
         pairs, text = choose_pairs(numbered("x", "y"), gap=None)
         assert text == "all pairs"
         assert len({frozenset(both) for both in names(pairs)}) == len(pairs) == 8 * 7 / 2

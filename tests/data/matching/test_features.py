@@ -26,16 +26,13 @@ def _no_networks_kept():
     features.pretrained.cache_clear()
 
 
-def test_rootsift_is_the_root_of_sift_of_unit_sum():
+def test_rootsift_is_the_root_of_sift_of_unit_sum_and_a_blank_image_has_none():
     sift, root = features.detect_sift(texture(), 100), features.detect_rootsift(texture(), 100)
     rows = sift.descriptors.astype(np.float64)
     assert np.allclose(root.descriptors, np.sqrt(rows / np.abs(rows).sum(1)[:, None]), atol=1e-6)
     assert np.allclose(np.linalg.norm(root.descriptors, axis=1), 1, atol=1e-5)
     assert root.descriptors.dtype == np.float32
     assert np.array_equal(root.points, sift.points)
-
-
-def test_blank_has_none():
     found = features.detect_rootsift(np.zeros((60, 80), np.uint8))
     assert (found.points.shape, found.descriptors.shape, found.size) == ((0, 2), (0, 128), (80, 60))
 

@@ -190,33 +190,32 @@ class TestDask:
         assert list(tmp_path.iterdir()) == []
 
 
-class TestGoingOn:
-    @pytest.mark.parametrize(
-        ("place", "error"),
-        [
-            ("kornia_learnnorm.data.matching.match_store.StoreWriter.add", OSError(28, "No space left on device")),
-            ("kornia_learnnorm.data.matching.match_store.np.savez", OSError("1024 written of 000.png")),
-            ("kornia_learnnorm.data.matching.match_store.read_frame", KeyboardInterrupt()),
-        ],
-    )
-    def test_after_an_error(self, images, expected, tmp_path, monkeypatch, place, error):
-        path, calls, call = tmp_path / "store.h5", [], pkgutil.resolve_name(place)
+@pytest.mark.parametrize(
+    ("place", "error"),
+    [
+        ("kornia_learnnorm.data.matching.match_store.StoreWriter.add", OSError(28, "No space left on device")),
+        ("kornia_learnnorm.data.matching.match_store.np.savez", OSError("1024 written of 000.png")),
+        ("kornia_learnnorm.data.matching.match_store.read_frame", KeyboardInterrupt()),
+    ],
+)
+def test_after_an_error(images, expected, tmp_path, monkeypatch, place, error):
+    path, calls, call = tmp_path / "store.h5", [], pkgutil.resolve_name(place)
 
-        def fails(*args, **arrays):
-            calls.append(args)
-            if len(calls) == 11:
-                raise error
-            return call(*args, **arrays)
+    def fails(*args, **arrays):
+        calls.append(args)
+        if len(calls) == 11:
+            raise error
+        return call(*args, **arrays)
 
-        monkeypatch.setattr(place, fails)
-        with pytest.raises(type(error), match=r"No space left|cannot write the features of .* full|^$"):
-            collect_matches(pairs_of(images), path, OPTIONS)
-        monkeypatch.undo()
-        assert not path.exists()
-        assert any((tmp_path / "store.h5.parts").glob("0*.h5"))
-        assert not any((tmp_path / "store.h5.parts").glob("features-*"))  # gives back what room it can
+    monkeypatch.setattr(place, fails)
+    with pytest.raises(type(error), match=r"No space left|cannot write the features of .* full|^$"):
         collect_matches(pairs_of(images), path, OPTIONS)
-        assert_same(expected, path)
+    monkeypatch.undo()
+    assert not path.exists()
+    assert any((tmp_path / "store.h5.parts").glob("0*.h5"))
+    assert not any((tmp_path / "store.h5.parts").glob("features-*"))  # gives back what room it can
+    collect_matches(pairs_of(images), path, OPTIONS)
+    assert_same(expected, path)
 
 
 class TestBadInput:

@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from scenes import epipolar_distances
+from references import epipolar_distances
 
 from kornia_learnnorm.data.matching.matchers import match_images
 from kornia_learnnorm.data.synthetic.render import correspondences, render_pair, room, rotation, write_pair
@@ -17,8 +17,7 @@ def pair():
 
 def test_images(pair):
     for image in (pair.image1, pair.image2):
-        assert image.shape == (480, 640)
-        assert image.dtype == np.uint8
+        assert (image.shape, image.dtype) == ((480, 640), np.uint8)
         assert image.std() > 40
         assert np.mean((image == 0) | (image == 255)) < 0.02  # no holes, hardly anything over- or underexposed
     assert np.mean(pair.image1 != pair.image2) > 0.5

@@ -160,13 +160,11 @@ def test_the_smallest_error_wins_and_what_is_level_is_named():
         assert [fact for fact in facts if fact not in text] == []
 
 
-def test_weights_of_ones_own_are_named_where_another_method_wins():
+def test_weights_of_ones_own_and_an_unknown_truth():
+    """They are named where another method wins; without truth, errors are on held-out matches beside inliers."""
     trained_on = {"Hartley": [], "best": [], "own": ["a@0:9"], "crossview": ["kitti_00"]}
     text = summary_of({"best": 0.5, "own": 0.8, "crossview": 0.9}, trained_on=trained_on)
     assert text.endswith("`own` has 5.200 px.")
-
-
-def test_without_ground_truth_the_error_is_on_heldout_matches_beside_the_share_of_inliers():
     text = summary_of({"mine": 0.5}, key="heldout")
     assert "`mine` has the smallest error on held-out matches" in text
     assert "`mine` 25.0 %, `Hartley` 25.0 %. No ground truth is known." in text

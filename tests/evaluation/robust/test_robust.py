@@ -130,8 +130,7 @@ def test_each_finds_the_truth(name, matches):
         pytest.skip(str(error))
     drawn = matches()
     found = run_estimator(estimator, drawn, 0, 1.0)
-    assert found.F_mat.shape == (3, 3)
-    assert found.F_mat.dtype == torch.float64
+    assert (found.F_mat.shape, found.F_mat.dtype) == ((3, 3), torch.float64)
     assert found.seconds > 0
     figures = measure(drawn, found.F_mat, 1.0)
     assert figures["error"] < 1.5

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 from pairwise import pairwise
-from scenes import DTYPES, numpy_hartley, numpy_whitening, prepared, shaken, uniform
+from references import numpy_hartley, numpy_whitening
+from scenes import DTYPES, prepared, shaken, uniform
 from torch.autograd import gradcheck
 from torch.nn.functional import layer_norm
 
@@ -79,21 +80,20 @@ class TestArchitecture:
             PaperNetwork(width, depth)
 
 
-class TestForward:
-    @pairwise(size=[(16, 3), (128, 12)], name=["driving", "handheld"], num_points=[8, 30], weighted=[False, True])
-    def test_agrees_with_numpy(self, size, name, num_points, weighted, device):
-        net, points = network(*size).to(device), normalized(name, 5, num_points)
-        weights = uniform(5, num_points) * (torch.arange(num_points) % 4 > 0) if weighted else None
-        on_device = [None if v is None else v.to(device) for v in (*points, weights)]
-        features = net.global_features(on_device[0], on_device[2]).detach().cpu()
-        answers = [params.detach().cpu() for params in net(*on_device)]
-        net = net.cpu()
-        for k in range(5):
-            w = None if weights is None else weights[k].numpy()
-            np.testing.assert_allclose(features[k].numpy(), numpy_features(net, points[0][k].numpy(), w), atol=1e-9)
-            for params, p in zip(answers, points, strict=True):
-                expected = numpy_params(net, p[k].numpy(), w)
-                np.testing.assert_allclose(params[k].numpy(), expected, rtol=1e-8, atol=1e-10)
+@pairwise(size=[(16, 3), (128, 12)], name=["driving", "handheld"], num_points=[8, 30], weighted=[False, True])
+def test_agrees_with_numpy(size, name, num_points, weighted, device):
+    net, points = network(*size).to(device), normalized(name, 5, num_points)
+    weights = uniform(5, num_points) * (torch.arange(num_points) % 4 > 0) if weighted else None
+    on_device = [None if v is None else v.to(device) for v in (*points, weights)]
+    features = net.global_features(on_device[0], on_device[2]).detach().cpu()
+    answers = [params.detach().cpu() for params in net(*on_device)]
+    net = net.cpu()
+    for k in range(5):
+        w = None if weights is None else weights[k].numpy()
+        np.testing.assert_allclose(features[k].numpy(), numpy_features(net, points[0][k].numpy(), w), atol=1e-9)
+        for params, p in zip(answers, points, strict=True):
+            expected = numpy_params(net, p[k].numpy(), w)
+            np.testing.assert_allclose(params[k].numpy(), expected, rtol=1e-8, atol=1e-10)
 
 
 class TestGradients:
