@@ -31,26 +31,23 @@ class TestReadColmap:
             assert np.array_equal(text.K, binary.K)
             assert np.array_equal(text.pose, binary.pose)
 
-    @pytest.mark.parametrize(
-        ("camera", "distortion"),
-        [
+    def test_projection_is_that_of_colmap(self, colmap):
+        cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+        for camera, distortion in [
             ("PINHOLE 160 120 130 131 80 60", ()),
             ("SIMPLE_RADIAL 160 120 130 80 60 0.1", (0.1, 0, 0, 0)),
             ("OPENCV 160 120 130 131 80 60 0.1 -0.02 0.003 -0.004", (0.1, -0.02, 0.003, -0.004)),
-        ],
-    )
-    def test_projection_is_that_of_colmap(self, colmap, camera, distortion):
-        cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
-        set_camera(colmap, camera)
-        frame = read(colmap)[3]
-        assert frame.distortion == distortion
-        image = pycolmap.Reconstruction(str(colmap / "model")).find_image_with_name(frame.name)
-        points = np.array([[0.1, -0.3, 4.0], [1.0, 1.0, 3.0], [-0.5, 0.8, 2.5]])
-        expected = np.array([image.project_point(point) for point in points]) - 0.5
-        in_camera = (np.linalg.inv(frame.pose) @ np.column_stack([points, np.ones(3)]).T)[:3].T
-        coefficients = np.array(distortion, float) if distortion else None
-        pixels = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), frame.K, coefficients)[0][:, 0]
-        assert np.allclose(pixels, expected, atol=1e-6)
+        ]:
+            set_camera(colmap, camera)
+            frame = read(colmap)[3]
+            assert frame.distortion == distortion
+            image = pycolmap.Reconstruction(str(colmap / "model")).find_image_with_name(frame.name)
+            points = np.array([[0.1, -0.3, 4.0], [1.0, 1.0, 3.0], [-0.5, 0.8, 2.5]])
+            expected = np.array([image.project_point(point) for point in points]) - 0.5
+            in_camera = (np.linalg.inv(frame.pose) @ np.column_stack([points, np.ones(3)]).T)[:3].T
+            coefficients = np.array(distortion, float) if distortion else None
+            pixels = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), frame.K, coefficients)[0][:, 0]
+            assert np.allclose(pixels, expected, atol=1e-6)
 
     def test_wrong_camera(self, colmap):
         for camera, message in [
