@@ -120,9 +120,8 @@ class TestRealPairs:
         second = Frame(Path("2.png"), "2.png", "room", (160, 120), case.K.numpy(), pose)
         order = torch.randperm(len(case.points1), generator=torch.Generator().manual_seed(0))[:60]
         matches = case.points1[order], case.points2[order]
-        matched = SimpleNamespace(
-            estimate=lambda **K: kln.estimate_matches(*matches, size1=(160, 120), size2=(160, 120), **K)
-        )
+        given = dict.fromkeys(("size1", "size2"), (160, 120))
+        matched = SimpleNamespace(estimate=lambda **K: kln.estimate_matches(*matches, **given, **K))
         return real_pairs.Pair("tum", 3, FramePair(first, second), True, "sift+nearest", matched)
 
     def test_all_get_the_same_matches_and_cameras_where_known(self, real_pair, case):

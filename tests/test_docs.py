@@ -21,9 +21,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 CARDS = sorted((ROOT / "kornia_learnnorm/weights").glob("*.md"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *CARDS, *sorted(DOCS.rglob("*.md"))]
-TEXTS = {
-    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in PAGES if "_build" not in path.parts
-}
+TEXTS = {p.relative_to(ROOT).as_posix(): p.read_text(encoding="utf-8") for p in PAGES if "_build" not in p.parts}
 RESULTS = sorted(path for path in (DOCS / "results").iterdir() if path.suffix != ".toml")
 COMMANDS = tomllib.loads((DOCS / "results/commands.toml").read_text(encoding="utf-8"))
 FENCE = re.compile(r"^ *```([^\n]*)\n(.*?)^ *```$", flags=re.DOTALL | re.MULTILINE)

@@ -102,13 +102,11 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
     assert not any(value.requires_grad for value in run(points[0].requires_grad_(), points[1], **given))
 
 
-@pytest.mark.parametrize(
-    ("kind", "draw"), [(kln.LearnedRelativePose, calibrated_sets), (kln.LearnedHomography, planes)]
-)
-def test_siblings(kind, draw, monkeypatch):
+@pytest.mark.parametrize(("cls", "draw"), [(kln.LearnedRelativePose, calibrated_sets), (kln.LearnedHomography, planes)])
+def test_siblings(cls, draw, monkeypatch):
     for name in ("EARLY_STEPS", "LOCAL_STEPS"):
         monkeypatch.setattr(pose_stages, name, 1)
-    layer = kind(width=8, depth=1, refine_steps=1, samples=4)
+    layer = cls(width=8, depth=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()
     for size in SIZES:
         check(program, layer, *draw(*size), scores=torch.rand(size))

@@ -131,9 +131,8 @@ def test_without_labels_further_matches_supervise():
     assert sets.inliers.isnan().all()
     exact = SyntheticSets(200).draw(8, 100, seeded(3))
     F_mat = kln.find_fundamental(exact.heldout1.double(), exact.heldout2.double(), rank2="optimal")
-    found, exact = (
-        kln.symmetric_epipolar_distance(s.heldout1.double(), s.heldout2.double(), F_mat) for s in (sets, exact)
-    )
+    heldout = ((s.heldout1.double(), s.heldout2.double()) for s in (sets, exact))
+    found, exact = (kln.symmetric_epipolar_distance(*points, F_mat) for points in heldout)
     assert exact.median() < 0.1
     assert (found > 5).double().mean() > 0.1  # outliers are among them
 

@@ -188,13 +188,11 @@ class TestGradients:
         weights = uniform(2, num_points, low=0.2)
         check_gradients(numbers, *correspondences("handheld", 2, num_points), weights, eps=1e-6, atol=1e-4)
 
-    @pytest.mark.parametrize(
-        ("name", "num_points"), [("whitening", 8), ("learned", 8), ("hartley", 9), ("whitening", 9)]
-    )
-    def test_second(self, name, num_points):
-        layer, weights = LAYERS[name]().double(), [uniform(1, 9, low=0.2)] if num_points == 9 else []
+    @pytest.mark.parametrize(("name", "number"), [("whitening", 8), ("learned", 8), ("hartley", 9), ("whitening", 9)])
+    def test_second(self, name, number):
+        layer, weights = LAYERS[name]().double(), [uniform(1, 9, low=0.2)] if number == 9 else []
         gradient = derivative(lambda *values: signless(layer(*values)))
-        values = *correspondences("handheld", 1, num_points), *weights
+        values = *correspondences("handheld", 1, number), *weights
         check_gradients(gradient, *values, eps=1e-4, atol=1e-3, rtol=1e-2)
 
 

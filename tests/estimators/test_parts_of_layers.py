@@ -56,9 +56,8 @@ def drawn_rows(size):
     weights = uniform(2, 40, seed=2)
     options = weights, weights.argsort(dim=1, descending=True, stable=True), NUMBER
     index = draw_matches(*options, size).view(2, NUMBER, size)
-    rows = [
-        np.einsum("knj,knl->knjl", *(x[b][:, index[b]].numpy().transpose(1, 2, 0) for x in (x1, x2))) for b in (0, 1)
-    ]
+    views = ([x[b][:, index[b]].numpy().transpose(1, 2, 0) for x in (x1, x2)] for b in (0, 1))
+    rows = [np.einsum("knj,knl->knjl", *view) for view in views]
     return Evidence.from_points(x1, x2), options, np.stack(rows).reshape(2, NUMBER, size, 9)
 
 

@@ -127,16 +127,12 @@ class TestSymmetricEpipolarDistance:
 class TestTransferDistance:
     def test_agrees_with_numpy(self):
         points1, points2, H = plane(noise=2.0)
-        there, back = (
-            homogeneous(p.numpy()) @ M.numpy().swapaxes(1, 2) for p, M in ((points1, H), (points2, H.inverse()))
-        )
+        there, back = (homogeneous(p.numpy()) @ M.mT.numpy() for p, M in ((points1, H), (points2, H.inverse())))
         errors = [x[..., :2] / x[..., 2:] - p.numpy() for x, p in ((there, points2), (back, points1))]
         expected = np.sqrt((np.concatenate(errors, -1) ** 2).sum(-1))
         np.testing.assert_allclose(transfer_distance(points1, points2, -3 * H), expected, rtol=1e-9)
         assert transfer_distance(points1.float(), points2.float(), H.float()).dtype == torch.float32
 
     def test_gradcheck(self):
-        values = [
-            value.requires_grad_() for value in (uniform(2, 5, 2), uniform(2, 5, 2, seed=1), 1 + uniform(2, 3, 3))
-        ]
+        values = [v.requires_grad_() for v in (uniform(2, 5, 2), uniform(2, 5, 2, seed=1), 1 + uniform(2, 3, 3))]
         assert gradcheck(lambda p, q, H: transfer_distance(p, q, H + 2 * torch.eye(3)), values)

@@ -149,9 +149,8 @@ class TestLinearProblem:
         for distinct in (7, num_points):
             rows, points = torch.arange(num_points) % distinct, correspondences("handheld", 5, distinct)
             for normalizer in (None, Whitening()):
-                F_mat, shuffled = (
-                    find_fundamental(*(p[:, i] for p in points), normalizer=normalizer) for i in (rows, rows[order])
-                )
+                views = ([p[:, i] for p in points] for i in (rows, rows[order]))
+                F_mat, shuffled = (find_fundamental(*view, normalizer=normalizer) for view in views)
                 assert (F_mat - shuffled).abs().max() < 1e-6
 
     def test_select_and_detach(self):

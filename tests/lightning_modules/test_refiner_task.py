@@ -153,10 +153,9 @@ def test_a_fixed_matrix_sends_no_gradient_to_its_own_half(folder, options):
 
 @pytest.mark.parametrize("calibrated", [False, True])
 def test_gradients_pass_the_layer_and_leave_it(folder, calibrated):
-    name, kind = (
-        ("robust-pose-synthetic", kln.LearnedRelativePose) if calibrated else ("robust-tiny", kln.LearnedEightPoint)
-    )
-    task = RefinerTask(kln.MatchRefiner(), HeldOutLoss(kind.from_pretrained(name)))
+    kind = kln.LearnedRelativePose if calibrated else kln.LearnedEightPoint
+    layer = kind.from_pretrained("robust-pose-synthetic" if calibrated else "robust-tiny")
+    task = RefinerTask(kln.MatchRefiner(), HeldOutLoss(layer))
     task.compute_loss(source(folder).draw(2, 16, seeded())).backward()
     assert all(p.grad is None for p in task.loss.estimator.parameters())
     assert task.trained.shift.weight.grad.any()

@@ -166,12 +166,10 @@ def test_a_training_without_an_end_has_no_cycle(tmp_path):
         trainer.fit(set_task(), make_sets())
 
 
-@pytest.mark.parametrize(
-    ("estimator", "kind"), [(kln.Hartley(), "LearnedLayer"), (kln.EightPoint(), "LearnedNormalizer")]
-)
-def test_estimators_that_learn_nothing_are_refused(estimator, kind):
+@pytest.mark.parametrize(("layer", "kind"), [(kln.Hartley(), "LearnedLayer"), (kln.EightPoint(), "LearnedNormalizer")])
+def test_estimators_that_learn_nothing_are_refused(layer, kind):
     with pytest.raises(TypeError, match=f"expected a {kind} .*, got Hartley"):
-        EstimatorTask(estimator)
+        EstimatorTask(layer)
 
 
 def test_untrained_weights_are_not_written(tmp_path):

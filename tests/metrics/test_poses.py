@@ -128,7 +128,5 @@ def test_exceptions(summary):
     ]:
         with pytest.raises(ValueError, match=message):
             summary(errors)
-        with pytest.raises(
-            ValueError, match="thresholds must be positive" if summary is pose_auc else "limit must be one"
-        ):
-            summary(torch.ones(3), (5, -1) if summary is pose_auc else 0)
+    with pytest.raises(ValueError, match="thresholds must be positive" if summary is pose_auc else "limit must be one"):
+        summary(torch.ones(3), (5, -1) if summary is pose_auc else 0)

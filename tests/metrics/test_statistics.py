@@ -24,9 +24,8 @@ def uneven(effect=0.0, number=30, seed=1):
 def resampled_means(values, groups):
     """Means of 4,000 draws of whole groups with replacement."""
     parts, rng = [values[groups == group] for group in np.unique(groups)], np.random.default_rng(0)
-    return np.array(
-        [np.concatenate([parts[i] for i in rng.integers(len(parts), size=len(parts))]).mean() for _ in range(4000)]
-    )
+    draws = (rng.integers(len(parts), size=len(parts)) for _ in range(4000))
+    return np.array([np.concatenate([parts[i] for i in draw]).mean() for draw in draws])
 
 
 def interval(values, groups, **options):

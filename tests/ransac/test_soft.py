@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from pairwise import pairwise
 from references import eight_point, numpy_hartley, numpy_sampson, numpy_whitening, up_to_sign
-from scenes import DTYPES, correspondences, uniform
+from scenes import DTYPES, correspondences, seeded, uniform
 from torch.autograd import gradcheck
 
 from kornia_learnnorm import Hartley, Whitening
@@ -50,9 +50,7 @@ class TestSampleMinimalSets:
 
     def test_repeats_with_the_generator_and_ignores_a_constant(self):
         logits = uniform(2, 20)
-        first, again, moved = (
-            sample_minimal_sets(values, 7, torch.Generator().manual_seed(3)) for values in (logits, logits, logits + 50)
-        )
+        first, again, moved = (sample_minimal_sets(values, 7, seeded(3)) for values in (logits, logits, logits + 50))
         assert torch.equal(first[0], again[0])
         assert torch.equal(first[0], moved[0])
         torch.testing.assert_close(first[1], moved[1])

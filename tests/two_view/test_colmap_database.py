@@ -43,9 +43,7 @@ def make_store(kind="cloud", noise=0.05, names=NAMES) -> CorrespondenceStore:
     wrong = np.arange(len(second)) % 4 == 3
     second[wrong] = second[wrong][::-1]
     ratio = np.where(wrong, 0.79, 0.5)
-    return store_of(
-        first, second, MATCHES * np.arange(len(pairs) + 1), [(names[a], names[b]) for a, b in pairs], SIZE, ratio
-    )
+    return store_of(first, second, MATCHES * np.arange(len(pairs) + 1), [*combinations(names, 2)], SIZE, ratio)
 
 
 @pytest.fixture

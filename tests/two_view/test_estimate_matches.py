@@ -111,9 +111,8 @@ class TestEstimateMatches:
         assert (found.F_mat, found.choice.parallax, found.estimator) == (None, None, "RANSAC")
         json.dumps(found.as_dict(), allow_nan=False)
         points1 = uniform(60, 2, high=400)
-        mirrored = kln.estimate_matches(
-            points1, points1 * torch.tensor([-1.0, 1]) + 400, **SIZES, K1=K, K2=K, model="homography"
-        )
+        points2 = points1 * torch.tensor([-1.0, 1]) + 400
+        mirrored = kln.estimate_matches(points1, points2, **SIZES, K1=K, K2=K, model="homography")
         assert (codes(mirrored), mirrored.R) == (["no_pose"], None)
 
     def test_a_tie_between_poses(self, matches, monkeypatch):

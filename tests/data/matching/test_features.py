@@ -161,9 +161,8 @@ def test_weights_without_a_network_are_one_line(monkeypatch, tmp_path, refused, 
 
 def test_weights_without_a_network_end_a_list_of_pairs(monkeypatch, tmp_path, planes):
     """They are no fault of one pair."""
-    monkeypatch.setattr(
-        "kornia.feature.xfeat.load_state_dict_from_url", Mock(side_effect=urllib.error.URLError("none"))
-    )
+    missing = Mock(side_effect=urllib.error.URLError("none"))
+    monkeypatch.setattr("kornia.feature.xfeat.load_state_dict_from_url", missing)
     pairs, out = [(planes / "left.png", planes / "right.png")], tmp_path / "out"
     with pytest.raises(features.MissingWeightsError, match="the weights of XFeat are not in"):
         estimate_pairs(pairs, out, PairOptions(detector="xfeat"), jobs=1)

@@ -54,9 +54,8 @@ def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_r
     shares = found.cells[0].predictions["whitening"]["inliers"].clone()
     heldout = {name: p["heldout"].clone() for name, p in found.cells[0].predictions.items()}
     found, robust = without_truth(found, robust)
-    cells = [
-        cell for table in (*report_tables(found), *robust_tables(robust)) for row in as_text(table.rows) for cell in row
-    ]
+    every = (*report_tables(found), *robust_tables(robust))
+    cells = [cell for table in every for row in as_text(table.rows) for cell in row]
     assert "" in cells
     assert not [cell for cell in cells if re.search("nan|inf", cell)]
     for name, values in heldout.items():
