@@ -55,15 +55,15 @@ def track(images: list[np.ndarray], pair: EvaluatedPair) -> tuple[Tensor, Tensor
     return pair.points1, torch.from_numpy(np.where(status[..., None] > 0, tracked, second)[:, 0]).double()
 
 
-def mover(refiner: kln.MatchRefiner, passes: int) -> Mover:
-    """Return the refiner, applied some times, as a function of grey images and a pair."""
+def mover(path: str, passes: int) -> Mover:
+    """Return a refiner's weights as a function of grey images and a pair."""
+    refiner = kln.MatchRefiner.from_pretrained(path)
+    refiner.passes = passes
 
     @torch.no_grad()
     def move(images: list[np.ndarray], pair: EvaluatedPair) -> tuple[Tensor, Tensor]:
         views = [torch.from_numpy(image)[None, None] for image in images]
-        points1, points2 = pair.points1[None], pair.points2[None]
-        for _ in range(passes):
-            points1, points2, _ = refiner(*views, points1, points2)
+        points1, points2, _ = refiner(*views, pair.points1[None], pair.points2[None])
         return points1[0], points2[0]
 
     return move
@@ -138,14 +138,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--pairs", type=int, default=25, help="of each store, evenly spaced; 0: all")
     parser.add_argument("--filtered", action="store_true", help="matches that pass the ratio test, as for SIFT")
     parser.add_argument("--weights", nargs="+", default=["refiner"], help="of a MatchRefiner, by name or a file")
-    parser.add_argument("--passes", type=int, default=1, help="how often the refiner is applied")
+    parser.add_argument("--passes", type=int, default=1, help="how often the refiner moves the points")
     parser.add_argument("--estimators", nargs="*", default=[*ESTIMATORS])
     parser.add_argument("--keypt2subpx", metavar="FOLDER", help="a checkout of its repository")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     names = names_of(args.weights) if len(args.weights) > 1 else {args.weights[0]: "moved"}
-    moved = {name: mover(kln.MatchRefiner.from_pretrained(path), args.passes) for path, name in names.items()}
+    moved = {name: mover(path, args.passes) for path, name in names.items()}
     movers = {"found": lambda _, pair: (pair.points1, pair.points2), **moved, "Lucas-Kanade": track}
     estimators, protocol = find_installed(args.estimators), "filtered" if args.filtered else "unfiltered"
     header, rows = ["matches", "px", "fit", *estimators, "ms"], []
