@@ -25,8 +25,9 @@ from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.evaluation.methods import find_method
 from kornia_learnnorm.evaluation.robust.robust_run import even_pairs, shuffled_pair
 from kornia_learnnorm.evaluation.tables import format_table
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, MAX_RESIDUAL, PROTOCOLS
-from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, draw_distinct
+from kornia_learnnorm.ransac.samplers import draw_distinct
 
 SOLVERS = ["Hartley", "whitening", "reweighted", "crossview", "Hartley+optimal", "seven-point"]
 MIN_INLIERS = 16  # ground-truth inliers; pairs with fewer are not measured
@@ -76,7 +77,7 @@ def errors_of(path: str, protocol: str, name: str, pairs: int, samples: int, num
         inliers = kln.symmetric_epipolar_distance(x1, x2, pair.F_mat) < INLIER_THRESHOLD
         if int(inliers.sum()) < MIN_INLIERS:
             continue
-        rows = draw_distinct(torch.full((samples,), len(x1)), SAMPLE_SIZE, torch.Generator().manual_seed(0))
+        rows = draw_distinct(torch.full((samples,), len(x1)), Fundamental.min_points, torch.Generator().manual_seed(0))
         parts = [measure(solver, x1, x2, part, inliers) for part in rows.split(BATCH)]
         errors, scores = (torch.cat(part).float().double() for part in zip(*parts, strict=True))
         found.append([picked(errors, scores, number) for number in numbers])

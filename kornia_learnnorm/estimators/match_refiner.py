@@ -72,7 +72,7 @@ class MatchRefiner(nn.Module):
         bound: largest change of the displacement between both points, pixels; each moves by half of it.
 
     Attributes:
-        passes: how often the points are moved, 1 unless set; 2 bring coarse matches nearer, in less than twice the time.
+        passes: how often the points are moved, 1 unless set; 2 bring coarse matches nearer.
         trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
 
     Raises:

@@ -16,14 +16,15 @@ from torch.nn.functional import normalize, pad
 from kornia_learnnorm.geometry.checks import check_choice
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss, constrained_fit
 from kornia_learnnorm.geometry.distances import DISTANCE_SCALES, line_norms
-from kornia_learnnorm.geometry.dlt import design_matrix, solve_rows
+from kornia_learnnorm.geometry.dlt import design_matrix, null_space, solve_rows
 from kornia_learnnorm.geometry.matrices import inverse, nearest_rank2
-from kornia_learnnorm.geometry.minimal import solve_samples
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2
+from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.contract import TwoViewModel
 
 SIDEWAYS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, -(0.5**0.5), 0.0)  # F whose epipolar lines are the image's rows
+MIN_PIVOT = 1e-6  # of the largest one, of a sample of seven correspondences that is not degenerate
 MIN_RANK2_DETERMINANT = 1e-9  # of the 2x2 part of a matrix of rank 2 and unit norm
 MIN_RANK2_RATIO = 1e-10  # second over first singular value of a matrix of rank 2
 NORMAL_FLOOR = 1e-4  # of the root mean square norm of the lines' normals, added to each in learned layers
@@ -41,7 +42,7 @@ class Fundamental(TwoViewModel):
     name = "fundamental"
     min_points = 8
     dof = 7
-    sample_size = 8
+    sample_size = 7
     preferred: tuple[float, ...] = SIDEWAYS
 
     def __init__(
@@ -141,8 +142,10 @@ class Fundamental(TwoViewModel):
         return Rank2(torch.stack([U, Vh.mT], 1), torch.diag_embed(normalize(s[:, :2], dim=-1)))
 
     def solve_samples(self, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
-        """Return the optimally corrected matrices of the samples of eight that determine one."""
-        return solve_samples(x1, x2, shift)
+        """Return the matrices of the samples of seven, up to three each; degenerate ones have none."""
+        basis, pivots = null_space(design_matrix(x1, x2))
+        M, real = fundamental_in_span(torch.unflatten(basis.mT, -1, (3, 3)))
+        return M[real & (pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1))[:, None]]
 
     def score_terms(self, x1: Tensor, x2: Tensor) -> Tensor:
         """Return what algebraic residuals are linear in, and the normals' squared norms in view 2 and 1, (27, N)."""

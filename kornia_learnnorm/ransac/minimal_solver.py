@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.linear import solve_linear
-from kornia_learnnorm.geometry.minimal import are_independent
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.normalizers.normalizer import Normalizer
@@ -16,28 +15,43 @@ MIN_SAMPLE_SHIFT = 0.01  # thresholds; a sample that a shift of a point by less 
 def solve_minimal_samples(
     scorer: PairScorer, rows: Tensor, linear: TwoViewModel, normalizer: Normalizer | None
 ) -> Tensor:
-    """Return the matrices of the non-degenerate minimal samples (K, S), or of all where every one is degenerate.
+    """Return the matrices of the non-degenerate minimal samples (K, S), or of all their correspondences without any.
 
-    Matches on one line give none. Samples that a normaliser must see, and degenerate ones, are solved by the DLT of the
-    model ``linear``.
+    Matches on one line give none. Samples that a normaliser must see, and all correspondences together, are solved by
+    the DLT of the model ``linear``.
     """
     model, shift = scorer.model, MIN_SAMPLE_SHIFT * scorer.threshold
     x1, x2 = scorer.samples(rows)
-    if normalizer is None or model.sample_size < model.min_points:
+    if normalizer is None or rows.shape[1] < model.min_points:
         M = model.solve_samples(x1, x2, shift)
-        if len(M) or model.sample_size < model.min_points:
+        if len(M) or model is not linear:
             return M
-        determined = torch.zeros_like(rows[:, 0], dtype=torch.bool)
     else:
         R = torch.linalg.qr(model.rows(x1, x2).mT, mode="r")[1]
         determined = are_independent(R, x1, x2, shift)
-    if bool(determined.any()):
-        rows = rows[determined]
-    elif any(_on_a_line(points, shift) for points in scorer.pixels):
+        if bool(determined.any()):
+            return _solve(scorer, rows[determined], linear, normalizer)
+    rows = torch.unique(rows)[None]
+    if rows.shape[1] < linear.min_points or any(_on_a_line(points, shift) for points in scorer.pixels):
         return x1.new_zeros(0, 3, 3)
+    return _solve(scorer, rows, linear, normalizer)
+
+
+def _solve(scorer: PairScorer, rows: Tensor, linear: TwoViewModel, normalizer: Normalizer | None) -> Tensor:
     points1, points2 = (points[rows] for points in scorer.pixels)
     problem = LinearProblem.from_points(points1, points2, None, linear)
     return scorer.from_pixels(solve_linear(problem, normalizer))
+
+
+def are_independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
+    """Return a mask of the non-degenerate minimal samples (K, S, 3), by the R of their transposed design matrices.
+
+    The constraints must be independent: each row of the design matrix is farther from the span of the rows before
+    it than the least that a shift of the point, in pixels, moves it.
+    """
+    distance = R.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
+    independent: Tensor = distance > shift * torch.minimum(x1[..., 2], x2[..., 2]).amin(-1)
+    return independent
 
 
 def _on_a_line(points: Tensor, shift: float) -> bool:

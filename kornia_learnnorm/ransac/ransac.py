@@ -23,7 +23,7 @@ from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
 from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
 from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
-from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE, ProsacSampler, Sampler, UniformSampler
+from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler, UniformSampler
 from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, PRESCORED, Hypotheses, PairScorer, finite_and_bounded
 from kornia_learnnorm.ransac.threads import one_thread
 
@@ -49,11 +49,11 @@ class RansacResult(NamedTuple):
 class RANSAC(nn.Module):
     r"""Robust estimation of a fundamental matrix from correspondences with outliers.
 
-    Minimal samples of eight run through :func:`~kornia_learnnorm.find_fundamental` with any normaliser, a thousand at
-    once, and MSAC scores them. The best of each batch are fitted to their inliers by reweighted least squares, and
-    the first also by the normaliser (local optimisation); the inliers of the best matrix so far say how many samples
-    are still needed. In the end the best few are fitted on Geman and McClure's loss, and the one of least cost goes on
-    to Levenberg-Marquardt where least squares have not converged.
+    Minimal samples of seven are solved a thousand at once, or with a normaliser samples of eight by
+    :func:`~kornia_learnnorm.find_fundamental`, and MSAC scores their matrices. The best of each batch are fitted to
+    their inliers by reweighted least squares, and the first also by the normaliser (local optimisation); the inliers of
+    the best matrix so far say how many samples are still needed. In the end the best few are fitted on Geman and
+    McClure's loss, and the one of least cost goes on to Levenberg-Marquardt where least squares have not converged.
 
     With both cameras, minimal samples of five run through Kornia's five-point solver, and local optimisation and the
     final fit are least squares on essential matrices; distances stay in pixels. Where a fundamental matrix then
@@ -70,8 +70,8 @@ class RANSAC(nn.Module):
     constructor's arguments differ, the matrix has unit Frobenius norm, and weights steer the sampling.
 
     Args:
-        normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, for minimal samples with
-            ``rank2="projection"`` (Hartley's when not given) and for the refits of local optimisation.
+        normalizer: maps ``(points1, points2, weights)`` to the transforms of both views, for samples of eight and for
+            the refits of local optimisation. Leave it out to draw samples of seven, of which fewer are needed.
         inl_th: largest distance of an inlier, pixels.
         max_samples: largest number of minimal samples (Kornia's ``max_iter`` counts batches of 2,048).
         max_seconds: time after which no further batch of samples, 64 at first and up to 1,024, is drawn; with it the
@@ -80,13 +80,13 @@ class RANSAC(nn.Module):
             best matrix so far has found all inliers; 1 draws all ``max_samples`` samples. It is close to 1 by default,
             since a sample must not have much noise either.
         distance: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
-        rank2: how the singularity constraint is enforced on minimal samples: ``"projection"`` in the normaliser's
-            coordinates, or ``"optimal"`` correction, which takes fewer samples and, without a normaliser, a fraction of
-            the time. When not given, ``"projection"`` with a ``normalizer`` and ``"optimal"`` without.
+        rank2: how the singularity constraint is enforced on samples of eight: ``"projection"`` in the normaliser's
+            coordinates (Hartley's when not given), the default with a ``normalizer``, or ``"optimal"`` correction.
+            Matrices of samples of seven are singular.
         refine: whether to optimise; otherwise the result is the minimal sample of highest score.
         sampler: how weights steer the sampling: :class:`~kornia_learnnorm.ransac.samplers.ProsacSampler` or
-            :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`. It is called with the weights, and with cameras
-            also with ``size=5``.
+            :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`. It is called with the weights and with ``size``,
+            the number of correspondences in a sample.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
         model: ``"fundamental"``, ``"homography"``, or a model of one's own in place of one of that ``distance`` and
             ``rank2``. A homography has minimal samples of four, no cameras and no ``rank2``; its symmetric distance is
@@ -185,9 +185,9 @@ class RANSAC(nn.Module):
         Returns:
             the matrix :math:`(3, 3)`, :math:`x_2^\top F x_1 = 0`, the inliers of the matrix before it is rounded to the
             dtype of the points, the number of samples and the score; no gradients. Zeros and no inliers where no matrix
-            of rank 2 was found that has more inliers than a sample, which are eight, or five with cameras, and where
-            fewer weights than that are positive. Where every sample is degenerate, as on a plane without noise or under
-            no motion, the matrix is one of those that fit. With cameras a plane has at most two.
+            of rank 2 was found that has more than eight inliers, or five with cameras, and where fewer weights than
+            that are positive. Where every sample is degenerate, as on a plane without noise or under no motion, the
+            matrix is one of those that fit. With cameras a plane has at most two.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or weights or cameras not
@@ -203,8 +203,8 @@ class RANSAC(nn.Module):
                 f"K1 and K2 make a fundamental matrix an essential one, got a {self.model.name}: leave them out"
             )
         cameras = None if K1 is None or K2 is None else (K1, K2)
-        size = self.model.sample_size if cameras is None else Essential.sample_size
-        check_matches(points1, points2, weights, size)
+        least = self.model.min_points if cameras is None else Essential.sample_size
+        check_matches(points1, points2, weights, least)
         device = points1.device.type
         with ExitStack() as stack:
             if device == "cpu":
@@ -213,12 +213,12 @@ class RANSAC(nn.Module):
                 stack.enter_context(torch.autocast(device, enabled=False))
             # Inference mode is faster, but what a normaliser keeps of it would be of no use in training.
             stack.enter_context(torch.inference_mode() if self.normalizer is None else torch.no_grad())
-            result = self._estimate(points1, points2, weights, cameras, size)
+            result = self._estimate(points1, points2, weights, cameras, least)
         E_mat = None if result.E_mat is None else result.E_mat.clone()
         return result._replace(F_mat=result.F_mat.clone(), inliers=result.inliers.clone(), E_mat=E_mat)
 
     def _estimate(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, size: int
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, least: int
     ) -> RansacResult:
         """Estimate from the matches that count: finite, bounded, and one on each point."""
         kept = torch.ones_like(points1[:, 0], dtype=torch.bool)
@@ -227,20 +227,21 @@ class RANSAC(nn.Module):
         best = distinct_points(points1[kept], points2[kept], None if weights is None else weights[kept])
         kept = kept.masked_scatter(kept, best)
         weights = None if weights is None else weights[kept]
-        result = self._estimate_kept(points1[kept], points2[kept], weights, cameras, size)
+        result = self._estimate_kept(points1[kept], points2[kept], weights, cameras, least)
         return result._replace(inliers=torch.zeros_like(kept).masked_scatter(kept, result.inliers))
 
     def _estimate_kept(
-        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, size: int
+        self, points1: Tensor, points2: Tensor, weights: Tensor | None, cameras: Cameras | None, least: int
     ) -> RansacResult:
-        if (len(points1) if weights is None else int((weights > 0).sum())) < size:
+        if (len(points1) if weights is None else int((weights > 0).sum())) < least:
             return _failure(points1, 0, cameras)
         x1, x2 = (points.to(solve_dtype(points.device)) for points in (points1, points2))
         seed = int(torch.randint(2**62, ())) if self.seed is None else self.seed
         generator = torch.Generator(x1.device).manual_seed(seed)
+        size = least if self.normalizer is not None else min(least, self.model.sample_size)
         sampler: Sampler = UniformSampler(len(x1), x1.device, size)
         if weights is not None:
-            sampler = self.sampler(weights.to(x1), **({} if size == SAMPLE_SIZE else {"size": size}))
+            sampler = self.sampler(weights.to(x1), size=size)
         scored: Tensor | slice = slice(None)
         if len(x1) >= 2 * PRESCORED:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:MAX_SCORED]
@@ -254,7 +255,7 @@ class RANSAC(nn.Module):
             return _failure(points1, drawn, cameras)
         F = state.matrix()
         distances = scorer.distances(F[0])
-        if int((inliers := distances <= self.inl_th).sum()) <= size:
+        if int((inliers := distances <= self.inl_th).sum()) <= least:
             return _failure(points1, drawn, cameras)
         score = float((1 - (distances / self.inl_th).square()).clamp(min=0).nansum())
         F_mat = unit_matrix(scorer.to_pixels(F)[0]).to(points1.dtype)

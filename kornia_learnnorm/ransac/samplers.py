@@ -5,7 +5,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-SAMPLE_SIZE = 8  # correspondences in a minimal sample without cameras
+SAMPLE_SIZE = 8  # correspondences in a sample unless another size is asked for
 MAX_RANDOM_NUMBERS = 1 << 22  # random numbers in memory at once
 MIN_WEIGHT = 1e-30  # smallest positive weight, relative to the largest
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
-from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
+from kornia_learnnorm.models.fundamental import Fundamental
 
 __all__ = ["PairWarning", "find_warnings", "log_false_alarms", "log_false_samples"]
 
@@ -71,11 +71,12 @@ def log_false_alarms(matches: int, inliers: int, threshold: float, size: Size, m
 def log_false_samples(matches: int, inliers: int, threshold: float, size: Size) -> float:
     """Return log10 of the expected number of a search's samples with as many inliers among random matches.
 
-    A search tries 50,000 samples of eight, far fewer than all that :func:`log_false_alarms` counts. A true matrix with
-    too few inliers to be told from all those can have more than a search among random matches finds.
+    A search tries the three matrices of 50,000 samples of seven, far fewer than all that :func:`log_false_alarms`
+    counts. A true matrix with too few inliers to be told from all those can have more than a search among random
+    matches finds.
     """
-    others = max(0, inliers - SAMPLE_SIZE)
-    samples = SEARCH_SAMPLES * math.comb(max(0, matches - SAMPLE_SIZE), others)
+    others = max(0, inliers - Fundamental.sample_size)
+    samples = 3 * SEARCH_SAMPLES * math.comb(max(0, matches - Fundamental.sample_size), others)
     return math.log10(max(1, samples)) + others * _log_strip(threshold, size)
 
 

@@ -19,9 +19,9 @@ from kornia_learnnorm.evaluation.methods import REFINED, base_name, find_method,
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version
 from kornia_learnnorm.evaluation.tables import names_of
 from kornia_learnnorm.models.essential import Essential
+from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.pretrained import weights_digest, weights_model
 from kornia_learnnorm.ransac.ransac import RANSAC
-from kornia_learnnorm.ransac.samplers import SAMPLE_SIZE
 
 TRUTH = "ground-truth"
 MAX_SAMPLES = 20_000  # minimal samples of RANSAC:METHOD, whose normaliser can be a network
@@ -67,7 +67,7 @@ Estimator = Callable[[EvaluatedPair, int, float], Found]  # of a pair, a seed an
 def run_estimator(estimator: Estimator, pair: EvaluatedPair, seed: int, threshold: float) -> Estimate:
     """Return the estimate and its time; a failure if there are fewer than eight correspondences."""
     start = time.perf_counter()
-    F_mat, samples = (None, 0.0) if len(pair.points1) < SAMPLE_SIZE else estimator(pair, seed, threshold)
+    F_mat, samples = (None, 0.0) if len(pair.points1) < Fundamental.min_points else estimator(pair, seed, threshold)
     seconds = time.perf_counter() - start
     return Estimate(torch.full((3, 3), torch.nan).double() if F_mat is None else F_mat, seconds, samples)
 
