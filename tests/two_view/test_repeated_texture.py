@@ -87,7 +87,7 @@ class TestResolveAmbiguity:
 
 def test_rendered_windows():
     """More matches fit a wrong matrix, of another pose, than the true one."""
-    pair = render_kind("repeated", 1061)
+    pair = render_kind("repeated", 1062)
     found = kln.estimate_pair(pair.image1, pair.image2)
     assert found.warnings == ()
     K = torch.from_numpy(pair.K)[None]
