@@ -102,12 +102,14 @@ def test_points_move_apart_alike_and_within_the_bound():
     assert 0.25 < first.norm(dim=-1).max() <= 0.3
 
 
-@given(st.integers(0, 1000))
+@given(st.integers(0, 1000), st.sampled_from([1, 2]))
 @settings(max_examples=8)
-def test_swapping_the_views_swaps_the_result(seed):
+def test_swapping_the_views_swaps_the_result(seed, passes):
     image1, image2, points1, points2 = inputs(num_points=10)
     points2 = points2 + uniform(1, 10, 2, low=-1, seed=seed)
-    found, swapped = trained()(image1, image2, points1, points2), trained()(image2, image1, points2, points1)
+    refiner = trained()
+    refiner.passes = passes
+    found, swapped = refiner(image1, image2, points1, points2), refiner(image2, image1, points2, points1)
     torch.testing.assert_close(swapped.points1, found.points2, atol=1e-12, rtol=0)
     torch.testing.assert_close(swapped.points2, found.points1, atol=1e-12, rtol=0)
     torch.testing.assert_close(swapped.scale, found.scale, atol=1e-12, rtol=0)
@@ -166,12 +168,24 @@ def test_images_without_texture_and_points_outside_move_nothing_far():
         assert all(value.isfinite().all() for value in found)
 
 
-def test_gradcheck():
+def test_a_second_pass_is_that_of_the_moved_points():
+    """A match alone, whose frame is the identity wherever it is."""
+    values, refiner = inputs(num_points=1), trained()
+    once = refiner(*values)
+    expected, refiner.passes = refiner(*values[:2], *once[:2]), 2
+    for found, other, before in zip(refiner(*values), expected, once, strict=True):
+        torch.testing.assert_close(found, other)
+        assert not torch.allclose(found, before)
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_gradcheck(passes):
     image1, image2, points1, points2 = inputs(num_points=3)
     crops = [image[..., 20:50, 20:60].contiguous() for image in (image1, image2)]
     points = [15.3 + 5 * uniform(1, 3, 2, seed=seed) for seed in (4, 5)]
-    check_gradients(lambda *values: torch.cat([v.flatten(1) for v in trained()(*values)], 1), *crops, *points)
     refiner = trained()
+    refiner.passes = passes
+    check_gradients(lambda *values: torch.cat([v.flatten(1) for v in refiner(*values)], 1), *crops, *points)
     sum(value.sum() for value in refiner(image1, image2, points1, points2)).backward()
     assert all(bool(p.grad.isfinite().all()) and bool(p.grad.any()) for p in refiner.parameters())
 
