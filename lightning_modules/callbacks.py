@@ -119,8 +119,7 @@ class ExpectedTime(Callback):
 class AgainstStart(Callback):
     """Compare the errors of the validation with those before the first step.
 
-    Before it a new normaliser is its base, such as Hartley's normalisation, and other models are the weights that they
-    start from. ``num_sanity_val_steps=-1`` of the trainer makes the sanity check the whole validation.
+    The latter are known where ``num_sanity_val_steps=-1`` of the trainer makes the sanity check the whole validation.
     """
 
     def __init__(self) -> None:
@@ -169,8 +168,8 @@ def _duration(seconds: float) -> str:
 class ExportWeights(Callback):
     """Write the trained module to ``weights.safetensors`` in the trainer's default root directory when training ends.
 
-    What cannot be saved and loaded again is refused before the training. The file names the training data: the stores,
-    or ``synthetic scenes``; nothing for a source of another class.
+    What cannot be saved and loaded again is refused before the training. The file names the stores of the training data
+    and ``synthetic scenes``.
     """
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
@@ -223,9 +222,8 @@ class WritePredictions(Callback):
             return
         path = Path(trainer.default_root_dir) / "predictions.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
-        fields = {key: torch.cat([batch[key] for batch in batches]) for key in batches[0]}
         with atomic_write(path) as beside:
-            save_file(fields, beside)
+            save_file({key: torch.cat([batch[key] for batch in batches]) for key in batches[0]}, beside)
         print(f"wrote {path}")
 
 

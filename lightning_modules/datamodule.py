@@ -22,10 +22,9 @@ EVALUATION_SEED = 4_000_000_007  # far from the seeds of training epochs, below 
 class BatchLoader:
     """Batches of sets, drawn anew each epoch; the state is the epoch and the batch, so training resumes exactly.
 
-    A block is cut into batches of nearly equal size, so none of its samples is lost or comes twice. The first block of
-    the first epoch, after the filter, decides the number of batches in every epoch; where other blocks differ from it,
-    batches are smaller or larger than ``batch_size``. An epoch ends early where a block has fewer samples than batches.
-    Each process takes its share of every batch, which can be empty.
+    A block is cut into batches of nearly equal size, about ``batch_size``: the first block of the first epoch, after
+    the filter, decides their number in every epoch, which ends early where a block has fewer samples than batches. Each
+    process takes its share of every batch, which can be empty.
 
     ``batch_size`` counts the samples of all processes together, or with ``by_pair`` the image pairs, each with all its
     samples. With None, each block is a batch as it is. Without ``shuffle`` one draw is kept in order, for evaluation.

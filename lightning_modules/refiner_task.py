@@ -67,14 +67,12 @@ class HeldOutLoss(nn.Module):
         """Return the distances (B, 2 N) of both halves of matches, each under the matrix of the other half."""
         halves1, halves2 = (torch.cat([*points.double().chunk(2, 1)]) for points in (points1, points2))  # (2 B, N, 2)
         F_mat = self._estimate(sets, halves1, halves2).roll(len(points1), 0)
-        if self.detach:
-            F_mat = F_mat.detach()
+        F_mat = F_mat.detach() if self.detach else F_mat
         if self.labels and sets.E_mat is not None:
             inverse1, inverse2 = (torch.linalg.inv_ex(K)[0] for K in cameras_of(sets))
             true = (inverse2.mT @ sets.E_mat.double() @ inverse1).repeat(2, 1, 1)
             F_mat = torch.where(true.isfinite().all(-1).all(-1)[:, None, None], true, F_mat)
-        distance = symmetric_epipolar_distance(halves1, halves2, F_mat)
-        return torch.cat([*distance.chunk(2)], 1)
+        return torch.cat(symmetric_epipolar_distance(halves1, halves2, F_mat).chunk(2), 1)
 
     def _estimate(self, sets: MatchSets, halves1: Tensor, halves2: Tensor) -> Tensor:
         """Return the matrices (2 B, 3, 3) of halves (2 B, N, 2)."""
@@ -134,8 +132,7 @@ class RefinerTask(EstimatorTask):
 
     def validation_step(self, batch: MatchSets, batch_idx: int) -> None:
         """Log the medians of a batch, in the test too; Lightning gathers them over batches and processes."""
-        found, moved = all_matches(batch), self._move(batch)
-        before = self.loss.distances(batch, *found)
+        moved, before = self._move(batch), self.loss.distances(batch, *all_matches(batch))
         after = self.loss.distances(batch, moved.points1, moved.points2)
         for name, distance in (("found", before), ("moved", after)):
             self._log(f"median_{name}", distance[before < TRUE_MATCH])

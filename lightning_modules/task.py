@@ -1,7 +1,7 @@
 """The training task: sets of correspondences in, losses of the estimated matrices out, with labels or without."""
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, ClassVar, cast
 
 import pytorch_lightning as pl
@@ -37,7 +37,7 @@ def adamw(params: Iterable[nn.Parameter]) -> Optimizer:
 
 
 class SetLoss(nn.Module):
-    """Loss of sets of matches with outliers: labelled sets have another loss than those without ground truth.
+    """Loss of sets of matches with outliers, with ground truth or without.
 
     Args:
         label_free: loss of all matches of the sets without ground truth, times ``label_free_weight``.
@@ -45,8 +45,7 @@ class SetLoss(nn.Module):
         inlier_weight: weight of the cross-entropy of the logits, which is added to ``labelled``.
         label_free_weight: weight of the label-free loss.
         pose: loss of essential matrices and the true ones.
-        pose_weight: share of ``pose``, from 0 to 1, in the loss of labelled sets with cameras; the rest is
-            ``labelled``'s.
+        pose_weight: share of ``pose``, 0 to 1, in the loss of labelled sets with cameras; the rest is ``labelled``'s.
     """
 
     def __init__(
@@ -175,11 +174,9 @@ class EstimatorTask(pl.LightningModule):
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Skip a step that has no sets, or whose gradient is not finite: the same one in all processes."""
         finite = all(bool(p.grad.isfinite().all()) for p in self.parameters() if p.grad is not None)
-        skipped = self._sets == 0 or not finite
-        if skipped:
+        if skipped := self._sets == 0 or not finite:
             rank_zero_warn(f"a step was skipped: {'non-finite gradient' if self._sets else 'no samples'}")
-            for p in self.parameters():
-                p.grad = None  # an optimiser leaves these alone
+            self.zero_grad()  # to None, which an optimiser leaves alone
         self.log("train/skipped", float(skipped))
         self._sets = 0
 
@@ -242,12 +239,10 @@ class EstimatorTask(pl.LightningModule):
 
         trained = self.trained
         networks = [trained.network] if isinstance(trained, LearnedNormalizer) else trained.networks
-        handles = [network.register_forward_hook(attach) for network in networks]
-        try:
+        with ExitStack() as stack:
+            for network in networks:
+                stack.enter_context(network.register_forward_hook(attach))  # removed when the block ends
             yield
-        finally:
-            for handle in handles:
-                handle.remove()
 
     def validation_step(self, batch: MatchSets, batch_idx: int) -> None:
         """Log the metrics of a batch, in the test too; Lightning gathers them over batches and processes."""
