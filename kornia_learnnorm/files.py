@@ -57,8 +57,7 @@ def write_text(path: str | Path, text: str) -> None:
 def exclusive(path: str | Path) -> Iterator[None]:
     """Hold the lock of a folder or a file that a run writes; BlockingIOError names another process that holds it.
 
-    The lock is a file, ``.lock`` in the folder or ``.NAME.lock`` beside the file; a killed process leaves it, without
-    effect.
+    It is the file ``.lock`` in the folder or ``.NAME.lock`` beside the file; that of a killed process has no effect.
     """
     from filelock import FileLock, Timeout  # a requirement of torch
 

@@ -77,8 +77,7 @@ def load_module(name: str | Path, file_format: str, build: Callable[[Path, str],
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: the tensors do not fit the architecture: {text}") from error
     module.to(next(iter(state.values())).dtype if state else None)
-    broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
-    if broken:
+    if broken := [key for key, value in state.items() if not bool(value.isfinite().all())]:
         raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
     if any(value.is_meta for value in (*module.parameters(), *module.buffers())):
         raise ValueError(f"{path}: a constructor makes a tensor that state_dict does not hold: register it as a buffer")
@@ -140,8 +139,7 @@ def _metadata(path: Path) -> dict[str, str]:
 
 def check_architecture(*parts: Mapping[str, Any]) -> None:
     """Raise a ValueError for numbers that no module of this package needs, and that would take all memory."""
-    large = [v for part in parts for v in part.values() if isinstance(v, int) and v > MAX_ARCHITECTURE_INT]
-    if large:
+    if large := [v for part in parts for v in part.values() if isinstance(v, int) and v > MAX_ARCHITECTURE_INT]:
         raise ValueError(f"numbers can be at most {MAX_ARCHITECTURE_INT}, got {large[0]}")
 
 

@@ -88,8 +88,7 @@ def run(args: argparse.Namespace) -> int:
         record_run(args.out, stores, methods, options, command=args.command_line)
         recorded = read_run(args.out)
         _print_tables(args, recorded, tables)
-    further = [name for name in recorded.about["methods"] if name not in map(short_name_of, methods)]
-    if further:
+    if further := [name for name in recorded.about["methods"] if name not in map(short_name_of, methods)]:
         print(f"{args.out} also holds, from before: {', '.join(further)}", file=sys.stderr)
     done = f"\nwrote {args.out}; learnnorm report {args.out} makes tables and figures of it"
     print(done, file=sys.stderr if args.json == "-" else sys.stdout)

@@ -38,8 +38,7 @@ def run(args: argparse.Namespace) -> int:
     """Record a run of robust estimators."""
     stores = {name: path for path, name in names_of(args.stores).items()}
     options = {name: getattr(args, name) for name in DEFAULT_OPTIONS}
-    missing = record_robust(args.out, stores, args.estimators, options, args.redo, args.command_line)
-    if missing:
+    if missing := record_robust(args.out, stores, args.estimators, options, args.redo, args.command_line):
         print(f"left out, since not installed: {', '.join(missing)}", file=sys.stderr)
     print(f"wrote {args.out}; learnnorm report {args.out} makes its tables and pictures")
     return 0

@@ -188,8 +188,7 @@ def _read_offsets(path: Path, file: Any) -> NDArray[np.int64]:
     if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
         got = f"format={file.attrs.get('format')!r}, version={file.attrs.get('version')}"
         raise ValueError(f"{path} is not a store: expected format={FORMAT!r}, version={VERSION}, got {got}")
-    missing = [name for name in (*_layout(file), "offsets", "names") if own_dataset(file, name) is None]
-    if missing:
+    if missing := [name for name in (*_layout(file), "offsets", "names") if own_dataset(file, name) is None]:
         raise ValueError(f"{path} lacks the datasets {', '.join(missing)} (links to other files are not followed)")
     offsets = np.asarray(file["offsets"][:], np.int64)
     if offsets.ndim != 1 or len(offsets) < 2 or offsets[0] != 0 or (np.diff(offsets) < 0).any():

@@ -32,8 +32,7 @@ def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
     found = sorted(reconstruction.images.values(), key=lambda image: (image.name.rpartition("/")[0], image.name))
     if not found:
         raise ValueError(f"the model {model} has no images")
-    missing = [image.name for image in found if not (images / image.name).is_file()]
-    if missing:
+    if missing := [image.name for image in found if not (images / image.name).is_file()]:
         raise FileNotFoundError(f"{len(missing)} of {len(found)} images are not in {images}, the first is {missing[0]}")
     return [_frame(image, images / image.name) for image in found]
 

@@ -1,7 +1,4 @@
-r"""Frames and pairs of frames, which the readers of datasets return and matching takes, and sequences on disk.
-
-Pixels follow OpenCV: the centre of the top left pixel is (0, 0).
-"""
+"""Frames and pairs of frames, which the readers of datasets return and matching takes, and sequences on disk."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace

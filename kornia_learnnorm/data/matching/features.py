@@ -1,7 +1,4 @@
-"""Local features of an image: OpenCV's SIFT (extra ``images``) and Kornia's learned detectors.
-
-The latter load their weights through :mod:`torch.hub`, from its cache or from the internet.
-"""
+"""Local features of an image: OpenCV's SIFT (extra ``images``) and Kornia's learned detectors, by :mod:`torch.hub`."""
 
 import sys
 import warnings
@@ -90,8 +87,7 @@ def detect_xfeat(image: NDArray[np.uint8], num_features: int = 4000) -> Features
 def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Features:
     """Return the features of Kornia's KeyNet, AffNet and HardNet of a grey image; otherwise as :func:`detect_aliked`.
 
-    A. Barroso-Laguna et al., Key.Net, ICCV 2019; D. Mishkin et al., AffNet, ECCV 2018; A. Mishchuk et al., HardNet,
-    NIPS 2017.
+    A. Barroso-Laguna et al., ICCV 2019; D. Mishkin et al., ECCV 2018; A. Mishchuk et al., NIPS 2017.
     """
     _check(image, num_features)
     with torch.inference_mode():
@@ -105,13 +101,11 @@ def detect_keynet(image: NDArray[np.uint8], num_features: int = 4000) -> Feature
 def keep_features(features: Features, mask: NDArray[np.bool_]) -> Features:
     """Return the features whose pixels count and are more than 8 rows or columns away from those that do not.
 
-    ``mask`` is true for the pixels that count, (H, W) bool; TypeError or ValueError for other arrays. The border of the
-    image itself drops nothing.
+    ``mask`` is true for the pixels that count, (H, W) bool; TypeError or ValueError for other arrays.
     """
     check_mask(mask, features.size)
     width, height = features.size
-    side = 2 * MASK_MARGIN + 1
-    inner = import_cv2().erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    inner = import_cv2().erode(mask.astype(np.uint8), np.ones([2 * MASK_MARGIN + 1] * 2, np.uint8)) > 0
     x, y = np.rint(features.points).astype(int).clip(0, (width - 1, height - 1)).T
     kept = inner[y, x]
     lafs = None if features.lafs is None else features.lafs[kept]

@@ -1,7 +1,4 @@
-"""Matching all pairs of frames into a store, on all cores or on many machines.
-
-The features of a frame stay on disk until its last pair is matched, so memory does not grow with the number of pairs.
-"""
+"""Matching all pairs of frames into a store, on all cores or on many machines, with features on disk meanwhile."""
 
 import sys
 from collections import Counter
@@ -107,11 +104,9 @@ def collect_matches(
 
     Until the store is complete, its pairs are in ``<path>.parts``. ``about`` gives its ``dataset`` and ``pairs``,
     ``jobs`` is a number of processes on this machine, -1 for one a core, and ``dask`` the address of a scheduler whose
-    workers match instead; they need the images under the same paths.
-
-    Returns the pairs that could not be matched, ``"name1 name2"``, and why; the store lists them. ValueError if there
-    are no pairs, none could be matched, or ``path`` holds another store; OSError if a file cannot be written, another
-    process writes it, or workers crash repeatedly.
+    workers match instead; they need the images under the same paths. Returns the pairs that could not be matched,
+    ``"name1 name2"``, and why. ValueError if there are no pairs, none could be matched, or ``path`` holds another
+    store; OSError if a file cannot be written, another process writes it, or workers crash repeatedly.
     """
     options, about = options or MatchOptions(), about or {}
     if not pairs:

@@ -99,10 +99,9 @@ def check_methods(detector: str, matcher: str) -> None:
 
 
 def match_images(image1: NDArray[np.uint8], image2: NDArray[np.uint8], num_features: int = 4000) -> Matches:
-    """Match the SIFT features of image 1 to their nearest neighbours in image 2.
+    """Match the SIFT features of image 1 to their nearest neighbours in image 2, as many as image 1 has features.
 
-    Arguments and errors are those of :func:`~kornia_learnnorm.data.matching.features.detect_sift` and
-    :func:`match_nearest`: there are as many matches as image 1 has features.
+    Errors are those of :func:`~kornia_learnnorm.data.matching.features.detect_sift` and :func:`match_nearest`.
     """
     return match_nearest(detect_sift(image1, num_features), detect_sift(image2, num_features))
 
@@ -111,8 +110,7 @@ def one_to_one(points1: Tensor, points2: Tensor, ratio: Tensor) -> Tensor:
     """Return the indices, int64, of matches (N, 2), (N, 2), (N,) that share no point, sorted by ratio.
 
     A match is dropped if it shares a pixel, in image 1 or in image 2, with a kept match of a smaller ratio (or another
-    cost). Coordinates decide between equal ratios, so the order of the matches has no effect on which are kept, and a
-    limit on the ratio can be applied before or after.
+    cost). Coordinates decide between equal ratios, so the order of the matches has no effect on which are kept.
     """
     KORNIA_CHECK_SHAPE(points1, ["N", "2"])
     KORNIA_CHECK_SHAPE(points2, [str(len(points1)), "2"])
