@@ -24,15 +24,14 @@ class ImageSets(StoreSets):
 
     An image is the file of its name in the store below one of the folders, or else the only one whose name without
     folder and suffix is that of the store's. Pairs without images, of another shape than in the store, or with fewer
-    than 32 matches are left out. In half of the sets a random displacement is added to the matches. Images and matches
-    are flipped and transposed at random, both views alike.
+    than 32 matches are left out. In half of the sets a random displacement is added to the matches.
 
     Args:
         paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables are filled in.
         images: folders of images.
         max_ratios: limits of Lowe's ratio, of which each draw takes one; None for no limit.
         jitter: largest standard deviation of the displacement that is added, pixels.
-        symmetries: flip and transpose.
+        symmetries: flip and transpose images and matches at random, both views alike.
 
     The attribute ``left_out`` counts pairs without images of their names and shapes. FileNotFoundError if a store or a
     folder does not exist; ValueError if no pair is left, or an argument is out of its range.
@@ -52,8 +51,7 @@ class ImageSets(StoreSets):
         self.jitter, self.symmetries = jitter, symmetries
         find = find_images(images)
         files = [[find(name, size) for name, size in zip(pair.names, pair.sizes, strict=True)] for pair in self._pairs]
-        kept = [i for i, found in enumerate(files) if None not in found]
-        if not kept:
+        if not (kept := [i for i, found in enumerate(files) if None not in found]):
             raise ValueError(f"none of {len(files)} pairs of {', '.join(paths)} has images in {', '.join(images)}")
         self.left_out = len(files) - len(kept)
         self._pairs = [self._pairs[i] for i in kept]

@@ -97,8 +97,7 @@ class StoreSets:
         paths: store files, or some pairs of them as ``file.h5@3:10``; environment variables are filled in.
         num_heldout: further matches of the pair.
         max_ratios: limits of Lowe's ratio, of which each draw takes one; None for no limit.
-        labels: use the ground truth where there is one; without, all pairs are supervised by their own matches, as
-            pairs without ground truth always are, see :class:`~kornia_learnnorm.BoundedEpipolarLoss`.
+        labels: use the ground truth where there is one; pairs without are supervised by their own matches.
     """
 
     def __init__(
@@ -189,8 +188,7 @@ class SyntheticSets:
         num_heldout: exact correspondences of each scene, or further matches.
         matches: function of the number of scenes, the points per scene, further exact ones and a generator.
         labels: use exact correspondences and the true inliers; without, scenes are supervised by their own matches.
-        coarse: share of scenes whose matches are as those of learned detectors, see
-            :func:`~kornia_learnnorm.data.synthetic.random_matches.random_matches`; zero for another function.
+        coarse: share of scenes with matches as of learned detectors, see ``random_matches``; zero for other functions.
     """
 
     def __init__(

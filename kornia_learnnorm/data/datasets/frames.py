@@ -125,8 +125,7 @@ def sequence_folders(dataset: str, root: str | Path) -> dict[str, Path]:
             raise FileNotFoundError(f"no folder {parent}, expected the sequences of KITTI in it")
         return {folder.name: folder for folder in sorted(parent.iterdir()) if folder.is_dir()}
     folders = [root] if (root / MARKER).exists() else sorted(root.iterdir())
-    found = {folder.resolve().name: folder for folder in folders if (folder / MARKER).exists()}
-    if not found:
+    if not (found := {folder.resolve().name: folder for folder in folders if (folder / MARKER).exists()}):
         raise FileNotFoundError(f"no {MARKER} in {root}, nor in a folder in it")
     return found
 

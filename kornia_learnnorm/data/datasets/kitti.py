@@ -54,8 +54,7 @@ def read_calibration(path: Path, key: str) -> tuple[Array, Array]:
 
 
 def _images(folder: Path) -> list[tuple[int, Path]]:
-    images = list(folder.glob("*.png"))
-    if not images:
+    if not (images := list(folder.glob("*.png"))):
         raise FileNotFoundError(f"no images *.png in {folder}")
     if wrong := [image for image in images if not (image.stem.isascii() and image.stem.isdecimal())]:
         raise ValueError(f"{wrong[0]}: an image's name must be its frame's number, as in 000000.png")

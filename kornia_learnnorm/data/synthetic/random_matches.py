@@ -35,7 +35,7 @@ class SyntheticMatches(NamedTuple):
 def random_matches(
     batch_size: int, num_points: int, num_exact: int, generator: Generator, coarse: float = 0.0
 ) -> SyntheticMatches:
-    """Draw matches of varied scenes.
+    """Draw ``num_points`` matches of varied scenes, and ``num_exact`` further correspondences without noise.
 
     All scenes of a call are of one kind: random (:func:`~kornia_learnnorm.data.synthetic.scenes.random_scenes`),
     driving, hand-held, orbit or :func:`wide_baseline`. The noise is Gaussian or, in half of the scenes, Student-t with
@@ -48,8 +48,6 @@ def random_matches(
     A share ``coarse`` of the scenes has matches as learned detectors give them: noise of 0.2-1.5 px, smaller where the
     score is high; half of these scenes as LightGlue leaves them, with up to 20 % outliers and most scores near one, the
     others as mutual nearest neighbours with 10 to 70 %.
-
-    A scene has ``num_points`` matches and ``num_exact`` further correspondences without noise.
     """
     named = (partial(draw, noise=0.0) for draw in (scenes.forward_driving, scenes.handheld, scenes.orbit))
     kinds: list[Callable[..., scenes.TwoViewScene]] = [scenes.random_views, *named, wide_baseline]
@@ -76,8 +74,7 @@ def random_planes(
     """
     size, K = draws.random_cameras(batch_size, generator)
     shape = (batch_size, PLANE_CANDIDATES)
-    shared = num_exact // 2
-    total = num_points + shared
+    shared, total = num_exact // 2, num_points + num_exact // 2
     points1 = draws.spread_points(size, 8 * total, generator, clustered=0.3)
     anywhere = draws.spread_points(size, num_exact - shared, generator)
     angle = draws.log_uniform(shape, 0.005, 0.7, generator)
