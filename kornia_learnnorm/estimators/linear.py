@@ -298,16 +298,21 @@ class EightPoint(LinearLayer):
 
 
 def prepare_problem(
-    model: TwoViewModel, points1: Tensor, points2: Tensor, weights: Tensor | None, mask: Tensor | None
+    model: TwoViewModel,
+    points1: Tensor,
+    points2: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    least: int | None = None,
 ) -> LinearProblem:
-    """Return the problem of a layer's arguments, checked; masked rows have weight zero."""
+    """Return the problem of a layer's arguments, checked, ``least`` rows too; masked rows have weight zero."""
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
         refuse_jit()
     if mask is not None:
         check_mask(mask, points1, points2, weights)
         points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
         weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
-    check_correspondences(points1, points2, weights, model.sample_size)
+    check_correspondences(points1, points2, weights, model.min_points if least is None else least)
     weights = None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
     return LinearProblem.from_points(points1, points2, weights, model)
 

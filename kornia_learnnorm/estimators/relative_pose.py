@@ -220,7 +220,7 @@ class LearnedRelativePose(LearnedLayer):
         """Return the problem, the cameras, which sets are determined and by how much, and the stages."""
         if K1 is None or K2 is None:
             raise ValueError("cameras K1 and K2 are needed; LearnedEightPoint does without")
-        problem = prepare_problem(self.model, points1, points2, weights, mask)
+        problem = prepare_problem(self.model, points1, points2, weights, mask, Essential.sample_size)
         check_cameras(K1, K2, points1.shape[0])
         scores = None if scores is None else check_scores(scores, points1, mask).to(problem.x1)
         K1, K2 = (K.to(problem.x1).expand(points1.shape[0], 3, 3) for K in (K1, K2))
