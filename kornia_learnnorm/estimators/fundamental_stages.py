@@ -29,7 +29,6 @@ FIRST_STEPS, LOCAL_STEPS = 1, 3  # reweightings of the network's matrix before t
 SEARCH_STEPS = 5  # of the last stage's steps that a search takes the place of
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
-SAMPLE_SIZE = 7
 MAX_SCORED = 128  # matches by which the matrices of samples are compared first
 SHORTLIST = 6  # matrices of samples that are compared on all matches
 # Matches, and the sum of their probabilities, from which samples are drawn: among few, some fit most of them by chance.
@@ -112,7 +111,7 @@ class FundamentalRefinement(Refinement):
         real = torch.ones_like(large[..., 0, 0], dtype=torch.bool)
         if self.few_outliers is not None and is_known_true(self.few_outliers.all()):
             return large, real
-        basis, determined = draw_samples(evidence, weights, order, self.samples, SAMPLE_SIZE)
+        basis, determined = draw_samples(evidence, weights, order, self.samples, self.model.sample_size)
         drawn, singular = fundamental_in_span(basis.flatten(0, 1))
         shape = -1, 3 * self.samples
         singular = singular.view(shape) & determined.repeat_interleave(3, 1)
