@@ -35,7 +35,10 @@ def fundamental_in_span(basis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _roots(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the roots (B, 3) of cubics x^3 + c x^2 + b x + a by Cardano and Viete, and which of them are real."""
+    """Return the roots (B, 3) of cubics x^3 + c x^2 + b x + a by Cardano and Viete, and which of them are real.
+
+    Kornia's ``solve_cubic`` gives zeros in the place of those that are not.
+    """
     middle = c / 3
     p, q = b / 3 - middle.square(), middle**3 + (a - middle * b) / 2  # y^3 + 3 p y + 2 q, x = y - middle
     discriminant = p**3 + q.square()
