@@ -13,7 +13,6 @@ from pair_data import Pairs, SetNetwork, load_pairs, parse
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.metrics.inliers import f1_score
-from kornia_learnnorm.ransac.samplers import WeightedSampler
 from kornia_learnnorm.ransac.soft import SoftChoice, expected_loss, sample_minimal_sets
 
 
@@ -27,8 +26,8 @@ def choose(pairs: Pairs, logits: torch.Tensor, generator: torch.Generator, count
 
 def ransac_f1(pairs: Pairs, logits: torch.Tensor, normalizer: torch.nn.Module) -> float:
     """Return the mean F1 at 1 px in percent of the best of 64 minimal samples that are drawn with the logits."""
-    ransac = kln.RANSAC(normalizer, max_samples=64, confidence=1, refine=False, sampler=WeightedSampler, seed=0)
-    rows = zip(pairs.points1, pairs.points2, logits.softmax(-1), strict=True)
+    ransac = kln.RANSAC(normalizer, max_samples=64, confidence=1, refine=False, seed=0)
+    rows = zip(pairs.points1, pairs.points2, (logits / 2).softmax(-1), strict=True)  # RANSAC squares them
     F_mat = torch.stack([ransac(*row)[0] for row in rows])
     return 100 * f1_score(pairs.points1, pairs.points2, F_mat, pairs.F_mat, threshold=1.0).nanmean().item()
 

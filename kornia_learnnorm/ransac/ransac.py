@@ -2,9 +2,8 @@ r"""RANSAC whose minimal samples and refits run through a normaliser, or through
 
 import math
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +22,7 @@ from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
 from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
 from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
-from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler, UniformSampler
+from kornia_learnnorm.ransac.samplers import Sampler, UniformSampler, WeightedSampler
 from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, PRESCORED, Hypotheses, PairScorer, finite_and_bounded
 from kornia_learnnorm.ransac.threads import one_thread
 
@@ -84,22 +83,18 @@ class RANSAC(nn.Module):
             coordinates (Hartley's when not given), the default with a ``normalizer``, or ``"optimal"`` correction.
             Matrices of samples of seven are singular.
         refine: whether to optimise; otherwise the result is the minimal sample of highest score.
-        sampler: how weights steer the sampling: :class:`~kornia_learnnorm.ransac.samplers.ProsacSampler` or
-            :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`. It is called with the weights and with ``size``,
-            the number of correspondences in a sample.
         seed: makes every call on the same input and device give the same result; None draws from PyTorch's generator.
         model: ``"fundamental"``, ``"homography"``, or a model of one's own in place of one of that ``distance`` and
             ``rank2``. A homography has minimal samples of four, no cameras and no ``rank2``; its symmetric distance is
             the root of the sum of both squared transfer errors.
 
     Raises:
-        TypeError: if ``normalizer``, ``distance`` or ``sampler`` cannot be called, or an argument that must be a number
-            is not one.
+        TypeError: if ``normalizer`` or ``distance`` cannot be called, or an argument that must be a number is not one.
         ValueError: if a number is out of its range, or there is no such ``distance`` or ``rank2``.
 
     Reference:
         P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J. Kittler, Locally optimized RANSAC, DAGM
-        2003; O. Chum, J. Matas, Matching with PROSAC, CVPR 2005.
+        2003.
 
     Example:
         >>> import kornia_learnnorm as kln
@@ -123,7 +118,6 @@ class RANSAC(nn.Module):
         distance: Literal["sampson", "symmetric"] = "sampson",
         rank2: Literal["projection", "optimal"] | None = None,
         refine: bool = True,
-        sampler: Callable[..., Any] = ProsacSampler,
         seed: int | None = None,
         model: Literal["fundamental", "homography"] | TwoViewModel = "fundamental",
     ) -> None:
@@ -131,8 +125,6 @@ class RANSAC(nn.Module):
         check_numbers(inl_th, max_samples, max_seconds, confidence, seed)
         if normalizer is not None:
             check_normalizer(normalizer)
-        if not callable(sampler):
-            raise TypeError(f"sampler must be a function or a class, got {sampler!r}")
         if rank2 is None:
             rank2 = "optimal" if normalizer is None else "projection"
         if isinstance(model, str):
@@ -142,13 +134,13 @@ class RANSAC(nn.Module):
         self.normalizer = Hartley() if normalizer is None and rank2 == "projection" else normalizer
         self.rank2: Literal["projection", "optimal"] = rank2
         self.inl_th, self.max_samples, self.max_seconds, self.confidence = inl_th, max_samples, max_seconds, confidence
-        self.distance, self.refine, self.sampler = distance, refine, sampler
+        self.distance, self.refine = distance, refine
         self.seed = None if seed is None else int(seed)
 
     def extra_repr(self) -> str:
         """Return the parameters."""
-        names = ("inl_th", "max_samples", "max_seconds", "confidence", "distance", "rank2", "refine", "sampler", "seed")
-        return ", ".join(f"{n}={getattr(getattr(self, n), '__name__', repr(getattr(self, n)))}" for n in names)
+        names = ("inl_th", "max_samples", "max_seconds", "confidence", "distance", "rank2", "refine", "seed")
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
     def forward(
         self,
@@ -177,8 +169,9 @@ class RANSAC(nn.Module):
                 :math:`N \ge 5`, float32 or float64. Rows that are not finite, more than 1e6 median distances from the
                 other points, or share a point with a better match, are no inliers.
             points2: pixels in the second image with shape :math:`(N, 2)`.
-            weights: optional non-negative scores :math:`(N,)`, higher is better, such as one minus Lowe's ratio. They
-                steer sampling, and decide between matches that share a point; a match of weight zero is never sampled.
+            weights: optional non-negative scores :math:`(N,)`, higher is better, such as one minus Lowe's ratio or
+                LightGlue's scores. Matches are sampled in proportion to their squares, never where they are zero; of
+                matches that share a point, the one of highest weight counts.
             K1: optional camera of the first image with shape :math:`(3, 3)`.
             K2: optional camera of the second image with shape :math:`(3, 3)`; both or none.
 
@@ -241,7 +234,7 @@ class RANSAC(nn.Module):
         size = least if self.normalizer is not None else min(least, self.model.sample_size)
         sampler: Sampler = UniformSampler(len(x1), x1.device, size)
         if weights is not None:
-            sampler = self.sampler(weights.to(x1), size=size)
+            sampler = WeightedSampler(weights.to(x1), size)
         scored: Tensor | slice = slice(None)
         if len(x1) >= 2 * PRESCORED:
             scored = torch.randperm(len(x1), generator=generator, device=x1.device)[:MAX_SCORED]

@@ -1,4 +1,4 @@
-r"""Minimal samples of eight correspondences or any size: uniform, by rank (PROSAC), and in proportion to weights."""
+r"""Minimal samples of eight correspondences or any size: uniform, and in proportion to squared weights."""
 
 from typing import Protocol
 
@@ -61,62 +61,14 @@ class UniformSampler:
         return float(inliers.float().mean()) ** self.size
 
 
-class ProsacSampler:
-    r"""PROSAC: samples from a growing set of the best-weighted correspondences.
-
-    The :math:`t`-th sample holds the :math:`n(t)`-th best correspondence, all others in it are better ones, and
-    :math:`n(t)` grows as if 200,000 uniform samples were ordered by their worst member. Only the order of the weights
-    counts; correspondences of weight zero are never drawn.
-
-    Args:
-        weights: scores, higher is better, (N,), at least as many of them positive as a sample holds.
-        size: correspondences in a sample.
-
-    Reference:
-        O. Chum, J. Matas, Matching with PROSAC, CVPR 2005, section 2.
-    """
-
-    MAX_SAMPLES = 200_000  # uniform samples whose order PROSAC follows
-    MIN_SHARE = 0.25  # smallest share of the best correspondences whose inliers may stop the sampling
-
-    def __init__(self, weights: Tensor, size: int = SAMPLE_SIZE) -> None:
-        self.weights, self.size = weights, size
-        order = weights.argsort(descending=True, stable=True)
-        self.order = order[weights[order] > 0]
-        total = len(self.order)
-        sizes = torch.arange(size, total + 1, dtype=torch.float64)
-        taken = torch.arange(size, dtype=torch.float64)
-        expected = self.MAX_SAMPLES * ((sizes[:, None] - taken) / (total - taken)).prod(-1)
-        until = torch.cat([expected.new_ones(1), 1 + expected.diff().ceil().cumsum(-1)])
-        self.until, self.drawn = until.long().to(weights.device), 0  # samples among the best size, size + 1, ...
-
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return the indices of the next samples; how many there were before counts."""
-        total, device = len(self.order), self.order.device
-        t = torch.arange(self.drawn + 1, self.drawn + count + 1, device=device)
-        self.drawn += count
-        grown = torch.searchsorted(self.until, t)
-        last = (grown + self.size - 1).clamp(max=total - 1)
-        ranked = torch.cat([draw_distinct(last, self.size - 1, generator), last[:, None]], -1)
-        uniform = draw_distinct(torch.full_like(last, total), self.size, generator)
-        return self.order[torch.where(grown[:, None] < len(self.until), ranked, uniform)]
-
-    def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
-        """Return the largest share of inliers among the best correspondences to the power of the size."""
-        weights = self.weights[rows]
-        order = weights.argsort(descending=True, stable=True)[: int((weights > 0).sum())]
-        if len(order) == 0:
-            return 0.0
-        ranked = inliers[order].cpu().double()
-        shares = ranked.cumsum(-1) / torch.arange(1, len(ranked) + 1)
-        return float(shares[int(self.MIN_SHARE * len(shares)) :].max() ** self.size)
-
-
 class WeightedSampler:
-    """Samples with probability in proportion to weights, without replacement; weight zero is never drawn.
+    """Samples with probability in proportion to the squares of weights, without replacement.
+
+    The square draws the best correspondences more often where most are outliers, and still all of them where few are.
 
     Args:
-        weights: non-negative weights, (N,), at least as many of them positive as a sample holds.
+        weights: non-negative weights, (N,), at least as many of them positive as a sample holds. Weight zero is never
+            drawn.
         size: correspondences in a sample.
 
     Reference:
@@ -126,20 +78,29 @@ class WeightedSampler:
     def __init__(self, weights: Tensor, size: int = SAMPLE_SIZE) -> None:
         self.size = size
         share = weights.double() / weights.max().double()
-        self.weights = torch.where(share > 0, share.clamp(min=MIN_WEIGHT), 0.0).float()
+        self.weights = torch.where(share > 0, share.square().clamp(min=MIN_WEIGHT), 0.0)
+        self.upto = self.weights.cpu().cumsum(-1).to(weights.device)  # on a GPU sums differ from call to call
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Return the indices of the next samples."""
-        blocks = torch.split(torch.arange(count), max(1, MAX_RANDOM_NUMBERS // len(self.weights)))
-        return torch.cat([self._draw_block(len(block), generator) for block in blocks])
+        # The first that differ among twice as many independent draws are drawn without replacement.
+        uniform = torch.rand(count, 2 * self.size, generator=generator, device=self.upto.device, dtype=self.upto.dtype)
+        drawn = torch.searchsorted(self.upto, uniform * self.upto[-1], right=True)
+        repeats = (drawn[:, :, None] == drawn[:, None]).tril(-1).any(-1)
+        kept = ~repeats & (drawn < len(self.upto))
+        kept &= kept.cumsum(-1) <= self.size
+        full = kept.sum(-1) == self.size
+        drawn = drawn[full][kept[full]].view(-1, self.size)
+        blocks = torch.arange(count - len(drawn)).split(max(1, MAX_RANDOM_NUMBERS // len(self.upto)))
+        return torch.cat([drawn, *(self._draw_block(len(block), generator) for block in blocks)])
 
     def _draw_block(self, count: int, generator: torch.Generator) -> Tensor:
         uniform = torch.rand(
             count, len(self.weights), generator=generator, device=self.weights.device, dtype=torch.float32
         )
-        return (uniform.clamp_(min=MIN_WEIGHT).log() / self.weights).topk(self.size).indices
+        return (uniform.clamp_(min=MIN_WEIGHT).log() / self.weights.float()).topk(self.size).indices
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
-        """Return the share of the weights that inliers have to the power of the size."""
-        weights = self.weights[rows].cpu().double()
+        """Return the share of the squared weights that inliers have to the power of the size."""
+        weights = self.weights[rows].cpu()
         return float(((weights * inliers.cpu()).sum() / weights.sum()) ** self.size)

@@ -26,7 +26,6 @@ from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
-from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.two_view.inputs import check_settings, read_cameras
 from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms
 from kornia_learnnorm.two_view.solver import MIN_SCORE
@@ -55,7 +54,6 @@ class _Pair(NamedTuple):
     points1: Array  # (N, 2)
     points2: Array
     scores: Array  # (N,)
-    scored: bool  # by a matcher, not by the ratio test
 
 
 class _Geometry(NamedTuple):
@@ -146,9 +144,8 @@ def _read_pairs(store: CorrespondenceStore, images: Path, ratio: float, turned: 
             stored_pixels(images / name, points[rows], size, turned)
             for name, points, size in zip(names, (store.points1, store.points2), store.image_size[place], strict=True)
         ]
-        scored = bool(np.isnan(store.ratio[rows]).all())
         scores = store.score[rows].astype(np.float64)
-        pair = _Pair(names, (size1, size2), points1 + CORNER, points2 + CORNER, scores, scored)
+        pair = _Pair(names, (size1, size2), points1 + CORNER, points2 + CORNER, scores)
         pairs.setdefault(frozenset(names), pair)
     return [*pairs.values()]
 
@@ -161,8 +158,7 @@ def _estimate(
         return None
     points1, points2, scores = (torch.from_numpy(value) for value in (pair.points1, pair.points2, pair.scores))
     K = None if camera is None else torch.from_numpy(camera)
-    sampler = WeightedSampler if pair.scored else ProsacSampler
-    options: dict[str, Any] = {"inl_th": threshold, "distance": "symmetric", "seed": seed, "sampler": sampler}
+    options: dict[str, Any] = {"inl_th": threshold, "distance": "symmetric", "seed": seed}
     matches = points1, points2, scores.clamp(min=MIN_SCORE)
     if layer is None:
         F_mat = RANSAC(**options).estimate(*matches, K, K).F_mat

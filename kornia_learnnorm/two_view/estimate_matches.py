@@ -1,7 +1,6 @@
 """The fundamental matrix or homography of matches, with its predicted error and the reasons to doubt it."""
 
 import math
-from collections.abc import Callable
 from typing import Any, cast
 
 import torch
@@ -16,7 +15,6 @@ from kornia_learnnorm.metrics.statistics import median
 from kornia_learnnorm.models.essential import nearest_essential
 from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.ransac import RANSAC
-from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view import predicted_error
 from kornia_learnnorm.two_view.camera_check import find_camera_doubt
@@ -44,7 +42,6 @@ def estimate_matches(
     seed: int = 0,
     K1: Points | None = None,
     K2: Points | None = None,
-    sampler: Callable[..., Sampler] = ProsacSampler,
     model: str = "auto",
 ) -> PairEstimate:
     """Return the fundamental matrix or homography of matches with its predicted error and the reasons to doubt it.
@@ -67,8 +64,6 @@ def estimate_matches(
         seed: seed of RANSAC and of the parts of the matches.
         K1: camera of image 1, (3, 3), in pixels.
         K2: camera of image 2; both or none.
-        sampler: how the scores steer RANSAC. A matcher's confidences, such as LightGlue's, want
-            :class:`~kornia_learnnorm.ransac.samplers.WeightedSampler`: samples of the highest alone are worse.
         model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
 
     Returns:
@@ -85,7 +80,7 @@ def estimate_matches(
     points1, points2, scores = _usable(*read_matches(points1, points2, scores), threshold)
     given = size1, size2
     size1, size2 = read_size("size1", size1, points1), read_size("size2", size2, points2)
-    solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras, sampler)
+    solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras)
     choice, found, H_mat = choose_model(solver, model, size1, size2)
     F_mat = None if found is None else found.matrix
     if choice.model == "homography":

@@ -16,7 +16,6 @@ from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
-from kornia_learnnorm.ransac.samplers import ProsacSampler, WeightedSampler
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
 from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, check_whole, read_cameras
 from kornia_learnnorm.two_view.repeated_texture import mutual_share, resolve_ambiguity
@@ -111,13 +110,12 @@ class MatchedPair:
     ) -> PairEstimate:
         """Return the estimate of the matches; arguments and errors are those of :func:`estimate_pair`."""
         S1, S2 = images.scaling(self.full_size1, self.size1), images.scaling(self.full_size2, self.size2)
-        sampler = WeightedSampler if self.ratio is None else ProsacSampler  # LightGlue's highest scores mislead PROSAC
         cameras = read_cameras(K1, K2)
         K1, K2 = (None, None) if cameras is None else (S1 @ cameras[0], S2 @ cameras[1])
 
         def solve(model: str, points1: Tensor, points2: Tensor, scores: Tensor) -> PairEstimate:
             sizes = self.size1, self.size2
-            return estimate_matches(points1, points2, scores, *sizes, layer, threshold, seed, K1, K2, sampler, model)
+            return estimate_matches(points1, points2, scores, *sizes, layer, threshold, seed, K1, K2, model)
 
         try:
             first = solve(model, self.points1[self.mutual], self.points2[self.mutual], self.scores[self.mutual])

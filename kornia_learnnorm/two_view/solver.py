@@ -1,6 +1,5 @@
 """The matrices of matches by RANSAC or a learned layer, plane and parallax, and parts of the matches."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple, Self
@@ -18,7 +17,6 @@ from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
-from kornia_learnnorm.ransac.samplers import ProsacSampler, Sampler
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
@@ -66,7 +64,6 @@ class TwoViewSolver:
     seed: int
     layer: LearnedEightPoint | None = None  # estimates in the place of RANSAC
     cameras: Cameras | None = None
-    sampler: Callable[..., Sampler] = ProsacSampler  # of RANSAC, by the scores
 
     def search(self, first: Solution, size2: Size) -> Solution:
         """Return the best matrix of :meth:`solve` and random parts; raise NoReliableMatrixError for few inliers."""
@@ -155,7 +152,7 @@ class TwoViewSolver:
         return float(self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1).score.sum())
 
     def _ransac(self, model: Literal["fundamental", "homography"] = "fundamental") -> RansacResult:
-        ransac = RANSAC(inl_th=self.threshold, seed=self.seed, sampler=self.sampler, model=model)
+        ransac = RANSAC(inl_th=self.threshold, seed=self.seed, model=model)
         cameras = self.cameras or () if model == "fundamental" else ()
         return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *cameras)
 

@@ -20,7 +20,6 @@ from kornia_learnnorm import RANSAC
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.metrics.inliers import f1_score
-from kornia_learnnorm.ransac.samplers import WeightedSampler
 
 
 def pair(name: str = "handheld", num_points: int = 400, noise: float = 0.3, outliers: float = 0.4, seed: int = 0):
@@ -112,7 +111,6 @@ class TestExceptions:
             ({"confidence": 0.0}, ValueError, "confidence"),
             ({"seed": 2**64}, ValueError, r"seed .* \[0, 2\^63\), got 18446744073709551616"),
             *(({"seed": seed}, TypeError, f"seed must be .* got {seed!r}") for seed in ("a", True)),
-            ({"sampler": "prosac"}, TypeError, "sampler must be .* got 'prosac'"),
             ({"normalizer": "hartley"}, TypeError, "normalizer must be .* got 'hartley'"),
             ({"inl_th": "1"}, TypeError, "inl_th must be a number, got '1'"),
         ]:
@@ -219,7 +217,6 @@ class TestBudget:
         good = true + 0.5 * uniform(400)
         plain = self.count((points1, points2))
         assert self.count((points1, points2), good) < plain
-        assert self.count((points1, points2), 0.01 + good, sampler=WeightedSampler) < plain
 
 
 LINE = torch.linspace(0, 300, 60, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0])
