@@ -91,7 +91,7 @@ class WeightedSampler:
         kept &= kept.cumsum(-1) <= self.size
         full = kept.sum(-1) == self.size
         drawn = drawn[full][kept[full]].view(-1, self.size)
-        blocks = torch.arange(count - len(drawn)).split(max(1, MAX_RANDOM_NUMBERS // len(self.upto)))
+        blocks = torch.split(torch.arange(count - len(drawn)), max(1, MAX_RANDOM_NUMBERS // len(self.upto)))
         return torch.cat([drawn, *(self._draw_block(len(block), generator) for block in blocks)])
 
     def _draw_block(self, count: int, generator: torch.Generator) -> Tensor:

@@ -71,9 +71,9 @@ class TestChooseModel:
         assert H_mat is not None
 
     def test_no_matrix(self):
-        solver = make_solver(0.0, outliers=30, plane=0)
+        solver = make_solver(0.0, outliers=20, plane=0)
         for model in ("auto", "homography"):
-            with pytest.raises(NoReliableMatrixError, match="30 matches agree") as caught:
+            with pytest.raises(NoReliableMatrixError, match="20 matches agree") as caught:
                 choose_model(solver, model, SIZE, SIZE)
             assert caught.value.code == "no_consensus"
 
