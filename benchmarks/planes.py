@@ -1,11 +1,17 @@
-"""Compare estimators of homographies on synthetic planes and rotations with exact truth.
+"""Compare estimators of homographies on synthetic planes and rotations with exact truth, and on photographs of planes.
 
 Sets of N matches have noise of 0.3-1.5 px in both images and a share of outliers, three in five anywhere in image 2,
 the others at the partner of another match. The corner error is the mean distance, pixels, of the corners of image 1,
 mapped by the estimate and by the truth; failures count. Table: median, AUC up to 1, 3 and 5 px, %, and mean time, ms,
 of one thread; learned matrices are estimated 32 sets at once. Thresholds are 2 px.
 
-    python benchmarks/planes.py [--sizes 16 64 256 512] [--outliers 0.1 0.5 0.8] [--sets 32] [--csv FILE]
+With a store of matches of photographs, those that pass the ratio test at 0.8 count, of the pairs of which one
+homography explains at least half of the inliers of a fundamental matrix, both by OpenCV's USAC_MAGSAC. A random half of
+a pair's matches gives the homography; the error is the transfer distance of the other half, outliers too. Each half
+gives one, twice.
+
+    python benchmarks/planes.py [--sizes 16 64 256 512] [--outliers 0.1 0.5 0.8] [--sets 128] [--csv FILE]
+    python benchmarks/planes.py --photographs $LEARNNORM_DATA/correspondences/photos.h5 [--csv FILE]
 
 What is not installed is left out.
 """
@@ -13,8 +19,10 @@ What is not installed is left out.
 import importlib
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
+import numpy as np
 import torch
 from kornia.geometry import ransac as kornia_ransac
 from kornia.geometry.homography import find_homography_dlt, find_homography_dlt_iterated
@@ -22,6 +30,7 @@ from shared import auc_cells, make_parser, write_csv
 from torch import Tensor
 
 import kornia_learnnorm as kln
+from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.draws import normal, uniform
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.evaluation.tables import format_table
@@ -31,6 +40,9 @@ THRESHOLDS = (1, 3, 5)  # of the AUC, pixels
 MAX_ERROR = 1e3  # pixels, of a failure
 BATCH = 32  # sets that the learned layer solves at once
 HEADER = ["estimator", "median", "AUC 1", "3", "5", "ms"]
+MAX_RATIO = 0.8  # of the distances of the nearest and the second-nearest descriptor
+MIN_ON_PLANE, MIN_PLANE_SHARE = 50, 0.5  # inliers of the homography of a pair of a plane, and of those of F
+LEARNED = "learned:robust-homography"
 
 
 def draw(number: int, size: int, outliers: float, seed: int = 0) -> tuple[Tensor, ...]:
@@ -97,7 +109,27 @@ def find_estimators() -> dict[str, Callable[[Tensor, Tensor], Tensor | None]]:
         )
     except ImportError as error:
         print(f"left out: {error}")
+    try:
+        superansac = importlib.import_module("pysuperansac")
+        settings = superansac.RANSACSettings()
+        settings.inlier_threshold = THRESHOLD
+
+        def robust(points1: Tensor, points2: Tensor) -> Tensor:
+            joined, sizes = torch.cat([points1, points2], 1), [*points1.amax(0).tolist(), *points2.amax(0).tolist()]
+            return torch.from_numpy(superansac.estimateHomography(joined.numpy(), sizes, config=settings)[0])
+
+        found["pysuperansac"] = robust
+    except ImportError as error:
+        print(f"left out: {error}")
     return found
+
+
+def solve(estimate: Callable[[Tensor, Tensor], Tensor | None], points1: Tensor, points2: Tensor) -> Tensor | None:
+    """Return a homography; None also where OpenCV raises an error."""
+    try:
+        return estimate(points1, points2)
+    except cv2.error:
+        return None
 
 
 def measure(size: int, outliers: float, number: int, estimators: dict, layer: kln.LearnedHomography) -> list[list[str]]:
@@ -107,17 +139,13 @@ def measure(size: int, outliers: float, number: int, estimators: dict, layer: kl
     seconds: dict[str, float] = {}
     for name, estimate in estimators.items():
         estimate(points1[0], points2[0])  # the first call loads and compiles
-        start, solved[name] = time.perf_counter(), []
-        for pair in zip(points1, points2, strict=True):
-            try:
-                solved[name].append(estimate(*pair))
-            except cv2.error:
-                solved[name].append(None)
+        start = time.perf_counter()
+        solved[name] = [solve(estimate, *pair) for pair in zip(points1, points2, strict=True)]
         seconds[name] = time.perf_counter() - start
-    name, start = "learned:robust-homography", time.perf_counter()
+    start = time.perf_counter()
     with torch.no_grad():
         parts = [layer(*pair) for pair in zip(points1.split(BATCH), points2.split(BATCH), strict=True)]
-    solved[name], seconds[name] = [*torch.cat(parts)], time.perf_counter() - start
+    solved[LEARNED], seconds[LEARNED] = [*torch.cat(parts)], time.perf_counter() - start
     rows = []
     for name, matrices in solved.items():
         error = torch.tensor([corner_error(*row) for row in zip(matrices, true, corners, strict=True)]).double()
@@ -126,21 +154,64 @@ def measure(size: int, outliers: float, number: int, estimators: dict, layer: kl
     return rows
 
 
+def read_planes(path: Path) -> list[tuple[Tensor, Tensor]]:
+    """Return the matches (N, 2) x 2 of the pairs of a store whose inliers lie mostly on one plane."""
+    store, pairs = read_store(path), []
+    for matches in (store.matches(pair, MAX_RATIO) for pair in range(len(store))):
+        points1, points2 = (points.astype(np.float64) for points in matches[:2])
+        near = cv2.findFundamentalMat(points1, points2, cv2.USAC_MAGSAC, THRESHOLD)[1]
+        on_plane = cv2.findHomography(points1, points2, cv2.USAC_MAGSAC, THRESHOLD)[1]
+        if near is None or on_plane is None or on_plane.sum() < MIN_ON_PLANE:
+            continue
+        if (near & on_plane).sum() >= MIN_PLANE_SHARE * near.sum():
+            pairs.append((torch.from_numpy(points1), torch.from_numpy(points2)))
+    return pairs
+
+
+def measure_photographs(pairs: list[tuple[Tensor, Tensor]], estimators: dict) -> list[list[str]]:
+    """Return a row for each estimator of halves of the matches of pairs."""
+    rows = []
+    for name, estimate in estimators.items():
+        errors, seconds = [], []
+        for number, pair in enumerate(pairs):
+            generator = torch.Generator().manual_seed(number)
+            for order in (torch.randperm(len(pair[0]), generator=generator) for _ in range(2)):
+                halves = order.chunk(2)
+                for fitted, held_out in (halves, halves[::-1]):
+                    start = time.perf_counter()
+                    H_mat = solve(estimate, *(points[fitted] for points in pair))
+                    seconds.append(time.perf_counter() - start)
+                    found = H_mat is not None and H_mat.shape == (3, 3) and bool(H_mat.any())
+                    H = H_mat.double() if found else torch.full((3, 3), torch.nan).double()
+                    errors.append(kln.transfer_distance(*(points[held_out][None] for points in pair), H[None])[0])
+        every = torch.cat(errors).nan_to_num(MAX_ERROR)
+        rows.append([name, *auc_cells(every, THRESHOLDS), f"{1000 * np.median(seconds):.1f}"])
+    return rows
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = make_parser(__doc__, csv="write all tables to this file")
     parser.add_argument("--sizes", type=int, nargs="+", default=[16, 64, 256, 512])
     parser.add_argument("--outliers", type=float, nargs="+", default=[0.1, 0.5, 0.8])
-    parser.add_argument("--sets", type=int, default=32)
+    parser.add_argument("--sets", type=int, default=128)
+    parser.add_argument("--photographs", type=Path, help="a store of matches")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     estimators, layer, rows = find_estimators(), kln.LearnedHomography.from_pretrained(), []
-    for outliers in args.outliers:
-        for size in args.sizes:
-            found = measure(size, outliers, args.sets, estimators, layer)
-            print(f"N = {size}, {outliers:.0%} outliers\n\n{format_table(HEADER, found)}\n", flush=True)
-            rows += [[f"{outliers:.0%}", str(size), *row] for row in found]
-    write_csv(args.csv, [["outliers", "N", *HEADER], *rows])
+    if args.photographs:
+        estimators[LEARNED] = torch.no_grad()(lambda points1, points2: layer(points1[None], points2[None])[0])
+        pairs, header = read_planes(args.photographs), ["estimator", *HEADER[2:]]
+        rows = measure_photographs(pairs, estimators)
+        print(f"{len(pairs)} pairs of photographs\n\n{format_table(header, rows)}")
+    else:
+        header = ["outliers", "N", *HEADER]
+        for outliers in args.outliers:
+            for size in args.sizes:
+                found = measure(size, outliers, args.sets, estimators, layer)
+                print(f"N = {size}, {outliers:.0%} outliers\n\n{format_table(HEADER, found)}\n", flush=True)
+                rows += [[f"{outliers:.0%}", str(size), *row] for row in found]
+    write_csv(args.csv, [header, *rows])
 
 
 if __name__ == "__main__":

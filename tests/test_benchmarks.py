@@ -3,6 +3,7 @@
 import argparse
 import json
 import math
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from torch import Tensor
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import Frame, FramePair, fundamental_from_motion
+from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
@@ -182,6 +184,20 @@ def test_planes(tmp_path, capsys):
     assert errors["kornia-dlt"] > 20
     assert "20% outliers" in capsys.readouterr().out
     assert planes.corner_error(None, torch.eye(3).double(), torch.zeros(4, 2).double()) == planes.MAX_ERROR
+
+
+def test_photographs_of_planes(tmp_path, capsys):
+    """The store has a plane, which counts, and a scene with relief, which does not."""
+    store = synthetic_store(2, points=200, scenes=["orbit"])
+    matches = random_planes(1, 1, 200, torch.Generator().manual_seed(0))
+    rows = store.rows(1)
+    store.points1[rows], store.points2[rows] = matches.exact1[0, : len(rows)], matches.exact2[0, : len(rows)]
+    write_store(tmp_path / "store.h5", replace(store, ratio=np.full_like(store.ratio, 0.5)))
+    planes.main(["--photographs", str(tmp_path / "store.h5"), "--csv", str(tmp_path / "planes.csv")])
+    header, *rows = read_csv(tmp_path / "planes.csv")
+    assert header == ["estimator", *planes.HEADER[2:]]
+    assert {row[0]: float(row[1]) for row in rows}[planes.LEARNED] > 90
+    assert "1 pairs of photographs" in capsys.readouterr().out
 
 
 def test_refined_matches_beside_found_and_tracked_ones(tmp_path):
