@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.moments import Evidence, normal_equations
+from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.geometry.checks import safe_divisor
+from kornia_learnnorm.geometry.dlt import normal_equations
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 

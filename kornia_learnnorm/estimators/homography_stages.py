@@ -15,13 +15,11 @@ from kornia_learnnorm.estimators.moments import (
     evenly_ranked,
     geometric_scale,
     least_cost,
-    normal_equations,
 )
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.estimators.stages import Refinement
-from kornia_learnnorm.geometry.checks import safe_divisor
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.models.homography import Homography, UnitMatrix, solve_four_points
+from kornia_learnnorm.models.homography import Homography, solve_four_points, squared_distances
 
 __all__ = ["HomographyRefinement"]
 
@@ -112,48 +110,9 @@ class HomographyRefinement(Refinement):
     def _descend(
         self, M: Tensor, evidence: tuple[Tensor, Tensor], weigh: Callable[[Tensor], Tensor], steps: int
     ) -> Tensor:
-        r"""Return the matrices (B, K, 3, 3) after steps of reweighted least squares; differentiable.
-
-        Each is a Gauss-Newton step of new weights, with the gradient of :math:`\sum_i w_i \epsilon_i^\top C_i^{-1}
-        \epsilon_i`: with :math:`\lambda = C^{-1} \epsilon` it is that of :math:`\sum_i w_i (\epsilon_i^\top C_i^{-1}
-        \epsilon_i - \lambda_i^\top C_i \lambda_i)` where :math:`C_i^{-1}` and :math:`\lambda_i` are held.
-        """
+        """Return the matrices (B, K, 3, 3) after steps of reweighted least squares; differentiable."""
         terms, products = evidence
         for _ in range(steps):
-            p, q, a, b, c, volume = self.model.sampson_parts(M, terms)
-            first, second = (c * p - b * q) / volume, (a * q - b * p) / volume
-            weights = weigh(p * first + q * second)
-            weights = weights / safe_divisor(weights.sum(2, keepdim=True))
-            M = self._step(M, terms, products, weights, (first, second), (a, b, c, volume))
+            parts = self.model.sampson_parts(M, terms)
+            M = self.model.reweighted_step(M, terms, products, parts, weigh(squared_distances(parts)))[0]
         return M
-
-    def _step(
-        self,
-        M: Tensor,
-        terms: Tensor,
-        products: Tensor,
-        weights: Tensor,
-        multipliers: tuple[Tensor, Tensor],
-        covariance: tuple[Tensor, ...],
-    ) -> Tensor:
-        """Return the matrices after a step with weights (B, K, N)."""
-        u, v = terms[:, None, 3], terms[:, None, 4]
-        (first, second), (a, b, c, volume) = multipliers, covariance
-        share = weights / volume
-        w11, w12, w22 = share * c, -share * b, share * a
-        w1, w2 = w11 * u + w12 * v, w12 * u + w22 * v
-        depth = weights * (first.square() + second.square())
-        rows = torch.stack([w11, w12, w22, -w1, -w2, w1 * u + w2 * v, depth], 2)
-        S11, S12, S22, S1, S2, S3, depths = torch.unflatten(rows @ products.mT[:, None], 3, (3, 3)).unbind(2)
-        moments = torch.cat([torch.cat(row, 3) for row in ([S11, S12, S1], [S12, S22, S2], [S1, S2, S3])], 2)
-        L = torch.stack([first, second, -(u * first + v * second)], 2)
-        L = (L * weights[:, :, None]) @ L.mT
-        flat, last = torch.diag(M.new_tensor([1.0, 1.0, 0.0])), torch.diag(M.new_tensor([0.0, 0.0, 1.0]))
-        held = L[..., :, None, :, None] * flat[:, None] + last[:, None, :, None] * depths[..., None, :, None, :]
-        difference = moments - held.flatten(4, 5).flatten(2, 3)
-        D = UnitMatrix(M.flatten(0, 1).mT).tangents()  # moments are those of row-major entries
-        h = M.flatten(0, 1).flatten(1)[..., None]
-        normal, gradient = normal_equations(moments.flatten(0, 1), difference.flatten(0, 1) @ h, D)
-        moved = h - D @ torch.linalg.solve_ex(normal, gradient)[0]
-        unit: Tensor = moved / torch.linalg.vector_norm(moved, dim=1, keepdim=True)
-        return unit.view_as(M)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.dlt import null_space
+from kornia_learnnorm.geometry.dlt import normal_equations, null_space
 
 __all__ = [
     "Evidence",
@@ -26,14 +26,12 @@ __all__ = [
     "fit_samples",
     "geometric_scale",
     "least_cost",
-    "normal_equations",
     "pick",
 ]
 
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
 MIN_PIVOT = 1e-6  # of the largest one, of a minimal sample that is not degenerate, such as by drawing a match twice
 LARGE_SAMPLE = 20  # matches of a sample that averages their noise: most are right in sets of few outliers
-DAMPING = 1e-9  # of the mean diagonal of the normal matrix, added to it
 
 
 class Evidence(NamedTuple):
@@ -132,18 +130,6 @@ def descend(
         lower = new.mT @ difference @ new <= e.mT @ pull + torch.finfo(M.dtype).eps
         state, F_mat = choose(lower, moved, state), torch.where(lower, moved_F, F_mat)
     return state
-
-
-def normal_equations(M: Tensor, pull: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal matrices (B, P, P) of steps along tangents, a little damped, and the gradients (B, P, 1).
-
-    ``pull`` (B, 9, 1) is half of the derivative of the cost by the entries.
-    """
-    along = tangents.mT
-    normal = along @ M @ tangents
-    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
-    eye = torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
-    return normal + damping * eye, along @ pull
 
 
 def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float) -> Callable[[Tensor], Tensor]:

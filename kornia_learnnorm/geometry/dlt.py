@@ -1,4 +1,4 @@
-r"""Linear algebra of the DLT: design matrix and null vector.
+r"""Linear algebra: design matrix and null vector of the DLT, normal equations of least-squares steps.
 
 Every function is batched and has derivatives that stay finite on degenerate input.
 """
@@ -19,6 +19,7 @@ NINTH_ROW = (0.118, -0.264, 0.354, -0.028, -0.41, 0.208, -0.174, 0.444, 0.062)
 # Relative gap up to which rows are linearly dependent but for rounding.
 DEPENDENT_GAP = {dtype: 256 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
 MAX_ZERO_VALUE = 1e-10  # relative singular value up to which dependent rows have another null vector
+DAMPING = 1e-9  # of the mean diagonal of the normal matrix, added to it
 
 
 def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
@@ -191,3 +192,15 @@ def _newton_step(v: Tensor, image: Tensor, others: Tensor, inverse_gap: Tensor) 
     """Return the vector after a step to the last eigenvector of a Gram matrix, of which ``image`` is the product."""
     image = image - (v * image).sum(-1, keepdim=True) / (v * v).sum(-1, keepdim=True) * v
     return v - (others.mT @ (inverse_gap * (others @ image[..., None])[..., 0])[..., None])[..., 0]
+
+
+def normal_equations(M: Tensor, pull: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal matrices (B, P, P) of steps along tangents, a little damped, and the gradients (B, P, 1).
+
+    ``pull`` (B, 9, 1) is half of the derivative of the cost by the entries.
+    """
+    along = tangents.mT
+    normal = along @ M @ tangents
+    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
+    eye = torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
+    return normal + damping * eye, along @ pull

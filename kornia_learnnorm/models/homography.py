@@ -5,6 +5,7 @@ weights, unless three of them are on a line. On its manifold it is a matrix of u
 it.
 """
 
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
@@ -12,6 +13,8 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from kornia_learnnorm.geometry.checks import check_choice, safe_divisor
+from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
+from kornia_learnnorm.geometry.dlt import normal_equations
 from kornia_learnnorm.geometry.matrices import cofactors, determinant, inverse
 from kornia_learnnorm.models.contract import TwoViewModel
 
@@ -117,8 +120,8 @@ class Homography(TwoViewModel):
         The second tensor, the inverse of the mean eigenvalue of :math:`J J^\top`, turns squared algebraic residuals
         into about as much.
         """
-        p, q, a, b, c, volume = self.sampson_parts(M, terms)
-        return (c * p.square() - 2 * b * p * q + a * q.square()) / volume, 2 / (a + c)
+        parts = self.sampson_parts(M, terms)
+        return squared_distances(parts), 2 / (parts[2] + parts[4])
 
     def sampson_parts(self, M: Tensor, terms: Tensor) -> tuple[Tensor, ...]:
         r"""Return the residuals p, q, then a, b, c of :math:`J J^\top = [[a, b], [b, c]]` and its determinant.
@@ -152,6 +155,59 @@ class Homography(TwoViewModel):
             return super().score_squares(M, terms, threshold)
         return self.sampson_squares(M, terms)[0] / threshold**2
 
+    def reweighted_fit(self, x1: Tensor, x2: Tensor, M: Tensor, losses: Sequence[Loss]) -> Fit | None:
+        """Return matrices fitted by least squares of the Sampson distances; None for others."""
+        if self.distance == "symmetric":
+            return None
+        # Steps are of points whose last coordinate is one; their unit is about the size of both images.
+        unit = (x1[2, 0] * x2[2, 0]).sqrt()
+        to_unit1, to_unit2 = (torch.diag(torch.stack([unit, unit, x[2, 0]])) / unit for x in (x1, x2))
+        x1, x2 = (torch.cat([x[:2] / unit, torch.ones_like(x[2:])]) for x in (x1, x2))
+        terms, products = self.sampson_terms(x1, x2)[None], (x1[:, None] * x1).flatten(0, 1)[None]
+        fitted = self.state(inverse(to_unit2) @ M @ to_unit1).M[None]
+        for loss in losses:
+            parts = self.sampson_parts(fitted, terms)
+            values, weights = loss(squared_distances(parts) * unit.square())
+            fitted, gain = self.reweighted_step(fitted, terms, products, parts, weights)
+        found, cost = fitted.isfinite().all(-1).all(-1)[0], values.sum(-1)[0]
+        M = torch.where(found[:, None, None], self.state(to_unit2 @ fitted[0] @ inverse(to_unit1)).M, M)
+        share = gain[0] * weights.sum(-1)[0] * unit.square() / cost
+        return Fit(M, torch.where(found, cost, torch.inf), share)
+
+    def reweighted_step(
+        self, M: Tensor, terms: Tensor, products: Tensor, parts: tuple[Tensor, ...], weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        r"""Return matrices (B, K, 3, 3) after a step of weighted least squares, and what it gains of the mean, (B, K).
+
+        ``products`` (B, 9, N) are those of the points of view 1, ``parts`` those of :meth:`sampson_parts`, weights
+        (B, K, N). It is a Gauss-Newton step with the gradient of :math:`\sum_i w_i \epsilon_i^\top C_i^{-1}
+        \epsilon_i`: with :math:`\lambda = C^{-1} \epsilon` it is that of :math:`\sum_i w_i (\epsilon_i^\top C_i^{-1}
+        \epsilon_i - \lambda_i^\top C_i \lambda_i)` where :math:`C_i^{-1}` and :math:`\lambda_i` are held.
+        """
+        u, v = terms[:, None, 3], terms[:, None, 4]
+        p, q, a, b, c, volume = parts
+        first, second = (c * p - b * q) / volume, (a * q - b * p) / volume
+        weights = weights / safe_divisor(weights.sum(2, keepdim=True))
+        share = weights / volume
+        w11, w12, w22 = share * c, -share * b, share * a
+        w1, w2 = w11 * u + w12 * v, w12 * u + w22 * v
+        depth = weights * (first.square() + second.square())
+        rows = torch.stack([w11, w12, w22, -w1, -w2, w1 * u + w2 * v, depth], 2)
+        S11, S12, S22, S1, S2, S3, depths = torch.unflatten(rows @ products.mT[:, None], 3, (3, 3)).unbind(2)
+        moments = torch.cat([torch.cat(row, 3) for row in ([S11, S12, S1], [S12, S22, S2], [S1, S2, S3])], 2)
+        L = torch.stack([first, second, -(u * first + v * second)], 2)
+        L = (L * weights[:, :, None]) @ L.mT
+        flat, last = torch.diag(M.new_tensor([1.0, 1.0, 0.0])), torch.diag(M.new_tensor([0.0, 0.0, 1.0]))
+        held = L[..., :, None, :, None] * flat[:, None] + last[:, None, :, None] * depths[..., None, :, None, :]
+        difference = moments - held.flatten(4, 5).flatten(2, 3)
+        D = UnitMatrix(M.flatten(0, 1).mT).tangents()  # moments are those of row-major entries
+        h = M.flatten(0, 1).flatten(1)[..., None]
+        normal, gradient = normal_equations(moments.flatten(0, 1), difference.flatten(0, 1) @ h, D)
+        step = torch.linalg.solve_ex(normal, gradient)[0]
+        moved = h - D @ step
+        unit: Tensor = moved / torch.linalg.vector_norm(moved, dim=1, keepdim=True)
+        return unit.view_as(M), (step.mT @ gradient).view(M.shape[:2])
+
     def is_degenerate(self, state: Any) -> Tensor:
         """Return which matrices are singular."""
         return determinant(state.M).abs() < MIN_DETERMINANT
@@ -177,6 +233,12 @@ class UnitMatrix(NamedTuple):
         """Return the state after a step, (B, 8)."""
         moved = self.M.mT.flatten(1) + (self.tangents() @ step[..., None])[..., 0]
         return type(self)(torch.unflatten(normalize(moved, dim=-1), -1, (3, 3)).mT)
+
+
+def squared_distances(parts: tuple[Tensor, ...]) -> Tensor:
+    """Return squared Sampson distances from what :meth:`Homography.sampson_parts` gives."""
+    p, q, a, b, c, volume = parts
+    return (c * p.square() - 2 * b * p * q + a * q.square()) / volume
 
 
 def solve_four_points(x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:

@@ -205,3 +205,22 @@ def test_minimizer():
     assert best.converged.all()
     assert (best.cost < before).all()
     assert corner_error(model.carry(best.state.matrix(), T.inverse(), T.inverse()), H) < 2
+
+
+def test_reweighted_fit_of_a_homography():
+    """It ends where Levenberg and Marquardt's steps do, in coordinates as RANSAC's; a matrix that is none stays."""
+    points1, points2, H = plane(noise=0.5, outliers=0.2)
+    x1, x2 = homogeneous(points1[0] - 300, 250.0).mT, homogeneous(points2[0] - 300, 90.0).mT
+    T1, T2 = (torch.tensor([[1, 0, -300], [0, 1, -300], [0, 0, w]]).double() for w in (250, 90))
+    model, loss = Homography(), GemanMcClure(3.0)
+    start = unit_matrix(model.carry(H[:1], T1.inverse(), T2.inverse()) + 0.001 * uniform(3, 3, 3, low=-1))
+    fit = model.reweighted_fit(x1, x2, torch.cat([start, torch.full_like(start[:1], torch.nan)]), 12 * [loss])
+    cost = RobustCost(model, x1[None], x2[None], torch.ones_like(x1[:1]), loss)
+    best = minimize(cost, model.state(start), 100, 1e-9)[1]
+    optimum, found = (model.carry(M, T1, T2) for M in (best.state.matrix(), fit.F_mat[:3]))
+    assert corner_error(found, optimum) < 1e-6
+    torch.testing.assert_close(fit.cost[:3], best.cost, rtol=1e-6, atol=0)
+    assert (fit.gain[:3] < 1e-9).all()
+    assert fit.cost[3].isinf()
+    assert fit.F_mat[3].isnan().all()
+    assert Homography("symmetric").reweighted_fit(x1, x2, start, [loss]) is None
