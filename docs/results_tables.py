@@ -68,6 +68,14 @@ COMPARED = {  # in the picture of the landing page and the README, each divided 
     "RANSAC": ("RANSAC", ORANGE, "-"),
     "learned:robust-synthetic": ("LearnedEightPoint", BLUE, "-"),
 }
+PLANES = {  # in the picture of homographies
+    "kornia": ("Kornia RANSAC", GREEN, "--"),
+    "opencv-usac-magsac": ("OpenCV MAGSAC", PURPLE, "-"),
+    "poselib": ("PoseLib", GREEN, "-"),
+    "pysuperansac": ("SupeRANSAC", GREY, "-"),
+    "RANSAC": ("RANSAC", ORANGE, "-"),
+    "learned:robust-homography": ("LearnedHomography", BLUE, "-"),
+}
 VIEWS = {"kitti_06": "Street from a car (KITTI 06)", "tum_fr3_office": "Office, camera in hand (TUM)"}
 POSE_STORES = {"photographs": "photos", **STORES}
 DETECTORS = {"xfeat": "XFeat", "aliked": "ALIKED"}
@@ -219,12 +227,26 @@ def poses_table(column: str, matcher: str, name: str = "poses") -> Markdown:
     return cross_table(column, {(r[1], _store_words(r[0])): r[place] for r in rows if r[0].endswith(matcher)})
 
 
-def planes_table(column: str, outliers: str) -> Markdown:
-    """Return a number of planes.csv by estimator and number of matches, at one share of outliers."""
+def planes_plot() -> HTML:
+    """Draw the median corner errors of planes.csv against the number of matches, a panel for each share of outliers."""
     header, *rows = read_rows("planes")
-    place = header.index(column)
-    cells = {(row[2], f"N = {row[1]}"): row[place] for row in rows if row[0] == outliers}
-    return cross_table(f"{column}, {outliers} outliers", cells)
+    names, size, error = header.index("estimator"), header.index("N"), header.index("median")
+    with plt.rc_context(PLAIN):
+        shares = list(dict.fromkeys(row[0] for row in rows))
+        figure, axes = plt.subplots(1, len(shares), figsize=(6, 3.4), layout="constrained", sharex=True, sharey=True)
+        for share, ax in zip(shares, axes, strict=True):
+            for name, (label, colour, line) in PLANES.items():
+                drawn = [(int(row[size]), float(row[error])) for row in rows if (row[0], row[names]) == (share, name)]
+                width = 2.2 if name.startswith("learned") else 1.2
+                ax.plot(*zip(*drawn, strict=True), line, marker=".", color=colour, label=label, linewidth=width)
+            ax.set(title=f"{share} outliers", xlabel="matches", xscale="log", yscale="log", ylim=(0.3, 20))
+            ax.set_xticks(*zip(*((n, str(n)) for n in dict(drawn)), strict=True))
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.minorticks_off()
+            ax.grid(visible=True)
+        axes[0].set_ylabel("median corner error, px", fontsize=9)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        return show(figure, "Median corner error of homographies against the number of matches")
 
 
 def scores_table(title: str) -> Markdown:
