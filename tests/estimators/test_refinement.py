@@ -22,7 +22,6 @@ from kornia_learnnorm.models.fundamental import Fundamental
 # Distances in pixels, those of Sampson with signs.
 DISTANCES = {"sampson": ref.numpy_sampson, "symmetric": ref.epipolar_distances}
 LOSSES = [squared_loss, Huber(0.5), Cauchy(0.5), GemanMcClure(2.0), Truncated(3.0)]
-NAMED = ["driving", "handheld", "orbit"]
 both = pytest.mark.parametrize("calibrated", [False, True])
 
 
@@ -84,7 +83,7 @@ def test_smoke(calibrated, batch_size, device, dtype):
     assert all(value.device.type == device.type for value in found)
 
 
-@pairwise(name=NAMED, kind=DISTANCES, num_points=[12, 40], calibrated=[False, True])
+@pairwise(name=["driving", "handheld", "orbit"], kind=DISTANCES, num_points=[12, 40], calibrated=[False, True])
 def test_agrees_with_numpy(name, kind, num_points, calibrated):
     scene = scenes(name, 3, num_points, noise=0.5)
     refine, (points, cameras), start = problem(calibrated, name, 3, num_points)
@@ -157,14 +156,7 @@ def test_robust_losses_see_past_outliers(loss):
     assert found < 0.5 * without
 
 
-@given(
-    st.integers(0, 2**31),
-    st.sampled_from([8, 9, 30]),
-    st.sampled_from(sorted(SCENES)),
-    st.sampled_from(sorted(DISTANCES)),
-    st.sampled_from(LOSSES),
-    st.integers(0, 12),
-)
+@given(st.integers(0, 2**31), *map(st.sampled_from, ([8, 9, 30], [*SCENES], [*DISTANCES], LOSSES, range(13))))
 def test_cost_never_rises_and_rank_two_holds(seed, num_points, name, kind, loss, max_iterations):
     points1, points2 = correspondences(name, 5, num_points, seed)
     F0 = find_fundamental(points1, points2)
@@ -314,19 +306,13 @@ def test_wrong_arguments():
             refine(**{"points1": POINTS, "points2": POINTS, **start, **cameras} | wrong)
 
 
-def framed(num_points: int = 40, **options):
-    """Homogeneous points of about unit size, a matrix to start from and weights."""
-    points = [(p - 300) / 200 for p in correspondences("handheld", 6, num_points, **options)]
-    x1, x2 = (torch.from_numpy(ref.homogeneous(p.numpy())) for p in points)
-    return x1, x2, kln.find_fundamental(*points), uniform(6, num_points, low=0.2)
-
-
 @pytest.mark.parametrize("num_points", [12, 40])
 def test_is_the_optimum_at_its_scale(num_points):
     """Dividing a set's points by its scale gives Geman and McClure's loss at one pixel."""
-    x1, x2, F_mat, weights = framed(num_points, noise=0.3)
+    points1, points2 = ((p - 300) / 200 for p in correspondences("handheld", 6, num_points, noise=0.3))
+    F_mat, weights = find_fundamental(points1, points2), uniform(6, num_points, low=0.2)
+    x1, x2 = (torch.from_numpy(ref.homogeneous(p.numpy())) for p in (points1, points2))
     found = refine_unrolled(Fundamental(), x1.mT, x2.mT, F_mat, weights, 60)
-    points1, points2 = x1[..., :2], x2[..., :2]
     distance = kln.sampson_distance(points1, points2, F_mat)
     mean = ((weights * (distance**2 + 1e-10).log() / 2).sum(1) / weights.sum(1)).exp()
     effective = (weights.sum(1) ** 2 / (weights**2).sum(1)).clamp(min=8)
