@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from make_sequences import blobs, centroids, texture
+from pairwise import pairwise
 
 from kornia_learnnorm.data import images
 
@@ -87,8 +88,7 @@ class TestBroken:
 
 
 class TestSizeAndTurn:
-    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
-    @pytest.mark.parametrize("orientation", range(1, 9))
+    @pairwise(suffix=[".png", ".jpg", ".tif"], orientation=range(1, 9))
     def test_as_opencv_decodes_it(self, tmp_path, suffix, orientation):
         path, exif = tmp_path / f"turned{suffix}", Image.Exif()
         exif[0x0112] = orientation
@@ -171,8 +171,7 @@ class TestScaling:
 
 
 class TestContentMask:
-    @pytest.mark.parametrize("sides", [(30, 30, 0, 0), (0, 0, 25, 0), (1, 0, 0, 2), (5, 7, 9, 11)])
-    @pytest.mark.parametrize("level", [0, 2])
+    @pairwise(sides=[(30, 30, 0, 0), (0, 0, 25, 0), (1, 0, 0, 2), (5, 7, 9, 11)], level=[0, 2])
     def test_frame(self, sides, level):
         widths = (sides[:2], sides[2:])
         image = np.pad(np.maximum(texture(), 40), widths, constant_values=level)
@@ -214,9 +213,7 @@ class TestReadMask:
 
     def test_wrong(self, tmp_path):
         cv2.imwrite(str(tmp_path / "m.png"), np.ones((4, 5), np.uint8))
-        for size, message in [
-            ((4, 5), r"m\.png has 5 x 4 pixels, its image 4 x 5"),
-            ((5, 4), r"m\.png has no pixel above 127"),
-        ]:
-            with pytest.raises(ValueError, match=message):
-                images.read_mask(tmp_path / "m.png", size)
+        with pytest.raises(ValueError, match=r"m\.png has 5 x 4 pixels, its image 4 x 5"):
+            images.read_mask(tmp_path / "m.png", (4, 5))
+        with pytest.raises(ValueError, match=r"m\.png has no pixel above 127"):
+            images.read_mask(tmp_path / "m.png", (5, 4))
