@@ -103,7 +103,6 @@ def test_images_of_stores(folder, tmp_path):
 
 @pytest.mark.parametrize("kind", ["learned", "eight-point", "RANSAC"])
 def test_the_loss_is_that_of_the_other_half(folder, kind):
-    """Against a computation half by half."""
     sets = source(folder).draw(2, 32, seeded())
     points = all_matches(sets)
     moved = kln.MatchRefiner()(sets.image1, sets.image2, *points)
