@@ -14,10 +14,13 @@ from hypothesis import strategies as st
 from pairwise import pairwise
 from references import check_gradients, check_refuses, corner_error, numpy_sampson, signless, true_essential, up_to_sign
 from scenes import DTYPES, inputs, plane, rewrite_weights, roughened, scenes, seeded, shaken_estimator, uniform
+from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators import pose_stages
+from kornia_learnnorm.estimators.learned import inlier_probability
 from kornia_learnnorm.estimators.match_features import masked_median
+from kornia_learnnorm.geometry.problem import LinearProblem
 
 CLASSES = {"fundamental": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}
 LAYERS = {
@@ -109,6 +112,14 @@ def test_weights_when_views_are_swapped(kind):
     points2 = torch.cat([600 * uniform(3, 5, 2), points2[:, 5:]], 1)
     found, swapped = layer.estimate(points1, points2, *cameras), layer.estimate(points2, points1, *cameras[::-1])
     assert torch.allclose(swapped.weights, found.weights, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["fundamental", "homography"])
+def test_gradients_of_probabilities(kind):
+    model, (points1, points2) = LAYERS[kind]().model, inputs(kind, 2, 20)
+    problem = LinearProblem.from_points(points1, points2, None, model)
+    M, logits = uniform(2, 3, 3).requires_grad_(), uniform(2, 20).requires_grad_()
+    assert gradcheck(lambda *given: inlier_probability(model, problem, *given, problem.determined), (M, logits))
 
 
 @pytest.mark.parametrize("kind", ["fundamental", "homography"])

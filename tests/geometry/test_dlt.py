@@ -101,6 +101,14 @@ class TestSmallestSingularVectors:
         assert gradient.isfinite().all()
 
 
+def test_transposed_are_determinant_times_inverse(dtype):
+    A = uniform(20, 3, 3, low=-1, dtype=dtype)
+    np.testing.assert_allclose(matrices.determinant(A).numpy(), np.linalg.det(A.numpy()), atol=1e-6)
+    expected = np.linalg.det(A.numpy())[:, None, None] * np.linalg.inv(A.numpy())
+    atol = 2e-6 if dtype == torch.float32 else 1e-14
+    np.testing.assert_allclose(matrices.cofactors(A).mT.numpy(), expected, atol=atol)
+
+
 def problem_of(points1, points2, weights=None):
     return LinearProblem.from_points(points1, points2, weights, Fundamental())
 
