@@ -18,8 +18,6 @@ from kornia_learnnorm.estimators.robust_losses import squared_loss
 
 LOSSES = {"squared": squared_loss, "Huber": kln.Huber(0.5), "Cauchy": kln.Cauchy(0.5)}
 LOSSES |= {"Geman-McClure": kln.GemanMcClure(2.0), "truncated": kln.Truncated(3.0)}
-
-
 NORMALIZERS = {"identity": kln.Identity(), "whitening": Whitening(), "reweighted": kln.ReweightedWhitening()}
 LINEAR = {name: partial(find_fundamental, normalizer=normalizer) for name, normalizer in NORMALIZERS.items()}
 LINEAR |= {"projection": find_fundamental, "optimal": partial(find_fundamental, rank2="optimal")}

@@ -22,8 +22,6 @@ from make_sequences import texture  # noqa: E402 (needs Pillow, which comes with
 pytestmark = pytest.mark.numerical
 WIDTH, HEIGHT = 120, 90
 SHIFT = 0.4, -0.3  # of the second image against the first, pixels
-
-
 trained = partial(roughened, kln.MatchRefiner)
 
 

@@ -16,8 +16,6 @@ K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
 R = np.array([[0.9998, 0, 0.02], [0, 1, 0], [-0.02, 0, 0.9998]])
 t = np.array([0.4, 0.05, 0.1])
 H = torch.from_numpy(K @ (R + np.outer(t, [0, 0, 1]) / 5) @ np.linalg.inv(K))  # of the plane Z = 5
-
-
 ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # epipolar lines are the rows
 
 

@@ -10,12 +10,6 @@ from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
 
 
-@pytest.fixture(scope="module")
-def model(written):
-    """A model and its images, not to be changed."""
-    return written / "colmap"
-
-
 def read(folder):
     return read_colmap(folder / "model", folder / "images")
 
@@ -25,7 +19,8 @@ def set_camera(folder, camera: str) -> None:
 
 
 class TestReadColmap:
-    def test_binary_model(self, model, tmp_path):
+    def test_binary_model(self, written, tmp_path):
+        model = written / "colmap"
         pycolmap.Reconstruction(str(model / "model")).write_binary(str(tmp_path))
         for text, binary in zip(read(model), read_colmap(str(tmp_path), str(model / "images")), strict=True):
             assert text.name == binary.name
@@ -80,8 +75,9 @@ class TestReadColmap:
 
 class TestCovisiblePairs:
     @pytest.mark.parametrize("min_points", [1, 88, 96, 97])
-    def test_common_points(self, model, min_points):
+    def test_common_points(self, written, min_points):
         """As many as the text of the model lists."""
+        model = written / "colmap"
         lines = (model / "model" / "images.txt").read_text().splitlines()[1:]
         points = [set(line.split()[2::3]) - {"-1"} for line in lines[1::2]]
         seen = dict(zip([line.split()[-1] for line in lines[::2]], points, strict=True))

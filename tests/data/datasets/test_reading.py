@@ -65,7 +65,6 @@ def test_splits_and_ground_truth(written):
 
 WHOLE = 0  # in place of the number of a line
 
-
 # File, line, its text, and the message. A line None is taken out, a file None is removed.
 MALFORMED = [
     ("poses/00.txt", 2, "1 2 3", r"00\.txt, line 2: the 12 numbers of a pose expected, got '1 2 3'"),
