@@ -74,6 +74,12 @@ def numpy_whitening(points, weights=None) -> np.ndarray:
     return np.array(T)
 
 
+def rank_three(points1, points2, weights=None) -> Tensor:
+    """The DLT's solution in Hartley's coordinates, of rank 3, in pixels."""
+    T1, T2 = numpy_hartley(points1, weights), numpy_hartley(points2, weights)
+    return torch.from_numpy(unit(T2.swapaxes(-1, -2) @ null_matrices(points1, points2, T1, T2, weights) @ T1))
+
+
 def epipolar_distances(points1, points2, F) -> np.ndarray:
     """The sum of both points' distances to their epipolar lines, line by line."""
     x1, x2 = homogeneous(np.asarray(points1)), homogeneous(np.asarray(points2))

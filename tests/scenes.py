@@ -14,6 +14,9 @@ from kornia_learnnorm.geometry.transforms import paper_transform
 
 SCENES = {"random": random_scenes, "driving": forward_driving, "handheld": handheld, "orbit": orbit}
 DTYPES = [torch.float32, torch.float64]
+ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # x2^T F x1 = y1 - y2; symmetric distance: twice |y1 - y2|
+ORIGIN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]])  # both epipoles are at the origin
+SMALL = {"width": 16, "depth": 2, "stages": 2, "samples": 8}  # of learned layers
 
 
 def plane(batch_size: int = 3, number: int = 40, noise: float = 0.0, outliers: float = 0.0):
@@ -64,6 +67,14 @@ def correspondences(name: str = "handheld", *args, **options) -> tuple[Tensor, T
     return scene.points1, scene.points2
 
 
+def inputs(kind: str, batch_size: int, num_points: int, seed: int = 0, scene: str = "handheld") -> list[Tensor]:
+    """Points of scenes, or of planes with some noise, and the cameras of a pose."""
+    if kind == "homography":
+        return [*plane(batch_size, num_points, noise=0.2)[:2]]
+    found = scenes(scene, batch_size, num_points, seed)
+    return [found.points1, found.points2, *((found.K1, found.K2) if kind == "pose" else ())]
+
+
 def uniform(*shape: int, low: float = 0.0, high: float = 1.0, seed: int = 0, dtype=torch.float64) -> Tensor:
     return torch.empty(shape, dtype=dtype).uniform_(low, high, generator=seeded(seed))
 
@@ -105,11 +116,18 @@ def shaken_estimator(seed: int = 0, **options) -> LearnedEightPoint:
 def roughened(cls: type, **options) -> torch.nn.Module:
     """A small learned layer in float64 whose weights all differ from one another, as after training."""
     torch.manual_seed(0)
-    layer, generator = cls(**{"width": 16, "depth": 2, "stages": 2, "samples": 8} | options).double().eval(), seeded(1)
+    small = {"patch_size": 9, "width": 8} if cls is kln.MatchRefiner else SMALL
+    layer, generator = cls(**small | options).double().eval(), seeded(1)
     with torch.no_grad():
         for parameter in layer.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype))
     return layer
+
+
+def refined(points1, points2, weights=None, steps: int = 5, **options) -> Tensor:
+    """Some steps of Levenberg-Marquardt from the linear solution."""
+    start = kln.find_fundamental(points1, points2, weights).detach()
+    return kln.refine_fundamental(points1, points2, start, weights, max_iterations=steps, **options).F_mat
 
 
 LAYERS = {

@@ -113,38 +113,34 @@ class TestPairs:
         assert {record["crashed"] for record in records} == {None}
 
 
-class TestRealPairs:
-    @pytest.fixture
-    def real_pair(self, case):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = case.R.mT, -case.R.mT @ case.t  # camera 2 to camera 1, which is the world
-        first = Frame(Path("1.png"), "1.png", "room", (160, 120), case.K.numpy(), np.eye(4))
-        second = Frame(Path("2.png"), "2.png", "room", (160, 120), case.K.numpy(), pose)
-        order = torch.randperm(len(case.points1), generator=torch.Generator().manual_seed(0))[:60]
-        matches = case.points1[order], case.points2[order]
-        given = dict.fromkeys(("size1", "size2"), (160, 120))
-        matched = SimpleNamespace(estimate=lambda **K: kln.estimate_matches(*matches, **given, **K))
-        return real_pairs.Pair("tum", 3, FramePair(first, second), True, "sift+nearest", matched)
+def test_real_pairs_get_the_same_matches_and_cameras_where_known(case):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = case.R.mT, -case.R.mT @ case.t  # camera 2 to camera 1, which is the world
+    first = Frame(Path("1.png"), "1.png", "room", (160, 120), case.K.numpy(), np.eye(4))
+    second = Frame(Path("2.png"), "2.png", "room", (160, 120), case.K.numpy(), pose)
+    order = torch.randperm(len(case.points1), generator=torch.Generator().manual_seed(0))[:60]
+    matches = case.points1[order], case.points2[order]
+    given = dict.fromkeys(("size1", "size2"), (160, 120))
+    matched = SimpleNamespace(estimate=lambda **K: kln.estimate_matches(*matches, **given, **K))
+    real_pair = real_pairs.Pair("tum", 3, FramePair(first, second), True, "sift+nearest", matched)
+    seen = []
 
-    def test_all_get_the_same_matches_and_cameras_where_known(self, real_pair, case):
-        given = []
+    def peer(x1, x2, sizes, seed, threshold, *cameras):
+        seen.append((len(x1), len(cameras)))
+        return true_matrix(case).numpy() if len(x1) > 20 else None
 
-        def peer(x1, x2, sizes, seed, threshold, *cameras):
-            given.append((len(x1), len(cameras)))
-            return true_matrix(case).numpy() if len(x1) > 20 else None
-
-        records = real_pairs.measure(real_pair, {"poselib": peer}, (8, 20, 0))
-        assert [record["size"] for record in records] == [0, 8, 20]
-        assert given == [(60, 1), (8, 1), (20, 1)]
-        assert records[0]["poselib"] < 1e-5
-        assert [record["poselib"] for record in records[1:]] == [math.inf] * 2
-        own = records[0]["estimate_pair"]
-        assert (own["model"], own["inliers"]) == ("fundamental", 60)
-        assert own["error"] < 1e-3
-        assert own["true"] < 1e-3
-        assert records[1]["estimate_pair"]["refused"] == "few_matches"
-        assert real_pairs.measure(real_pair._replace(calibrated=False), {"poselib": peer}, ())
-        assert given[-1] == (60, 0)
+    records = real_pairs.measure(real_pair, {"poselib": peer}, (8, 20, 0))
+    assert [record["size"] for record in records] == [0, 8, 20]
+    assert seen == [(60, 1), (8, 1), (20, 1)]
+    assert records[0]["poselib"] < 1e-5
+    assert [record["poselib"] for record in records[1:]] == [math.inf] * 2
+    own = records[0]["estimate_pair"]
+    assert (own["model"], own["inliers"]) == ("fundamental", 60)
+    assert own["error"] < 1e-3
+    assert own["true"] < 1e-3
+    assert records[1]["estimate_pair"]["refused"] == "few_matches"
+    assert real_pairs.measure(real_pair._replace(calibrated=False), {"poselib": peer}, ())
+    assert seen[-1] == (60, 0)
 
 
 @pytest.mark.parametrize("backward", [False, True])

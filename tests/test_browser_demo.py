@@ -79,10 +79,8 @@ class TestSolve:
     def test_files_are_named_without_their_folder(self, monkeypatch, tmp_path):
         (tmp_path / "none.png").touch()
         first = demo.example_files()[0]
-        for limit, message in (
-            (10**6, "image none.png cannot be decoded: 0 bytes"),
-            (9, "image1.png has 0 MB, at most"),
-        ):
+        messages = {10**6: "image none.png cannot be decoded: 0 bytes", 9: "image1.png has 0 MB, at most"}
+        for limit, message in messages.items():
             monkeypatch.setattr(demo, "MAX_BYTES", limit)
             with pytest.raises(ValueError, match=message) as caught:
                 demo.solve(first, tmp_path / "none.png")

@@ -24,13 +24,9 @@ def example(monkeypatch):
     return importlib.import_module
 
 
-@pytest.fixture
-def synthetic(monkeypatch):
-    monkeypatch.delenv("LEARNNORM_DATA", raising=False)
-
-
 @pytest.mark.parametrize(("name", "steps", "gain"), [("predict_weights", 64, 0.3), ("guided_sampling", 20, 0.5)])
-def test_learns_from_synthetic_pairs(name, steps, gain, example, synthetic):
+def test_learns_from_synthetic_pairs(name, steps, gain, example, monkeypatch):
+    monkeypatch.delenv("LEARNNORM_DATA", raising=False)
     before, after = example(name).main(["--steps", str(steps), "--points", "128"])
     assert after < gain * before
 
@@ -40,7 +36,8 @@ def test_runs_on_real_pairs(example, real_data):
     assert 0 < min(before, after) <= max(before, after) < 10
 
 
-def test_kornia_ransac_example(example, synthetic):
+def test_kornia_ransac_example(example, monkeypatch):
+    monkeypatch.delenv("LEARNNORM_DATA", raising=False)
     results = example("kornia_ransac").main(["--samples", "100", "--pairs", "2"])
     assert len(results) == 7
     assert all(f1 > 50 and error < 3 for f1, error in results.values())

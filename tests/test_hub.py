@@ -15,7 +15,6 @@ LAYERS += [(kln.LearnedNormalizer, "crossview-synthetic"), (kln.MatchRefiner, "r
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder with the weights ``robust-tiny``."""
     hub.HubModel(kln.LearnedEightPoint.from_pretrained("robust-tiny")).save_pretrained(tmp_path / "tiny")
     return tmp_path / "tiny"
 

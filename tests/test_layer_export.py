@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 from references import signless, up_to_sign
-from scenes import correspondences, plane, scenes, shaken, shaken_estimator
+from scenes import inputs, shaken, shaken_estimator
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators import fundamental_stages, pose_stages
@@ -39,17 +39,8 @@ assert not [name for name in sys.modules if name.partition(".")[0] in ("kornia_l
 """
 
 
-def sets(batch_size: int, num_points: int, device="cpu") -> list[torch.Tensor]:
-    return [points.float().to(device) for points in correspondences("handheld", batch_size, num_points)]
-
-
-def calibrated_sets(batch_size: int, num_points: int) -> list[torch.Tensor]:
-    scene = scenes("handheld", batch_size, num_points)
-    return [value.float() for value in (scene.points1, scene.points2, scene.K1, scene.K2)]
-
-
-def planes(batch_size: int, num_points: int) -> list[torch.Tensor]:
-    return [points.float() for points in plane(batch_size, num_points, noise=1.0)[:2]]
+def sets(batch_size: int, num_points: int, kind: str = "fundamental") -> list[torch.Tensor]:
+    return [value.float() for value in inputs(kind, batch_size, num_points)]
 
 
 @torch.no_grad()
@@ -102,14 +93,14 @@ def test_any_batch_and_number_of_points_also_without_the_package(tmp_path, monke
     assert not any(value.requires_grad for value in run(points[0].requires_grad_(), points[1], **given))
 
 
-@pytest.mark.parametrize(("cls", "draw"), [(kln.LearnedRelativePose, calibrated_sets), (kln.LearnedHomography, planes)])
-def test_siblings(cls, draw, monkeypatch):
+@pytest.mark.parametrize(("cls", "kind"), [(kln.LearnedRelativePose, "pose"), (kln.LearnedHomography, "homography")])
+def test_siblings(cls, kind, monkeypatch):
     for name in ("EARLY_STEPS", "LOCAL_STEPS"):
         monkeypatch.setattr(pose_stages, name, 1)
     layer = cls(width=8, depth=1, refine_steps=1, samples=4)
     program = export_layer(layer, ["scores"]).module()
     for size in SIZES:
-        check(program, layer, *draw(*size), scores=torch.rand(size))
+        check(program, layer, *sets(*size, kind), scores=torch.rand(size))
 
 
 def test_weights_mask_and_gradients():
@@ -134,8 +125,8 @@ def test_shipped_weights(name):
     most = 12 if name.startswith("crossview") else 300
     program = export_layer(layer).module()
     for batch_size, num_points in SIZES:
-        draw = calibrated_sets if isinstance(layer, kln.LearnedRelativePose) else sets
-        check(program, layer, *draw(batch_size, min(num_points, most)))
+        kind = "pose" if isinstance(layer, kln.LearnedRelativePose) else "fundamental"
+        check(program, layer, *sets(batch_size, min(num_points, most), kind))
     if isinstance(layer, kln.EightPoint):
         check(export_layer(layer, num_points=8).module(), layer, *sets(5, 8))
 
@@ -153,7 +144,7 @@ def test_compiled_ahead_of_time(tmp_path):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 def test_program_of_a_layer_on_the_gpu():
     layer = shaken_estimator(stages=1, depth=1, refine_steps=1).cuda()
-    check(export_layer(layer).module(), layer, *sets(5, 64, "cuda"))
+    check(export_layer(layer).module(), layer, *(points.cuda() for points in sets(5, 64)))
 
 
 class TestNetworks:

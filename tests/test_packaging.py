@@ -18,7 +18,6 @@ BUILD = "from hatchling.build import build_wheel; import sys; build_wheel(sys.ar
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory):
-    """Two wheels of the repository."""
     pytest.importorskip("hatchling", reason="hatchling is not installed")
     folders = [tmp_path_factory.mktemp("wheel") for _ in range(2)]
     for folder in folders:

@@ -109,12 +109,8 @@ class TestWeights:
             ({"width": 4096, "depth": 100}, "the tensors do not fit the architecture"),  # 20 GB of weights
             ({"width": -1, "depth": 1}, "describes no normaliser of this version"),
         ]:
-            network = {"name": "CrossViewNetwork", **numbers}
-            architecture = {
-                "base": {"name": "Whitening", "floor": 1e-6},
-                "network": network,
-                "transform": "spd_transform",
-            }
+            architecture = {"base": {"name": "Whitening", "floor": 1e-6}, "transform": "spd_transform"}
+            architecture["network"] = {"name": "CrossViewNetwork", **numbers}
             metadata = {"format": "kornia_learnnorm.normalizer.v1", "architecture": json.dumps(architecture)}
             save_file({"network.set_network.head.2.bias": torch.zeros(5)}, tmp_path / "forged.safetensors", metadata)
             with pytest.raises(ValueError, match=message):

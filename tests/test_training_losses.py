@@ -7,14 +7,11 @@ import pytest
 import torch
 from pairwise import pairwise
 from references import epipolar_distances
-from scenes import scenes, uniform
+from scenes import ORIGIN, ROWS, scenes, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
 from kornia_learnnorm import BoundedEpipolarLoss, EpipolarLoss, LogEpipolarLoss
-
-ROWS = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # symmetric distance: twice |y1 - y2|
-ORIGIN = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # both epipoles are at the origin
 
 
 def rows(*differences, dtype=torch.float32):
@@ -107,8 +104,6 @@ class TestEpipolarLoss:
 
 
 class TestLossesOfSets:
-    """One number a set, against hand computation."""
-
     def test_by_hand(self):
         values = rows([1.0, 0.0], [2.0, 50.0], dtype=torch.float64)
         expected = [(4 / 8 + 0) / 2, (16 / 20 + 10_000 / 10_004) / 2]

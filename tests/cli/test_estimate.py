@@ -173,15 +173,11 @@ class TestManyPairs:
             assert row["warnings"].split() == [warning["code"] for warning in line["warnings"]]
 
     def test_lists(self, tmp_path):
-        """Of names with spaces and comments, and bad ones."""
         path = tmp_path / "list.txt"
         path.write_text("# two images\n'a b.png' c.png\n")
         assert read_pair_list(path) == [(tmp_path / "a b.png", tmp_path / "c.png")]
-        for text, message in (
-            ("'a.png b.png\n", "line 1: No clos"),
-            ("a b c\n", "line 1: .* got 'a b c'"),
-            ("\n", "no pairs"),
-        ):
+        wrong = {"'a.png b.png\n": "line 1: No clos", "a b c\n": "line 1: .* got 'a b c'", "\n": "no pairs"}
+        for text, message in wrong.items():
             path.write_text(text)
             with pytest.raises(ValueError, match=message):
                 read_pair_list(path)

@@ -7,7 +7,6 @@ from kornia_learnnorm.data.cameras import exif_camera, read_camera
 
 Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
-
 KITTI = "P{} 0 607.1928 0 0 718.856 185.2157 0 0 0 1 0\n"  # sequence 00; P0 counts
 STRECHA = "2700 0 1500\n0 2710 1000\n0 0 1\n{} 0 0\n1 0 0\n0 1 0\n0 0 1\n-14 -5 0.1\n3072 2048"
 COLMAP = {  # the centre of the top left pixel is (0.5, 0.5)

@@ -27,13 +27,6 @@ def paths(tmp_path):
     return features, matches
 
 
-def change(path, name, value=None):
-    with h5py.File(path, "r+") as file:
-        del file[name]
-        if value is not None:
-            file[name] = value
-
-
 def test_reference(paths, tmp_path):
     write_store(tmp_path / "stored.h5", read_hloc(*paths))
     got = read_store(tmp_path / "stored.h5")
@@ -61,7 +54,10 @@ def test_reference(paths, tmp_path):
     ],
 )
 def test_broken(paths, which, name, value, message):
-    change(paths[which], name, value)
+    with h5py.File(paths[which], "r+") as file:
+        del file[name]
+        if value is not None:
+            file[name] = value
     with pytest.raises(ValueError, match=message):
         read_hloc(*paths)
 

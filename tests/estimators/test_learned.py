@@ -12,8 +12,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
-from references import check_gradients, check_refuses, corner_error, numpy_sampson, signless, up_to_sign
-from scenes import DTYPES, correspondences, plane, rewrite_weights, roughened, scenes, seeded, shaken_estimator, uniform
+from references import check_gradients, check_refuses, corner_error, numpy_sampson, signless, true_essential, up_to_sign
+from scenes import DTYPES, inputs, plane, rewrite_weights, roughened, scenes, seeded, shaken_estimator, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
@@ -21,8 +21,6 @@ from kornia_learnnorm.estimators import pose_stages
 from kornia_learnnorm.estimators.learned import inlier_probability
 from kornia_learnnorm.estimators.match_features import masked_median
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.models.homography import Homography
 
 CLASSES = {"fundamental": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}
 LAYERS = {
@@ -31,21 +29,10 @@ LAYERS = {
     "homography": lambda **options: roughened(kln.LearnedHomography, **options),
 }
 LEAST = {"fundamental": 8, "pose": 5, "homography": 4}  # correspondences
-MATRICES = {
-    "fundamental": {"F_mat": (3, 3)},
-    "pose": {"E_mat": (3, 3), "F_mat": (3, 3), "R": (3, 3), "t": (3,)},
-    "homography": {"H_mat": (3, 3)},
-}
+MATRICES = {"fundamental": {"F_mat": (3, 3)}, "homography": {"H_mat": (3, 3)}}
+MATRICES |= {"pose": {"E_mat": (3, 3), "F_mat": (3, 3), "R": (3, 3), "t": (3,)}}
 every = pytest.mark.parametrize("kind", LAYERS)
 siblings = pytest.mark.parametrize("kind", ["pose", "homography"])
-
-
-def inputs(kind: str, batch_size: int, num_points: int, seed: int = 0, scene: str = "handheld") -> list[torch.Tensor]:
-    """Points of scenes, or of planes with some noise, and the cameras of a pose."""
-    if kind == "homography":
-        return [*plane(batch_size, num_points, noise=0.2)[:2]]
-    found = scenes(scene, batch_size, num_points, seed)
-    return [found.points1, found.points2, *((found.K1, found.K2) if kind == "pose" else ())]
 
 
 @pairwise(kind=LAYERS, batch_size=[0, 1, 3], more=[0, 1, 3, 55], given=["", "weights", "mask", "scores"], dtype=DTYPES)
@@ -65,12 +52,7 @@ def test_smoke(kind, batch_size, more, given, dtype, device):
 
 @every
 @settings(max_examples=5)
-@given(
-    more=st.sampled_from([0, 1, 35]),
-    seed=st.integers(0, 2**20),
-    factor=st.floats(1e-3, 1e3),
-    shift=st.floats(-1e3, 1e3),
-)
+@given(st.sampled_from([0, 1, 35]), st.integers(0, 2**20), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
 @torch.no_grad()
 def test_invariances(kind, more, seed, factor, shift):
     """To the order of the correspondences, a swap of the views, and one scale and translation of both images."""
@@ -132,9 +114,9 @@ def test_weights_when_views_are_swapped(kind):
     assert torch.allclose(swapped.weights, found.weights, atol=1e-6)
 
 
-@pytest.mark.parametrize("model", [Fundamental(), Homography()])
-def test_gradients_of_probabilities(model):
-    points1, points2 = inputs(model.name, 2, 20)
+@pytest.mark.parametrize("kind", ["fundamental", "homography"])
+def test_gradients_of_probabilities(kind):
+    model, (points1, points2) = LAYERS[kind]().model, inputs(kind, 2, 20)
     problem = LinearProblem.from_points(points1, points2, None, model)
     M, logits = uniform(2, 3, 3).requires_grad_(), uniform(2, 20).requires_grad_()
     assert gradcheck(lambda *given: inlier_probability(model, problem, *given, problem.determined), (M, logits))
@@ -178,11 +160,9 @@ def test_sets_of_few_outliers_leave_stages_out(kind):
     assert len(calls) == len(layer.networks)
 
 
-class TestSmallSets:
-    """Of fundamental matrices."""
-
+class TestSmallSetsOfFundamentalMatrices:
     def test_eight_are_the_optimal_correction_or_with_outliers_hartleys_projection(self):
-        points1, points2 = correspondences("handheld", 40)
+        points1, points2 = inputs("fundamental", 40, 8)
         points2[5:] += 30 * torch.randn(35, 8, 2, generator=seeded(), dtype=points2.dtype)
         optimal, hartley = (kln.find_fundamental(points1, points2, rank2=kind) for kind in ("optimal", "projection"))
         residual = kln.sampson_distance(points1, points2, optimal).square().mean(1).sqrt()
@@ -195,13 +175,13 @@ class TestSmallSets:
         assert up_to_sign(found[~fits], hartley[~fits]) < 1e-9
 
     def test_an_untrained_layer_is_hartleys(self):
-        points = correspondences("handheld", 5, 20)
+        points = inputs("fundamental", 5, 20)
         layer = kln.LearnedEightPoint(width=16, depth=1, stages=1, refine_steps=0)
         assert up_to_sign(layer(*points).detach(), kln.find_fundamental(*points)) < 1e-6
 
 
 def test_stages_without_refinement():
-    points, scores = correspondences("driving", 3, 30), torch.rand(3, 30)
+    points, scores = inputs("fundamental", 3, 30, scene="driving"), torch.rand(3, 30)
     layers = (shaken_estimator(stages=3, refine_steps=steps) for steps in (10, 0))
     refined, plain = (layer.estimate(*points, scores=scores) for layer in layers)
     assert up_to_sign(plain.F_mat.detach(), plain.stages[-1].F_mat.detach()) < 1e-3
@@ -253,7 +233,7 @@ def test_finite_on_degenerate_sets(kind, name):
     [
         ("fundamental", "handheld", 20, {}),
         ("pose", "orbit", 12, {"stages": 1, "samples": 0}),
-        ("homography", "", 12, {"stages": 1}),
+        *(("homography", "", number, {"stages": 1}) for number in (12, 20)),
     ],
 )
 def test_gradients(kind, scene, number, options):
@@ -312,12 +292,17 @@ def test_vmap_and_compile_agree(kind, monkeypatch):
     assert up_to_sign(traced(*values).detach(), expected) < 1e-6
 
 
-def test_autocast_leaves_the_solver_in_float64():
-    points1, points2, H = plane(2, 40)
+@siblings
+def test_autocast_leaves_the_solver_in_float64(kind):
+    scene, (points1, points2, H) = scenes("orbit", 2, 40, noise=0.0), plane(2, 40)
+    values = (points1, points2) if kind == "homography" else (scene.points1, scene.points2, scene.K1, scene.K2)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = LAYERS["homography"](refine_steps=10).float()(points1, points2)
+        found = LAYERS[kind](refine_steps=10).float()(*values).detach()
     assert found.dtype == torch.float64
-    assert corner_error(found, H) < 1e-4
+    if kind == "homography":
+        assert corner_error(found, H) < 1e-4
+    else:
+        assert up_to_sign(found, true_essential(scene)) < 1e-6
 
 
 class TestFiles:

@@ -1,6 +1,7 @@
 """The refiner of matches: identity before training, Lucas-Kanade, frames, symmetry, masks, gradients, files, errors."""
 
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
 from references import check_gradients
-from scenes import DTYPES, rewrite_weights, seeded, uniform
+from scenes import DTYPES, rewrite_weights, roughened, seeded, uniform
 from torch import Tensor
 
 import kornia_learnnorm as kln
@@ -21,16 +22,7 @@ from make_sequences import texture  # noqa: E402 (needs Pillow, which comes with
 pytestmark = pytest.mark.numerical
 WIDTH, HEIGHT = 120, 90
 SHIFT = 0.4, -0.3  # of the second image against the first, pixels
-
-
-def trained(**options) -> kln.MatchRefiner:
-    """A refiner whose weights differ from one another, as after training."""
-    torch.manual_seed(0)
-    refiner = kln.MatchRefiner(**{"patch_size": 9, "width": 8} | options).double().eval()
-    with torch.no_grad():
-        for parameter in refiner.parameters():
-            parameter.add_(0.1 * torch.randn(parameter.shape, generator=seeded(1), dtype=parameter.dtype))
-    return refiner
+trained = partial(roughened, kln.MatchRefiner)
 
 
 def images(number: int = 1, channels: int = 1) -> tuple[Tensor, Tensor]:

@@ -68,14 +68,6 @@ def test_every_form_of_lightglues_output_is_the_same():
             assert_close(correspondences_from_matches(*views, form), want)
 
 
-def test_lightglue_matcher_of_kornia():
-    scores, index = torch.rand(12, 1), torch.stack([torch.arange(12), torch.arange(12) + 10], -1)
-    points1, _, weights, mask = correspondences_from_matches(KEYPOINTS[0][:1], KEYPOINTS[1][:1], index[None], scores.T)
-    assert torch.equal(points1[0], KEYPOINTS[0][0, :12])
-    assert torch.equal(weights[0], scores[:, 0])
-    assert mask.all()
-
-
 @pytest.mark.parametrize("empty", [(), (0,), (1,), (0, 1)])
 def test_at_least_eight_rows_of_views_without_keypoints_or_matches(empty):
     keypoints = [torch.rand(2, 0 if k in empty else 30, 2) for k in range(2)]

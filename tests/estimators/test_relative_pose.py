@@ -4,6 +4,7 @@ import pytest
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import essential_from_Rt
+from pairwise import pairwise
 from references import true_essential, up_to_sign
 from scenes import distorted, roughened, scenes, seeded, uniform
 from torch.nn.functional import normalize
@@ -19,8 +20,7 @@ from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
 
-@pytest.mark.parametrize("num_points", [6, 8, 50, 400])
-@pytest.mark.parametrize("kind", ["orbit", "handheld", "driving"])
+@pairwise(kind=["orbit", "handheld", "driving"], num_points=[6, 8, 50, 400])
 def test_finds_the_truth_without_noise(kind, num_points):
     scene = scenes(kind, 20, num_points, noise=0.0)
     with torch.no_grad():
@@ -37,8 +37,7 @@ def test_finds_the_truth_without_noise(kind, num_points):
     assert (x2 * (x1 @ found.F_mat.mT)).sum(-1)[right].abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("kind", ["handheld", "driving"])
-@pytest.mark.parametrize("calibrated", [False, True])
+@pairwise(kind=["handheld", "driving"], calibrated=[False, True])
 def test_steps_on_moments_end_at_the_optimum_of_the_distances(kind, calibrated):
     scene = scenes(kind, 5, 200)
     points = [p + torch.randn(p.shape, generator=seeded(1)).to(p) for p in (scene.points1, scene.points2)]
@@ -125,11 +124,3 @@ def test_contradiction_is_that_of_an_f_test():
             patch.setattr(camera_evidence, "MIN_EFFECT", float(factor * gain))
             found = camera_evidence.contradict_cameras(evidence, state, weights, scale.square())
             assert found.tolist() == [factor < 1]
-
-
-def test_autocast_leaves_the_solver_in_float64():
-    scene = scenes("orbit", 2, 40, noise=0.0)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = roughened(kln.LearnedRelativePose).float()(scene.points1, scene.points2, scene.K1, scene.K2)
-    assert found.dtype == torch.float64
-    assert up_to_sign(found.detach(), true_essential(scene)) < 1e-6

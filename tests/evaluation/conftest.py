@@ -9,7 +9,6 @@ from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import robust_estimators
-from kornia_learnnorm.evaluation.robust.robust_run import shuffled_pair
 
 METHODS = ["none", "Hartley", "whitening", "crossview", "Hartley+optimal", "Hartley+LM"]
 ESTIMATORS = ["opencv-usac", "RANSAC", "RANSAC:whitening", "ground-truth"]
@@ -78,14 +77,3 @@ def robust_copied(robust_run, tmp_path):
 @pytest.fixture
 def robust_again(robust_copied, robust_command):
     return [*robust_command, str(robust_copied)]
-
-
-@pytest.fixture
-def matches():
-    """Return a function that draws the correspondences of a synthetic image pair."""
-
-    def draw(noise=0.2, outliers=0.2, points=300):
-        store = synthetic_store(1, points, seed=3, noise=noise, outliers=outliers, scenes=["hand-held"])
-        return shuffled_pair(store, 0, "unfiltered", 0)
-
-    return draw

@@ -15,8 +15,6 @@ from kornia_learnnorm import Hartley, Identity, ReweightedWhitening, Whitening
 from kornia_learnnorm.evaluation import diagnostics
 from kornia_learnnorm.evaluation.diagnostics import condition_number, diagnose, normalized_distance, singularity_ratio
 
-NORMALIZERS = [Identity(), Hartley(), Whitening(), ReweightedWhitening(3)]
-
 
 def numpy_diagnose(points1, points2, T1, T2) -> np.ndarray:
     """All five numbers (B, 5): eigenvalues of A^T A, and the eight-point algorithm in two steps."""
@@ -60,8 +58,7 @@ def test_scale_and_rotations_do_not_matter_to_the_condition_number(seed, factor)
 
 
 class TestDiagnose:
-    @pytest.mark.parametrize("batch_size", [0, 1, 3])
-    @pytest.mark.parametrize("num_points", [8, 20])
+    @pairwise(batch_size=[0, 1, 3], num_points=[8, 20])
     def test_smoke(self, batch_size, num_points, device, dtype):
         points = [p.to(device, dtype) for p in correspondences("handheld", 3, num_points)]
         found = diagnose(*(p[:batch_size] for p in points), Hartley())
@@ -70,7 +67,7 @@ class TestDiagnose:
             assert (values.shape, values.dtype, values.device.type) == ((batch_size,), torch.float64, device.type)
             assert torch.isfinite(values).all()
 
-    @pairwise(name=SCENES, num_points=[8, 20], normalizer=NORMALIZERS)
+    @pairwise(name=SCENES, num_points=[8, 20], normalizer=[Identity(), Hartley(), Whitening(), ReweightedWhitening(3)])
     def test_agrees_with_numpy(self, name, num_points, normalizer, device):
         options = {} if name == "random" else {"noise": 0.5}
         points = correspondences(name, 10, num_points, **options)

@@ -11,14 +11,8 @@ from scenes import correspondences, uniform
 from torch.autograd import gradcheck, gradgradcheck
 
 from kornia_learnnorm import Whitening, find_fundamental
+from kornia_learnnorm.geometry import matrices
 from kornia_learnnorm.geometry.dlt import design_matrix, nearest_null_vector, null_vector
-from kornia_learnnorm.geometry.matrices import (
-    cofactors,
-    determinant,
-    smallest_right_singular_vector,
-    smallest_singular_vectors,
-    unit_matrix,
-)
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import affine_transform
 from kornia_learnnorm.models.fundamental import Fundamental
@@ -89,17 +83,17 @@ class TestSmallestSingularVectors:
         ]:
             A = with_singular_values(values)
             U, s, Vh = np.linalg.svd(A.numpy())
-            u, v = smallest_singular_vectors(A)
+            u, v = matrices.smallest_singular_vectors(A)
             error = np.abs(np.stack([(u.numpy() * U[..., 2]).sum(-1), (v.numpy() * Vh[:, 2]).sum(-1)]))
             # Rounding turns the vectors by its size over that of the gap.
             bound = 1e-14 * s[:, 0] / (s[:, 1] - s[:, 2])
             assert (np.sqrt(2 * np.abs(1 - error)) < np.maximum(100 * bound, 1e-7)).all()
-            assert torch.equal(v, smallest_right_singular_vector(A)[0])
+            assert torch.equal(v, matrices.smallest_right_singular_vector(A)[0])
 
     @pytest.mark.parametrize("values", [[1, 0.3, 0.3], [1, 1, 1], [1, 0, 0], [1e-5, 0, 0]])
     def test_minimise_where_not_simple(self, values):
         A = with_singular_values(values)
-        v = smallest_right_singular_vector(A.requires_grad_())[0]
+        v = matrices.smallest_right_singular_vector(A.requires_grad_())[0]
         image = torch.linalg.vector_norm(A @ v[..., None], dim=(1, 2))
         assert (image - values[2]).abs().max() < 1e-6 * values[0]
         assert (v.norm(dim=-1) - 1).abs().max() < 1e-14
@@ -109,9 +103,10 @@ class TestSmallestSingularVectors:
 
 def test_transposed_are_determinant_times_inverse(dtype):
     A = uniform(20, 3, 3, low=-1, dtype=dtype)
-    np.testing.assert_allclose(determinant(A).numpy(), np.linalg.det(A.numpy()), atol=1e-6)
+    np.testing.assert_allclose(matrices.determinant(A).numpy(), np.linalg.det(A.numpy()), atol=1e-6)
     expected = np.linalg.det(A.numpy())[:, None, None] * np.linalg.inv(A.numpy())
-    np.testing.assert_allclose(cofactors(A).mT.numpy(), expected, atol=2e-6 if dtype == torch.float32 else 1e-14)
+    atol = 2e-6 if dtype == torch.float32 else 1e-14
+    np.testing.assert_allclose(matrices.cofactors(A).mT.numpy(), expected, atol=atol)
 
 
 def problem_of(points1, points2, weights=None):
@@ -172,7 +167,7 @@ def test_sign_under_pure_translation_does_not_depend_on_rounding(seed, size):
     x, y, z = uniform(3, low=-1, seed=seed).tolist()
     F_mat = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
     moved = -F_mat + size * uniform(3, 3, low=-1, seed=seed + 1)
-    assert (unit_matrix(F_mat) - unit_matrix(moved)).abs().max() < 1e-6
+    assert (matrices.unit_matrix(F_mat) - matrices.unit_matrix(moved)).abs().max() < 1e-6
 
 
 def test_equal_views():

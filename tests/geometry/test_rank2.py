@@ -2,18 +2,10 @@
 
 import numpy as np
 import pytest
+import references as ref
 import torch
 from kornia.core.exceptions import ShapeError
-from references import (
-    check_gradients,
-    epipolar_distances,
-    hartley_difference,
-    homogeneous,
-    null_matrices,
-    numpy_hartley,
-    signless,
-    unit,
-)
+from pairwise import pairwise
 from scenes import correspondences, scenes, uniform
 from torch.autograd import gradcheck, gradgradcheck
 
@@ -27,17 +19,11 @@ from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.scoring import PairScorer
 
 
-def linear(points1, points2, weights=None) -> torch.Tensor:
-    """The DLT's solution in Hartley's coordinates, of rank 3, in pixels."""
-    T1, T2 = numpy_hartley(points1, weights), numpy_hartley(points2, weights)
-    return torch.from_numpy(unit(T2.swapaxes(-1, -2) @ null_matrices(points1, points2, T1, T2, weights) @ T1))
-
-
 def reference(F, points1, points2, iterations: int = 3) -> np.ndarray:
     """Kanatani and Sugaya's correction set by set: pseudo-inverses, and covariances from the Jacobian of xi."""
-    T1, T2 = numpy_hartley(points1), numpy_hartley(points2)
-    start = unit(np.linalg.inv(T2).swapaxes(-1, -2) @ np.asarray(F) @ np.linalg.inv(T1)).reshape(-1, 9)
-    x1, x2 = homogeneous(points1.numpy()) @ T1.swapaxes(-1, -2), homogeneous(points2.numpy()) @ T2.swapaxes(-1, -2)
+    T1, T2 = ref.numpy_hartley(points1), ref.numpy_hartley(points2)
+    start = ref.unit(np.linalg.inv(T2).swapaxes(-1, -2) @ np.asarray(F) @ np.linalg.inv(T1)).reshape(-1, 9)
+    x1, x2 = (ref.homogeneous(p.numpy()) @ T.swapaxes(-1, -2) for p, T in ((points1, T1), (points2, T2)))
     corrected = []
     for k, u in enumerate(start):
         P, M = np.eye(9) - np.outer(u, u), np.zeros((9, 9))
@@ -56,24 +42,23 @@ def reference(F, points1, points2, iterations: int = 3) -> np.ndarray:
             V = P @ V @ P
         U, s, Vh = np.linalg.svd(u.reshape(3, 3))
         corrected.append(T2[k].T @ U @ np.diag([s[0], s[1], 0]) @ Vh @ T1[k])
-    return unit(np.stack(corrected))
+    return ref.unit(np.stack(corrected))
 
 
 class TestOptimalRank2:
-    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
-    @pytest.mark.parametrize("num_points", [8, 12, 50])
+    @pairwise(name=["driving", "handheld", "orbit"], num_points=[8, 12, 50])
     def test_agrees_with_numpy(self, name, num_points):
         points = correspondences(name, 10, num_points, noise=0.2)
-        F0 = linear(*points)
+        F0 = ref.rank_three(*points)
         F_mat, expected = optimal_rank2(F0, *points), reference(F0, *points)
-        assert hartley_difference(F_mat, expected, *points) < 1e-5
-        assert hartley_difference(find_fundamental(*points, rank2="optimal"), F_mat, *points) < 1e-6
+        assert ref.hartley_difference(F_mat, expected, *points) < 1e-5
+        assert ref.hartley_difference(find_fundamental(*points, rank2="optimal"), F_mat, *points) < 1e-6
 
     @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
     def test_fits_eight_points_far_better_than_hartley(self, name):
         points = correspondences(name, 200, 8, noise=0.5)
-        F_mats = find_fundamental(*points), optimal_rank2(linear(*points), *points)
-        plain, corrected = (epipolar_distances(*points, F_mat).mean(-1) for F_mat in F_mats)
+        F_mats = find_fundamental(*points), optimal_rank2(ref.rank_three(*points), *points)
+        plain, corrected = (ref.epipolar_distances(*points, F_mat).mean(-1) for F_mat in F_mats)
         assert (corrected < plain).mean() > 0.97
         assert np.median(corrected) < 0.3 * np.median(plain)
 
@@ -81,12 +66,12 @@ class TestOptimalRank2:
     def test_gradients(self, num_points):
         points = [uniform(2, num_points, 2, low=-1, seed=seed) for seed in (1, 2)]
         weights = uniform(2, num_points, low=0.5, seed=3)
-        check_gradients(lambda *values: signless(optimal_rank2(*values)), linear(*points), *points, weights)
+        ref.check_gradients(lambda *v: ref.signless(optimal_rank2(*v)), ref.rank_three(*points), *points, weights)
 
     def test_in_the_solver_the_normalisation_of_eight_points_does_not_matter(self):
         points = correspondences("driving", 20, 8, noise=0.5)
         results = [find_fundamental(*points, normalizer=n, rank2="optimal") for n in (Hartley(), Whitening())]
-        assert hartley_difference(*results, *points) < 1e-6
+        assert ref.hartley_difference(*results, *points) < 1e-6
 
 
 class TestRank2Projection:
@@ -109,11 +94,6 @@ class TestRank2Projection:
             rank2_projection(torch.rand(9))
 
 
-@pytest.fixture(params=["driving", "handheld", "orbit"])
-def scene(request):
-    return scenes(request.param, 1, 200, noise=0.5, outliers=0.2)
-
-
 def begin(scene, number: int = 3):
     """A scorer, and matrices of samples of twelve inliers in its coordinates."""
     points = scene.points1[0], scene.points2[0]
@@ -124,9 +104,11 @@ def begin(scene, number: int = 3):
 
 
 @pytest.mark.parametrize(("kind", "factor"), DISTANCE_SCALES.items())
+@pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
 class TestSteps:
-    def test_ends_at_the_optimum(self, scene, kind, factor):
+    def test_ends_at_the_optimum(self, name, kind, factor):
         """From there Levenberg-Marquardt does not lower the cost."""
+        scene = scenes(name, 1, 200, noise=0.5, outliers=0.2)
         scorer, F0 = begin(scene, 8)
         loss = Truncated(2.0)
         fit = constrained_fit(scorer.x1, scorer.x2, F0, 40 * [loss], factor)
@@ -139,7 +121,6 @@ class TestSteps:
         assert (values[:, 2] < 1e-5 * values[:, 1]).all()
         assert fit.gain.max() < 1e-10
 
-    @pytest.mark.parametrize("name", ["driving", "handheld", "orbit"])
     def test_gain(self, name, kind, factor):
         """Close to the optimum of least squares a step is to take away what is there above it."""
         scorer, F0 = begin(scenes(name, 1, 200, noise=0.5), 8)
@@ -159,7 +140,7 @@ class TestResults:
         F0 = scorer.from_pixels(torch.cat([F_true, F_true + 1e-4 * uniform(3, 3, 3, seed=3)]))
         fitted = constrained_fit(scorer.x1, scorer.x2, F0, 8 * [Truncated(3.0)], factor).F_mat
         for F in scorer.to_pixels(fitted):
-            assert epipolar_distances(points1[None, 1:], points2[None, 1:], F[None]).max() < 1e-6
+            assert ref.epipolar_distances(points1[None, 1:], points2[None, 1:], F[None]).max() < 1e-6
 
     def test_what_cannot_be_fitted_stays(self):
         """Without inliers a step has no equations, and another matrix in the batch must not notice."""

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from kornia_learnnorm.data.writer import write_store
 from lightning_modules.refiner_task import HeldOutLoss, RefinerTask, all_matches
 
 pytestmark = pytest.mark.usefixtures("program")
-CONFIGS = Path(__file__).parents[2] / "configs"
 WIDTH, HEIGHT = 200, 150
 NOISE = 0.7  # pixels, standard deviation of each coordinate of the second points
 
@@ -103,7 +101,6 @@ def test_images_of_stores(folder, tmp_path):
 
 @pytest.mark.parametrize("kind", ["learned", "eight-point", "RANSAC"])
 def test_the_loss_is_that_of_the_other_half(folder, kind):
-    """Against a computation half by half."""
     sets = source(folder).draw(2, 32, seeded())
     points = all_matches(sets)
     moved = kln.MatchRefiner()(sets.image1, sets.image2, *points)
@@ -186,5 +183,5 @@ def test_a_training_moves_matches_nearer_to_the_truth(folder, tmp_path, monkeypa
     assert main(["validate", *options, f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"]) == 0
     assert "val/median_moved" in capsys.readouterr().out
     for name in ("detached", "eight-point", "labels", "ransac"):
-        loss = ["--config", str(CONFIGS / f"ablations/refiner/{name}.yaml")]
+        loss = ["--config", f"ablations/refiner/{name}"]
         refused(["fit", *options, *loss, "--trainer.max_steps=0"], "trainer.max_steps is 0")  # the last that is checked

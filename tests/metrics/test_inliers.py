@@ -13,11 +13,7 @@ from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_sh
 
 INF, NAN = float("inf"), float("nan")
 ROWS = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]], dtype=torch.float64)  # y1 - y2
-METRICS = {
-    "share": lambda points1, points2, F, true, threshold: inlier_share(points1, points2, F, threshold),
-    "f1": f1_score,
-    "error": epipolar_error,
-}
+METRICS = {"share": lambda *values: inlier_share(*values[:3], values[4]), "f1": f1_score, "error": epipolar_error}
 
 
 def by_hand(points1, points2, F, true, threshold):
@@ -28,11 +24,8 @@ def by_hand(points1, points2, F, true, threshold):
     if right:
         precision, recall = hits / max(len(chosen), 1), hits / len(right)
         f1 = 2 * precision * recall / (precision + recall) if hits else 0.0
-    return {
-        "share": len(chosen) / len(estimated),
-        "f1": f1,
-        "error": np.mean([estimated[i] for i in sorted(right)]) if right else NAN,
-    }
+    error = np.mean([estimated[i] for i in sorted(right)]) if right else NAN
+    return {"share": len(chosen) / len(estimated), "f1": f1, "error": error}
 
 
 def pairs(seed=0, batch_size=6, num_points=40, jitter=1e-3):

@@ -18,13 +18,8 @@ def crossview(**options):
     return lambda: shaken(kln.LearnedNormalizer(kln.Whitening(), kln.CrossViewNetwork(width=16, depth=2, **options)))
 
 
-CLOSED_FORM = {
-    "identity": kln.Identity,
-    "hartley": kln.Hartley,
-    "whitening": kln.Whitening,
-    "kornia": lambda: kln.PerView(normalize_points),
-    "reweighted": kln.ReweightedWhitening,
-}
+CLOSED_FORM = {"identity": kln.Identity, "hartley": kln.Hartley, "whitening": kln.Whitening}
+CLOSED_FORM |= {"kornia": lambda: kln.PerView(normalize_points), "reweighted": kln.ReweightedWhitening}
 LEARNED = {
     "own": crossview(features="own"),
     "both": crossview(features="both"),
@@ -65,8 +60,7 @@ def test_order_does_not_matter(name, seed, num_points, random):
         torch.testing.assert_close(found, expected, rtol=1e-4 if name in SOLVED else 1e-10, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", DIRECT)
-@pytest.mark.parametrize("num_points", [8, 20])
+@pairwise(name=DIRECT, num_points=[8, 20])
 def test_swapped_views_give_swapped_transforms(name, num_points):
     points1, points2 = correspondences("driving", 10, num_points)
     normalizer, weights = ALL[name]().double(), uniform(10, num_points, low=0.1)

@@ -61,8 +61,6 @@ class TestForward:
         assert all(torch.equal(value, named.state_dict()[key]) for key, value in default.state_dict().items())
 
     def test_composes_builder_and_base(self):
-        """With known parameters: T = B(p) T_base."""
-
         class Known(nn.Module):
             def forward(self, points1, points2, weights=None):
                 self.seen = points1, points2, weights
@@ -193,8 +191,6 @@ NO_FIT, UNKNOWN = r"the tensors do not fit the architecture(.|\n)*", "describes 
 
 
 class TestStrictness:
-    """Files that are nearly right, each with one thing wrong."""
-
     def fails(self, file, message):
         with pytest.raises(ValueError, match=message) as caught:
             LearnedNormalizer.from_pretrained(file)

@@ -13,28 +13,17 @@ from scenes import seeded
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
-from kornia_learnnorm.two_view.camera_check import (
-    camera_misfit,
-    drop_contradiction,
-    find_camera_doubt,
-    is_of_other_size,
-)
+from kornia_learnnorm.two_view import camera_check, predicted_error
 from kornia_learnnorm.two_view.pair_warnings import find_warnings, log_false_alarms, log_false_samples
-from kornia_learnnorm.two_view.predicted_error import (
-    drop_failed_parts,
-    predict_error,
-    predict_transfer_error,
-    random_parts,
-)
 
 
 def test_failed_searches_do_not_count():
     """Of 100 inliers, a matrix of a part must have 75; with fewer than four such matrices all count."""
     F_parts = torch.eye(3).double() * torch.arange(1.0, 7.0)[:, None, None]
     support = torch.tensor([110, 75, 74, 20, 90, 80])
-    assert drop_failed_parts(F_parts, support, 100)[:, 0, 0].tolist() == [1, 2, 5, 6]
-    assert len(drop_failed_parts(F_parts, support, 101)) == 6
-    assert torch.equal(drop_failed_parts(F_parts, support, 10), F_parts)
+    assert predicted_error.drop_failed_parts(F_parts, support, 100)[:, 0, 0].tolist() == [1, 2, 5, 6]
+    assert len(predicted_error.drop_failed_parts(F_parts, support, 101)) == 6
+    assert torch.equal(predicted_error.drop_failed_parts(F_parts, support, 10), F_parts)
 
 
 @pytest.mark.parametrize("number", [40, 200])
@@ -44,7 +33,7 @@ def test_predicted_error_is_near_the_true_one(number):
     exact = handheld(24, number + 200, generator, noise=0.0)
     noise = 0.5 * torch.randn(24, number, 4, generator=generator, dtype=torch.float64)
     x1, x2 = exact.points1[:, :number] + noise[..., :2], exact.points2[:, :number] + noise[..., 2:]
-    rows = random_parts(number, number, 0)
+    rows = predicted_error.random_parts(number, number, 0)
 
     def solve(points1, points2):
         return kln.refine_fundamental(points1, points2, kln.find_fundamental(points1, points2)).F_mat
@@ -52,7 +41,7 @@ def test_predicted_error_is_near_the_true_one(number):
     F_mat, F_parts = solve(x1, x2), solve(x1[:, rows].flatten(0, 1), x2[:, rows].flatten(0, 1)).unflatten(0, (24, -1))
     inliers = torch.ones(number, dtype=torch.bool)
     predicted = [
-        predict_error(parts, rows.shape[1], *points, F, inliers, K, K).distance
+        predicted_error.predict_error(parts, rows.shape[1], *points, F, inliers, K, K).distance
         for parts, *points, F, K in zip(F_parts, x1, x2, F_mat, exact.K1, strict=True)
     ]
     true = np.median(epipolar_distances(exact.points1[:, number:], exact.points2[:, number:], F_mat), axis=-1)
@@ -62,7 +51,7 @@ def test_predicted_error_is_near_the_true_one(number):
 def test_predicted_error_is_infinite_where_parts_have_no_matrix():
     scene = handheld(1, 50, torch.Generator().manual_seed(0), noise=0.0)
     x1, x2, F_mat, K1, K2 = (value[0] for value in (scene.points1, scene.points2, scene.F_mat, scene.K1, scene.K2))
-    found = predict_error(torch.zeros(12, 3, 3).double(), 40, x1, x2, F_mat, torch.ones(50, dtype=torch.bool), K1, K2)
+    found = predicted_error.predict_error(torch.zeros(12, 3, 3).double(), 40, x1, x2, F_mat, ALL[:50], K1, K2)
     assert found.distance == math.inf
     assert found.angle > 100
 
@@ -117,12 +106,12 @@ def test_of_homographies(number):
     truth, H_true = exact.exact1, kln.find_homography(exact.exact1, exact.exact2)
     noise = 0.5 * torch.randn(24, number, 4, generator=generator, dtype=torch.float64)
     x1, x2 = exact.exact1[:, :number] + noise[..., :2], exact.exact2[:, :number] + noise[..., 2:]
-    rows = random_parts(number, number, 0)
+    rows = predicted_error.random_parts(number, number, 0)
     H_mat = kln.find_homography(x1, x2)
     H_parts = kln.find_homography(x1[:, rows].flatten(0, 1), x2[:, rows].flatten(0, 1)).unflatten(0, (24, -1))
     inliers = torch.ones(number, dtype=torch.bool)
     found = [
-        predict_transfer_error(parts, rows.shape[1], points1, H, inliers)
+        predicted_error.predict_transfer_error(parts, rows.shape[1], points1, H, inliers)
         for parts, points1, H in zip(H_parts, x1, H_mat, strict=True)
     ]
     moved = [np.dstack([truth, np.ones(truth.shape[:2])]) @ H.mT.numpy() for H in (H_mat, H_true)]
@@ -135,7 +124,7 @@ def test_angles_of_homographies():
     """Half of the matches have as large an error as what they differ by from all."""
     points, inliers = torch.rand(100, 2).double(), torch.ones(100, dtype=torch.bool)
     about = torch.eye(3).double().repeat(3, 1, 1), 50, points, torch.eye(3).double(), inliers
-    assert predict_transfer_error(*about, torch.tensor([1.0, 2.0, 180.0])) == (0.0, 2.0)
+    assert predicted_error.predict_transfer_error(*about, torch.tensor([1.0, 2.0, 180.0])) == (0.0, 2.0)
 
 
 SCENE = handheld(1, 300, seeded(), noise=0.3)
@@ -159,7 +148,7 @@ def test_warnings_of_an_estimate():
         warned = [warning.text for warning in found.warnings if warning.code == "cameras"]
         assert len(warned) == (text is not None)
         assert text is None or text in warned[0]
-        assert len(drop_contradiction(found.warnings)) == len(found.warnings) - ("contradict" in str(text))
+        assert len(camera_check.drop_contradiction(found.warnings)) == len(found.warnings) - ("contradict" in str(text))
 
 
 def test_principal_points():
@@ -171,8 +160,8 @@ def test_principal_points():
         ((320, 500), True),  # outside
     ]:
         camera = torch.tensor([[600.0, 0, centre[0]], [0, 600, centre[1]], [0, 0, 1]])
-        assert is_of_other_size(camera, (640, 480)) == expected
-        doubt = find_camera_doubt((K, camera), (None, (640, 480)), *POINTS, None, 1.0)
+        assert camera_check.is_of_other_size(camera, (640, 480)) == expected
+        doubt = camera_check.find_camera_doubt((K, camera), (None, (640, 480)), *POINTS, None, 1.0)
         assert ["K2" in warning.text for warning in doubt] == [True] * expected
 
 
@@ -184,13 +173,13 @@ class TestCameraMisfit:
         tied = kln.refine_essential(*points, E_mat, *cameras).F_mat
         free = kln.refine_fundamental(*points, F_MAT[None]).F_mat
         more, less = (kln.sampson_distance(*points, F_mat)[0].square() for F_mat in (tied, free))
-        found, log_chance = camera_misfit(*POINTS, F_MAT, 30.0, cameras)  # so that all count alike
+        found, log_chance = camera_check.camera_misfit(*POINTS, F_MAT, 30.0, cameras)  # so that all count alike
         medians = (more.median() - less.median()).item() / 0.455
         assert found == pytest.approx(min((more - less).mean().item(), medians) ** 0.5, rel=0.05)
         assert log_chance < -20
 
     def test_grows_with_the_error_of_the_focal_length(self):
-        found = [camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(f),) * 2) for f in (1.0, 1.1, 1.2, 1.4)]
+        found = [camera_check.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(f),) * 2) for f in (1.0, 1.1, 1.2, 1.4)]
         assert found == sorted(found, key=lambda pair: (pair[0], -pair[1]))
         assert found[0][1] > -3
 
@@ -198,17 +187,17 @@ class TestCameraMisfit:
         """A third as many, of another motion."""
         other = handheld(1, 100, seeded(5), noise=0.3)
         points = (torch.cat([x, y[0]]) for x, y in zip(POINTS, (other.points1, other.points2), strict=True))
-        assert camera_misfit(*points, F_MAT, 1.0, (K, K))[0] < 0.03
+        assert camera_check.camera_misfit(*points, F_MAT, 1.0, (K, K))[0] < 0.03
 
     def test_few_matches_tell_nothing(self):
         cameras = (with_focal(1.4),) * 2
-        assert camera_misfit(*(x[:12] for x in POINTS), F_MAT, 1.0, cameras)[1] > -3
-        assert camera_misfit(*(x[:8] for x in POINTS), F_MAT, 1e-6, cameras) == (0.0, 0.0)
+        assert camera_check.camera_misfit(*(x[:12] for x in POINTS), F_MAT, 1.0, cameras)[1] > -3
+        assert camera_check.camera_misfit(*(x[:8] for x in POINTS), F_MAT, 1e-6, cameras) == (0.0, 0.0)
 
     @given(scale=st.floats(0.2, 5))
     def test_has_the_unit_of_the_points(self, scale):
         S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
         F_mat = torch.linalg.inv(S) @ F_MAT @ torch.linalg.inv(S)
-        found = camera_misfit(*(scale * x for x in POINTS), F_mat, scale, (S @ with_focal(1.3),) * 2)
-        misfit, log_chance = camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(1.3),) * 2)
+        found = camera_check.camera_misfit(*(scale * x for x in POINTS), F_mat, scale, (S @ with_focal(1.3),) * 2)
+        misfit, log_chance = camera_check.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(1.3),) * 2)
         assert found == pytest.approx((scale * misfit, log_chance), rel=1e-3)

@@ -34,14 +34,12 @@ def see_plane(R, t, noise: float = 0.2, depth: float = 5.0) -> tuple[np.ndarray,
     return x1, x2[:, :2] / x2[:, 2:] + rng.normal(0, 1, (150, 2)) * noise
 
 
-@pytest.fixture(scope="module")
-def matches():
-    return make_matches()
+MATCHES = make_matches()
 
 
 @pytest.fixture(scope="module")
-def result(matches):
-    return kln.estimate_matches(*matches)
+def result():
+    return kln.estimate_matches(*MATCHES)
 
 
 def codes(found) -> list[str]:
@@ -105,7 +103,7 @@ class TestEstimateMatches:
         assert np.allclose(found.R, R, atol=2e-3)
         json.dumps(found.as_dict(), allow_nan=False)
 
-    def test_a_homography_that_is_asked_for(self, matches):
+    def test_a_homography_that_is_asked_for(self):
         """Of a scene with relief: it moves few matches right. Of a mirror with cameras: no pose."""
         found = kln.estimate_matches(*see_plane(np.eye(3), [0.8, 0.1, 0.1]), **SIZES, model="homography")
         assert (found.F_mat, found.choice.parallax, found.estimator) == (None, None, "RANSAC")
@@ -115,27 +113,27 @@ class TestEstimateMatches:
         mirrored = kln.estimate_matches(points1, points2, **SIZES, K1=K, K2=K, model="homography")
         assert (codes(mirrored), mirrored.R) == (["no_pose"], None)
 
-    def test_a_tie_between_poses(self, matches, monkeypatch):
+    def test_a_tie_between_poses(self, monkeypatch):
         nothing = torch.full((1, 3, 3), torch.nan).double()
         monkeypatch.setattr(module, "relative_pose", lambda *_: (nothing, nothing[:, 0]))
-        found = kln.estimate_matches(*matches, K1=SCENE.K1[0], K2=SCENE.K2[0])
+        found = kln.estimate_matches(*MATCHES, K1=SCENE.K1[0], K2=SCENE.K2[0])
         assert (found.R, found.t, found.front, codes(found)) == (None, None, None, ["no_pose"])
 
-    def test_order_has_no_effect(self, matches):
+    def test_order_has_no_effect(self):
         scores, order = uniform(200, seed=1), torch.randperm(200, generator=seeded(2))
-        first, second = (kln.estimate_matches(*(x[o] for x in (*matches, scores))) for o in (slice(None), order))
+        first, second = (kln.estimate_matches(*(x[o] for x in (*MATCHES, scores))) for o in (slice(None), order))
         assert torch.equal(first.F_mat, second.F_mat)
         assert first.predicted_error == second.predicted_error
 
-    def test_rows_that_are_not_finite_or_far_away_are_left_out(self, matches, result):
+    def test_rows_that_are_not_finite_or_far_away_are_left_out(self, result):
         wrong = torch.tensor([[torch.nan, 5.0], [5.0, torch.inf], [1e12, 5.0]], dtype=torch.float64)
         scores = torch.cat([torch.ones(200), torch.tensor([torch.nan, 0.5, 0.5])])
-        found = kln.estimate_matches(*(torch.cat([x, wrong + i]) for i, x in enumerate(matches)), scores)
+        found = kln.estimate_matches(*(torch.cat([x, wrong + i]) for i, x in enumerate(MATCHES)), scores)
         assert torch.equal(found.F_mat, result.F_mat)
         assert (found.num_matches, found.size1) == (result.num_matches, result.size1)
 
-    def test_arrays_of_any_number_type(self, matches, monkeypatch):
-        points = [x.round().numpy() for x in matches]
+    def test_arrays_of_any_number_type(self):
+        points = [x.round().numpy() for x in MATCHES]
         for convert in [
             lambda points: points.astype(np.int32),
             lambda points: points[::-1, ::-1].copy()[::-1, ::-1],

@@ -10,23 +10,12 @@ from hypothesis import strategies as st
 from references import epipolar_distances
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.two_view import parallax as parallax_module
-from kornia_learnnorm.two_view.parallax import (
-    MAX_LOG_CHANCE_PARALLAX,
-    distances_from_plane,
-    find_main_plane,
-    fit_plane_and_parallax,
-    measure_parallax,
-    parallax,
-    parallax_evidence,
-)
+from kornia_learnnorm.two_view import parallax as module
 
 K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
 R = np.array([[0.9998, 0, 0.02], [0, 1, 0], [-0.02, 0, 0.9998]])
 t = np.array([0.4, 0.05, 0.1])
 H = torch.from_numpy(K @ (R + np.outer(t, [0, 0, 1]) / 5) @ np.linalg.inv(K))  # of the plane Z = 5
-
-
 ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # epipolar lines are the rows
 
 
@@ -46,14 +35,14 @@ def make_scene(plane: int, off: int, outliers: int, noise: float, seed: int = 0)
 class TestFit:
     def test_exact(self):
         points1, points2 = make_scene(200, 5, 0, 0.0)
-        F_mat = fit_plane_and_parallax(points1, points2, H, 1.0, 0)
+        F_mat = module.fit_plane_and_parallax(points1, points2, H, 1.0, 0)
         assert np.abs(epipolar_distances(points1, points2, F_mat)).max() < 1e-5
         assert float(F_mat.norm()) == pytest.approx(1)
-        assert fit_plane_and_parallax(*make_scene(50, 2, 0, 0.0), H, 1.0, 0) is None  # nothing is off the plane
+        assert module.fit_plane_and_parallax(*make_scene(50, 2, 0, 0.0), H, 1.0, 0) is None  # nothing is off the plane
 
     def test_few_matches_off_the_plane_among_outliers(self):
         points1, points2 = make_scene(300, 15, 60, 0.3)
-        F_mat = fit_plane_and_parallax(points1, points2, H, 1.0, 0)
+        F_mat = module.fit_plane_and_parallax(points1, points2, H, 1.0, 0)
         assert np.median(epipolar_distances(points1[300:315], points2[300:315], F_mat)) < 1.0
 
 
@@ -62,8 +51,8 @@ class TestEvidence:
         points1, points2 = make_scene(3, 3, 0, 0.0)
         moved = np.c_[points1, np.ones(6)] @ H.numpy().T
         expected = np.linalg.norm(moved[:, :2] / moved[:, 2:] - points2.numpy(), axis=1)
-        assert np.allclose(parallax(points1, points2, H), expected, atol=1e-9)
-        assert torch.isinf(parallax(torch.zeros(1, 2), torch.zeros(1, 2), torch.diag(torch.tensor([1.0, 1, 0]))))
+        assert np.allclose(module.parallax(points1, points2, H), expected, atol=1e-9)
+        assert torch.isinf(module.parallax(torch.zeros(1, 2), torch.zeros(1, 2), torch.diag(torch.tensor([1.0, 1, 0]))))
 
     def test_by_hand(self):
         """Ten matches at 20 px, six of them on their lines and four across; two of the six determine the epipole."""
@@ -71,11 +60,12 @@ class TestEvidence:
         points2 = points1 + torch.tensor([[20.0, 0]] * 6 + [[0.0, 20]] * 4)
         ratio, shares = math.exp(100) / np.i0(100), np.arange(0.05, 1, 0.1)
         gain = (4 * np.log1p(shares * (ratio - 1)) + 4 * np.log1p(-shares)).max()
-        found = parallax_evidence(points1, points2, ROWS, torch.full((10,), 20.0), 1.0, (1.0,))
+        found = module.parallax_evidence(points1, points2, ROWS, torch.full((10,), 20.0), 1.0, (1.0,))
         assert found == pytest.approx(math.log10(10 * 45) - gain / math.log(10))
 
     def test_too_few_matches_off_the_plane(self):
-        assert parallax_evidence(*torch.rand(2, 5, 2).double(), ROWS, torch.tensor([9.0, 9, 0, 0, 0]), 1.0) == math.inf
+        distance = torch.tensor([9.0, 9, 0, 0, 0])
+        assert module.parallax_evidence(*torch.rand(2, 5, 2).double(), ROWS, distance, 1.0) == math.inf
 
     @given(st.integers(3, 40), st.integers(0, 40))
     def test_more_inliers_are_stronger_evidence(self, inliers, outliers):
@@ -83,21 +73,22 @@ class TestEvidence:
         distance = torch.full((len(points1),), 30.0)
         less, more = (torch.where(torch.arange(len(points1)) < n, 0.0, 30.0) for n in (inliers, inliers + 1))
         less, more = (torch.stack([torch.zeros(len(points1)), across], 1).double() for across in (less, more))
-        evidence = [parallax_evidence(points1, points2, ROWS, distance, 1.0) for points2 in (less, more)]
+        evidence = [module.parallax_evidence(points1, points2, ROWS, distance, 1.0) for points2 in (less, more)]
         assert evidence[1] <= evidence[0]
 
     @pytest.mark.parametrize("seed", range(6))
     def test_of_a_plane_there_is_none(self, seed):
         """Although the epipole is the best one, and a third of the matches is random."""
         points = make_scene(200, 0, 100, 0.5, seed)
-        F_mat = fit_plane_and_parallax(*points, H, 1.0, 0)
-        assert parallax_evidence(*points, F_mat, parallax(*points, H), 1.0) > MAX_LOG_CHANCE_PARALLAX
+        F_mat = module.fit_plane_and_parallax(*points, H, 1.0, 0)
+        evidence = module.parallax_evidence(*points, F_mat, module.parallax(*points, H), 1.0)
+        assert evidence > module.MAX_LOG_CHANCE_PARALLAX
 
 
 def test_main_plane():
     pytest.importorskip("cv2", reason="OpenCV is not installed")
     points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (40, 2)))
-    found = find_main_plane(points, points + 7.0, 1.0)
+    found = module.find_main_plane(points, points + 7.0, 1.0)
     assert np.allclose(found / found[2, 2], [[1, 0, 7], [0, 1, 7], [0, 0, 1]], atol=1e-6)
 
 
@@ -124,25 +115,18 @@ def matches(distortion, relief=0.0, noise=0.1, number=300):
     return tuple(p + noise * torch.from_numpy(rng.normal(size=(number, 2))) for p in points)
 
 
-@pytest.fixture(scope="module")
-def relief():
-    """Matches of a bent plane with relief, and their distances from it."""
-    points = matches(0.05, relief=5.0)
-    return points, distances_from_plane(*points, BENT, SIZE, SIZE, 1.0)
-
-
 class TestDistancesFromPlane:
     @pytest.mark.parametrize("distortion", [-0.1, 0.0, 0.15])
     def test_a_bent_plane_is_a_plane(self, distortion):
         points = matches(distortion, noise=0.0)
-        assert distances_from_plane(*points, BENT, SIZE, SIZE, 1.0).max() < 1e-3
+        assert module.distances_from_plane(*points, BENT, SIZE, SIZE, 1.0).max() < 1e-3
         if distortion:
-            assert parallax(*points, BENT).max() > 1
+            assert module.parallax(*points, BENT).max() > 1
 
     @pytest.mark.parametrize("distortion", [0.0, 0.08])
     def test_parallax_stays(self, distortion):
         points = matches(distortion, relief=10.0)
-        off = distances_from_plane(*points, BENT, SIZE, SIZE, 1.0)
+        off = module.distances_from_plane(*points, BENT, SIZE, SIZE, 1.0)
         expected = 10 * np.hypot(1, 0.5) * torch.linspace(-1, 1, 150).abs()
         assert off[1::2].max() < 0.6
         assert (off[::2] / expected)[expected > 2].median() == pytest.approx(1, abs=0.15)
@@ -150,14 +134,16 @@ class TestDistancesFromPlane:
     def test_points_at_infinity(self):
         points1, points2 = matches(0.0)
         points1[0] = torch.tensor([0.0, 50000.0])  # on the line that this homography moves to infinity
-        assert distances_from_plane(points1, points2, BENT, SIZE, SIZE, 1.0).isnan().sum() == 0
+        assert module.distances_from_plane(points1, points2, BENT, SIZE, SIZE, 1.0).isnan().sum() == 0
 
     @given(scale=st.floats(0.1, 10))
-    def test_moves_with_the_scale_of_the_images(self, relief, scale):
-        (points1, points2), expected = relief
+    def test_moves_with_the_scale_of_the_images(self, scale):
+        points1, points2 = matches(0.05, relief=5.0)
+        expected = module.distances_from_plane(points1, points2, BENT, SIZE, SIZE, 1.0)
         S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
         size = (SIZE[0] * scale, SIZE[1] * scale)
-        scaled = distances_from_plane(scale * points1, scale * points2, S @ BENT @ S.inverse(), size, size, scale)
+        moved = scale * points1, scale * points2, S @ BENT @ S.inverse()
+        scaled = module.distances_from_plane(*moved, size, size, scale)
         torch.testing.assert_close(scaled, scale * expected, rtol=1e-4, atol=1e-4 * scale)
 
 
@@ -185,10 +171,10 @@ SHIFT = torch.cat([torch.zeros(60), torch.linspace(10, 60, 40)])
 )
 def test_measure_parallax(shift, distance, near, planar, monkeypatch):
     """Of the identity, under which a hundred points stay or move along one direction."""
-    monkeypatch.setattr(parallax_module, "find_main_plane", lambda *_: torch.eye(3).double())
-    monkeypatch.setattr(parallax_module, "distances_from_plane", lambda *_: shift)
+    monkeypatch.setattr(module, "find_main_plane", lambda *_: torch.eye(3).double())
+    monkeypatch.setattr(module, "distances_from_plane", lambda *_: shift)
     points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], [640, 480], (100, 2)))
     across = torch.tensor([0, distance / 2], dtype=torch.float64)  # in each image
-    found = measure_parallax(points, points + across, ROWS, 1.0, (640, 480), (640, 480))
+    found = module.measure_parallax(points, points + across, ROWS, 1.0, (640, 480), (640, 480))
     assert (found.near, found.planar) == (pytest.approx(near), planar)
     assert f"explains {near:.0%} of the inliers within 1 px" in found.describe(1.0)

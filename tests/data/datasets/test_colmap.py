@@ -1,4 +1,5 @@
 import shutil
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -7,12 +8,6 @@ from make_sequences import SIZE, names
 from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-
-
-@pytest.fixture(scope="module")
-def model(written):
-    """A model and its images, not to be changed."""
-    return written / "colmap"
 
 
 def read(folder):
@@ -24,7 +19,8 @@ def set_camera(folder, camera: str) -> None:
 
 
 class TestReadColmap:
-    def test_binary_model(self, model, tmp_path):
+    def test_binary_model(self, written, tmp_path):
+        model = written / "colmap"
         pycolmap.Reconstruction(str(model / "model")).write_binary(str(tmp_path))
         for text, binary in zip(read(model), read_colmap(str(tmp_path), str(model / "images")), strict=True):
             assert text.name == binary.name
@@ -78,18 +74,14 @@ class TestReadColmap:
 
 
 class TestCovisiblePairs:
-    def shared(self, folder) -> dict[tuple[str, str], int]:
-        """Common points by pair, counted in the text of the model."""
-        lines = (folder / "model" / "images.txt").read_text().splitlines()[1:]
-        seen = {
-            image.split()[-1]: set(points.split()[2::3]) - {"-1"}
-            for image, points in zip(lines[::2], lines[1::2], strict=True)
-        }
-        return {(a, b): len(seen[a] & seen[b]) for a in seen for b in seen if a < b}
-
     @pytest.mark.parametrize("min_points", [1, 88, 96, 97])
-    def test_common_points(self, model, min_points):
-        expected = [pair for pair, count in sorted(self.shared(model).items()) if count >= min_points]
+    def test_common_points(self, written, min_points):
+        """As many as the text of the model lists."""
+        model = written / "colmap"
+        lines = (model / "model" / "images.txt").read_text().splitlines()[1:]
+        points = [set(line.split()[2::3]) - {"-1"} for line in lines[1::2]]
+        seen = dict(zip([line.split()[-1] for line in lines[::2]], points, strict=True))
+        expected = [(a, b) for a, b in combinations(sorted(seen), 2) if len(seen[a] & seen[b]) >= min_points]
         assert names(covisible_pairs(model / "model", read(model), min_points)) == expected
 
     def test_errors(self, colmap):

@@ -168,17 +168,12 @@ class TestProcesses:
 
 
 class TestDask:
-    @pytest.fixture
-    def cluster(self):
-        distributed = pytest.importorskip("distributed", reason="Dask is not installed")
-        with distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50
-        ) as cluster:
-            yield cluster
-
     @pytest.mark.usefixtures("_a_worker_dies")
-    def test_same_store_though_a_worker_is_killed(self, images, expected, tmp_path, cluster):
-        collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask=cluster.scheduler_address)
+    def test_same_store_though_a_worker_is_killed(self, images, expected, tmp_path):
+        distributed = pytest.importorskip("distributed", reason="Dask is not installed")
+        options = {"threads_per_worker": 1, "dashboard_address": ":0", "silence_logs": 50}
+        with distributed.LocalCluster(n_workers=2, processes=True, **options) as cluster:
+            collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS, dask=cluster.scheduler_address)
         assert_same(expected, tmp_path / "store.h5")
 
     def test_nobody_at_the_address(self, images, tmp_path):
@@ -261,10 +256,8 @@ def test_cut_is_a_subset_with_at_most_so_many_of_each_class(images, seed, most):
     noisy = np.concatenate([near + rng.normal(size=near.shape) * 0.1, rng.normal(size=(30, 8))])
     first = Features(points, np.concatenate([near, far]).astype(np.float32), (160, 120))
     second = Features(points + 1, noisy.astype(np.float32), (160, 120))
-    whole, cut = (
-        match_frames(pairs_of(images)[0], first, second, MatchOptions(max_matches=number, seed=seed))
-        for number in (None, most)
-    )
+    options = (MatchOptions(max_matches=number, seed=seed) for number in (None, most))
+    whole, cut = (match_frames(pairs_of(images)[0], first, second, option) for option in options)
     rows, some = (list(map(tuple, np.column_stack([s.points1, s.points2, s.ratio]))) for s in (whole, cut))
     assert len(set(some)) == len(some)
     assert set(some) <= set(rows)

@@ -93,7 +93,6 @@ class TestOneToOne:
 
 
 def test_both_ways():
-    """Against a table of all distances."""
     rng = np.random.default_rng(0)
     descriptors = [rng.integers(0, 256, (number, 128), dtype=np.uint8) for number in (40, 30)]
     descriptors[1][:20] = descriptors[0][:20] + rng.integers(0, 3, (20, 128), dtype=np.uint8)

@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from pairwise import pairwise
 
 from kornia_learnnorm.evaluation.report.method_tables import papers_data, rate_tables, report_tables
 from kornia_learnnorm.evaluation.report.robust_tables import robust_tables
@@ -28,15 +29,6 @@ def test_paired_tests(run):
     assert tests["Hartley+LM"][1].startswith("-")
 
 
-def without_truth(run, robust):
-    truth = ("truth", "heldout", "f1", "error", "rotation_error", "translation_error")
-    robust_results = [r for cell in robust.cells for e in cell.estimates.values() for r in e.values()]
-    for results in (*(p for cell in run.cells for p in cell.predictions.values()), *robust_results):
-        for key in results.keys() & truth:
-            results[key][:] = torch.nan
-    return run, robust
-
-
 def test_the_papers_data():
     for description, name in [
         ("KITTI odometry 06, 10", "KITTI"),
@@ -53,7 +45,11 @@ def test_without_ground_truth_there_are_inliers_and_heldout_errors(run, robust_r
     found, robust = read_run(run), read_robust(robust_run)
     shares = found.cells[0].predictions["whitening"]["inliers"].clone()
     heldout = {name: p["heldout"].clone() for name, p in found.cells[0].predictions.items()}
-    found, robust = without_truth(found, robust)
+    truth = ("truth", "heldout", "f1", "error", "rotation_error", "translation_error")
+    robust_results = [r for cell in robust.cells for e in cell.estimates.values() for r in e.values()]
+    for results in (*(p for cell in found.cells for p in cell.predictions.values()), *robust_results):
+        for key in results.keys() & truth:
+            results[key][:] = torch.nan
     every = (*report_tables(found), *robust_tables(robust))
     cells = [cell for table in every for row in as_text(table.rows) for cell in row]
     assert "" in cells
@@ -169,8 +165,7 @@ def test_weights_of_ones_own_and_an_unknown_truth():
     assert "`mine` 25.0 %, `Hartley` 25.0 %. No ground truth is known." in text
 
 
-@pytest.mark.parametrize("pairs", [1, 7, 8])
-@pytest.mark.parametrize("scale", [0.5, 2.0])
+@pairwise(pairs=[1, 7, 8], scale=[0.5, 2.0])
 def test_few_pairs_are_not_tested(pairs, scale):
     text = summary_of({"mine": scale}, torch.arange(SAMPLES) % pairs)
     assert ("change of the geometric mean" in text) == (pairs == 8)

@@ -21,6 +21,12 @@ def times(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*.npz")}
 
 
+def matches(noise=0.2, outliers=0.2):
+    """The correspondences of a synthetic image pair."""
+    store = synthetic_store(1, 300, seed=3, noise=noise, outliers=outliers, scenes=["hand-held"])
+    return shuffled_pair(store, 0, "unfiltered", 0)
+
+
 def test_files_and_numbers(robust_run, robust_store):
     assert len(times(robust_run / "robust")) == 2 * 2 * 4  # protocols, thresholds, estimators
     filtered, unfiltered = read_robust(robust_run).cells
@@ -105,7 +111,7 @@ def test_protocols_and_order():
     assert torch.equal(first, again)
 
 
-def test_measure(matches):
+def test_measure():
     drawn = matches()
     true = measure(drawn, drawn.F_mat, 0.5)
     assert true["f1"] == 1
@@ -123,7 +129,7 @@ KNOWN_CAMERAS = ["RANSAC-calibrated", "poselib-calibrated", "opencv-usac-magsac-
 
 
 @pytest.mark.parametrize("name", [*DEFAULT_ESTIMATORS, *KNOWN_CAMERAS, "RANSAC:Hartley+optimal"])
-def test_each_finds_the_truth(name, matches):
+def test_each_finds_the_truth(name):
     try:
         estimator = find_estimator(name)
     except ImportError as error:
@@ -138,7 +144,7 @@ def test_each_finds_the_truth(name, matches):
 
 
 @pytest.mark.parametrize("name", KNOWN_CAMERAS)
-def test_known_cameras(name, matches):
+def test_known_cameras(name):
     """The matrix has the essential one's equal singular values; without cameras there is none."""
     if name.startswith("poselib"):
         pytest.importorskip("poselib", reason="PoseLib is not installed")
@@ -151,7 +157,7 @@ def test_known_cameras(name, matches):
 
 
 @pytest.mark.parametrize("name", ["learned:{}", "learned:{}+LM", "guided:{}"])
-def test_learned_weights_in_a_file(name, matches, tmp_path):
+def test_learned_weights_in_a_file(name, tmp_path):
     layer, file = shaken_estimator(), tmp_path / "mine.safetensors"
     layer.save_pretrained(file)
     drawn = matches(outliers=0.0)
@@ -167,7 +173,7 @@ def test_learned_weights_in_a_file(name, matches, tmp_path):
     assert file.name in robust_estimators.identify_estimator(name.format(file))
 
 
-def test_learned_relative_pose_takes_cameras_and_scores(matches, tmp_path):
+def test_learned_relative_pose_takes_cameras_and_scores(tmp_path):
     layer, drawn = kln.LearnedRelativePose(width=16, depth=1).eval(), matches(outliers=0.2)
     layer.save_pretrained(tmp_path / "pose.safetensors")
     name = f"learned:{tmp_path / 'pose.safetensors'}"
@@ -183,14 +189,14 @@ def test_learned_relative_pose_takes_cameras_and_scores(matches, tmp_path):
         find_estimator(f"{name}+LM")
 
 
-def test_the_seed_decides(matches):
+def test_the_seed_decides():
     drawn, estimator = matches(noise=0.5, outliers=0.4), find_estimator("RANSAC:Hartley")
     first, again, other = (run_estimator(estimator, drawn, seed, 1.0).F_mat for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
-def test_what_fails_is_a_failure(monkeypatch, matches):
+def test_what_fails_is_a_failure(monkeypatch):
     for wrong in (None, np.zeros((9, 3))):
         package = peers.PeerPackage(lambda *_, wrong=wrong: wrong, "math")
         monkeypatch.setitem(peers.PEERS, "poselib", package)
@@ -211,14 +217,8 @@ def test_unknown():
 
 def test_names(tmp_path):
     path = str(tmp_path / "mine" / "weights.safetensors")
-    names = [
-        f"learned:{path}",
-        f"learned:{path}+scores",
-        f"RANSAC:{path}",
-        "poselib",
-        "RANSAC:kornia_learnnorm:Whitening",
-    ]
     short = ["learned:mine", "learned:mine+scores", "RANSAC:mine", "poselib", "RANSAC:kornia_learnnorm:Whitening"]
+    names = [name.replace("mine", path) for name in short]
     assert [*robust_estimators.estimator_names(names).values()] == short
     with pytest.raises(ValueError, match="same name"):
         robust_estimators.estimator_names(["RANSAC", "RANSAC"])

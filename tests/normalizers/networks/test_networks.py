@@ -117,7 +117,6 @@ class TestGradients:
 
 class TestSetMaximum:
     def test_leaves_out_absent_points(self):
-        """Five points of the first set and all of the second one."""
         features, absent = uniform(3, 8, 5, low=-1), torch.tensor([3, 0, 8])[:, None, None] <= torch.arange(8)[:, None]
         found = set_maximum(features, absent, 1)
         assert torch.equal(found[0], features[0, :3].amax(0))
@@ -192,8 +191,6 @@ class TestCrossViewNetwork:
 
 
 class TestFeatures:
-    """What a view's answer depends on."""
-
     @pytest.mark.parametrize(("features", "sees"), [("own", False), ("both", True), ("epipolar", True)])
     @pytest.mark.parametrize("num_points", [8, 20])
     def test_the_other_view(self, features, sees, num_points):
