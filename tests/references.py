@@ -170,10 +170,7 @@ def _wrong_correspondences(least: int) -> list[tuple]:
 
 
 def check_gradients(function, *values: Tensor, eps: float = 1e-6, atol: float = 1e-5, rtol: float = 1e-3) -> None:
-    """Check gradients of numbers (B, K) of B independent sets against central differences, all of them in one call.
-
-    As ``torch.autograd.gradcheck``, which calls the function twice for each entry.
-    """
+    """Check gradients of numbers (B, K) of B sets against central differences, all in one call, unlike gradcheck."""
     flat = torch.cat([value.detach().flatten(1) for value in values], 1).requires_grad_()
 
     def numbers(rows: Tensor) -> Tensor:

@@ -1,7 +1,4 @@
-"""Levenberg-Marquardt against Gauss-Newton in NumPy on numerical derivatives, and the properties it must have.
-
-Of fundamental matrices, invariances and zero weights are in test_contract.py.
-"""
+"""Levenberg-Marquardt against Gauss-Newton in NumPy on numerical derivatives; invariances are in test_contract.py."""
 
 import numpy as np
 import pytest

@@ -45,27 +45,19 @@ class TestWeighted:
         drawn = WeightedSampler(torch.full((50,), weight, dtype=torch.float64)).draw(500, generator)
         assert len(drawn.sort(-1).values.unique(dim=0)) > 490
 
-    def test_zero_is_less_than_next_to_nothing(self, generator):
-        weights = torch.zeros(50, dtype=torch.float64)
-        weights[:4], weights[4:12] = 1e10, 1e-30
-        assert WeightedSampler(weights).draw(500, generator).max() < 12
-
     @pytest.mark.parametrize("size", [5, 8])
     def test_zero_is_never_drawn(self, size, generator):
-        weights = torch.zeros(100)
-        weights[10:20] = torch.linspace(0.1, 1, 10)
+        """Next to nothing is, where too few have more."""
+        weights = torch.zeros(100, dtype=torch.float64)
+        weights[10:14], weights[14:20] = 1e10, 1e-30
         rows = WeightedSampler(weights, size).draw(2000, generator)
         assert rows.shape == (2000, size)
-        assert set(rows.flatten().tolist()) <= set(range(10, 20))
+        assert set(rows.flatten().tolist()) == set(range(10, 20))
         assert (rows.sort(-1).values.diff(dim=-1) > 0).all()
 
 
-ROWS = torch.arange(100)
-
-
 def test_hit_rate():
-    for sampler, inliers, expected in [
-        *((UniformSampler(100, CPU, size), ROWS < 50, 0.5**size) for size in (5, 8)),
-        (WeightedSampler(torch.where(ROWS < 10, 3.0, 1.0)), ROWS < 10, 0.5**8),
-    ]:
-        assert sampler.hit_rate(inliers, ROWS) == pytest.approx(expected)
+    rows = torch.arange(100)
+    weighted = WeightedSampler(torch.where(rows < 10, 3.0, 1.0))
+    for sampler, inliers in ((UniformSampler(100, CPU, 5), rows < 50), (weighted, rows < 10)):
+        assert sampler.hit_rate(inliers, rows) == pytest.approx(0.5**sampler.size)
