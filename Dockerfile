@@ -1,0 +1,11 @@
+# The versions of the lock, built without a network:
+#   pip download --requirement requirements.lock --dest wheels
+#   docker build --network none --tag learnnorm .
+#   docker run --rm --volume $PWD:/work learnnorm estimate left.jpg right.jpg
+FROM python:3.11-slim
+WORKDIR /source
+COPY . .
+RUN pip install --no-cache-dir --no-index --find-links wheels --requirement requirements.lock \
+    && pip install --no-cache-dir --no-deps --no-build-isolation .
+WORKDIR /work
+ENTRYPOINT ["learnnorm"]
