@@ -52,10 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = group.add_argument
     add("--ratio", type=float, default=options.ratio, help=f"ratio test of nearest neighbours {default}")
     add("--max-size", metavar="PX", type=int, default=options.max_size, help=f"longer side of the images {default}")
+    passes = f"passes of MatchRefiner, 2 for XFeat {default}"
+    add("--refine", metavar="PASSES", type=int, default=options.refine, help=passes)
     mask = "one or two: features count where it is white"
     add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
     many = parser.add_argument_group("many pairs")
-    listed = "two files a line, or a folder of images; results in --out"
+    listed = "two files a line, or a folder; results in --out"
     many.add_argument("--pairs", metavar="LIST", type=Path, help=listed)
     add = many.add_mutually_exclusive_group().add_argument
     add("--gap", metavar="N", type=int, default=1, help=f"of a folder: images N apart {default}")
@@ -70,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     _check_options(args)
     doubtful = NO_MATRIX if args.strict else DOUBTFUL
     weights = (args.weights or "robust-synthetic") if args.estimator == "learned" else None
-    names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher", "model", "matches")
+    names = ("ratio", "threshold", "seed", "max_size", "detector", "matcher", "model", "matches", "refine")
     options = many_pairs.PairOptions(weights, K=tuple(args.K), **{name: getattr(args, name) for name in names})
     if args.pairs is not None:
         listed = not args.pairs.is_dir()

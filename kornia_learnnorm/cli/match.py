@@ -52,7 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_feature_arguments(parser: argparse._ActionsContainer) -> None:
     """Add the arguments that say which features are matched and how."""
     for option, names in (("detector", DETECTORS), ("matcher", MATCHERS)):
-        text, default = f"{', '.join(names)} (default: %(default)s)", getattr(MatchOptions, option)
+        default = getattr(MatchOptions, option)
+        text = " ".join(f"{name} (default)" if name == default else name for name in names)
         parser.add_argument(f"--{option}", metavar="NAME", choices=names, default=default, help=text)
 
 

@@ -12,6 +12,7 @@ from kornia_learnnorm.data import images
 from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Features, check_mask, keep_features
 from kornia_learnnorm.data.matching.matchers import check_methods, match_both_ways, match_lightglue
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points
 from kornia_learnnorm.models.homography import Homography
@@ -45,6 +46,7 @@ def estimate_pair(
     detector: str = "sift",
     matcher: str = "nearest",
     model: str = "auto",
+    refiner: MatchRefiner | None = None,
 ) -> PairEstimate:
     """Return the fundamental matrix or homography of two images with its predicted error and the reasons to doubt it.
 
@@ -68,6 +70,7 @@ def estimate_pair(
         detector: a key of ``kornia_learnnorm.data.matching.features.DETECTORS``.
         matcher: one of ``kornia_learnnorm.data.matching.matchers.MATCHERS``.
         model: ``"auto"``, ``"fundamental"`` or ``"homography"``.
+        refiner: moves the matches to sub-pixel accuracy before the matrix is estimated.
 
     Raises:
         FileNotFoundError: if a file does not exist.
@@ -79,7 +82,7 @@ def estimate_pair(
     """
     check_settings(threshold, seed, layer, model)
     read_cameras(K1, K2)  # before the work begins
-    pair = match_two_images(image1, image2, ratio, mask1, mask2, max_size, detector, matcher)
+    pair = match_two_images(image1, image2, ratio, mask1, mask2, max_size, detector, matcher, refiner)
     return pair.estimate(layer, threshold, seed, K1, K2, model)
 
 
@@ -155,12 +158,17 @@ def match_two_images(
     max_size: int = MAX_SIZE,
     detector: str = "sift",
     matcher: str = "nearest",
+    refiner: MatchRefiner | None = None,
 ) -> MatchedPair:
     """Return the matches of two images; arguments and errors are those of :func:`estimate_pair`."""
     check_matching(ratio, max_size, detector, matcher)
+    if not isinstance(refiner, MatchRefiner | None):
+        raise TypeError(f"refiner must be a MatchRefiner or None, got {type(refiner).__name__}")
     path1, path2 = (Path(image) if isinstance(image, str | Path) else None for image in (image1, image2))
-    features1, full_size1 = _features(image1, mask1, max_size, detector)
-    features2, full_size2 = _features(image2, mask2, max_size, detector)
+    pixels1, full_size1 = _pixels(image1, max_size, detector in READS_COLOUR)
+    pixels2, full_size2 = _pixels(image2, max_size, detector in READS_COLOUR)
+    features1 = _features(pixels1, full_size1, mask1, detector)
+    features2 = _features(pixels2, full_size2, mask2, detector)
     for number, features in enumerate((features1, features2), 1):
         if len(features.points) < 2:
             text = f"image {number} is blank, nearly so, or masked: {len(features.points)} features, expected 2 or more"
@@ -168,12 +176,19 @@ def match_two_images(
     about = features1.size, features2.size, full_size1, full_size2
     if matcher != "nearest":
         points1, points2, scores = (part.double() for part in match_lightglue(features1, features2, detector))
-        return MatchedPair(points1, points2, scores, scores >= 0, *about, None, path1, path2)
-    matches, back = match_both_ways(features1, features2)
-    larger = torch.maximum(matches.ratio, back)
-    kept = matches.ratio.double() < ratio
-    points1, points2, ratios = (value[kept].double() for value in (matches.points1, matches.points2, larger))
-    return MatchedPair(points1, points2, 1 - ratios, ratios < ratio, *about, float(ratio), path1, path2)
+        found = MatchedPair(points1, points2, scores, scores >= 0, *about, None, path1, path2)
+    else:
+        matches, back = match_both_ways(features1, features2)
+        larger = torch.maximum(matches.ratio, back)
+        kept = matches.ratio.double() < ratio
+        points1, points2, ratios = (value[kept].double() for value in (matches.points1, matches.points2, larger))
+        found = MatchedPair(points1, points2, 1 - ratios, ratios < ratio, *about, float(ratio), path1, path2)
+    if refiner is None:
+        return found
+    views = (torch.from_numpy(np.atleast_3d(pixels)).permute(2, 0, 1)[None] for pixels in (pixels1, pixels2))
+    with torch.no_grad():
+        moved = refiner(*views, points1[None], points2[None])
+    return replace(found, points1=moved.points1[0], points2=moved.points2[0])
 
 
 def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> None:
@@ -195,9 +210,8 @@ def _named(error: NoReliableMatrixError, paths: tuple[Path | None, Path | None])
     return NoReliableMatrixError(error.code, f"{names}: {error}")
 
 
-def _features(image: Image, mask: Mask | None, max_size: int, detector: str) -> tuple[Features, images.Size]:
-    """Return the features of an image at the size at which it is matched, and its full size."""
-    pixels, size = _pixels(image, max_size, detector in READS_COLOUR)
+def _features(pixels: NDArray[np.uint8], size: images.Size, mask: Mask | None, detector: str) -> Features:
+    """Return the features of an image as it is matched; the mask has the full size."""
     frame = images.content_mask(_grey(pixels))
     if mask is not None:
         mask = mask.cpu().numpy() if isinstance(mask, Tensor) else mask
@@ -205,7 +219,7 @@ def _features(image: Image, mask: Mask | None, max_size: int, detector: str) -> 
         small = images.import_cv2().resize(mask.astype(np.uint8), pixels.shape[1::-1], interpolation=0) > 0
         frame = small if frame is None else small & frame
     features = DETECTORS[detector](pixels, NUM_FEATURES)
-    return (features if frame is None else keep_features(features, frame)), size
+    return features if frame is None else keep_features(features, frame)
 
 
 def _pixels(image: Image, max_size: int, colour: bool) -> tuple[NDArray[np.uint8], images.Size]:

@@ -19,12 +19,13 @@ from kornia_learnnorm.data.images import image_size, import_cv2
 from kornia_learnnorm.data.matching.features import MissingWeightsError
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.files import atomic_write, exclusive, full_disk_names, write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.two_view.estimate_pair import MAX_SIZE, check_matching, estimate_pair
-from kornia_learnnorm.two_view.inputs import check_settings
+from kornia_learnnorm.two_view.inputs import check_settings, check_whole
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, package_versions
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
@@ -51,22 +52,38 @@ class PairOptions:
     matcher: str = "nearest"
     model: str = "auto"
     matches: bool = False  # results hold the matches
+    refine: int = 0  # passes of ``MatchRefiner`` over the matches
 
     def __post_init__(self) -> None:
         check_settings(self.threshold, self.seed, model=self.model)
         check_matching(self.ratio, self.max_size, self.detector, self.matcher)
+        check_whole("refine", self.refine)
+        if self.refine < 0:
+            raise ValueError(f"refine must be 0 or more passes, got {self.refine}")
 
     def arguments(self, image1: Path, image2: Path) -> dict[str, Any]:
         """Return the keyword arguments of ``estimate_pair`` for two image files."""
-        options = {name: value for name, value in vars(self).items() if name not in ("weights", "K", "matches")}
+        options = {
+            name: value for name, value in vars(self).items() if name not in ("weights", "K", "matches", "refine")
+        }
         texts = self.K * 2 if len(self.K) == 1 else self.K
         cameras = [read_camera(text, image) for text, image in zip(texts, (image1, image2), strict=False)]
-        return {**options, "layer": _layer(self.weights), **dict(zip(("K1", "K2"), cameras, strict=False))}
+        modules = {"layer": _layer(self.weights), "refiner": _refiner(self.refine)}
+        return {**options, **modules, **dict(zip(("K1", "K2"), cameras, strict=False))}
 
 
 @lru_cache(maxsize=1)
 def _layer(weights: str | None) -> LearnedEightPoint | None:
     return None if weights is None else LearnedEightPoint.from_pretrained(weights)
+
+
+@lru_cache(maxsize=1)
+def _refiner(passes: int) -> MatchRefiner | None:
+    if passes == 0:
+        return None
+    refiner = MatchRefiner.from_pretrained()
+    refiner.passes = passes
+    return refiner
 
 
 def read_pair_list(path: str | Path) -> list[FilePair]:

@@ -5,6 +5,7 @@ import pytest
 import torch
 from references import epipolar_distances
 
+import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
@@ -80,6 +81,19 @@ class TestEstimatePair:
         assert found.threshold == pytest.approx(WIDTH / 240, rel=0.01)
         assert np.median(distances(result, found.F_mat)) < 0.5
 
+    def test_refined_matches(self, images, result):
+        """An untrained refiner moves nothing; the trained one moves points within its bound, nearer to their lines."""
+        found = match_two_images(*images)
+        same = match_two_images(*images, refiner=kln.MatchRefiner())
+        torch.testing.assert_close(same.points1, found.points1, rtol=0, atol=1e-3)
+        refiner = kln.MatchRefiner.from_pretrained()
+        moved = match_two_images(*images, refiner=refiner)
+        distance = (moved.points2 - found.points2).norm(dim=1)
+        assert 0.01 < distance.median() < distance.max() <= refiner.bound / 2**0.5 + 1e-6
+        assert not moved.points1.requires_grad
+        estimate = estimate_pair(*images, refiner=refiner)
+        assert np.median(distances(estimate, F)) < np.median(distances(result, F))
+
     def test_masks(self, images, result):
         left = np.zeros((HEIGHT, WIDTH), bool)
         left[:, : WIDTH // 2] = True
@@ -131,6 +145,7 @@ class TestErrors:
             ({"threshold": np.nan}, ValueError, "threshold must be positive"),
             ({"ratio": "x"}, TypeError, "ratio must be a number, got 'x'"),
             *(({"ratio": ratio}, ValueError, "ratio must be above 0") for ratio in (0.0, 1.5, np.nan)),
+            ({"refiner": "robust"}, TypeError, "refiner must be a MatchRefiner or None, got str"),
             ({"max_size": 99.5}, TypeError, "max_size must be a whole number, got 99.5"),
             ({"max_size": 10}, ValueError, "max_size must be at least 64"),
             ({"detector": "surf"}, ValueError, "detector must be one of sift, .*, got 'surf'"),
