@@ -89,7 +89,10 @@ def main(args: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still in the buffer
         return 141
     except (ValueError, OSError, ImportError) as error:
-        print(f"learnnorm {words[0]}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        text = str(error)
+        if isinstance(error, OSError) and error.strerror and error.filename:  # in words, not as Python shows it
+            text = f"{error.filename}: {error.strerror}"
+        print(f"learnnorm {words[0]}: error: {' '.join(text.split())}", file=sys.stderr)
         return 2
 
 
@@ -99,7 +102,7 @@ def make_parser(names: Collection[str] = (*TRAINING, *TOOLS)) -> argparse.Argume
     It knows the options of a training that are needed most, for its help; LightningCLI parses them, with all others.
     """
     parser = argparse.ArgumentParser(prog="learnnorm", formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.description, parser.epilog = "Learned normalisation of the eight-point algorithm", _examples(EXAMPLES)
+    parser.description, parser.epilog = "F, E and H from matches with outliers", _examples(EXAMPLES)
     parser.add_argument("--version", action="version", version=f"%(prog)s {kornia_learnnorm.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (text, about) in TRAINING.items():

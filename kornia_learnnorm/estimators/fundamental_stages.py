@@ -87,7 +87,7 @@ class FundamentalRefinement(Refinement):
         # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
         order = weights.argsort(dim=1, descending=True, stable=True)
         drawn, real = self._draw(evidence, weights, order)
-        some = evenly_ranked(order, MAX_SCORED)
+        some = evenly_ranked(order, present, MAX_SCORED)
         squares = evidence.single().select(some).squares(drawn.float())[0]
         means = geometric_scale(weights.gather(1, some).to(squares), self.model.dof, LAST_FLOOR**2)(squares)[..., 0]
         least = torch.where(real & means.isfinite(), means, torch.inf).amin(1)[:, None, None].to(M)

@@ -93,7 +93,8 @@ class HomographyRefinement(Refinement):
             torch.unflatten(value, 0, (-1, self.samples))
             for value in solve_four_points(x1.flatten(0, 1), x2.flatten(0, 1))
         )
-        present, some = (inliers > 0).to(inliers), evenly_ranked(order, MAX_SCORED)
+        present = (inliers > 0).to(inliers)
+        some = evenly_ranked(order, present, MAX_SCORED)
         few = present.gather(1, some)
         terms, products = (value.gather(2, some[:, None].expand(-1, value.shape[1], -1)) for value in self.evidence)
 

@@ -201,11 +201,14 @@ def draw_matches(weights: Tensor, order: Tensor, number: int, size: int) -> Tens
     return order.gather(1, ranks)
 
 
-def evenly_ranked(order: Tensor, most: int) -> Tensor:
-    """Return at most so many of sorted correspondences (B, N), evenly over their ranks."""
-    number = order.shape[1]
-    few = min(number, most)
-    return order[:, torch.arange(few, device=order.device) * number // few]
+def evenly_ranked(order: Tensor, present: Tensor, most: int) -> Tensor:
+    """Return at most so many of sorted correspondences (B, N), evenly over the ranks of those present, which are first.
+
+    ``present`` (B, N) is one for them and zero for others: how many others there are has no effect.
+    """
+    few = min(order.shape[1], most)
+    number = present.sum(1, keepdim=True, dtype=torch.int64).clamp(min=few)
+    return order.gather(1, torch.arange(few, device=order.device) * number // few)
 
 
 EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.0969815577985598, 20: 1.034397396133807}

@@ -177,7 +177,7 @@ def _most_consistent(
     E_mat, own_real = _suggested(spans, (E_mat, real[:, :number]), before)
     E_mat = least_cost(E_mat, own_real, _losses(evidence, model, E_mat, scale), present, 2)
     real = real[:, number:] & used.repeat_interleave(10, 1)
-    some = evenly_ranked(order, MAX_SCORED)
+    some = evenly_ranked(order, present, MAX_SCORED)
     losses = _losses(evidence.select(some), model, drawn, scale)
     E_mat = torch.cat([E_mat, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
     number = E_mat.shape[1]

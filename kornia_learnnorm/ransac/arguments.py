@@ -47,4 +47,5 @@ def check_matches(points1: Tensor, points2: Tensor, weights: Tensor | None, min_
         raise ValueError(f"weights must have shape {[*points1.shape[:1]]}, got {[*weights.shape]}")
     known = weights[(points1.isfinite() & points2.isfinite()).all(-1)]
     if not bool(known.isfinite().all()) or bool((known < 0).any()):
-        raise ValueError("weights must be finite and not negative where the points are finite")
+        wrong = int((~known.isfinite() | (known < 0)).sum())
+        raise ValueError(f"weights must be finite and not negative where the points are finite, got {wrong} others")

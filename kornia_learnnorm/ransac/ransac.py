@@ -140,7 +140,7 @@ class RANSAC(nn.Module):
     def extra_repr(self) -> str:
         """Return the parameters."""
         names = ("inl_th", "max_samples", "max_seconds", "confidence", "distance", "rank2", "refine", "seed")
-        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+        return ", ".join([f"model={self.model.name!r}", *(f"{name}={getattr(self, name)!r}" for name in names)])
 
     def forward(
         self,

@@ -6,7 +6,7 @@ import torch
 from pairwise import pairwise
 from scenes import uniform
 
-from kornia_learnnorm.estimators.moments import Evidence, draw_matches, draw_samples, fit_samples
+from kornia_learnnorm.estimators.moments import Evidence, draw_matches, draw_samples, evenly_ranked, fit_samples
 from kornia_learnnorm.estimators.set_network import MIN_VARIANCE, AttentiveContextBlock
 
 FEW, MANY = 6, 12  # correspondences, for a block of width 8: with many, statistics go into the weights
@@ -75,3 +75,13 @@ def test_heavier_correspondences_are_drawn_more_often():
     weights = torch.tensor([[1.0, 3.0, 0.0, 4.0]], dtype=torch.float64)
     drawn = draw_matches(weights, weights.argsort(dim=1, descending=True, stable=True), 2000, 7)
     np.testing.assert_allclose(np.bincount(drawn[0], minlength=4) / 14000, weights[0] / 8, atol=0.01)
+
+
+@pytest.mark.parametrize("number", [20, 150])
+def test_ranks_are_even_over_the_present(number):
+    """However many rows are masked: all of few, and of many those that are chosen without a mask."""
+    order, present = torch.arange(400).expand(2, -1), (torch.arange(400) < number).double().expand(2, -1)
+    alone = evenly_ranked(order[:, :number], present[:, :number], 128)
+    assert torch.equal(evenly_ranked(order, present, 128)[:, : alone.shape[1]], alone)
+    assert alone[0].diff().max() <= 2
+    assert alone.shape[1] == min(number, 128)
