@@ -1,8 +1,7 @@
 """Images for tests, and tiny image sequences in the layouts that the readers know.
 
-A camera moves along a textured wall that it faces, so that frame ``n`` is a window of the texture, ``STEP * n`` pixels
-further to the right, and cameras and poses are exact (but for the distortion of TUM's first two Kinects, which is not
-drawn).
+A camera moves along a textured wall that it faces: frame ``n`` is a window of the texture, ``STEP * n`` pixels further
+to the right. Cameras and poses are exact, but for the distortion of TUM's first two Kinects.
 """
 
 from functools import cache

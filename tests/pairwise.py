@@ -6,17 +6,13 @@ from itertools import combinations, product
 import pytest
 
 
-def pairwise_cases(*axes: Iterable) -> list[tuple]:
-    """Return cases with one value of each axis, chosen greedily until every pair of values of two axes is in one."""
-    values = [[*axis] for axis in axes]
+def pairwise(**axes: Iterable) -> pytest.MarkDecorator:
+    """Parametrise a test by cases, chosen greedily until every pair of values of two axes is in one."""
+    values = [[*axis] for axis in axes.values()]
     pairs = {case: {*combinations(enumerate(case), 2)} for case in product(*(range(len(axis)) for axis in values))}
     missing, cases = set().union(*pairs.values()), []
     while missing:
         cases.append(max(pairs, key=lambda case: len(pairs[case] & missing)))
         missing -= pairs[cases[-1]]
-    return [tuple(axis[k] for axis, k in zip(values, case, strict=True)) for case in cases]
-
-
-def pairwise(**axes: Iterable) -> pytest.MarkDecorator:
-    """Parametrise a test by the cases of these axes."""
-    return pytest.mark.parametrize(", ".join(axes), pairwise_cases(*axes.values()))
+    chosen = [tuple(axis[k] for axis, k in zip(values, case, strict=True)) for case in cases]
+    return pytest.mark.parametrize(", ".join(axes), chosen)

@@ -158,10 +158,7 @@ def prepared(transform, name: str = "handheld", batch_size: int = 6, num_points:
 
 
 def repeated_wall(copies: int = 90, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """A wall, a board of 120 points before it, and windows of the wall that match the next one.
-
-    The images have 640 x 480 pixels. Returns the points of both and what each match is: 0 wall, 1 board, 2 false.
-    """
+    """Points of a wall (0), of a board before it (1), and of windows that match the next one (2), 640 x 480 px."""
     cell, epipole = np.array([60.0, 0.0]), np.array([0.8, 0.6])  # from a window to the next, pixels; a direction
     rng = np.random.default_rng(seed)
     wall, board = rng.uniform(0, (640, 480), (600, 2)), rng.uniform(200, 300, (120, 2))

@@ -182,7 +182,7 @@ def test_planes(tmp_path, capsys):
     assert planes.corner_error(None, torch.eye(3).double(), torch.zeros(4, 2).double()) == planes.MAX_ERROR
 
 
-def test_photographs_of_planes(tmp_path, capsys):
+def test_photographs_of_planes(tmp_path):
     """The store has a plane, which counts, and a scene with relief, which does not."""
     store = synthetic_store(2, points=200, scenes=["orbit"])
     matches = random_planes(1, 1, 200, torch.Generator().manual_seed(0))
@@ -190,10 +190,7 @@ def test_photographs_of_planes(tmp_path, capsys):
     store.points1[rows], store.points2[rows] = matches.exact1[0, : len(rows)], matches.exact2[0, : len(rows)]
     write_store(tmp_path / "store.h5", replace(store, ratio=np.full_like(store.ratio, 0.5)))
     planes.main(["--photographs", str(tmp_path / "store.h5"), "--csv", str(tmp_path / "planes.csv")])
-    header, *rows = read_csv(tmp_path / "planes.csv")
-    assert header == ["estimator", *planes.HEADER[2:]]
-    assert {row[0]: float(row[1]) for row in rows}[planes.LEARNED] > 90
-    assert "1 pairs of photographs" in capsys.readouterr().out
+    assert float({row[0]: row[1] for row in read_csv(tmp_path / "planes.csv")}[planes.LEARNED]) > 90
 
 
 def test_refined_matches_beside_found_and_tracked_ones(tmp_path):

@@ -50,10 +50,7 @@ class Blocks(SyntheticSamples):
 
 
 class Spoil(pl.Callback):
-    """Put NaN into batches: all samples of the last process, one of them, and all samples of all.
-
-    In the fifth step the gradient of the last process is infinite.
-    """
+    """Put NaN into samples: all of the last process, one, all; in step five, the last one's gradient is infinite."""
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
         # Of two processes, the last one has every second sample.

@@ -303,8 +303,7 @@ def test_an_interrupted_training_exits_as_interrupted(number, code, tmp_path, mo
 def test_a_training_names_its_folder_on_a_full_disk(trained, tmp_path, monkeypatch, refused):
     error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     monkeypatch.setattr("lightning_modules.callbacks.ExpectedTime.on_train_start", Mock(side_effect=error))
-    command = ["fit", *trained[1], f"--trainer.default_root_dir={tmp_path}"]
-    refused(command, f"{tmp_path}: No space left on device")
+    refused(["fit", *trained[1], f"--trainer.default_root_dir={tmp_path}"], f"{tmp_path}: No space left on device")
 
 
 def test_a_training_does_not_replace_another(trained, refused):

@@ -1,7 +1,4 @@
-"""The learned fundamental matrix, relative pose and homography: what they promise, small sets, files, errors.
-
-Of the learned fundamental matrix, masks, degenerate sets, gradients and compilation are also in test_eight_point.py.
-"""
+"""The learned F, E and H: what they promise, small sets, files, errors; more of F is in test_eight_point.py."""
 
 import json
 import pickle
