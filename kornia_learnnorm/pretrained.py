@@ -47,16 +47,16 @@ def save_module(path: str | Path, module: nn.Module, file_format: str, architect
             raise OSError(f"{path} could not be written: {error}") from error
 
 
-def load_module(name: str | Path, file_format: str, build: Callable[[Path, str], Module]) -> Module:
+def load_module(name: str | Path, file_format: str, build: Callable[[Path, str], Module], model: str = "") -> Module:
     """Load a module that :func:`save_module` wrote, by name or file, in evaluation mode and the dtype of its weights.
 
     ``build`` makes it of the path and the architecture, JSON, on the device ``meta``: weights take no memory before
-    their shapes are known to be those in the file.
+    their shapes are known to be those in the file. Errors name shipped weights of this format and two-view model.
     """
     path = weights_path(name)
     if not path.is_file() and Path(name).is_file():
         raise ValueError(f"{name} is not a .safetensors file by its name")
-    fitting = ", ".join(shipped_weights(file_format))
+    fitting = ", ".join(other for other in shipped_weights(file_format) if weights_model(other) == model)
     if not path.is_file():
         raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {fitting}")
     try:
@@ -67,7 +67,7 @@ def load_module(name: str | Path, file_format: str, build: Callable[[Path, str],
         raise ValueError(f"{path} is not a safetensors file: {error}") from error
     if (got := metadata.get("format")) != file_format:
         held = f"{got!r} of a {CLASSES[got]}" if got in CLASSES else repr(got)
-        expected = f"{file_format!r} of a {CLASSES[file_format]}, such as {fitting}"
+        expected = f"{file_format!r}, such as {fitting}"
         raise ValueError(f"{name}: expected format {expected}, got {held}")
     with torch.device("meta"):
         module = build(path, metadata.get("architecture", ""))

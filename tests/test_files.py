@@ -97,7 +97,7 @@ def test_commands_name_the_file_on_a_full_disk(tmp_path, monkeypatch, planes, re
     for place, path in (("matplotlib.figure.Figure.savefig", picture), ("pathlib.Path.write_text", report)):
         with monkeypatch.context() as patch:
             patch.setattr(place, full)
-            refused(["estimate", *images, "--out", picture, "--json", report], f"No space left on device: '{path}'")
+            refused(["estimate", *images, "--out", picture, "--json", report], f"{path}: No space left on device")
     with monkeypatch.context() as patch:
         patch.setattr("h5py.File", full)
         refused(["synthesize", tmp_path], f"cannot write {tmp_path / 'synthetic.h5'}: No space left on device")

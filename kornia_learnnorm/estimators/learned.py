@@ -124,7 +124,7 @@ class LearnedLayer(MatchLayer):
                 architecture = cls.added | dict(json.loads(text))
                 model = architecture.pop("model", Fundamental.name)  # files before the name was written
                 if model != cls.model_name:
-                    raise ValueError(f"it estimates matrices of the model {model!r}, expected {cls.model_name!r}")
+                    raise ValueError(f"its model is {model!r}, that of {cls.__name__} {cls.model_name!r}")
                 if set(architecture) != set(cls.architecture):
                     raise ValueError(f"expected {', '.join(cls.architecture)}, got {', '.join(map(str, architecture))}")
                 check_architecture(architecture)
@@ -132,7 +132,7 @@ class LearnedLayer(MatchLayer):
             except (ValueError, TypeError, AttributeError, RuntimeError) as error:
                 raise ValueError(f"{path} describes no estimator of this version: {error}") from error
 
-        layer: Self = load_module(name, FORMAT, build)  # type: ignore[assignment]
+        layer: Self = load_module(name, FORMAT, build, cls.model_name)  # type: ignore[assignment]
         return layer
 
     def start_from(self, layer: LearnedEightPoint) -> Self:

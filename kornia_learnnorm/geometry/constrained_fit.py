@@ -22,7 +22,7 @@ STEP_LENGTH = 1.3  # over the least-squares step, which bounded losses make too 
 class Fit(NamedTuple):
     """Fitted matrices and their costs."""
 
-    F_mat: Tensor  # of unit norm, singular up to the square of the last step, (K, 3, 3)
+    F_mat: Tensor  # of unit norm, of F singular up to the square of the last step, (K, 3, 3)
     cost: Tensor  # sum of the last losses before the last step, (K,)
     gain: Tensor  # share of the cost that a least-squares step could still remove, (K,); small close to an optimum
 
