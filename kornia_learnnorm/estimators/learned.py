@@ -124,7 +124,8 @@ class LearnedLayer(MatchLayer):
                 architecture = cls.added | dict(json.loads(text))
                 model = architecture.pop("model", Fundamental.name)  # files before the name was written
                 if model != cls.model_name:
-                    raise ValueError(f"its model is {model!r}, that of {cls.__name__} {cls.model_name!r}")
+                    text = f"it is of the model {model!r}, expected {cls.model_name!r} for a {cls.__name__}"
+                    raise ValueError(text)
                 if set(architecture) != set(cls.architecture):
                     raise ValueError(f"expected {', '.join(cls.architecture)}, got {', '.join(map(str, architecture))}")
                 check_architecture(architecture)

@@ -222,5 +222,5 @@ def test_exceptions():
     ):
         with pytest.raises(ValueError, match=match):
             kln.MatchRefiner(**options)
-    with pytest.raises(FileNotFoundError, match="no weights 'none': .* one of refiner$"):
+    with pytest.raises(FileNotFoundError, match=r"no weights 'none': .* one of refiner$"):
         kln.MatchRefiner.from_pretrained("none")
