@@ -20,10 +20,12 @@ from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.optional import working_folder_importable
 
 WEIGHTS = Path(__file__).parent / "weights"
-CLASSES = {  # of the modules that files hold, by the format
-    "kornia_learnnorm.normalizer.v1": "LearnedNormalizer",
-    "kornia_learnnorm.eight_point.v1": "LearnedEightPoint",
-    "kornia_learnnorm.match_refiner.v1": "MatchRefiner",
+CLASSES = {  # of the modules that files hold, by the format and the two-view model
+    ("kornia_learnnorm.normalizer.v1", ""): "LearnedNormalizer",
+    ("kornia_learnnorm.eight_point.v1", "fundamental"): "LearnedEightPoint",
+    ("kornia_learnnorm.eight_point.v1", "essential"): "LearnedRelativePose",
+    ("kornia_learnnorm.eight_point.v1", "homography"): "LearnedHomography",
+    ("kornia_learnnorm.match_refiner.v1", ""): "MatchRefiner",
 }
 MAX_ARCHITECTURE_INT = 4096  # largest width, depth or number of iterations that a file may name
 
@@ -66,8 +68,9 @@ def load_module(name: str | Path, file_format: str, build: Callable[[Path, str],
     except SafetensorError as error:
         raise ValueError(f"{path} is not a safetensors file: {error}") from error
     if (got := metadata.get("format")) != file_format:
-        held = f"{got!r} of a {CLASSES[got]}" if got in CLASSES else repr(got)
-        expected = f"{file_format!r}, such as {fitting}"
+        owner = CLASSES.get((str(got), weights_model(path)))
+        held = f"{got!r} of a {owner}" if owner else repr(got)
+        expected = f"{file_format!r} of a {CLASSES[file_format, model]}, such as {fitting}"
         raise ValueError(f"{name}: expected format {expected}, got {held}")
     with torch.device("meta"):
         module = build(path, metadata.get("architecture", ""))

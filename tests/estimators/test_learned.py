@@ -339,7 +339,7 @@ class TestFiles:
             rewrite_weights(file, lambda _, metadata, text=text: metadata.update(architecture=text))
             with pytest.raises(ValueError, match=r"own\.safetensors describes no estimator of this version"):
                 kln.LearnedEightPoint.from_pretrained(file)
-        with pytest.raises(ValueError, match=r"crossview: .* such as robust, .* of a LearnedNormalizer"):
+        with pytest.raises(ValueError, match=r"crossview: .* LearnedEightPoint.* LearnedNormalizer"):
             kln.LearnedEightPoint.from_pretrained("crossview")
 
     @siblings
