@@ -58,7 +58,8 @@ def load_module(name: str | Path, file_format: str, build: Callable[[Path, str],
     path = weights_path(name)
     if not path.is_file() and Path(name).is_file():
         raise ValueError(f"{name} is not a .safetensors file by its name")
-    fitting = ", ".join(other for other in shipped_weights(file_format) if weights_model(other) == model)
+    shipped = shipped_weights(file_format)
+    fitting = ", ".join([other for other in shipped if weights_model(other) == model] or shipped)
     if not path.is_file():
         raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {fitting}")
     try:
@@ -70,7 +71,7 @@ def load_module(name: str | Path, file_format: str, build: Callable[[Path, str],
     if (got := metadata.get("format")) != file_format:
         owner = CLASSES.get((str(got), weights_model(path)))
         held = f"{got!r} of a {owner}" if owner else repr(got)
-        expected = f"{file_format!r} of a {CLASSES[file_format, model]}, such as {fitting}"
+        expected = f"{file_format!r} of a {CLASSES.get((file_format, model), 'layer')}, such as {fitting}"
         raise ValueError(f"{name}: expected format {expected}, got {held}")
     with torch.device("meta"):
         module = build(path, metadata.get("architecture", ""))

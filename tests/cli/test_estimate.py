@@ -90,15 +90,15 @@ class TestOnePair:
         assert np.allclose(content["H"], true / np.linalg.norm(true), atol=2e-3)
         assert cv2.imread("pair.png").shape[1] == 1200
 
-    def test_mask_camera_and_json_to_standard_output(self, command, result, capsys):
+    def test_mask_camera_refined_matches_and_json_to_standard_output(self, command, result, capsys):
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
         mask[:, WIDTH // 2 :] = 0
         cv2.imwrite("mask.png", mask)
-        command("--mask", "mask.png", "--json", "-", "--matches", "--K", "300,300,160,120")
+        command("--mask", "mask.png", "--json", "-", "--matches", "--K", "300,300,160,120", "--refine", "2")
         content = json.loads(capsys.readouterr().out)
         assert np.array(content["R"]).shape == (3, 3)
-        assert np.array(content["points1"])[:, 0].max() < WIDTH // 2
-        assert np.array(content["points2"])[:, 0].max() < WIDTH // 2
+        assert max(np.array(content[name])[:, 0].max() for name in ("points1", "points2")) < WIDTH // 2
+        assert not {*map(tuple, content["points1"])} & {*map(tuple, result.points1.tolist())}  # all have moved
         assert 8 <= content["num_matches"] < result.num_matches
 
     def test_bad_options_are_refused_before_the_work(self, command, planes, monkeypatch):
@@ -106,6 +106,7 @@ class TestOnePair:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: pytest.fail("the work was begun"))
         for arguments, error, message in [
+            (["--refine", "-1"], ValueError, "refine must be 0 or more passes, got -1"),
             (["--out", "pair.txt"], ValueError, r"--out pair\.txt: expected a name that ends in one of \.png"),
             (["--json", "none/F.json"], FileNotFoundError, "folder none does not exist"),
             (["--out", "IMAGE"], ValueError, r"--out .*left\.png: would overwrite"),
