@@ -1,5 +1,6 @@
 """The datamodule and its loader: batches of sets of correspondences from any sources, in an order that can resume."""
 
+import os
 import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -133,7 +134,8 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         batch_size: sets in a batch; None for sources that draw whole batches, such as
             :class:`~kornia_learnnorm.data.random_sets.RandomSets`.
         batch_pairs: image pairs in a training batch, each with all its samples; replaces ``batch_size`` there.
-        seed: seed of the training draws; validation and test are drawn once, from a seed of their own.
+        seed: seed of the training draws; that of ``seed_everything`` when not given. Validation and test are drawn
+            once, from a seed of their own.
         workers: processes that draw the next blocks of training sets meanwhile.
     """
 
@@ -144,13 +146,14 @@ class CorrespondenceDataModule(pl.LightningDataModule):
         test: BlockSource | None = None,
         batch_size: int | None = 1024,
         batch_pairs: int | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         workers: int = 0,
     ) -> None:
         super().__init__()
         self.train, self.val, self.test = train, val, test
         self.batch_size, self.batch_pairs = batch_size, batch_pairs
-        self.seed, self.workers = seed, workers
+        self.seed = int(os.environ.get("PL_GLOBAL_SEED", 0)) if seed is None else seed
+        self.workers = workers
 
     def train_dataloader(self) -> BatchLoader:
         """Return the shuffled loader of the training sets."""

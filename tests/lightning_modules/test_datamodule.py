@@ -45,15 +45,16 @@ def test_wrong_sizes_of_batches():
             BatchLoader(SyntheticSamples(number=10, max_residual=None), size, seed=0, shuffle=True, **options)
 
 
-def test_validation_shares_no_sample_with_training_and_can_be_missing():
+def test_validation_shares_no_sample_with_training_and_can_be_missing(monkeypatch):
     source = SyntheticSamples(number=64, max_residual=None)
     data = CorrespondenceDataModule(source, source, batch_size=64)
-    (validated,) = (batch.points1 for batch in data.val_dataloader())
-    (trained,) = (batch.points1 for batch in data.train_dataloader())
-    assert not (validated[:, None] == trained[None]).flatten(2).all(-1).any()
+    (validated,), (trained,) = data.val_dataloader(), data.train_dataloader()
+    assert not (validated.points1[:, None] == trained.points1[None]).flatten(2).all(-1).any()
     assert CorrespondenceDataModule().val_dataloader() == []
     with pytest.raises(ValueError, match=r"data\.train is not set"):
         CorrespondenceDataModule().train_dataloader()
+    monkeypatch.setenv("PL_GLOBAL_SEED", "1")  # as seed_everything sets it
+    assert (CorrespondenceDataModule().seed, CorrespondenceDataModule(seed=2).seed) == (1, 2)
 
 
 def test_batch_pairs_are_for_training_alone():

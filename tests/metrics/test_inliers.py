@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from references import epipolar_distances
-from scenes import scenes
+from scenes import scenes, seeded
 
 from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
 
@@ -31,8 +31,7 @@ def by_hand(points1, points2, F, true, threshold):
 def pairs(seed=0, batch_size=6, num_points=40, jitter=1e-3):
     """Noisy scenes with outliers, and matrices that are somewhat wrong, in the numbers that the points see."""
     scene = scenes("handheld", batch_size, num_points, seed=seed, noise=0.5, outliers=0.3)
-    generator = torch.Generator().manual_seed(seed)
-    wrong = 1 + jitter * torch.randn(scene.F_mat.shape, generator=generator, dtype=torch.float64)
+    wrong = 1 + jitter * torch.randn(scene.F_mat.shape, generator=seeded(seed), dtype=torch.float64)
     return scene.points1, scene.points2, scene.F_mat * wrong, scene.F_mat
 
 

@@ -222,10 +222,9 @@ def test_predictions_of_the_true_matrix():
 def test_consensus_is_that_of_the_metrics(max_ratio):
     store = synthetic_store(pairs=3, points=60, seed=5)
     store.F[2] = np.nan
-    generator = torch.Generator().manual_seed(0)
     pair = torch.tensor([0, 2, 1, 0, 1])
     F_mat = torch.from_numpy(np.nan_to_num(store.F, nan=0.3))[pair]
-    F_mat *= 1 + 1e-4 * torch.randn(5, 3, 3, generator=generator, dtype=torch.float64)
+    F_mat *= 1 + 1e-4 * torch.randn(5, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     F_mat[3] = torch.nan  # a failed estimate
     found = consensus(F_mat, pair, store, max_ratio)
     for row, index in enumerate(pair.tolist()):
