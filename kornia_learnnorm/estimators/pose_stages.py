@@ -41,12 +41,13 @@ EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and 
 EARLY_SCALE, LAST_SCALE, SETTLED_SCALE = 3.0, 0.7, 3.1
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
+MIN_KEPT = 0.2  # of the sum of the inliers' losses below one: a pose without cameras that keeps less is no pose at all
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
 PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
-SHORTLIST = 4  # matrices of minimal samples that are compared on all matches
+SHORTLIST = 6  # matrices of minimal samples that are compared on all matches
 
 Candidates = tuple[Tensor, Tensor]  # essential matrices (B, S, 3, 3), and which of them are real
 
@@ -274,12 +275,19 @@ def _leave_cameras(
     unit: Tensor,
     steps: int,
 ) -> Calibrated:
-    """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras."""
+    """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras.
+
+    Where a plane leaves the fundamental matrix nearly undetermined, its pose may fit hardly any correspondence.
+    """
     with torch.no_grad():
         square_scale = _square_scale(inliers, scale, unit)(evidence.squares(state.matrix()[:, None])[0])
         left = contradict_cameras(evidence, state, weights, square_scale[:, 0])
     if is_known_true(~left.any()):
         return state
     free = _reweight(evidence, Fundamental().state(state.matrix()), weights, inliers, scale, unit, steps)
-    nearest: Calibrated = choose(left, differentiable_state(model, free.matrix()), state)
-    return nearest
+    nearest = differentiable_state(model, free.matrix())
+    with torch.no_grad():
+        losses = evidence.losses(torch.stack([state.matrix(), nearest.matrix()], 1), square_scale)
+        fit = ((1 - losses) @ weights[..., None])[..., 0]
+    kept: Calibrated = choose(left & (fit[:, 1] > MIN_KEPT * fit[:, 0]), nearest, state)
+    return kept

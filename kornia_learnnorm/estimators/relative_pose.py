@@ -99,7 +99,7 @@ class LearnedRelativePose(LearnedLayer):
     features, residual_features, outputs = POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES, POSE_OUTPUTS
 
     def __init__(
-        self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 5, samples: int = 32
+        self, width: int = 48, depth: int = 4, stages: int = 2, refine_steps: int = 5, samples: int = 64
     ) -> None:
         eye = torch.eye(3)[None]
         super().__init__(Essential(eye, eye), width, depth, stages, False, refine_steps)
@@ -125,7 +125,7 @@ class LearnedRelativePose(LearnedLayer):
 
     @classmethod
     def from_eight_point(
-        cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 5, samples: int = 32
+        cls, layer: LearnedEightPoint, stages: int = 2, refine_steps: int = 5, samples: int = 64
     ) -> LearnedRelativePose:
         """Return an untrained estimator whose networks start from the first ones of one of fundamental matrices.
 

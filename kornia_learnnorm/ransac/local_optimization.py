@@ -22,6 +22,7 @@ MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
 MANIFOLD_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages on the manifold
 MANIFOLD_STEPS = 2  # steps in a stage
+MANIFOLD_POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
 
 
 def optimize_locally(scorer: PairScorer, M: Tensor, number: int) -> Hypotheses:
@@ -54,7 +55,7 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
     start = pool.F_mat[:FINAL_POOL_SIZE]
     fit = model.reweighted_fit(scorer.x1, scorer.x2, start, [Truncated(threshold), *FINAL_STEPS * [loss]])
     if fit is None:
-        return _fit_on_manifold(scorer, start, loss)
+        return _fit_on_manifold(scorer, start[:MANIFOLD_POOL_SIZE], loss)
     best = int(fit.cost.argmin())
     state, cost = model.state(fit.F_mat[best : best + 1]), float(fit.cost[best])
     if not float(fit.gain[best]) <= FINAL_GAIN:

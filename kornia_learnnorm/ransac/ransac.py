@@ -269,8 +269,9 @@ class RANSAC(nn.Module):
             found = scorer.best(scorer.shortlist(F_mat) if self.refine else F_mat, POOL_SIZE)
             pool = pool.join(found, POOL_SIZE)
             needed = self._samples_needed(pool, scorer, sampler)
-            # A pool that ends the search is optimised anyway.
-            if self.refine and drawn < needed and len(found.F_mat):
+            # The final fit optimises a pool that ends the search, but of essential matrices its best one alone.
+            last = drawn >= needed and not isinstance(scorer.model, Essential)
+            if self.refine and not last and len(found.F_mat):
                 pool = pool.join(self._optimize(scorer, found.F_mat), POOL_SIZE)
                 needed = self._samples_needed(pool, scorer, sampler)
         return pool, drawn
