@@ -14,7 +14,6 @@ from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
 
 LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps: a noisy sample has few inliers
-FINAL_POOL_SIZE = 4  # best hypotheses that the final fit starts from
 FINAL_LOSS_SCALE = 0.7  # scale of the final fit's loss, in thresholds
 FINAL_STEPS = 3  # steps of least squares on that loss
 FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
@@ -52,10 +51,9 @@ def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
     """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
     model, threshold = scorer.model, scorer.threshold
     loss = GemanMcClure(FINAL_LOSS_SCALE * threshold)
-    start = pool.F_mat[:FINAL_POOL_SIZE]
-    fit = model.reweighted_fit(scorer.x1, scorer.x2, start, [Truncated(threshold), *FINAL_STEPS * [loss]])
+    fit = model.reweighted_fit(scorer.x1, scorer.x2, pool.F_mat, [Truncated(threshold), *FINAL_STEPS * [loss]])
     if fit is None:
-        return _fit_on_manifold(scorer, start[:MANIFOLD_POOL_SIZE], loss)
+        return _fit_on_manifold(scorer, pool.F_mat[:MANIFOLD_POOL_SIZE], loss)
     best = int(fit.cost.argmin())
     state, cost = model.state(fit.F_mat[best : best + 1]), float(fit.cost[best])
     if not float(fit.gain[best]) <= FINAL_GAIN:

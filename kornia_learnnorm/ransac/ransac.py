@@ -29,7 +29,7 @@ from kornia_learnnorm.ransac.threads import one_thread
 FIRST_BATCH = 64  # samples in the first batch; each batch is four times as large as the one before
 MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
-POOL_SIZE = 8  # best hypotheses of a batch, which local optimisation fits
+POOL_SIZE = 12  # best hypotheses of a batch, which local optimisation fits, and of all, which the final fit does
 Cameras = tuple[Tensor, Tensor]
 
 
