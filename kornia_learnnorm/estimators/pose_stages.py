@@ -41,7 +41,7 @@ EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and 
 EARLY_SCALE, LAST_SCALE, SETTLED_SCALE = 3.0, 0.7, 3.1
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
-MIN_KEPT = 0.2  # of the sum of the inliers' losses below one: a pose without cameras that keeps less is no pose at all
+MIN_KEPT = 0.3  # of what the cameras' pose fits, at a scale of two pixels or more, of a pose without cameras
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
 PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
@@ -277,7 +277,8 @@ def _leave_cameras(
 ) -> Calibrated:
     """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras.
 
-    Where a plane leaves the fundamental matrix nearly undetermined, its pose may fit hardly any correspondence.
+    Where a plane leaves the fundamental matrix nearly undetermined, its pose may fit hardly any correspondence; inexact
+    cameras cost a few pixels.
     """
     with torch.no_grad():
         square_scale = _square_scale(inliers, scale, unit)(evidence.squares(state.matrix()[:, None])[0])
@@ -287,7 +288,8 @@ def _leave_cameras(
     free = _reweight(evidence, Fundamental().state(state.matrix()), weights, inliers, scale, unit, steps)
     nearest = differentiable_state(model, free.matrix())
     with torch.no_grad():
-        losses = evidence.losses(torch.stack([state.matrix(), nearest.matrix()], 1), square_scale)
+        wide = square_scale.maximum((EARLY_PIXELS / unit).square()[:, None])
+        losses = evidence.losses(torch.stack([state.matrix(), nearest.matrix()], 1), wide)
         fit = ((1 - losses) @ weights[..., None])[..., 0]
     kept: Calibrated = choose(left & (fit[:, 1] > MIN_KEPT * fit[:, 0]), nearest, state)
     return kept

@@ -80,7 +80,7 @@ def test_cameras_are_left_where_matches_contradict_them():
     cameras = scene.K1, scene.K2
     moved = [distorted(p, K, -0.1) for p, K in zip((scene.points1, scene.points2), cameras, strict=True)]
     never = (camera_evidence, "MIN_EFFECT", torch.inf), (pose_stages, "MIN_KEPT", torch.inf)
-    for limit in ((pose_stages, "MIN_KEPT", 0.2), *never):
+    for limit in ((pose_stages, "MIN_KEPT", 0.3), *never):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(*limit)
             found = layer.estimate(*moved, *cameras)
