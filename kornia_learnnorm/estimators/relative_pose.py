@@ -64,7 +64,8 @@ class LearnedRelativePose(LearnedLayer):
     the first stage leave out its matrix, the other networks and half of the samples.
 
     Cameras may be inexact, or lenses distort: where the correspondences contradict them by a score test, and a pose
-    without them has at most three times the standard error, the pose is that of the refined fundamental matrix.
+    without them has at most three times the standard error and fits to a few pixels, the pose is that of the refined
+    fundamental matrix.
 
     The order of the correspondences has no effect. Swapping the views, with their cameras, gives :math:`E^\top` up to
     sign. Planes and cameras that move forward are solved as other scenes are; a camera that only turns has no
