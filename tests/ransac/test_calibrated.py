@@ -79,6 +79,13 @@ class TestAccuracy:
         optimum = kln.refine_essential(*points, found.E_mat[None], *cameras, loss=kln.GemanMcClure(0.7))
         assert optimum.cost_before <= 1.001 * optimum.cost
 
+    def test_the_optimum_does_not_depend_on_the_samples(self):
+        """Of coarse matches, where a first batch of samples is enough."""
+        points, cameras, _, _ = pair("driving", 400, noise=1.0, outliers=0.1, seed=9)
+        Fs = [RANSAC(seed=seed, inl_th=2.0).estimate(*points, None, *cameras).F_mat for seed in range(6)]
+        costs = kln.GemanMcClure(1.4)(torch.stack([kln.sampson_distance(*points, F) for F in Fs]).square())[0].sum(-1)
+        assert costs.max() < 1.003 * costs.min()
+
 
 def error_of_pose(F_mat, points, cameras, R, t):
     near = kln.sampson_distance(*points, F_mat) <= 1

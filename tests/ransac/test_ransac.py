@@ -201,8 +201,7 @@ class TestBudget:
 
     def test_confidence(self):
         points = pair(outliers=0.05)[:2]
-        assert self.count(points) <= 128
-        assert self.count(points, confidence=1.0, max_samples=3000) == 3000
+        assert self.count(points) <= 128 < self.count(points, confidence=1.0, max_samples=3000) == 3000
 
     def test_time(self, monkeypatch):
         """By a clock that is a second later whenever it is read."""
@@ -211,12 +210,6 @@ class TestBudget:
             monkeypatch.setattr(time, "perf_counter", count().__next__)
             drawn.append(self.count(points, max_samples=10**9, confidence=1.0, max_seconds=seconds))
         assert 0 < drawn[0] < drawn[1] < 10_000
-
-    def test_good_weights_spare_samples(self):
-        points1, points2, _, true = pair(outliers=0.7)
-        good = true + 0.5 * uniform(400)
-        plain = self.count((points1, points2))
-        assert self.count((points1, points2), good) < plain
 
 
 LINE = torch.linspace(0, 300, 60, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0])
