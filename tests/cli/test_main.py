@@ -122,10 +122,9 @@ def settings(node, name=""):
     return set().union(*(settings(value, f"{name}.{key}".strip(".")) for key, value in node.items()))
 
 
-# Seeds have two settings, the transform of the paper needs three parameters, a source leaves its share.
-TWO = {"seed-1", "seed-2", "transform-paper", "layer-hartley-optimal", "layer-seed-1", "layer-seed-2"}
+# The transform of the paper needs three parameters, a source leaves its share.
+TWO = {"transform-paper", "layer-hartley-optimal", "pose-synthetic", "refiner-xfeat"}
 TWO |= {f"layer-without-{source}" for source in ("kitti", "photos", "synthetic")}
-TWO |= {"pose-seed-1", "pose-seed-2", "pose-synthetic", "refiner-seed-1", "refiner-xfeat"}
 
 
 @pytest.mark.parametrize("name", ABLATIONS | SHORTER)
