@@ -270,8 +270,8 @@ class RANSAC(nn.Module):
             pool = pool.join(found, POOL_SIZE)
             needed = self._samples_needed(pool, scorer, sampler)
             # The final fit optimises a pool that ends the search, but of essential matrices its best one alone.
-            last = drawn >= needed and not isinstance(scorer.model, Essential)
-            if self.refine and not last and len(found.F_mat):
+            fitted_later = drawn >= needed and not isinstance(scorer.model, Essential)
+            if self.refine and not fitted_later and len(found.F_mat):
                 pool = pool.join(self._optimize(scorer, found.F_mat), POOL_SIZE)
                 needed = self._samples_needed(pool, scorer, sampler)
         return pool, drawn
