@@ -1,4 +1,4 @@
-"""Whether correspondences contradict their cameras: a fundamental matrix explains them better and is as certain."""
+"""What correspondences say of calibrated poses: which are in front of both cameras, whether they contradict them."""
 
 import torch
 from torch import Tensor
@@ -10,11 +10,34 @@ from kornia_learnnorm.geometry.dlt import normal_equations
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["contradict_cameras"]
+__all__ = ["contradict_cameras", "in_front_of_best_pose"]
 
 SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
 MIN_EFFECT = 0.05  # share of the noise that two more parameters must explain: errors of matches are not independent
+MIN_NOISE = 0.01  # of the loss's scale: where inliers have no noise, the pull of outliers is no evidence
 MIN_PRECISION = 1 / 9  # of a pose without cameras over that with them: at most three times the standard error
+
+
+def in_front_of_best_pose(evidence: Evidence, state: Calibrated, weights: Tensor, number: int) -> Tensor:
+    """Return which correspondences are in front of both cameras under the best of the four poses, (B, S, N) bool.
+
+    States are ``number`` of each set; the pose with the largest sum of weights (B, S or 1, N) in front is the best.
+    """
+    R, t, C1, C2 = state.rotations(), state.axes[:, 0, :, 2:], state.C1, state.C2
+
+    def times(forms: Tensor, points: Tensor) -> Tensor:
+        """Return the products of K forms of each state, (B S, K, P), with all points, (B, S, K, N)."""
+        values = torch.unflatten(forms, 0, (-1, number)).flatten(1, 2) @ points
+        return torch.unflatten(values, 1, (number, forms.shape[1]))
+
+    between = times((C2.mT[:, None] @ R @ C1[:, None]).mT.flatten(2), evidence.rows)  # x2^T R x1 of directions
+    along1, along2 = times(((R[:, 0] @ C1).mT @ t).mT, evidence.x1), times((C2.mT @ t).mT, evidence.x2)  # of either R
+    products1, products2 = evidence.products.chunk(2, 1)
+    square1, square2 = times((C1.mT @ C1).view(-1, 1, 9), products1), times((C2.mT @ C2).view(-1, 1, 9), products2)
+    depth1, depth2 = along2 * between - along1 * square2, along2 * square1 - along1 * between
+    front = torch.cat([(depth1 > 0) & (depth2 > 0), (depth1 < 0) & (depth2 < 0)], 2)
+    best = (front.to(weights) @ weights[..., None]).argmax(2, keepdim=True)
+    return front.gather(2, best.expand(-1, -1, 1, front.shape[-1]))[:, :, 0]
 
 
 @torch.no_grad()
@@ -49,8 +72,9 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
         gains.append((gradient.mT @ inverse @ gradient)[:, 0, 0] * scale)
         variances.append((steps @ inverse @ steps.mT).diagonal(dim1=-2, dim2=-1).sum(-1))
     noise = (inner.square() / weights.clamp(min=torch.finfo(weights.dtype).tiny) * squares).sum(1)
+    noise = noise + inner.sum(1) * MIN_NOISE**2 * square_scale[:, 0]
     freedom = (inner.sum(1) - Fundamental.dof).clamp(min=1.0)
-    effect = (gains[1] - gains[0]) * inner.sum(1) / safe_divisor(noise) / freedom
+    effect = (gains[1] - gains[0]) * inner.sum(1) / noise / freedom
     least = (SIGNIFICANCE ** (-2 / freedom) - 1).clamp(min=MIN_EFFECT)
     contradicted: Tensor = (effect > least) & (variances[0] > MIN_PRECISION * variances[1])
     return contradicted

@@ -43,6 +43,7 @@ class RobustCost(NamedTuple):
     x2: Tensor
     weights: Tensor  # of the losses, (B or 1, N)
     loss: Loss  # of squared distances
+    relaxation: float = 1.0  # of a step; a bounded loss curves less than its weights say
 
     def select(self, rows: Tensor) -> RobustCost:
         """Return the cost of some of the matrices."""
@@ -116,7 +117,7 @@ def _descend(cost: RobustCost, best: Optimum, max_iterations: int, tolerance: fl
 def _try_step(cost: RobustCost, best: Optimum, active: Tensor, tolerance: float) -> Optimum:
     added = best.normal.diagonal(dim1=-2, dim2=-1) * best.damping[:, None]
     step = torch.linalg.solve_ex(best.normal + torch.diag_embed(added), best.gradient)[0]
-    state = best.state.retract(-step)
+    state = best.state.retract(-cost.relaxation * step)
     iterations = best.iterations + active
     moved = _evaluate(cost, state, tolerance, 0.1 * best.damping, iterations)
     better = active & (moved.cost < best.cost)  # not where either is NaN

@@ -7,7 +7,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.camera_evidence import contradict_cameras
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose
 from kornia_learnnorm.estimators.match_features import (
     POINT_FEATURES,
     RESIDUAL_FEATURES,
@@ -184,7 +184,7 @@ def _most_consistent(
     number = E_mat.shape[1]
     repeated = Essential(*(C.repeat_interleave(number, 0) for C in (model.C1, model.C2)))
     state, square = repeated.calibrated(E_mat.flatten(0, 1)), scale.square()[:, None]
-    front = _in_front(evidence, state, present, number)
+    front = in_front_of_best_pose(evidence, state, present[:, None], number)
     options = present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION
     state = descend(evidence, state, *options)
     if not is_known_true(settled.all()):
@@ -193,25 +193,6 @@ def _most_consistent(
     cost = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0]
     best = cost.argmin(1)
     return pick(state, best, number), front.gather(1, best[:, None, None].expand(-1, 1, front.shape[-1]))[:, 0]
-
-
-def _in_front(evidence: Evidence, state: Calibrated, weights: Tensor, number: int) -> Tensor:
-    """Return which matches are in front of both cameras, (B, S, N) bool, under the pose of most weight (B, N)."""
-    R, t, C1, C2 = state.rotations(), state.axes[:, 0, :, 2:], state.C1, state.C2
-
-    def times(forms: Tensor, points: Tensor) -> Tensor:
-        """Return the products of K forms of each state, (B S, K, P), with all points, (B, S, K, N)."""
-        values = torch.unflatten(forms, 0, (-1, number)).flatten(1, 2) @ points
-        return torch.unflatten(values, 1, (number, forms.shape[1]))
-
-    between = times((C2.mT[:, None] @ R @ C1[:, None]).mT.flatten(2), evidence.rows)  # x2^T R x1 of directions
-    along1, along2 = times(((R[:, 0] @ C1).mT @ t).mT, evidence.x1), times((C2.mT @ t).mT, evidence.x2)  # of either R
-    products1, products2 = evidence.products.chunk(2, 1)
-    square1, square2 = times((C1.mT @ C1).view(-1, 1, 9), products1), times((C2.mT @ C2).view(-1, 1, 9), products2)
-    depth1, depth2 = along2 * between - along1 * square2, along2 * square1 - along1 * between
-    front = torch.cat([(depth1 > 0) & (depth2 > 0), (depth1 < 0) & (depth2 < 0)], 2)
-    best = (front.to(weights) @ weights[:, None, :, None]).argmax(2, keepdim=True)
-    return front.gather(2, best.expand(-1, -1, 1, front.shape[-1]))[:, :, 0]
 
 
 def _moment_spans(evidence: Evidence, model: Essential, weights: Tensor) -> Tensor:

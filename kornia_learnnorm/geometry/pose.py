@@ -81,18 +81,6 @@ def in_front(R: Tensor, t: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, poin
     return _in_front(R[:, None], t[:, None], _rays(points1, K1), _rays(points2, K2))[:, 0]
 
 
-def in_front_of_best_pose(E_mat: Tensor, rays1: Tensor, rays2: Tensor, weights: Tensor) -> Tensor:
-    """Return which correspondences are in front of both cameras under the best of the four poses, (B, N) bool.
-
-    Rays are directions :math:`K^{-1} x` (N, 3), shared by all matrices (B, 3, 3). The pose with the largest sum of
-    weights (B, N) in front is the best.
-    """
-    R, t = motion_from_essential(E_mat)
-    front = _in_front(R, t[..., 0], rays1[None, None], rays2[None, None])
-    best = (front * weights[:, None]).sum(-1).argmax(-1)
-    return front[torch.arange(len(R), device=R.device), best]
-
-
 def _check(F_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2: Tensor, mask: Tensor | None) -> None:
     named = {"F_mat": F_mat, "K1": K1, "K2": K2, "points1": points1, "points2": points2}
     for name, value in named.items():

@@ -159,14 +159,6 @@ class TwoViewModel(Residuals):
         """
         return None
 
-    def voters(self, state: Any, x1: Tensor, x2: Tensor, gains: Tensor) -> Tensor:
-        """Return which correspondences (3, N) may support each state, (K, N) bool; gains are their votes, (K, N)."""
-        return torch.ones_like(gains, dtype=torch.bool)
-
-    def relaxed(self) -> "TwoViewModel | None":
-        """Return the model of more parameters that takes over where correspondences contradict this one, or None."""
-        return None
-
     def is_degenerate(self, state: Any) -> Tensor:
         """Return which states are limits of the manifold rather than matrices of the model, (B,) bool."""
         return torch.zeros(len(state.matrix()), dtype=torch.bool)

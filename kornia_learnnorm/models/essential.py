@@ -15,7 +15,6 @@ from torch import Tensor
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
 from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.five_point import essential_in_span
-from kornia_learnnorm.geometry.pose import in_front_of_best_pose
 from kornia_learnnorm.models.fundamental import Fundamental, Rank2
 
 MIN_PIVOT = 1e-12  # of the largest one, of a sample of five correspondences that determine finitely many matrices
@@ -72,14 +71,6 @@ class Essential(Fundamental):
     def reweighted_fit(self, x1: Tensor, x2: Tensor, M: Tensor, losses: Sequence[Loss]) -> Fit | None:
         """Return None: there is no fit but Levenberg-Marquardt."""
         return None
-
-    def voters(self, state: Any, x1: Tensor, x2: Tensor, gains: Tensor) -> Tensor:
-        """Return which correspondences are in front of both cameras under the best of the four poses."""
-        return in_front_of_best_pose(state.essential(), x1.mT @ self.C1[0].mT, x2.mT @ self.C2[0].mT, gains)
-
-    def relaxed(self) -> Fundamental:
-        """Return the model of fundamental matrices: cameras may be inexact."""
-        return Fundamental(distance=self.distance)
 
 
 class Calibrated(NamedTuple):

@@ -1,17 +1,19 @@
 """Local optimisation of RANSAC's hypotheses, and the final fit of the best ones."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.camera_evidence import contradict_cameras
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose
 from kornia_learnnorm.estimators.moments import Evidence, descend
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
 from kornia_learnnorm.models.essential import Essential
-from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.ransac.scoring import PRESCORED, Hypotheses, PairScorer
 
 LOCAL_SCALES = (3.0, 2.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps: a noisy sample has few inliers
 FINAL_LOSS_SCALE = 0.7  # scale of the final fit's loss, in thresholds
@@ -19,8 +21,9 @@ FINAL_STEPS = 3  # steps of least squares on that loss
 FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
-MANIFOLD_SCALES = (3.0, 1.5, 1.0)  # thresholds of local optimisation's stages on the manifold
-MANIFOLD_STEPS = 2  # steps in a stage
+LM_RELAXATION = 1.4  # of its steps, which bounded losses make too short
+MANIFOLD_SCALES = (3.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps on the manifold
+MANIFOLD_RELAXATION = 1.3  # of these steps but the first, which comes from afar
 MANIFOLD_POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
 
 
@@ -36,14 +39,16 @@ def optimize_locally(scorer: PairScorer, M: Tensor, number: int) -> Hypotheses:
         return scorer.best(fit.F_mat, number)
     state = scorer.model.state(M)
     if isinstance(scorer.model, Essential):
-        x1, x2 = (x[None, :, scorer.rows] for x in (scorer.x1, scorer.x2))
+        every = math.ceil(scorer.terms.shape[-1] / PRESCORED)
+        x1, x2 = (x[None, :, scorer.rows][..., ::every] for x in (scorer.x1, scorer.x2))
         evidence, weights = Evidence.from_points(x1, x2), torch.ones_like(x1[:, :1]).expand(-1, len(M), -1)
-        for scale in MANIFOLD_SCALES:
-            state = descend(evidence, state, weights, _fixed(scale * scorer.threshold), MANIFOLD_STEPS)
+        for step, scale in enumerate(MANIFOLD_SCALES):
+            relaxation = MANIFOLD_RELAXATION if step else 1.0
+            state = descend(evidence, state, weights, _fixed(scale * scorer.threshold), 1, relaxation)
         return scorer.best(state.matrix(), number)
     for scale in MANIFOLD_SCALES:
         cost = _cost(scorer, Truncated(scale * scorer.threshold), scorer.rows)
-        state = minimize(cost, state, MANIFOLD_STEPS, LM_TOLERANCE)[1].state
+        state = minimize(cost, state, 1, LM_TOLERANCE)[1].state
     return scorer.best(state.matrix(), number)
 
 
@@ -66,25 +71,23 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     """Return the optimum (1, 3, 3) of the model that is next to the best of some matrices (K, 3, 3).
 
     Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
-    contradict the model, the optimum is that of the relaxed one.
+    contradict the cameras, the optimum is that of fundamental matrices.
     """
     model, state = scorer.model, scorer.model.state(M)
-    distances = torch.stack([scorer.distances(matrix) for matrix in M])
-    gains = (1 - (distances / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
-    voters = model.voters(state, scorer.x1, scorer.x2, gains)
-    best = int((gains * voters).sum(-1).argmax())
-    state, weights = type(state)(*(value[best : best + 1] for value in state)), voters[best : best + 1].to(gains)
+    gains = (1 - (scorer.distances(M) / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
+    weights, evidence = torch.ones_like(gains), None
+    if isinstance(model, Essential):
+        evidence = Evidence.from_points(scorer.x1[None], scorer.x2[None])
+        weights = in_front_of_best_pose(evidence, state, gains[None], len(M))[0].to(gains)
+    best = int((gains * weights).sum(-1).argmax())
+    state, weights = type(state)(*(value[best : best + 1] for value in state)), weights[best : best + 1]
     near, last = (_cost(scorer, rho, weights=weights) for rho in (Truncated(scorer.threshold), loss))
-    state = minimize(near, state, MANIFOLD_STEPS, LM_TOLERANCE)[1].state
+    state = minimize(near, state, 1, LM_TOLERANCE)[1].state
     state = minimize(last, state, MAX_LM_STEPS, LM_TOLERANCE)[1].state
-    relaxed = model.relaxed()
-    if relaxed is None:
-        return state
     square_scale = weights.new_full((1, 1), (FINAL_LOSS_SCALE * scorer.threshold) ** 2)
-    evidence = Evidence.from_points(scorer.x1[None], scorer.x2[None])
-    if not bool(contradict_cameras(evidence, state, weights, square_scale)):
+    if evidence is None or not bool(contradict_cameras(evidence, state, weights, square_scale)):
         return state
-    return minimize(last, relaxed.state(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)[1].state
+    return minimize(last, Fundamental().state(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)[1].state
 
 
 def _fixed(scale: float) -> Callable[[Tensor], Tensor]:
@@ -96,7 +99,8 @@ def _cost(
     scorer: PairScorer, loss: Loss, rows: Tensor | slice = slice(None), weights: Tensor | None = None
 ) -> RobustCost:
     x1, x2 = scorer.x1[None, :, rows], scorer.x2[None, :, rows]
-    return RobustCost(scorer.model, x1, x2, torch.ones_like(x1[:, 0]) if weights is None else weights, loss)
+    weights = torch.ones_like(x1[:, 0]) if weights is None else weights
+    return RobustCost(scorer.model, x1, x2, weights, loss, LM_RELAXATION)
 
 
 def _largest_cost(scorer: PairScorer, pool: Hypotheses) -> float:

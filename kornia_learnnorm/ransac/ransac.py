@@ -247,7 +247,7 @@ class RANSAC(nn.Module):
         if bool(scorer.model.is_degenerate(state)):
             return _failure(points1, drawn, cameras)
         F = state.matrix()
-        distances = scorer.distances(F[0])
+        distances = scorer.distances(F)[0]
         if int((inliers := distances <= self.inl_th).sum()) <= least:
             return _failure(points1, drawn, cameras)
         score = float((1 - (distances / self.inl_th).square()).clamp(min=0).nansum())

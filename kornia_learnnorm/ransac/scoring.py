@@ -107,9 +107,8 @@ class PairScorer:
         return self._gains(F_mat, self.terms) >= 0
 
     def distances(self, F_mat: Tensor) -> Tensor:
-        """Return the distances of all correspondences from one matrix (3, 3), pixels, (N,); NaN on an epipole."""
-        residual = self.model.residual(F_mat[None], self.x1[None], self.x2[None])
-        return self.model.squares(residual)[0].sqrt()
+        """Return the distances (K, N) of all correspondences from matrices (K, 3, 3), pixels; NaN on an epipole."""
+        return self.model.squares(self.model.residual(F_mat, self.x1[None], self.x2[None])).sqrt()
 
     def _scores(self, F_mat: Tensor, terms: Tensor) -> Tensor:
         size = max(1, BLOCK // terms.shape[-1])
