@@ -9,11 +9,11 @@ from kornia_learnnorm.geometry.checks import check_pairs, check_tensor
 
 
 def check_numbers(
-    inl_th: float, max_samples: int, max_seconds: float | None, confidence: float, seed: int | None
+    inl_th: float, max_samples: int, max_seconds: float | None, confidence: float | None, seed: int | None
 ) -> None:
     """Raise a clear error for numbers that are none, or out of their range."""
     for name, value in {"inl_th": inl_th, "confidence": confidence, "max_seconds": max_seconds}.items():
-        if (isinstance(value, bool) or not isinstance(value, Real)) and (value is not None or name != "max_seconds"):
+        if (isinstance(value, bool) or not isinstance(value, Real)) and (value is not None or name == "inl_th"):
             raise TypeError(f"{name} must be a number, got {value!r}")
     if not 1e-12 <= inl_th <= 1e12:
         raise ValueError(f"inl_th must be a positive number of pixels, from 1e-12 to 1e12, got {inl_th}")
@@ -21,7 +21,7 @@ def check_numbers(
         raise ValueError(f"max_samples must be a whole number of samples, at least 1, got {max_samples}")
     if max_seconds is not None and not max_seconds > 0:
         raise ValueError(f"max_seconds must be positive or None, got {max_seconds}")
-    if not 0 < confidence <= 1:
+    if confidence is not None and not 0 < confidence <= 1:
         raise ValueError(f"confidence must lie in (0, 1], got {confidence}")
     if seed is not None and not _is_whole(seed):
         raise TypeError(f"seed must be a whole number or None, got {seed!r}")

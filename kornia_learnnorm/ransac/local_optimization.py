@@ -21,9 +21,9 @@ FINAL_STEPS = 3  # steps of least squares on that loss
 FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
-LM_RELAXATION = 1.4  # of its steps, which bounded losses make too short
 MANIFOLD_SCALES = (3.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps on the manifold
-MANIFOLD_RELAXATION = 1.3  # of these steps but the first, which comes from afar
+MANIFOLD_RELAXATION = 1.3  # of these steps but the first, which comes from afar: bounded losses make them too short
+LM_RELAXATION = 1.4  # of those of Levenberg-Marquardt on the manifold
 MANIFOLD_POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
 
 
@@ -81,7 +81,8 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
         weights = in_front_of_best_pose(evidence, state, gains[None], len(M))[0].to(gains)
     best = int((gains * weights).sum(-1).argmax())
     state, weights = type(state)(*(value[best : best + 1] for value in state)), weights[best : best + 1]
-    near, last = (_cost(scorer, rho, weights=weights) for rho in (Truncated(scorer.threshold), loss))
+    losses = Truncated(scorer.threshold), loss
+    near, last = (_cost(scorer, rho, weights=weights)._replace(relaxation=LM_RELAXATION) for rho in losses)
     state = minimize(near, state, 1, LM_TOLERANCE)[1].state
     state = minimize(last, state, MAX_LM_STEPS, LM_TOLERANCE)[1].state
     square_scale = weights.new_full((1, 1), (FINAL_LOSS_SCALE * scorer.threshold) ** 2)
@@ -99,8 +100,7 @@ def _cost(
     scorer: PairScorer, loss: Loss, rows: Tensor | slice = slice(None), weights: Tensor | None = None
 ) -> RobustCost:
     x1, x2 = scorer.x1[None, :, rows], scorer.x2[None, :, rows]
-    weights = torch.ones_like(x1[:, 0]) if weights is None else weights
-    return RobustCost(scorer.model, x1, x2, weights, loss, LM_RELAXATION)
+    return RobustCost(scorer.model, x1, x2, torch.ones_like(x1[:, 0]) if weights is None else weights, loss)
 
 
 def _largest_cost(scorer: PairScorer, pool: Hypotheses) -> float:

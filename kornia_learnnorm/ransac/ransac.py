@@ -30,6 +30,7 @@ FIRST_BATCH = 64  # samples in the first batch; each batch is four times as larg
 MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
 POOL_SIZE = 12  # best hypotheses of a batch, which local optimisation fits, and of all, which the final fit does
+CONFIDENCE, CALIBRATED_CONFIDENCE = 0.999999, 0.9999  # unless another one is asked for
 Cameras = tuple[Tensor, Tensor]
 
 
@@ -76,8 +77,8 @@ class RANSAC(nn.Module):
         max_seconds: time after which no further batch of samples, 64 at first and up to 1,024, is drawn; with it the
             result depends on the machine.
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
-            best matrix so far has found all inliers; 1 draws all ``max_samples`` samples. It is close to 1 by default,
-            since a sample must not have much noise either.
+            best matrix so far has found all inliers; 1 draws all ``max_samples`` samples. By default 0.999999, since a
+            sample must not have much noise either, and 0.9999 with cameras, which leave noise less room.
         distance: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
         rank2: how the singularity constraint is enforced on samples of eight: ``"projection"`` in the normaliser's
             coordinates (Hartley's when not given), the default with a ``normalizer``, or ``"optimal"`` correction.
@@ -114,7 +115,7 @@ class RANSAC(nn.Module):
         inl_th: float = 1.0,
         max_samples: int = 50_000,
         max_seconds: float | None = None,
-        confidence: float = 0.999999,
+        confidence: float | None = None,
         distance: Literal["sampson", "symmetric"] = "sampson",
         rank2: Literal["projection", "optimal"] | None = None,
         refine: bool = True,
@@ -286,12 +287,14 @@ class RANSAC(nn.Module):
 
     def _samples_needed(self, pool: Hypotheses, scorer: PairScorer, sampler: Sampler) -> int:
         """Return how many samples hold one without outliers with the confidence, if the best matrix is right."""
-        if len(pool.F_mat) == 0 or self.confidence == 1:
+        usual = CALIBRATED_CONFIDENCE if isinstance(scorer.model, Essential) else CONFIDENCE
+        confidence = usual if self.confidence is None else self.confidence
+        if len(pool.F_mat) == 0 or confidence == 1:
             return self.max_samples
         hit_rate = min(sampler.hit_rate(scorer.inliers(pool.F_mat[:1])[0], scorer.rows), 1 - 1e-9)
         if hit_rate == 0:
             return self.max_samples
-        return math.ceil(min(self.max_samples, math.log(1 - self.confidence) / math.log1p(-hit_rate)))
+        return math.ceil(min(self.max_samples, math.log(1 - confidence) / math.log1p(-hit_rate)))
 
 
 def _failure(points: Tensor, drawn: int, cameras: Cameras | None) -> RansacResult:
