@@ -132,20 +132,28 @@ def descend(
     return state
 
 
-def geometric_scale(inliers: Tensor, dof: int, floor: Tensor | float) -> Callable[[Tensor], Tensor]:
+def geometric_scale(
+    inliers: Tensor, dof: int, floor: Tensor | float, near: float | None = None
+) -> Callable[[Tensor], Tensor]:
     r"""Return the function from squared distances (B, S, N) to their squared scale (B, S, 1).
 
     It is the geometric mean over correspondences weighted by ``inliers`` (B, N), times :math:`n / (n - p)` of
     :math:`n = (\sum_i w_i)^2 / \sum_i w_i^2` effective correspondences, at least :math:`p + 1`, and ``dof`` parameters
     :math:`p`: a matrix that was fitted to few correspondences leaves distances that are too small. ``floor`` is added
-    to the squared distances.
+    to the squared distances. With ``near``, the mean is taken twice, the second time with weights that fall off at so
+    many times the first one: outliers with large weights, far away, would make it several times too large.
     """
     share = (inliers / safe_divisor(inliers.sum(1, keepdim=True)))[:, None]
     number = (1 / safe_divisor(share.square().sum(2, keepdim=True))).clamp(min=dof + 1.0)
     factor = number / (number - dof)
 
     def square_scale(squares: Tensor) -> Tensor:
-        return factor * ((squares + floor).log_() @ share.mT).exp()
+        logs = (squares + floor).log_()
+        mean = (logs @ share.mT).exp()
+        if near is not None:
+            close = share / (1 + squares / (near**2 * mean))
+            mean = ((logs * close).sum(2, keepdim=True) / safe_divisor(close.sum(2, keepdim=True))).exp()
+        return factor * mean
 
     return square_scale
 

@@ -38,7 +38,8 @@ POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATU
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
 EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of candidates, twice if not settled
 # Scales of the robust loss in geometric means of the distances, the first two times the network's factor.
-EARLY_SCALE, LAST_SCALE, SETTLED_SCALE = 3.0, 0.7, 3.1
+EARLY_SCALE, LAST_SCALE, SETTLED_SCALE = 4.2, 1.0, 4.4
+NEAR = 3.0  # geometric means, from which distances count less in the mean itself
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
 MIN_KEPT = 0.3  # share of the matches' fit under the cameras that a pose without them must keep
@@ -242,7 +243,7 @@ def _square_scale(inliers: Tensor, scale: Tensor, unit: Tensor) -> Callable[[Ten
 
     The scale (B, 1) is in geometric means of the distances, weighted by the probabilities of inliers.
     """
-    mean = geometric_scale(inliers, Essential.dof, (PIXEL_FLOOR / unit).square()[:, None])
+    mean = geometric_scale(inliers, Essential.dof, (PIXEL_FLOOR / unit).square()[:, None], NEAR)
     return lambda squares: scale.square()[:, None] * mean(squares)
 
 
