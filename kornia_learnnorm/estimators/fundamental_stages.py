@@ -5,12 +5,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.estimators.even_samples import evenly_ranked, fit_samples, sample_null_spaces
 from kornia_learnnorm.estimators.moments import (
     Evidence,
     descend,
-    draw_samples,
-    evenly_ranked,
-    fit_samples,
     geometric_scale,
     least_cost,
     pick,
@@ -111,7 +109,7 @@ class FundamentalRefinement(Refinement):
         real = torch.ones_like(large[..., 0, 0], dtype=torch.bool)
         if self.few_outliers is not None and is_known_true(self.few_outliers.all()):
             return large, real
-        basis, determined = draw_samples(evidence, weights, order, self.samples, self.model.sample_size)
+        basis, determined = sample_null_spaces(evidence, weights, order, self.samples, self.model.sample_size)
         drawn, singular = fundamental_in_span(basis.flatten(0, 1))
         shape = -1, 3 * self.samples
         singular = singular.view(shape) & determined.repeat_interleave(3, 1)

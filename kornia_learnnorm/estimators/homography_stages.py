@@ -9,10 +9,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.estimators.even_samples import draw_matches, evenly_ranked
 from kornia_learnnorm.estimators.match_features import CommonFrame
 from kornia_learnnorm.estimators.moments import (
-    draw_matches,
-    evenly_ranked,
     geometric_scale,
     least_cost,
 )

@@ -15,23 +15,17 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.dlt import normal_equations, null_space
+from kornia_learnnorm.geometry.dlt import normal_equations
 
 __all__ = [
     "Evidence",
     "descend",
-    "draw_matches",
-    "draw_samples",
-    "evenly_ranked",
-    "fit_samples",
     "geometric_scale",
     "least_cost",
     "pick",
 ]
 
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
-MIN_PIVOT = 1e-6  # of the largest one, of a minimal sample that is not degenerate, such as by drawing a match twice
-LARGE_SAMPLE = 20  # matches of a sample that averages their noise: most are right in sets of few outliers
 
 
 class Evidence(NamedTuple):
@@ -170,56 +164,6 @@ def pick(state: Any, index: Tensor, number: int) -> Any:
     """Return, of ``number`` states of each set, those of given indices (B,)."""
     rows = index + number * torch.arange(index.shape[0], device=index.device)
     return type(state)(*[value[rows] for value in state])
-
-
-def draw_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int) -> tuple[Tensor, Tensor]:
-    """Return the null spaces (B, S, 9 - size, 3, 3) of minimal samples, and which have no larger one, (B, S) bool.
-
-    Samples are those of :func:`draw_matches`.
-    """
-    basis, pivots = null_space(_sample_rows(evidence, weights, order, number, size).mT)
-    determined = pivots.amin(-1) > MIN_PIVOT * pivots.amax(-1)
-    return torch.unflatten(basis.mT, -1, (3, 3)).mT, determined
-
-
-def fit_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int) -> Tensor:
-    """Return the likeliest matrices of samples of 20 matches, (B, S, 3, 3)."""
-    rows = _sample_rows(evidence, weights, order, number, LARGE_SAMPLE)
-    return torch.unflatten(torch.linalg.eigh(rows @ rows.mT)[1][..., 0], -1, (3, 3)).mT
-
-
-def _sample_rows(evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int) -> Tensor:
-    """Return the design rows of samples, (B, S, 9, size)."""
-    rows = evidence.select(draw_matches(weights, order, number, size)).rows
-    return torch.unflatten(rows, 2, (number, size)).permute(0, 2, 1, 3)
-
-
-def draw_matches(weights: Tensor, order: Tensor, number: int, size: int) -> Tensor:
-    """Return the correspondences of minimal samples, indices (B, number size), one sample after another.
-
-    They are drawn by the weights (B, N), without a generator of random numbers.
-    ``order`` (B, N) sorts the correspondences by their weights. The samples are those of multiples of the powers of the
-    root of :math:`x^{d + 1} = x + 1` for d = ``size``, which spread evenly (M. Roberts, 2018).
-    """
-    shares = weights.gather(1, order).cumsum(1)
-    shares = shares / shares[:, -1:]
-    steps = EVEN_ROOTS[size] ** -torch.arange(1, size + 1, dtype=shares.dtype, device=shares.device)
-    chances = (torch.arange(1, number + 1, device=shares.device)[:, None] * steps).frac().flatten()
-    ranks = torch.searchsorted(shares, chances + 0.0 * shares[:, :1]).clamp(max=shares.shape[1] - 1)
-    return order.gather(1, ranks)
-
-
-def evenly_ranked(order: Tensor, present: Tensor, most: int) -> Tensor:
-    """Return at most so many of sorted correspondences (B, N), evenly over the ranks of those present, which are first.
-
-    ``present`` (B, N) is one for them and zero for others: how many others there are has no effect.
-    """
-    few = min(order.shape[1], most)
-    number = present.sum(1, keepdim=True, dtype=torch.int64).clamp(min=few)
-    return order.gather(1, torch.arange(few, device=order.device) * number // few)
-
-
-EVEN_ROOTS = {4: 1.1673039782614187, 5: 1.1347241384015194, 7: 1.0969815577985598, 20: 1.034397396133807}
 
 
 def _normal_forms() -> Tensor:

@@ -8,6 +8,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose
+from kornia_learnnorm.estimators.even_samples import evenly_ranked, sample_null_spaces
 from kornia_learnnorm.estimators.match_features import (
     POINT_FEATURES,
     RESIDUAL_FEATURES,
@@ -18,8 +19,6 @@ from kornia_learnnorm.estimators.match_features import (
 from kornia_learnnorm.estimators.moments import (
     Evidence,
     descend,
-    draw_samples,
-    evenly_ranked,
     geometric_scale,
     least_cost,
     pick,
@@ -209,7 +208,7 @@ def _sample_spans(
     evidence: Evidence, model: Essential, weights: Tensor, order: Tensor, number: int
 ) -> tuple[Tensor, Tensor]:
     """Return the null spaces of minimal samples, (B, S, 4, 3, 3), and which of them are not larger, (B, S) bool."""
-    spans, determined = draw_samples(evidence, weights, order, number, Essential.sample_size)
+    spans, determined = sample_null_spaces(evidence, weights, order, number, Essential.sample_size)
     inverse1, inverse2 = (torch.linalg.inv_ex(C)[0][:, None, None] for C in (model.C1, model.C2))
     return inverse2.mT @ spans @ inverse1, determined
 

@@ -7,7 +7,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import RobustCost, attach_gradient, minimize
-from kornia_learnnorm.estimators.robust_losses import Loss, squared_loss
+from kornia_learnnorm.estimators.robust_losses import Loss, check_loss, squared_loss
 from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, check_matrices, solve_dtype
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import hartley_coordinates
@@ -197,10 +197,7 @@ def _check(
     check_correspondences(points1, points2, weights, min_points)
     shared = len(points1) == 1 and isinstance(matrices, Tensor)
     check_matrices(name, matrices, len(matrices) if shared else len(points1))
-    if isinstance(loss, type):
-        raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
-    if not callable(loss):
-        raise TypeError(f"loss must be a function or an instance such as Huber(1.0), got {loss!r}")
+    check_loss(loss)
     if not isinstance(max_iterations, int):
         raise TypeError(f"max_iterations must be a whole number, got {max_iterations!r}")
     if max_iterations < 0 or not tolerance >= 0:

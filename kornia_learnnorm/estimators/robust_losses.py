@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kornia_learnnorm.geometry.constrained_fit import Loss
 
-__all__ = ["Cauchy", "GemanMcClure", "Huber", "Loss", "Truncated", "squared_loss"]
+__all__ = ["Cauchy", "GemanMcClure", "Huber", "Loss", "Truncated", "check_loss", "squared_loss"]
 
 
 def squared_loss(squares: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,3 +111,11 @@ class Truncated(_RobustLoss):
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
         """Return the losses and their derivatives by the squared distances."""
         return squares.clamp(max=self.scale**2), (squares <= self.scale**2).to(squares)
+
+
+def check_loss(loss: object) -> None:
+    """Raise a clear TypeError for what is no loss, such as a class in place of its instance."""
+    if isinstance(loss, type):
+        raise TypeError(f"loss must be a function or an instance such as {loss.__name__}(1.0), got the class")
+    if not callable(loss):
+        raise TypeError(f"loss must be a function or an instance such as Huber(1.0), got {loss!r}")

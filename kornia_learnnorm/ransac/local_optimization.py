@@ -73,7 +73,8 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
     contradict the cameras, the optimum is that of fundamental matrices.
     """
-    model, state = scorer.model, scorer.model.state(M)
+    model = scorer.model
+    state: Any = model.state(M)
     gains = (1 - (scorer.distances(M) / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
     weights, evidence = torch.ones_like(gains), None
     if isinstance(model, Essential):

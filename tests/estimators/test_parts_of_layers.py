@@ -6,10 +6,12 @@ import torch
 from pairwise import pairwise
 from scenes import uniform
 
-from kornia_learnnorm.estimators.moments import Evidence, draw_matches, draw_samples, evenly_ranked, fit_samples
+from kornia_learnnorm.estimators.even_samples import draw_matches, evenly_ranked, fit_samples, sample_null_spaces
+from kornia_learnnorm.estimators.moments import Evidence, geometric_scale
 from kornia_learnnorm.estimators.set_network import MIN_VARIANCE, AttentiveContextBlock
 
 FEW, MANY = 6, 12  # correspondences, for a block of width 8: with many, statistics go into the weights
+NUMBER = 5  # samples of each set
 
 
 def reference(block: AttentiveContextBlock, hidden: np.ndarray, absent: np.ndarray) -> np.ndarray:
@@ -40,9 +42,6 @@ def test_sums_keep_their_precision_under_autocast(number):
         assert AttentiveContextBlock(8)(uniform(2, number, 8).float(), None).dtype == torch.float32
 
 
-NUMBER = 5  # samples of each set
-
-
 def drawn_rows(size):
     """Evidence of random points, what draws from it, and the rows that are drawn, in NumPy, (B, S, size, 9)."""
     x1, x2 = (torch.cat([uniform(2, 2, 40, seed=s), torch.ones(2, 1, 40)], 1) for s in (0, 1))
@@ -64,11 +63,17 @@ def test_large_samples_against_singular_vectors():
 @pytest.mark.parametrize("size", [5, 7])
 def test_matrices_of_minimal_samples_leave_no_residual(size):
     evidence, options, rows = drawn_rows(size)
-    basis, determined = draw_samples(evidence, *options, size)
+    basis, determined = sample_null_spaces(evidence, *options, size)
     residual = np.einsum("bsnk,bsdk->bsnd", rows, basis.mT.flatten(3).numpy())
     assert basis.shape == (2, NUMBER, 9 - size, 3, 3)
     assert np.abs(residual[determined.numpy()]).max() < 1e-9
     assert determined.double().mean() > 0.5
+
+
+def test_outliers_far_away_do_not_count_in_the_noise():
+    squares = torch.cat([uniform(1, 1, 60), torch.full((1, 1, 40), 1e6)], 2)
+    among_all, near = (geometric_scale(torch.ones(1, 100).double(), 5, 1e-9, near)(squares) for near in (None, 3.0))
+    assert near < 2 * squares[..., :60].log().mean().exp() < among_all / 20
 
 
 def test_heavier_correspondences_are_drawn_more_often():

@@ -1,15 +1,12 @@
-"""COLMAP models: their frames, and the pairs of frames that see the same points. pycolmap is imported on use."""
+"""COLMAP models: their frames and cameras. pycolmap is imported on use."""
 
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.datasets.frames import Frame, FramePair
+from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.textfiles import camera_matrix, text_lines
 from kornia_learnnorm.data.images import image_size
 from kornia_learnnorm.optional import import_extra
@@ -28,33 +25,13 @@ def read_colmap(model: str | Path, images: str | Path) -> list[Frame]:
     ValueError if the model is malformed or empty, a camera has distortion other than k1, k2, p1, p2, or an image does
     not have its camera's size, as one that EXIF turns by a quarter.
     """
-    images, reconstruction = Path(images), _reconstruction(Path(model))
+    images, reconstruction = Path(images), read_reconstruction(Path(model))
     found = sorted(reconstruction.images.values(), key=lambda image: (image.name.rpartition("/")[0], image.name))
     if not found:
         raise ValueError(f"the model {model} has no images")
     if missing := [image.name for image in found if not (images / image.name).is_file()]:
         raise FileNotFoundError(f"{len(missing)} of {len(found)} images are not in {images}, the first is {missing[0]}")
     return [_frame(image, images / image.name) for image in found]
-
-
-def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int = 30) -> Iterator[FramePair]:
-    """Yield the pairs of frames that see at least ``min_points`` 3D points of a COLMAP model in common, by name."""
-    if min_points < 1:
-        raise ValueError(f"the frames of a pair must share at least 1 point, got min_points {min_points}")
-    named = {image.name: image for image in _reconstruction(Path(model)).images.values()}
-    ordered = sorted(frames, key=lambda frame: frame.name)
-    seen: list[set[int]] = []
-    observers: defaultdict[int, list[int]] = defaultdict(list)
-    for index, frame in enumerate(ordered):
-        if frame.name not in named:
-            raise ValueError(f"no image {frame.name!r} among the {len(named)} of the model {model}")
-        seen.append({point.point3D_id for point in named[frame.name].get_observation_points2D()})
-        for point in seen[-1]:
-            observers[point].append(index)
-    for index, points in enumerate(seen):
-        shared = Counter(chain.from_iterable(observers[point] for point in points))
-        for other in sorted(other for other, count in shared.items() if other > index and count >= min_points):
-            yield FramePair(ordered[index], ordered[other])
 
 
 def read_pinhole(path: Path) -> NDArray[np.float64]:
@@ -75,7 +52,8 @@ def read_pinhole(path: Path) -> NDArray[np.float64]:
     return camera_matrix(params[0], params[first - 3], *(params[first - 2 : first] - 0.5))
 
 
-def _reconstruction(model: Path) -> Any:
+def read_reconstruction(model: Path) -> Any:
+    """Return pycolmap's reconstruction of a model."""
     pycolmap = import_extra("pycolmap", "colmap", "reading COLMAP models")
     for name in ("cameras", "images", "points3D"):
         if not any((model / f"{name}.{suffix}").is_file() for suffix in ("bin", "txt")):

@@ -12,14 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size, import_cv2, read_colour, read_image, scaling
+from kornia_learnnorm.protocol import SPLITS
 
-# Sequences by dataset and split, as B. Fan et al. choose them (A revisit of the normalized eight-point algorithm and a
-# self-supervised deep solution, section 5.1); None for all sequences that no other split names. StMarysChurch of
-# Cambridge Landmarks has its own lists of training and test images, which `read_cambridge` reads.
-SPLITS: dict[str, dict[str, tuple[str, ...] | None]] = {
-    "kitti": {"train": ("00", "01", "02", "03", "04", "05"), "test": ("06", "07", "08", "09", "10")},
-    "tum": {"train": None, "val": ("rgbd_dataset_freiburg3_long_office_household",)},
-}
 MARKER = "rgb.txt"  # file that makes a folder a sequence of TUM
 
 

@@ -13,25 +13,13 @@ from kornia_learnnorm.evaluation import tables
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.evaluation.tables import Cell, Number, Table, median_number
 from kornia_learnnorm.metrics.statistics import better_rate, comparable
-from kornia_learnnorm.protocol import PROTOCOLS, THRESHOLDS
+from kornia_learnnorm.protocol import PAPERS_DATA, PROTOCOLS, TABLE1, THRESHOLDS
 
 BASELINE = "Hartley"  # the method that all others are compared with
 MIN_DISTANCE = 1e-6  # pixels; smaller distances are clamped before the logarithm
 # Columns of the table that learnnorm evaluate prints.
 HEADER = ["method", "better than Hartley %", "than whitening %", "mean px", "median px"]
 HEADER += ["truth: median px", "truth: better than Hartley %"]
-
-# Fan et al., Table 1: better than Hartley % by training set, on the data of PAPERS_DATA.
-PRINTED: dict[str, dict[str, float]] = {
-    "KITTI 00-05": {"KITTI": 86.68, "TUM": 90.04},
-    "TUM": {"KITTI": 84.22, "TUM": 89.73},
-    "KITTI 00-05 and TUM": {"KITTI": 87.05, "TUM": 91.43},
-}
-# The data that Fan et al. test on: the beginning of what a run notes of a store, KITTI 06-10 or TUM at KITTI's size.
-PAPERS_DATA = {
-    "KITTI": r"KITTI odometry (0[6-9]|10)(, (0[6-9]|10))*, \d+ pairs",
-    "TUM": r"TUM RGB-D (rgbd_dataset_)?freiburg3_long_office_household\b.*, resized to 1\d{3}x3\d{2}, \d+ pairs",
-}
 
 
 def with_baseline(run: Run) -> Run:
@@ -84,7 +72,7 @@ def _better_rates(run: Run, cells: list[RunCell], baseline: str) -> Table:
     if protocol == "filtered" and any(papers):
         rows += [
             ["Fan et al., as printed", *(Number(values[p], ".2f") if p in values else "" for p in papers), train]
-            for train, values in PRINTED.items()
+            for train, values in TABLE1.items()
         ]
         text += " Fan et al. test on KITTI 06-10 and on TUM freiburg3_long_office at KITTI's size."
     header = ["method", *(f"{cell.store}: {len(cell.pair)} of {cell.drawn}" for cell in cells), "trained on"]

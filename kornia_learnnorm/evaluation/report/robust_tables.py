@@ -7,22 +7,9 @@ from kornia_learnnorm.evaluation.report.method_tables import papers_data
 from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
 from kornia_learnnorm.evaluation.tables import Cell, Number, Table, median_number
-from kornia_learnnorm.protocol import MAX_RESIDUAL, THRESHOLDS
+from kornia_learnnorm.protocol import MAX_RESIDUAL, TABLES2_AND_3, THRESHOLDS
 
 MAX_ERROR = MAX_RESIDUAL  # pixels; larger errors are clamped
-# Fan et al., Tables 2 and 3: data, protocol, method, share of inliers and F1 at 0.1 px, then at 1 px, %.
-PRINTED: tuple[tuple[str, str, str, float, float | None, float, float | None], ...] = (
-    ("KITTI", "filtered", "Ranftl and Koltun", 24.61, 14.65, 85.87, 75.77),
-    ("KITTI", "filtered", "MLESAC", 18.60, 12.54, 84.48, 75.15),
-    ("KITTI", "filtered", "LMEDS", 20.01, 13.34, 84.23, 75.44),
-    ("KITTI", "filtered", "USAC", 21.43, 13.90, 85.13, 75.70),
-    ("KITTI", "filtered", "RANSAC, Hartley", 21.85, 13.84, 84.96, 75.65),
-    ("KITTI", "filtered", "RANSAC, learned", 21.89, 13.86, 84.98, 75.66),
-    ("KITTI", "unfiltered", "RANSAC, Hartley", 4.40, None, 30.50, None),
-    ("KITTI", "unfiltered", "RANSAC, learned", 4.38, None, 30.55, None),
-    ("TUM", "unfiltered", "RANSAC, Hartley", 7.60, None, 44.13, None),
-    ("TUM", "unfiltered", "RANSAC, learned", 7.64, None, 44.18, None),
-)
 BASELINE = "RANSAC"  # that RANSAC with other normalisers is compared with
 TABLE_NUMBER = {"filtered": " (Table 2)", "unfiltered": " (Table 3)"}  # in Fan et al.
 SCALES = {"inliers": 100.0, "f1": 100.0, "error": 1.0}  # shares are printed in %
@@ -66,7 +53,7 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
             cells += [_mean(100 * inliers, 2), _mean(100 * f1, 2), _mean(error, 3)]
         rows.append([name, *cells, median_number(error)])
     kind = papers_data(run.about["stores"][cell.store]), cell.protocol
-    printed = [row[2:] for row in PRINTED if row[:2] == kind]
+    printed = [row[2:] for row in TABLES2_AND_3 if row[:2] == kind]
     for name, *values in printed:
         a, b, c, d = ("" if value is None else Number(value, ".2f") for value in values)
         rows.append([f"Fan et al., as printed: {name}", a, b, "", c, d, "", ""])

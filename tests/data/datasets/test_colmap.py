@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from make_sequences import SIZE, names
 
-from kornia_learnnorm.data.datasets.colmap import covisible_pairs, read_colmap
+from kornia_learnnorm.data.datasets.colmap import read_colmap
+from kornia_learnnorm.data.datasets.pairing import covisible_pairs
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
 
