@@ -10,11 +10,12 @@ from kornia_learnnorm.geometry.dlt import normal_equations
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["contradict_cameras", "in_front_of_best_pose"]
+__all__ = ["contradict_cameras", "in_front_of_best_pose", "keeps_fit"]
 
 SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
 MIN_EFFECT = 0.05  # share of the noise that two more parameters must explain: errors of matches are not independent
 MIN_NOISE = 0.01  # of the loss's scale: where inliers have no noise, the pull of outliers is no evidence
+MIN_KEPT = 0.3  # share of the fit with cameras that the pose of one without must keep
 MIN_PRECISION = 1 / 9  # of a pose without cameras over that with them: at most three times the standard error
 
 
@@ -78,3 +79,18 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     least = (SIGNIFICANCE ** (-2 / freedom) - 1).clamp(min=MIN_EFFECT)
     contradicted: Tensor = (effect > least) & (variances[0] > MIN_PRECISION * variances[1])
     return contradicted
+
+
+@torch.no_grad()
+def keeps_fit(
+    evidence: Evidence, state: Calibrated, other: Calibrated, weights: Tensor, square_scale: Tensor
+) -> Tensor:
+    """Return for which sets the other states fit at least 0.3 times as well as the states, (B,) bool.
+
+    Where a plane leaves a fundamental matrix nearly undetermined, its pose may fit hardly any correspondence, while
+    inexact cameras cost a few pixels: the squared scale (B, 1) is to allow for these.
+    """
+    losses = evidence.losses(torch.stack([state.matrix(), other.matrix()], 1), square_scale[:, None])
+    fit = ((1 - losses) @ weights[..., None])[..., 0]
+    kept: Tensor = fit[:, 1] > MIN_KEPT * fit[:, 0]
+    return kept

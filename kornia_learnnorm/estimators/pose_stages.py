@@ -7,7 +7,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose, keeps_fit
 from kornia_learnnorm.estimators.even_samples import evenly_ranked, sample_null_spaces
 from kornia_learnnorm.estimators.match_features import (
     POINT_FEATURES,
@@ -41,7 +41,6 @@ EARLY_SCALE, LAST_SCALE, SETTLED_SCALE = 4.2, 1.0, 4.4
 NEAR = 3.0  # geometric means, from which distances count less in the mean itself
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
-MIN_KEPT = 0.3  # share of the matches' fit under the cameras that a pose without them must keep
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 EARLY_PIXELS, LAST_PIXELS = 2.0, 0.7  # scales of the losses that candidates are compared by
 PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
@@ -256,11 +255,7 @@ def _leave_cameras(
     unit: Tensor,
     steps: int,
 ) -> Calibrated:
-    """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras.
-
-    Where a plane leaves the fundamental matrix nearly undetermined, its pose may fit hardly any correspondence; inexact
-    cameras cost a few pixels.
-    """
+    """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras."""
     with torch.no_grad():
         square_scale = _square_scale(inliers, scale, unit)(evidence.squares(state.matrix()[:, None])[0])
         left = contradict_cameras(evidence, state, weights, square_scale[:, 0])
@@ -268,9 +263,6 @@ def _leave_cameras(
         return state
     free = _reweight(evidence, Fundamental().state(state.matrix()), weights, inliers, scale, unit, steps)
     nearest = differentiable_state(model, free.matrix())
-    with torch.no_grad():
-        wide = square_scale.maximum((EARLY_PIXELS / unit).square()[:, None])
-        losses = evidence.losses(torch.stack([state.matrix(), nearest.matrix()], 1), wide)
-        fit = ((1 - losses) @ weights[..., None])[..., 0]
-    kept: Calibrated = choose(left & (fit[:, 1] > MIN_KEPT * fit[:, 0]), nearest, state)
+    wide = square_scale[:, 0].maximum((EARLY_PIXELS / unit).square())
+    kept: Calibrated = choose(left & keeps_fit(evidence, state, nearest, weights, wide), nearest, state)
     return kept

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose, keeps_fit
 from kornia_learnnorm.estimators.moments import Evidence, descend
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
@@ -24,6 +24,7 @@ LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has conve
 MANIFOLD_SCALES = (3.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps on the manifold
 MANIFOLD_RELAXATION = 1.3  # of these steps but the first, which comes from afar: bounded losses make them too short
 LM_RELAXATION = 1.4  # of those of Levenberg-Marquardt on the manifold
+POSE_PIXELS = 2.0  # scale at which the pose of a matrix that left the cameras must still fit
 MANIFOLD_POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
 
 
@@ -71,7 +72,7 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     """Return the optimum (1, 3, 3) of the model that is next to the best of some matrices (K, 3, 3).
 
     Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
-    contradict the cameras, the optimum is that of fundamental matrices.
+    contradict the cameras, the optimum is that of fundamental matrices, if its pose still fits.
     """
     model = scorer.model
     state: Any = model.state(M)
@@ -89,7 +90,10 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     square_scale = weights.new_full((1, 1), (FINAL_LOSS_SCALE * scorer.threshold) ** 2)
     if evidence is None or not bool(contradict_cameras(evidence, state, weights, square_scale)):
         return state
-    return minimize(last, Fundamental().state(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)[1].state
+    free = minimize(last, Fundamental().state(state.matrix()), MAX_LM_STEPS, LM_TOLERANCE)[1].state
+    pose: Any = model.state(free.matrix())
+    wide = square_scale.clamp(min=POSE_PIXELS**2)
+    return free if bool(keeps_fit(evidence, state, pose, weights, wide)) else state
 
 
 def _fixed(scale: float) -> Callable[[Tensor], Tensor]:

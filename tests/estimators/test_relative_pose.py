@@ -10,7 +10,7 @@ from scenes import distorted, roughened, scenes, seeded, uniform
 from torch.nn.functional import normalize
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.estimators import camera_evidence, moments, pose_stages
+from kornia_learnnorm.estimators import camera_evidence, moments
 from kornia_learnnorm.estimators.match_features import CommonFrame
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
@@ -79,8 +79,8 @@ def test_cameras_are_left_where_matches_contradict_them():
     scene = scenes("handheld", 8, 400, noise=0.3)
     cameras = scene.K1, scene.K2
     moved = [distorted(p, K, -0.1) for p, K in zip((scene.points1, scene.points2), cameras, strict=True)]
-    never = (camera_evidence, "MIN_EFFECT", torch.inf), (pose_stages, "MIN_KEPT", torch.inf)
-    for limit in ((pose_stages, "MIN_KEPT", 0.3), *never):
+    never = (camera_evidence, "MIN_EFFECT", torch.inf), (camera_evidence, "MIN_KEPT", torch.inf)
+    for limit in ((camera_evidence, "MIN_KEPT", 0.3), *never):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(*limit)
             found = layer.estimate(*moved, *cameras)
