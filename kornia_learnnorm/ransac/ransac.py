@@ -55,11 +55,11 @@ class RANSAC(nn.Module):
     the best matrix so far say how many samples are still needed. In the end the best few are fitted on Geman and
     McClure's loss, and the one of least cost goes on to Levenberg-Marquardt where least squares have not converged.
 
-    With both cameras, minimal samples of five run through Kornia's five-point solver, and local optimisation and the
+    With both cameras, minimal samples of five run through Nister's five-point solver, and local optimisation and the
     final fit are least squares on essential matrices; distances stay in pixels. Where a fundamental matrix then
     fits so much better that chance explains it with a probability below 0.001, and its pose has at most three times the
-    standard error, the cameras are inexact, or a lens or a shutter is not that of a pinhole: the result is this matrix.
-    ``normalizer`` and ``rank2`` have no effect.
+    standard error and still fits, the cameras are inexact, or a lens or a shutter is not that of a pinhole: the result
+    is this matrix. ``normalizer`` and ``rank2`` have no effect.
 
     Matches that share a point exactly, in either view, with a match of higher weight, or of the same weight and before
     them, are treated as absent: many matches on one point agree with every epipolar line through it.
