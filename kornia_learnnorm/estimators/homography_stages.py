@@ -24,7 +24,7 @@ __all__ = ["HomographyRefinement"]
 
 # Of the robust loss, in geometric means of the inliers' distances: of early stages, comparisons and the last fit.
 EARLY_SCALE, COMPARED_SCALE, LAST_SCALE = 3.0, 1.5, 6.0
-NEAR = 3.0  # geometric means, from which distances count less in the mean itself
+NEAR = 3.0  # geometric means, up to about which distances count in the mean itself in evaluation
 LAST_POWER = 0.05  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
 LOCAL_STEPS = 2  # reweightings of candidates
@@ -60,7 +60,8 @@ class HomographyRefinement(Refinement):
         The choice among matrices has no derivative; through a zero, the transforms still get a gradient of zero.
         """
         inliers = probability if self.weights is None else probability * self.weights
-        mean, weights = geometric_scale(inliers, self.model.dof, SQUARE_FLOOR, NEAR), inliers
+        near = NEAR if self.settle else None
+        mean, weights = geometric_scale(inliers, self.model.dof, SQUARE_FLOOR, near), inliers
         if last:
             weights = probability.clamp(min=torch.finfo(M.dtype).tiny) ** LAST_POWER
             weights = weights if self.weights is None else weights * self.weights

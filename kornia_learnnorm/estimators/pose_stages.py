@@ -1,7 +1,6 @@
 r"""The stages of the learned relative pose: features, logits, moment matrix, essential matrices, robust steps."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -36,9 +35,11 @@ __all__ = ["POSE_OUTPUTS", "POSE_POINT_FEATURES", "POSE_RESIDUAL_FEATURES", "run
 POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
 EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of candidates, twice if not settled
-# Scales of the robust loss in geometric means of the distances, the first two times the network's factor.
-EARLY_SCALE, LAST_SCALE, SETTLED_SCALE = 4.2, 1.0, 4.4
-NEAR = 3.0  # geometric means, from which distances count less in the mean itself
+# Scales of the robust loss in geometric means of the distances: of all stages but the last and of the last, times the
+# network's factor, and of settled sets.
+EARLY_SCALE, LAST_SCALE = 3.0, 0.7
+# In evaluation, the means are those of near distances, up to about three means. Networks would learn slower by them.
+NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE, SETTLED_SCALE = 3.0, 4.2, 1.0, 4.4
 SCALE_BOUND = 1.5  # the logarithm of the factor stays within plus and minus this
 LAST_POWER = 0.1  # of the weights in the last stage: most matches are to count, and a robust loss drops outliers
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
@@ -76,6 +77,7 @@ def run_pose_stages(
     found: list[Tensor] = []
     settled = torch.zeros_like(problem.x1[:, 0, 0], dtype=torch.bool)
     dtype, tiny = next(networks.parameters()).dtype, torch.finfo(problem.x1.dtype).tiny
+    near, early, last = (NEAR, EARLY_NEAR_SCALE, LAST_NEAR_SCALE) if settle else (None, EARLY_SCALE, LAST_SCALE)
     for network in networks:
         seen, factor, before = features, None, None
         if states:
@@ -103,15 +105,17 @@ def run_pose_stages(
             break
         with torch.no_grad():
             state = _likeliest(evidence, model, unit, weights, suggested, before)
-        states.append(_reweight(evidence, state, weights, weights, EARLY_SCALE * scale, unit, EARLY_STEPS))
+        square_scale = _square_scale(weights, early * scale, unit, near)
+        states.append(descend(evidence, state, weights[:, None], square_scale, EARLY_STEPS, RELAXATION))
     drawn = 0 if detach_stages else samples
     with torch.no_grad():
         state, front = _most_consistent(evidence, model, unit, weights, suggested, before, drawn, settled)
     share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
-    options = weights, torch.where(settled[:, None], SETTLED_SCALE, LAST_SCALE * scale), unit, refine_steps
-    state = _reweight(evidence, state, share, *options)
+    scale = torch.where(settled[:, None], SETTLED_SCALE, last * scale)
+    options = _square_scale(weights, scale, unit, near), refine_steps, RELAXATION
+    state = descend(evidence, state, share[:, None], *options)
     if not detach_stages:
-        state = _leave_cameras(evidence, model, state, share, *options)
+        state = _leave_cameras(evidence, model, state, share, unit, *options)
     # A settled set has gone to the last stage at once.
     states = [choose(settled, state, other) for other in states]
     left = len(networks) - len(states)
@@ -228,20 +232,12 @@ def _suggested(spans: Tensor, found: Candidates, before: Candidates | None) -> C
     return E_mat, real
 
 
-def _reweight(
-    evidence: Evidence, state: Any, weights: Tensor, inliers: Tensor, scale: Tensor, unit: Tensor, steps: int
-) -> Any:
-    """Return states after steps of reweighted least squares, differentiable."""
-    square_scale = _square_scale(inliers, scale, unit)
-    return descend(evidence, state, weights[:, None], square_scale, steps, RELAXATION)
-
-
-def _square_scale(inliers: Tensor, scale: Tensor, unit: Tensor) -> Callable[[Tensor], Tensor]:
+def _square_scale(inliers: Tensor, scale: Tensor, unit: Tensor, near: float | None) -> Callable[[Tensor], Tensor]:
     """Return the function from squared distances (B, S, N) to the squared scale (B, S, 1) of the loss.
 
     The scale (B, 1) is in geometric means of the distances, weighted by the probabilities of inliers.
     """
-    mean = geometric_scale(inliers, Essential.dof, (PIXEL_FLOOR / unit).square()[:, None], NEAR)
+    mean = geometric_scale(inliers, Essential.dof, (PIXEL_FLOOR / unit).square()[:, None], near)
     return lambda squares: scale.square()[:, None] * mean(squares)
 
 
@@ -250,19 +246,20 @@ def _leave_cameras(
     model: Essential,
     state: Calibrated,
     weights: Tensor,
-    inliers: Tensor,
-    scale: Tensor,
     unit: Tensor,
+    square_scale: Callable[[Tensor], Tensor],
     steps: int,
+    relaxation: float,
 ) -> Calibrated:
     """Return the states, but the poses of fundamental matrices where correspondences contradict the cameras."""
     with torch.no_grad():
-        square_scale = _square_scale(inliers, scale, unit)(evidence.squares(state.matrix()[:, None])[0])
-        left = contradict_cameras(evidence, state, weights, square_scale[:, 0])
+        square = square_scale(evidence.squares(state.matrix()[:, None])[0])[:, 0]
+        left = contradict_cameras(evidence, state, weights, square)
     if is_known_true(~left.any()):
         return state
-    free = _reweight(evidence, Fundamental().state(state.matrix()), weights, inliers, scale, unit, steps)
+    start = Fundamental().state(state.matrix())
+    free = descend(evidence, start, weights[:, None], square_scale, steps, relaxation)
     nearest = differentiable_state(model, free.matrix())
-    wide = square_scale[:, 0].maximum((EARLY_PIXELS / unit).square())
+    wide = square.maximum((EARLY_PIXELS / unit).square())
     kept: Calibrated = choose(left & keeps_fit(evidence, state, nearest, weights, wide), nearest, state)
     return kept
