@@ -18,6 +18,7 @@ __all__ = ["POINT_FEATURES", "RESIDUAL_FEATURES", "CommonFrame", "masked_median"
 
 POINT_FEATURES, RESIDUAL_FEATURES = 9, 5  # numbers of a correspondence
 RESIDUAL_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
+DEVIATION_FLOOR = 1e-5  # of the frame's unit: the rounding of an exact shift of the image says nothing
 MIN_PROBABILITY = 1e-3  # added to the probabilities of inliers in a mean
 
 
@@ -66,7 +67,7 @@ def match_features(frame: CommonFrame, scores: Tensor | None, present: Tensor | 
     shift = second - first
     shift = shift - masked_median(shift, present)
     deviation = masked_median(shift.norm(dim=-1, keepdim=True), present)
-    relative = torch.asinh(shift / safe_divisor(deviation))
+    relative = torch.asinh(shift / deviation.clamp(min=DEVIATION_FLOOR))
     if scores is None:
         score = torch.zeros_like(relative)
     else:

@@ -162,5 +162,4 @@ class TestAugment:
         assert kept.double().mean() > 0.55
 
     def test_without_scores(self):
-        sets = SyntheticSets(8).draw(3, 20, seeded())._replace(scores=None)
-        assert augment(sets, seeded()).scores is None
+        assert augment(SyntheticSets(8).draw(3, 20, seeded())._replace(scores=None), seeded()).scores is None

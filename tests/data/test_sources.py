@@ -125,8 +125,7 @@ def test_blocks_without_samples(store, tmp_path):
     blocks = source.blocks(0)
     assert sorted(block.pairs for block in blocks) == [0, 1]
     for number, block in enumerate(blocks):
-        samples = source.draw(0, number)
-        assert samples.points1.shape == (block.samples, 9, 2)
+        assert source.draw(0, number).points1.shape == (block.samples, 9, 2)
     with pytest.raises(ValueError, match=r"no pair of .*few\.h5 has 9 correspondences"):
         StoreSamples([str(tmp_path / "few.h5")], size=9)
 

@@ -157,6 +157,13 @@ def test_sets_of_few_outliers_leave_stages_out(kind):
     assert len(calls) == len(layer.networks)
 
 
+@every
+def test_the_rounding_of_an_exact_shift_has_no_large_gradient(kind):
+    points, _, *cameras = (value.float() for value in inputs(kind, 1, 200))
+    found = CLASSES[kind].from_pretrained()(points.requires_grad_(), points.detach() + 7, *cameras)
+    assert torch.autograd.grad(found[:, 0].sum(), points)[0].abs().max() < 1
+
+
 class TestSmallSetsOfFundamentalMatrices:
     def test_eight_are_the_optimal_correction_or_with_outliers_hartleys_projection(self):
         points1, points2 = inputs("fundamental", 40, 8)

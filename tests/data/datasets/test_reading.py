@@ -138,8 +138,7 @@ def test_a_folder_within_does_not_part_its_sequence_and_hidden_files_are_none(tm
         (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
         (tmp_path / name).touch()
     assert names(pair_frames(read_folder(str(tmp_path)))) == [("s/1.png", "s/3.png")]
-    frames = read_folder(tmp_path / "s-1")
-    assert [(frame.name, frame.size) for frame in frames] == [("1.png", (0, 0))]
+    assert [(frame.name, frame.size) for frame in read_folder(tmp_path / "s-1")] == [("1.png", (0, 0))]
     assert len(read_folder(tmp_path)) == 4
 
 

@@ -90,8 +90,7 @@ def test_share_of_gross_outliers(make, outliers, expected):
     scene = make(20, 40, seeded(3), noise=0.0, outliers=outliers)
     assert ((~scene.inliers).sum(-1) == expected).all()
     exact = make(20, 40, seeded(3), noise=0.0)
-    moved = (scene.points2 != exact.points2).any(-1)
-    assert torch.equal(moved, ~scene.inliers)
+    assert torch.equal((scene.points2 != exact.points2).any(-1), ~scene.inliers)
     assert torch.equal(scene.points1, exact.points1)
 
 
