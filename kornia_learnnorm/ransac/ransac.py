@@ -181,7 +181,8 @@ class RANSAC(nn.Module):
             dtype of the points, the number of samples and the score; no gradients. Zeros and no inliers where no matrix
             of rank 2 was found that has more than eight inliers, or five with cameras, and where fewer weights than
             that are positive. Where every sample is degenerate, as on a plane without noise or under no motion, the
-            matrix is one of those that fit. With cameras a plane has at most two.
+            matrix is one of those that fit. With cameras a plane has at most two. A homography is in the same field
+            ``F_mat``, from :math:`N \ge 4` matches of which more than four are inliers.
 
         Raises:
             TypeError: if the points are not floating-point tensors of one dtype, or weights or cameras not
