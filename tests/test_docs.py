@@ -129,8 +129,7 @@ def test_the_model_zoo_lists_every_shipped_file_with_its_size():
     rows = re.findall(r"\[`([\w-]+)`\]\(models/\1\.md\) \| `(\w+)` \| ([\d,]+) \| .+ \| .+ \|", TEXTS["docs/zoo.md"])
     assert sorted(name for name, *_ in rows) == sorted(path.stem for path in CARDS)
     for name, module, size in rows:
-        layer = getattr(kln, module).from_pretrained(name)
-        assert f"{sum(p.numel() for p in layer.parameters()):,}" == size
+        assert f"{sum(p.numel() for p in getattr(kln, module).from_pretrained(name).parameters()):,}" == size
         assert f"weights/{name}.md" in TEXTS[f"docs/models/{name}.md"]
 
 

@@ -49,8 +49,9 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     the gain of a Gauss-Newton step of seven parameters over one of five, divided by the mean of :math:`\psi^2` and
     times that of its slope, where :math:`\psi(d)` is half of the loss's derivative, is twice an F-distributed number of
     2 and :math:`m` degrees of freedom: it is above :math:`2x` with probability :math:`(1 + 2x / m)^{-m / 2}`. Errors of
-    neighbouring matches are not independent, so the step must also explain a twentieth of the noise. And the pose must
-    not become much less certain, as it does where a plane leaves seven parameters nearly undetermined.
+    neighbouring matches are not independent, so the step must also explain a twentieth of the noise, which is a
+    hundredth of the scale at least. And the pose must not become much less certain, as it does where a plane leaves
+    seven parameters nearly undetermined.
 
     Reference:
         F. Hampel, E. Ronchetti, P. Rousseeuw, W. Stahel, Robust Statistics, 1986, section 7.2.

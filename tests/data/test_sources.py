@@ -91,8 +91,7 @@ def test_blocks_hold_every_sample_once(store, rows_of, sources):
         assert len(blocks) == 4
         assert [block.samples for block in blocks] == [len(samples.pair) for samples in drawn]
         assert [block.pairs for block in blocks] == [len(samples.pair.unique()) for samples in drawn]
-        pairs = torch.cat([samples.pair.unique() for samples in drawn])
-        assert sorted(pairs.tolist()) == list(range(18))
+        assert sorted(torch.cat([samples.pair.unique() for samples in drawn]).tolist()) == list(range(18))
         passing = [int((store.ratio[a:b] < 0.8).sum()) // 8 for a, b in pairwise(store.offsets)]
         expected = [number + 101 // 8 for number in passing] * 2
         assert torch.bincount(torch.cat([samples.pair for samples in drawn])).tolist() == expected

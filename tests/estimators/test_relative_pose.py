@@ -52,8 +52,7 @@ def test_steps_on_moments_end_at_the_optimum_of_the_distances(kind, calibrated):
         row = slice(i, i + 1)
         own = Essential(model.C1[row], model.C2[row]) if calibrated else model
         cost = RobustCost(own, x1[row], x2[row], weights[0], GemanMcClure(float(scale[i])))
-        optimum = minimize(cost, own.state(best[None]), 100, 1e-10)[1].state.matrix()[0]
-        assert up_to_sign(best, optimum) < 1e-5
+        assert up_to_sign(best, minimize(cost, own.state(best[None]), 100, 1e-10)[1].state.matrix()[0]) < 1e-5
 
 
 def test_planes_and_outliers():

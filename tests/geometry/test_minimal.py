@@ -43,8 +43,7 @@ class TestSolve:
         assert len(found) == len(expected)
         assert torch.linalg.det(found).abs().max() < 1e-12
         for F in expected:
-            gaps = torch.stack([found - F, found + F]).flatten(2).norm(dim=-1)
-            assert gaps.min() < 1e-5
+            assert torch.stack([found - F, found + F]).flatten(2).norm(dim=-1).min() < 1e-5
 
     def test_leaves_undetermined_samples_out(self):
         points1, points2 = correspondences("handheld", 6)

@@ -46,6 +46,13 @@ def test_weights():
     assert up_to_sign(found.E_mat[None], E[None]) < 0.02
 
 
+def test_cameras_need_less_confidence_by_default():
+    points, cameras, _, _ = pair(outliers=0.7, seed=1)
+    estimates = (RANSAC(seed=0, confidence=c).estimate(*points, None, *cameras) for c in (None, 0.9999, 0.999999))
+    usual, same, more = (found.num_samples for found in estimates)
+    assert usual == same < more
+
+
 def test_failure():
     """Five matches fit exactly: no other one confirms the matrix."""
     found = estimate((uniform(5, 2), uniform(5, 2, seed=1)), (torch.eye(3), torch.eye(3)))

@@ -212,6 +212,10 @@ class TestBudget:
             drawn.append(self.count(points, max_samples=10**9, confidence=1.0, max_seconds=seconds))
         assert 0 < drawn[0] < drawn[1] < 10_000
 
+    def test_good_weights_spare_samples(self):
+        points1, points2, _, true = pair(outliers=0.7)
+        assert self.count((points1, points2), true + 0.5 * uniform(400)) < self.count((points1, points2))
+
 
 class TestHardInput:
     @pytest.mark.parametrize(
