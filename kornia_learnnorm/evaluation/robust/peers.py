@@ -9,7 +9,7 @@ import importlib
 import importlib.metadata
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,14 +21,6 @@ Array = NDArray[np.float64]
 Sizes = NDArray[np.int32]
 Peer = Callable[..., Any]
 CALIBRATED = "-calibrated"  # suffix of the names of estimators that know the cameras; a failure where a store has none
-
-
-class PeerPackage(NamedTuple):
-    """An estimator of another package."""
-
-    estimate: Callable[..., Any]  # takes the imported module and the arguments of Peer
-    module: str  # to import, of a distribution of the same name
-    extra: str = "robust"  # the extra of this package that installs it
 
 
 def _opencv(method: str, cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float) -> Any:
@@ -84,31 +76,33 @@ def _pysuperansac(pysuperansac: Any, x1: Array, x2: Array, sizes: Sizes, seed: i
     return pysuperansac.estimateFundamentalMatrix(joined, sizes.ravel().astype(float).tolist(), config=settings)[0]
 
 
-PEERS = {
-    "opencv-ransac": PeerPackage(partial(_opencv, "FM_RANSAC"), "cv2", "images"),
-    "opencv-lmeds": PeerPackage(partial(_opencv, "FM_LMEDS"), "cv2", "images"),
-    "opencv-usac": PeerPackage(partial(_opencv, "USAC_DEFAULT"), "cv2", "images"),
-    "opencv-usac-accurate": PeerPackage(partial(_opencv, "USAC_ACCURATE"), "cv2", "images"),
-    "opencv-usac-magsac": PeerPackage(partial(_opencv, "USAC_MAGSAC"), "cv2", "images"),
-    f"opencv-usac-magsac{CALIBRATED}": PeerPackage(_opencv_calibrated, "cv2", "images"),
-    "poselib": PeerPackage(_poselib, "poselib"),
-    f"poselib{CALIBRATED}": PeerPackage(_poselib_calibrated, "poselib"),
-    "kornia": PeerPackage(partial(_kornia, "fundamental"), "kornia.geometry.ransac"),
-    "kornia-8pt": PeerPackage(partial(_kornia, "fundamental_8pt"), "kornia.geometry.ransac"),
-    "pydegensac": PeerPackage(_pydegensac, "pydegensac"),
-    "pymagsac": PeerPackage(_pymagsac, "pymagsac"),
-    "pysuperansac": PeerPackage(_pysuperansac, "pysuperansac"),
+# The module that an estimator needs, of a distribution of the same name, and the function that takes it.
+PEERS: dict[str, tuple[str, Callable[..., Any]]] = {
+    "opencv-ransac": ("cv2", partial(_opencv, "FM_RANSAC")),
+    "opencv-lmeds": ("cv2", partial(_opencv, "FM_LMEDS")),
+    "opencv-usac": ("cv2", partial(_opencv, "USAC_DEFAULT")),
+    "opencv-usac-accurate": ("cv2", partial(_opencv, "USAC_ACCURATE")),
+    "opencv-usac-magsac": ("cv2", partial(_opencv, "USAC_MAGSAC")),
+    f"opencv-usac-magsac{CALIBRATED}": ("cv2", _opencv_calibrated),
+    "poselib": ("poselib", _poselib),
+    f"poselib{CALIBRATED}": ("poselib", _poselib_calibrated),
+    "kornia": ("kornia.geometry.ransac", partial(_kornia, "fundamental")),
+    "kornia-8pt": ("kornia.geometry.ransac", partial(_kornia, "fundamental_8pt")),
+    "pydegensac": ("pydegensac", _pydegensac),
+    "pymagsac": ("pymagsac", _pymagsac),
+    "pysuperansac": ("pysuperansac", _pysuperansac),
 }
 
 
 def find_peer(name: str) -> Peer:
     """Return an estimator of another package by its name in ``PEERS``."""
-    return partial(PEERS[name].estimate, import_extra(PEERS[name].module, PEERS[name].extra, f"the estimator {name}"))
+    module, estimate = PEERS[name]
+    return partial(estimate, import_extra(module, "images" if module == "cv2" else "robust", f"the estimator {name}"))
 
 
 def peer_version(name: str) -> str:
     """Return the package of an estimator and its version."""
-    package = PEERS[name].module.partition(".")[0]
+    package = PEERS[name][0].partition(".")[0]
     if package == "cv2":  # several distributions provide the module
         return f"opencv {importlib.import_module('cv2').__version__}"
     return f"{package} {importlib.metadata.version(package)}"

@@ -53,38 +53,37 @@ class RobustRun(NamedTuple):
 
 
 def record_robust(
-    folder: str | Path,
+    folder: Path,
     stores: Mapping[str, str],
-    estimators: Sequence[str] = robust_estimators.DEFAULT_ESTIMATORS,
-    options: Mapping[str, int] | None = None,
-    redo: Sequence[str] = (),
-    command: str = "",
+    estimators: Sequence[str],
+    options: Mapping[str, int],
+    redo: Sequence[str],
+    command: str,
 ) -> list[str]:
     """Compute the missing results of a run; return the estimators that were left out: their packages are not installed.
 
     Arguments and errors are those of ``record_run``; the results of ``redo`` are computed again.
     """
-    folder, options = Path(folder), {**DEFAULT_OPTIONS, **(options or {})}
     for name, value in options.items():
         if value < (least := 1 if name in ("seeds", "slow_seeds") else 0):
             raise ValueError(f"{name.replace('_', '-')} must be {least} or more, got {value}")
     if unknown := {*redo} - {*estimators}:
         raise ValueError(f"--redo {' '.join(sorted(unknown))}: not among the estimators of this command")
     names = robust_estimators.estimator_names(estimators)
-    found: dict[str, Estimator | None] = dict.fromkeys(names.values())
-    for name in estimators:
+    installed: dict[str, Estimator] = {}
+    for name, short in names.items():
         with suppress(ImportError):  # its package is not installed
-            found[names[name]] = robust_estimators.find_estimator(name)
+            installed[short] = robust_estimators.find_estimator(name)
+    identify = robust_estimators.identify_estimator
+    identities = {short: identify(name) if short in installed else None for name, short in names.items()}
     read = {name: read_store(path) for name, path in stores.items()}
-    identities = {names[name]: found[names[name]] and robust_estimators.identify_estimator(name) for name in estimators}
     about: About = {"estimators": identities, **options, "threads": torch.get_num_threads()}
-    installed = {name: estimator for name, estimator in found.items() if estimator is not None}
     jobs = _jobs(folder, read, installed, options)
     total = len(read) * len(PROTOCOLS) * len(THRESHOLDS) * len(installed)
     redone = [names[name] for name in redo]
     if failed := results_store.record(folder, "robust", read, about, jobs, total, redone, command):
         raise ValueError(f"{failed}. All others are in {folder}")
-    return [name for name, estimator in found.items() if estimator is None]
+    return [name for name in identities if name not in installed]
 
 
 def _jobs(
@@ -95,7 +94,7 @@ def _jobs(
         seeds = min(options["seeds"], options["slow_seeds"]) if robust_estimators.is_slow(name) else options["seeds"]
         draw = partial(shuffled_pair, stores[store], protocol=protocol, seed=options["seed"])
         compute = partial(_estimates, estimators[name], draw, threshold, pairs, seeds)
-        yield Job(name, estimate_path(folder, store, protocol, threshold, name), compute)
+        yield name, estimate_path(folder, store, protocol, threshold, name), compute
 
 
 def _estimates(

@@ -53,8 +53,6 @@ class SampleOptions:
     def __post_init__(self) -> None:
         if self.size < 8:
             raise ValueError(f"a sample needs at least 8 correspondences, got size={self.size}")
-        if self.max_samples is not None and self.max_samples < 1:
-            raise ValueError(f"max_samples must be 1 or more, or None for all, got {self.max_samples}")
 
     def draw(self, store: CorrespondenceStore, max_ratio: float | None) -> MatchSets:
         """Return samples before the filter on the residual; held-out points of pairs without any are NaN."""
@@ -107,18 +105,16 @@ def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio
     for index in torch.unique(pair).tolist():
         rows = torch.nonzero(pair == index).flatten()
         points1, points2 = pair_matches(store, index, max_ratio)
-        true = _within(points1[None], points2[None], torch.from_numpy(store.F[index : index + 1]))
-        number = len(rows), -1, -1
-        found = _within(points1.expand(*number), points2.expand(*number), F_mat[rows])
+        true, found = (_within(points1, points2, F) for F in (torch.from_numpy(store.F[index]), F_mat[rows]))
         inliers[rows] = found.double().mean(-1)
         f1[rows] = f1_from_masks(found, true)
     return {"inliers": inliers, "f1": f1}
 
 
 def _within(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    """Return which points lie within each threshold, (S, thresholds, N); none do under a matrix of NaN."""
+    """Return which points lie within each threshold, (..., thresholds, N); none do under a matrix of NaN."""
     distance = finite_distance(points1, points2, F_mat)
-    return distance[:, None] < distance.new_tensor(THRESHOLDS)[:, None]
+    return distance[..., None, :] < distance.new_tensor(THRESHOLDS)[:, None]
 
 
 def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
@@ -216,7 +212,7 @@ def _jobs(
             samples = _samples(array_path(folder, name, protocol, "samples"), place, options, store, max_ratio)
             for label, method in methods.items():
                 compute = partial(predict, method, samples, store, max_ratio, complete)
-                yield Job(label, array_path(folder, name, protocol, label), compute)
+                yield label, array_path(folder, name, protocol, label), compute
 
 
 def _samples(

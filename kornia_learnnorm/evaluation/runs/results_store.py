@@ -13,7 +13,7 @@ from datetime import datetime
 from hashlib import sha256
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from kornia_learnnorm.files import atomic_write, exclusive, write_text
 from kornia_learnnorm.optional import import_extra
 
 FORMAT = 4  # of the folder; runs of another format are refused
-# Parts of a section that may grow: what each is, by its name. The second are its methods.
+# Parts of a section that may grow: what each is, by its name. Those between stores and versions are of its methods.
 JOINED = {"evaluate": ("stores", "methods", "trained_on", "versions"), "robust": ("stores", "estimators", "versions")}
 # Parts that must stay as they are.
 OPTIONS = {
@@ -37,14 +37,7 @@ MAX_NAME = 80  # letters of a name in that of a file
 About = dict[str, Any]
 Arrays = dict[str, NDArray[Any]]
 Stores = Mapping[str, CorrespondenceStore]  # by their names in tables
-
-
-class Job(NamedTuple):
-    """A file of a run that a method makes."""
-
-    method: str
-    path: Path
-    compute: Callable[[], Arrays]
+Job = tuple[str, Path, Callable[[], Arrays]]  # a method, the file that it makes, and how
 
 
 def record(
@@ -69,20 +62,19 @@ def record(
     tqdm = import_extra("tqdm", "images", "the progress bar of an evaluation").tqdm
     failed: dict[str, str] = {}
     with exclusive(folder):
-        before = _begin(folder, section, stores, about, redo, command)
+        before, about = _begin(folder, section, stores, about, redo, command)
         _forget(folder, section, redo)
         with tqdm(total=total, unit="file", disable=None) as bar:
-            for job in jobs:
-                bar.set_postfix_str(f"{job.method}: {job.path.parent.relative_to(folder)}")
-                if not job.path.is_file() and job.method not in failed:
+            for method, path, compute in jobs:
+                bar.set_postfix_str(f"{method}: {path.parent.relative_to(folder)}")
+                if not path.is_file() and method not in failed:
                     try:
-                        write_arrays(job.path, job.compute())
+                        write_arrays(path, compute())
                     except ValueError as error:
-                        failed[job.method] = str(error)
+                        failed[method] = str(error)
                 bar.update()
-        about = read_section(folder, section) or {}
         forgotten = failed.keys() - (before.get(JOINED[section][1], {}).keys() - {*redo})
-        for key in about.keys() & {*JOINED[section]} - {"stores", "versions"}:
+        for key in JOINED[section][1:-1]:
             about[key] = {name: value for name, value in about[key].items() if name not in forgotten}
         _write(folder, section, about)
         _forget(folder, section, forgotten)
@@ -112,8 +104,10 @@ def read_section(folder: Path, section: str) -> About | None:
     return about
 
 
-def _begin(folder: Path, section: str, stores: Stores, about: About, redo: Collection[str], command: str) -> About:
-    """Write what a run is computed from, or refuse a folder of other options; return what the section was before."""
+def _begin(
+    folder: Path, section: str, stores: Stores, about: About, redo: Collection[str], command: str
+) -> tuple[About, About]:
+    """Write what a run is computed from, or refuse a folder of other options; return the section before and now."""
     about = about | {
         "stores": {
             name: f"{store.dataset or 'no description'}, {len(store)} pairs, {store.offsets[-1]} matches"
@@ -138,7 +132,7 @@ def _begin(folder: Path, section: str, stores: Stores, about: About, redo: Colle
     for key in joined:  # what is not installed now stays as it was
         about[key] = had[key] | {name: v for name, v in about[key].items() if v is not None or name not in had[key]}
     _write(folder, section, about)
-    return before
+    return before, about
 
 
 def _read(folder: Path) -> dict[str, Any]:

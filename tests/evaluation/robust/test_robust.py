@@ -74,7 +74,7 @@ def test_other_options_are_refused(robust_again, refused):
 
 
 def test_a_package_that_is_not_installed(robust_copied, robust_store, monkeypatch):
-    monkeypatch.setitem(peers.PEERS, "poselib", peers.PeerPackage(pytest.fail, "no_such_module"))
+    monkeypatch.setitem(peers.PEERS, "poselib", ("no_such_module", pytest.fail))
     options = ["--pairs", "2", "--seeds", "2", "--estimators", "poselib", "--out", str(robust_copied)]
     assert main(["robust", str(robust_store), *options]) == 0
     assert read_robust(robust_copied).about["estimators"]["poselib"] is None
@@ -198,8 +198,7 @@ def test_the_seed_decides():
 
 def test_what_fails_is_a_failure(monkeypatch):
     for wrong in (None, np.zeros((9, 3))):
-        package = peers.PeerPackage(lambda *_, wrong=wrong: wrong, "math")
-        monkeypatch.setitem(peers.PEERS, "poselib", package)
+        monkeypatch.setitem(peers.PEERS, "poselib", ("math", lambda *_, wrong=wrong: wrong))
         assert run_estimator(find_estimator("poselib"), matches(), 0, 1.0).F_mat.isnan().all()
     few = matches()._replace(points1=torch.rand(7, 2).double(), points2=torch.rand(7, 2).double())
     assert run_estimator(find_estimator("RANSAC"), few, 0, 1.0).F_mat.isnan().all()
