@@ -78,18 +78,13 @@ def bootstrap_interval(
         >>> bootstrap_interval(torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([0, 0, 1, 1]))
         (0.0, 1.0)
     """
-    return _middle(_means(values, groups, draws, seed), level)
+    return _bootstrap(values, groups, level, draws, seed)[1:]
 
 
-def _middle(means: Tensor, level: float) -> tuple[float, float]:
-    """Return the lower and upper end of the middle share ``level`` of a bootstrap's draws."""
+def _bootstrap(values: Tensor, groups: Tensor, level: float, draws: int, seed: int) -> tuple[Tensor, float, float]:
+    """Return the mean of each draw of whole groups, (draws,) float64, and the ends of their middle share ``level``."""
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1, got {level}")
-    return means.quantile((1 - level) / 2).item(), means.quantile((1 + level) / 2).item()
-
-
-def _means(values: Tensor, groups: Tensor, draws: int, seed: int) -> Tensor:
-    """Return the mean over the samples (S,) of each draw of whole groups with replacement, (draws,) float64."""
     if values.shape != groups.shape or values.ndim != 1:
         raise ValueError(f"values and groups must be two (S,) tensors, got {[*values.shape]} and {[*groups.shape]}")
     present, group = torch.unique(groups, return_inverse=True)
@@ -99,7 +94,8 @@ def _means(values: Tensor, groups: Tensor, draws: int, seed: int) -> Tensor:
     sums = torch.zeros_like(counts).index_add_(0, group, values.double())
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(len(present), (draws, len(present)), generator=generator).to(counts.device)
-    return sums[drawn].sum(1) / counts[drawn].sum(1)
+    means = sums[drawn].sum(1) / counts[drawn].sum(1)
+    return means, means.quantile((1 - level) / 2).item(), means.quantile((1 + level) / 2).item()
 
 
 class PairedDifference(NamedTuple):
@@ -129,7 +125,6 @@ def paired_bootstrap(
     difference = values.double() - baseline.double()
     if bad := int((~difference.isfinite()).sum()):
         raise ValueError(f"differences must be finite, got {bad} NaN or infinite ones of {len(difference)}")
-    means = _means(difference, groups, draws, seed)
-    low, high = _middle(means, level)
+    means, low, high = _bootstrap(difference, groups, level, draws, seed)
     fewest = min(int((means <= 0).sum()), int((means >= 0).sum()))
     return PairedDifference(difference.mean().item(), low, high, min(1.0, 2 * (1 + fewest) / (1 + draws)))
