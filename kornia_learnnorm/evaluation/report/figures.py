@@ -8,11 +8,12 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from kornia_learnnorm.evaluation.methods import CLOSED_FORMS, REFINED, base_name
+from kornia_learnnorm.evaluation.methods import CLOSED_FORMS, REFINED, SHIPPED, base_name
 from kornia_learnnorm.evaluation.report.method_tables import papers_data
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
 from kornia_learnnorm.two_view.drawing import import_matplotlib
@@ -43,7 +44,6 @@ DOTS: dict[str, Any] = {"marker": "o", "markersize": 3}
 MAX_FRAMES = 20  # image pairs on the axis of Figure 4a
 RHO_WINDOW = 100  # successive samples in a mean of Figure 13
 NORMALISATIONS = ("none", "Hartley", "whitening", "reweighted", "paper", "crossview", "searched")
-BUILT_IN = {*NORMALISATIONS, "crossview-synthetic"}
 
 
 class ReportPicture(NamedTuple):
@@ -58,8 +58,7 @@ class ReportPicture(NamedTuple):
 def report_figures(run: Run) -> list[ReportPicture]:
     """Draw all pictures of a run, of the first store with filtered samples."""
     cell = next((cell for cell in run.cells if cell.protocol == "filtered"), run.cells[0])
-    hues = HUES.split()
-    colors = {name: f"#{hues[place % len(hues)]}" for place, name in enumerate(run.about["methods"])}
+    colors = dict(zip(run.about["methods"], cycle(f"#{hue}" for hue in HUES.split()), strict=False))
     papers, pictures = papers_data(run.about["stores"][cell.store]), []
     with import_matplotlib().rc_context(SETTINGS):
         for number, (title, draw) in DRAWINGS.items():
@@ -153,7 +152,7 @@ def _dashes(names: list[str]) -> str:
 
 def _present(cell: RunCell, *names: str) -> list[str]:
     """Return the methods of the run among ``names``, and all methods that are not built in, such as own weights."""
-    own = [name for name in cell.predictions if "+" not in name and name not in BUILT_IN]
+    own = [name for name in cell.predictions if "+" not in name and name not in {*CLOSED_FORMS, *SHIPPED}]
     return [name for name in names if name in cell.predictions] + own
 
 
@@ -163,13 +162,10 @@ def _line_style(name: str) -> str:
 
 
 def _to_svg(figure: Figure, name: str) -> str:
-    """Return a figure as SVG, with one legend of all axes above it."""
-    entries: dict[str, Any] = {}
-    for axes in figure.axes:
-        handles, labels = axes.get_legend_handles_labels()
-        entries |= dict(zip(labels, handles, strict=True))
-    if entries:
-        figure.legend([*entries.values()], [*entries], loc="outside upper center", ncols=5)
+    """Return a figure as SVG, with one legend above its axes, whose entries are the same."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside upper center", ncols=5)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()
