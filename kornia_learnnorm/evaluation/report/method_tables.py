@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from itertools import product
 
 import torch
@@ -30,7 +29,7 @@ def with_baseline(run: Run) -> Run:
         has = f"the run has predictions of {', '.join(found) or 'no method'}: add it by learnnorm evaluate --methods"
         raise ValueError(f"a report compares with {BASELINE}, {has}")
     left_out = [f"{cell.title}, without {BASELINE}" for cell in run.cells if BASELINE not in cell.predictions]
-    return replace(run, cells=cells, missing=[*run.missing, *left_out])
+    return run._replace(cells=cells, missing=[*run.missing, *left_out])
 
 
 def rate_tables(run: Run) -> list[Table]:

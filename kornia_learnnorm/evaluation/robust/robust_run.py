@@ -160,10 +160,7 @@ def read_robust(folder: str | Path) -> RobustRun | None:
         for name, identity in about["estimators"].items():
             paths = {threshold: estimate_path(folder, store, protocol, threshold, name) for threshold in THRESHOLDS}
             if all(path.is_file() for path in paths.values()):
-                cells[-1].estimates[name] = {
-                    threshold: {key: torch.from_numpy(value).double() for key, value in read_arrays(path).items()}
-                    for threshold, path in paths.items()
-                }
+                cells[-1].estimates[name] = {threshold: read_arrays(path) for threshold, path in paths.items()}
             elif identity is not None:  # its package is installed
                 missing.append(f"{name} ({store}, {protocol})")
     return RobustRun(about, cells, missing)

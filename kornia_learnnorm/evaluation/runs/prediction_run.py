@@ -1,14 +1,13 @@
 """Predictions of methods on stores, kept in a folder a store: what ``learnnorm evaluate`` makes."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -143,8 +142,7 @@ def median_distance(points: Tensor, F_mat: Tensor) -> Tensor:
     return median(distance)
 
 
-@dataclass(frozen=True)
-class RunCell:
+class RunCell(NamedTuple):
     """The predictions of all methods on the samples of one store and protocol."""
 
     store: str  # its name
@@ -159,16 +157,15 @@ class RunCell:
         return f"{self.store}, {self.protocol}"
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """A run of predictions."""
 
     about: About  # what the run was computed from, its section of run.json
     cells: list[RunCell]
-    missing: list[str] = field(default_factory=list)  # what has not been computed yet
+    missing: list[str]  # what has not been computed yet
 
 
-def temporary_run(stores: Mapping[str, str], methods: Sequence[str], options: SampleOptions | None = None) -> Run:
+def temporary_run(stores: Mapping[str, str], methods: Sequence[str], options: SampleOptions) -> Run:
     """Return a run that is not kept, without shares of inliers."""
     with TemporaryDirectory(prefix="learnnorm-") as folder:
         record_run(folder, stores, methods, options, complete=False)
@@ -179,7 +176,7 @@ def record_run(
     folder: str | Path,
     stores: Mapping[str, str],
     methods: Sequence[str],
-    options: SampleOptions | None = None,
+    options: SampleOptions,
     complete: bool = True,
     command: str = "",
 ) -> None:
@@ -188,7 +185,6 @@ def record_run(
     ``stores`` are paths by the names that tables give them, ``methods`` names for ``find_method``. A run that is
     ``complete`` has shares of inliers and F1, too. ``command`` is the command line that asks for it, for the report.
     """
-    options = SampleOptions() if options is None else options
     folder, names = Path(folder), names_of(methods, short_name_of, "methods")
     found = {names[name]: find_method(name) for name in methods}
     read = {name: read_store(path) for name, path in stores.items()}
@@ -227,9 +223,9 @@ def _samples(
             raise ValueError(f"{place}: {few}")
         results_store.write_arrays(path, {"pair": drawn.pair.numpy(), "plain_residual": residual})
     found = read_arrays(path, SAMPLES, len(drawn.pair))
-    if not np.array_equal(found["pair"], drawn.pair.numpy()):
+    if not torch.equal(found["pair"], drawn.pair):
         raise ValueError(f"{path.parent} is of other samples than the run's seed draws of the store, remove it")
-    return drawn.select(torch.from_numpy(found["plain_residual"] < limit))
+    return drawn.select(found["plain_residual"] < limit)
 
 
 def read_run(folder: str | Path, complete: bool = True) -> Run:
@@ -250,12 +246,8 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
 
 def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, complete: bool) -> RunCell:
     samples = read_arrays(array_path(folder, store, protocol, "samples"), SAMPLES)
-    kept = torch.from_numpy(samples["plain_residual"] < about["max_residual"])
-    pair = torch.from_numpy(samples["pair"])[kept]
+    kept = samples["plain_residual"] < about["max_residual"]
+    pair = samples["pair"][kept]
     paths = {name: array_path(folder, store, protocol, name) for name in about["methods"]}
-    predictions = {
-        name: {key: torch.from_numpy(value) for key, value in read_arrays(path, KEYS[complete], len(pair)).items()}
-        for name, path in paths.items()
-        if path.is_file()
-    }
+    predictions = {name: read_arrays(path, KEYS[complete], len(pair)) for name, path in paths.items() if path.is_file()}
     return RunCell(store, protocol, pair, len(kept), predictions)

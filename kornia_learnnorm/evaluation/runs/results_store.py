@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.files import atomic_write, exclusive, write_text
@@ -175,17 +177,17 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
         np.savez_compressed(temporary, **arrays)
 
 
-def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> Arrays:
+def read_arrays(path: Path, keys: Sequence[str] = (), rows: int | None = None) -> dict[str, Tensor]:
     """Return the arrays of a file; raise ValueError if it is damaged, lacks ``keys`` or these have not ``rows``."""
     try:
         with path.open("rb") as file, np.load(file) as data:
-            found = dict(data)
+            found = {key: torch.from_numpy(value) for key, value in data.items()}
     except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} is damaged, remove it: {error}") from error
     if lacks := [key for key in keys if key not in found]:
         raise ValueError(f"{path} is damaged, remove it: expected arrays {', '.join(lacks)}, got {', '.join(found)}")
     for key in keys:
         if rows is not None and found[key].shape[:1] != (rows,):
-            got = f"{key} has shape {found[key].shape}"
+            got = f"{key} has shape {tuple(found[key].shape)}"
             raise ValueError(f"{path} is of other samples, remove it: expected {rows} rows, {got}")
     return found

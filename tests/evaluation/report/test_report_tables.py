@@ -78,7 +78,7 @@ def test_rates_on_the_papers_data_and_on_pairs_of_the_training():
     trained_on = {"Hartley": [], "crossview": ["kitti_06@0:3"]}
     about = {"size": 8, "max_residual": 60.0, "methods": dict.fromkeys(predictions, ""), "trained_on": trained_on}
     about["stores"] = {"kitti_06": "KITTI odometry 06, 20 pairs, 20000 matches"}
-    (table,) = rate_tables(Run(about, [cell]))
+    (table,) = rate_tables(Run(about, [cell], []))
     own, *printed = as_text(table.rows)
     assert own == ["crossview", "50.0 [50.0, 50.0] *", "kitti_06@0:3"]
     expected = {"KITTI 00-05": "86.68", "TUM": "84.22", "KITTI 00-05 and TUM": "87.05"}

@@ -5,7 +5,6 @@ import json
 import re
 import shutil
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +20,7 @@ from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method
 from kornia_learnnorm.evaluation.runs import prediction_run
-from kornia_learnnorm.evaluation.runs.prediction_run import ERRORS, consensus, predict, read_run, temporary_run
+from kornia_learnnorm.evaluation.runs.prediction_run import ERRORS, SampleOptions, consensus, predict, read_run
 from kornia_learnnorm.evaluation.runs.results_store import file_name
 from kornia_learnnorm.metrics.inliers import f1_score, inlier_share
 from kornia_learnnorm.protocol import THRESHOLDS
@@ -39,7 +38,7 @@ def assert_same(one, other):
 
 def test_a_temporary_run_of_methods_in_another_order_has_the_same_numbers(run, store, command):
     methods = command[3:-1]
-    found = temporary_run({"scenes": str(store)}, methods[::-1])
+    found = prediction_run.temporary_run({"scenes": str(store)}, methods[::-1], SampleOptions())
     assert [*found.about["methods"]] == methods[::-1]
     assert_same(read_run(run), found)
     assert {*found.cells[1].predictions["Hartley+LM"]} == {*ERRORS}
@@ -103,7 +102,7 @@ def test_a_store_that_joins_later_changes_no_number(copied, command, tmp_path):
     assert main([command[0], str(tmp_path / "other.h5"), *command[2:], str(copied)]) == 0
     after = read_run(copied)
     assert [*after.about["stores"]] == ["scenes", "other"]
-    assert_same(before, replace(after, cells=after.cells[:2]))
+    assert_same(before, after._replace(cells=after.cells[:2]))
 
 
 class TestOwnCode:
