@@ -86,8 +86,7 @@ def find_method(name: str) -> Method:
     base = base_name(name)
     normalizer = _find_normalizer(base)
     trained_on = () if base in CLOSED_FORMS else getattr(normalizer, "trained_on", ()) or (UNKNOWN,)
-    rank2: Literal["projection", "optimal"] = "optimal" if name.endswith(OPTIMAL) else "projection"
-    return Method(normalizer, rank2, name.endswith(REFINED), trained_on)
+    return Method(normalizer, "optimal" if name.endswith(OPTIMAL) else "projection", name.endswith(REFINED), trained_on)
 
 
 def base_name(name: str) -> str:

@@ -150,18 +150,16 @@ def _accuracy(cell: RunCell) -> Table:
         row += [median_number(p[key], ".4g") for key in ("condition_number", "rho", "distance1", "distance2")]
         rows.append([*row, median_number(100 * p["rank2_share"], "z.0f")])
     truth = int((~cell.predictions[BASELINE]["truth"].isnan()).sum())
-    known = "without truth"
-    if truth:
-        known = f"of which {truth} have ground-truth inliers and {int(posed.sum())} a ground-truth pose"
+    known = f"of which {truth} have ground-truth inliers and {int(posed.sum())} a ground-truth pose"
     text = (
-        f"Medians over {len(cell.pair)} samples, {known}, of symmetric epipolar distances: `fit` is the mean of the "
-        "sample's own points, `held out` the median of 16 other matches of the pair, some of which may be wrong, "
-        "`truth` that of the pair's ground-truth inliers. Angles are errors of the relative pose, summarised by AUC "
-        "and mAA(10), %; a pose that cannot be found is a failure. `+LM` is refined on the sample's points: nothing "
-        "fits them more closely. Condition number: largest over eighth singular value of the design matrix. `rho`: "
-        "second over third singular value of the normalised matrix before the projection to rank 2, which changes the "
-        "less the larger it is. Distances: mean ones of the normalised points from the origin. Error due to rank 2: "
-        "share of the fit."
+        f"Medians over {len(cell.pair)} samples, {known if truth else 'without truth'}, of symmetric epipolar "
+        "distances: `fit` is the mean of the sample's own points, `held out` the median of 16 other matches of the "
+        "pair, some of which may be wrong, `truth` that of the pair's ground-truth inliers. Angles are errors of the "
+        "relative pose, summarised by AUC and mAA(10), %; a pose that cannot be found is a failure. `+LM` is refined "
+        "on the sample's points: nothing fits them more closely. Condition number: largest over eighth singular value "
+        "of the design matrix. `rho`: second over third singular value of the normalised matrix before the projection "
+        "to rank 2, which changes the less the larger it is. Distances: mean ones of the normalised points from the "
+        "origin. Error due to rank 2: share of the fit."
     )
     return Table(f"Fit and accuracy: {cell.title}", text, header, rows)
 
@@ -170,12 +168,11 @@ def _consensus(cell: RunCell, run: Run) -> Table:
     """Return the table of inlier shares and F1; samples without ground truth are left out, unless none has one."""
     header = ["method", *(f"{name} @{threshold:g} px" for threshold in THRESHOLDS for name in ("inliers %", "F1 %"))]
     known = next(iter(cell.predictions.values()))["f1"].isfinite()
-    kept, rows = known | ~known.any(0), list[list[Cell]]()
-    for name, prediction in cell.predictions.items():
-        row: list[Cell] = [name]
-        for (place, keep), key in product(enumerate(kept.T), ("inliers", "f1")):
-            row.append(tables.mean_share(prediction[key][keep, place], cell.pair[keep]))
-        rows.append(row)
+    columns = [*product(enumerate((known | ~known.any(0)).T), ("inliers", "f1"))]
+    rows: list[list[Cell]] = [
+        [name, *(tables.mean_share(p[key][keep, place], cell.pair[keep]) for (place, keep), key in columns)]
+        for name, p in cell.predictions.items()
+    ]
     truth = bool(known.any())
     dropped = " and ".join(f"{int((~keep).sum())} at {t:g} px" for t, keep in zip(THRESHOLDS, known.T, strict=True))
     text = (

@@ -49,9 +49,8 @@ class Report(NamedTuple):
     missing: list[str]  # results that the run does not have yet
 
 
-def write_report(folder: str | Path) -> Report:
+def write_report(folder: Path) -> Report:
     """Write ``report.md``, ``report.html`` and the pictures into the folder of ``evaluate``, ``robust`` or both."""
-    folder = Path(folder)
     summary, about, tables = list[str](), list[str](), list[Table]()
     pictures, missing = list[ReportPicture](), list[str]()
     robust = read_robust(folder)

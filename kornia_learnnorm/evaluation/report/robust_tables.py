@@ -20,10 +20,9 @@ def robust_tables(run: RobustRun) -> list[Table]:
     made = []
     for cell in run.cells:
         if cell.estimates:
-            known = any(bool(pairs_with_truth(cell, threshold).any()) for threshold in THRESHOLDS)
-            estimates = {name: found for name, found in cell.estimates.items() if known or name != TRUTH}
-            known_cell = cell._replace(estimates=estimates)
-            made += [_agreement(known_cell, run), _pose_and_time(known_cell), *_tests(known_cell)]
+            if not any(bool(pairs_with_truth(cell, threshold).any()) for threshold in THRESHOLDS):
+                cell = cell._replace(estimates={n: found for n, found in cell.estimates.items() if n != TRUTH})
+            made += [_agreement(cell, run), _pose_and_time(cell), *_tests(cell)]
     return made
 
 
@@ -76,7 +75,7 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
 def _mean(values: Tensor, digits: int) -> Cell:
     """Return the mean of numbers (P, S) and the standard deviation of the mean over the S runs; empty if unknown."""
     runs = values.mean(0)
-    if values.numel() == 0 or bool(runs.isnan().any()):
+    if bool(runs.isnan().any()):
         return ""
     return Number(runs.mean().item(), f".{digits}f", std=runs.std().item() if len(runs) > 1 else None)
 

@@ -148,9 +148,8 @@ def estimate_path(folder: Path, store: str, protocol: str, threshold: float, nam
     return array_path(folder / "robust", store, protocol, f"{threshold:g}px", name)
 
 
-def read_robust(folder: str | Path) -> RobustRun | None:
+def read_robust(folder: Path) -> RobustRun | None:
     """Read a run of robust estimation, None where the folder has none; raise ValueError if it is damaged."""
-    folder = Path(folder)
     about, missing = results_store.read_section(folder, "robust"), list[str]()
     if about is None:
         return None

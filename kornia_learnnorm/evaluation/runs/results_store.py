@@ -11,7 +11,6 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import datetime
 from hashlib import sha256
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ OPTIONS = {
     "robust": ("pairs", "seeds", "slow_seeds", "seed", "threads"),
 }
 # Where the files of methods are.
-PLACES = {"evaluate": ("*/filtered", "*/unfiltered"), "robust": ("robust/*/*/*",)}
+PLACES = {"evaluate": "*/*", "robust": "robust/*/*/*"}
 MAX_NAME = 80  # letters of a name in that of a file
 
 About = dict[str, Any]
@@ -86,8 +85,8 @@ def record(
 
 
 def _forget(folder: Path, section: str, names: Iterable[str]) -> None:
-    for name, place in product(names, PLACES[section]):
-        for path in folder.glob(f"{place}/{file_name(name)}.npz"):
+    for name in names:
+        for path in folder.glob(f"{PLACES[section]}/{file_name(name)}.npz"):
             path.unlink()
 
 
