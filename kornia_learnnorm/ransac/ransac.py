@@ -126,6 +126,8 @@ class RANSAC(nn.Module):
         check_numbers(inl_th, max_samples, max_seconds, confidence, seed)
         if normalizer is not None:
             check_normalizer(normalizer)
+        if rank2 is not None and model == "homography":
+            raise ValueError(f"rank2 is a constraint of fundamental matrices, got {rank2!r} for a homography")
         if rank2 is None:
             rank2 = "optimal" if normalizer is None else "projection"
         if isinstance(model, str):

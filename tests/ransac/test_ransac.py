@@ -105,6 +105,7 @@ class TestExceptions:
             ({"max_samples": 0}, ValueError, "max_samples must be .* at least 1, got 0"),
             ({"max_samples": 1.5}, ValueError, "max_samples .* got 1.5"),
             ({"rank2": "foo"}, ValueError, "'projection' or 'optimal', got 'foo'"),
+            ({"rank2": "optimal", "model": "homography"}, ValueError, "rank2 .* 'optimal' for a homography"),
             ({"distance": "foo"}, ValueError, "'sampson' or 'symmetric', got 'foo'"),
             ({"distance": len}, ValueError, "'sampson' or 'symmetric', got <built-in"),
             ({"max_seconds": 0.0}, ValueError, "max_seconds"),
