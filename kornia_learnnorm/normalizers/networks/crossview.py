@@ -30,8 +30,7 @@ def set_maximum(features: Tensor, absent: Tensor | None, dim: int, keepdim: bool
 
 MAX_POINTS = 16384  # of all sets that a network evaluates at once, where no gradient is wanted
 
-# Numbers of features of a correspondence and of the set.
-_POINT_FEATURES, _SET_FEATURES = {"own": 2, "both": 4, "epipolar": 13}, {"own": 1, "both": 1, "epipolar": 10}
+_FEATURES = {"own": (2, 1), "both": (4, 1), "epipolar": (13, 10)}  # their numbers, of a correspondence and of the set
 
 
 class CrossViewNetwork(nn.Module):
@@ -61,16 +60,11 @@ class CrossViewNetwork(nn.Module):
         self, width: int = 16, depth: int = 3, num_parameters: int = 5, bound: float = 3.0, features: str = "epipolar"
     ) -> None:
         super().__init__()
-        if features not in _POINT_FEATURES:
-            raise ValueError(f"features must be one of {', '.join(_POINT_FEATURES)}, got {features!r}")
+        if features not in _FEATURES:
+            raise ValueError(f"features must be one of {', '.join(_FEATURES)}, got {features!r}")
         self.width, self.depth, self.num_parameters, self.bound = width, depth, num_parameters, bound
-        self.features = features
-        self.set_network = SetNetwork(_POINT_FEATURES[features], _SET_FEATURES[features], width, depth, num_parameters)
-
-    @property
-    def needs_null_matrix(self) -> bool:
-        """Whether :meth:`forward` uses the null matrix."""
-        return self.features == "epipolar"
+        self.features, self.needs_null_matrix = features, features == "epipolar"
+        self.set_network = SetNetwork(*_FEATURES[features], width, depth, num_parameters)
 
     def forward(
         self, points1: Tensor, points2: Tensor, weights: Tensor | None = None, null_matrix: Tensor | None = None
@@ -83,8 +77,9 @@ class CrossViewNetwork(nn.Module):
             weights: optional non-negative weights with shape :math:`(B, N)`; zero means absent.
             null_matrix: the DLT's unit null vectors there with shape :math:`(B, 3, 3)`; solved for when not given.
         """
-        points, sets = (part.to(self.dtype) for part in self._views(points1, points2, weights, null_matrix))
-        doubled = None if weights is None else torch.cat([weights, weights]).to(self.dtype)
+        dtype = self.set_network.point_stem.weight.dtype
+        points, sets = (part.to(dtype) for part in self._views(points1, points2, weights, null_matrix))
+        doubled = None if weights is None else torch.cat([weights, weights]).to(dtype)
         params = self.set_network(points, sets, doubled).to(points1.dtype)
         # Not `chunk`, which torch.export cannot trace with a dynamic batch.
         params1, params2 = torch.unflatten(self.bound * torch.tanh(params / self.bound), 0, (2, -1)).unbind(0)
@@ -94,7 +89,7 @@ class CrossViewNetwork(nn.Module):
         self, points1: Tensor, points2: Tensor, weights: Tensor | None, null_matrix: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return the features of points and sets as view 1 sees them and then as view 2 does, (2 B, N, C), (2 B, D)."""
-        if self.features != "epipolar":
+        if not self.needs_null_matrix:
             own, other = torch.cat([points1, points2]), torch.cat([points2, points1])
             points = own if self.features == "own" else torch.cat([own, other], -1)
             return points, torch.ones_like(points[:, 0, :1])
@@ -108,11 +103,6 @@ class CrossViewNetwork(nn.Module):
         own, other, doubled = torch.stack([x1, x2]), torch.stack([x2, x1]), torch.stack([F, F.mT])
         points, sets = _epipolar_features(own, other, doubled, torch.stack([v, u]), torch.stack([u, v]), weights)
         return points.flatten(0, 1), sets.flatten(0, 1)
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The dtype of the network's own weights."""
-        return next(self.parameters()).dtype
 
 
 def _epipolar_features(
