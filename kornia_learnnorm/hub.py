@@ -19,9 +19,8 @@ from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download  # 
 
 __all__ = ["HubModel"]
 
-# What a repository may hold.
 CLASSES = LearnedEightPoint, LearnedRelativePose, LearnedHomography, LearnedNormalizer, MatchRefiner
-LAYERS = {layer.__name__: layer for layer in CLASSES}
+LAYERS = {layer.__name__: layer for layer in CLASSES}  # what a repository may hold
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 

@@ -37,23 +37,21 @@ def save_module(path: str | Path, module: nn.Module, file_format: str, architect
     if Path(path).suffix != ".safetensors":
         raise ValueError(f"weights are written to a .safetensors file, got {str(path)!r}")
     state = {key: value.detach().cpu().contiguous() for key, value in module.state_dict().items()}
-    metadata = {
-        "format": file_format,
-        "architecture": json.dumps(architecture),
-        "trained_on": json.dumps(module.trained_on),
-    }
+    texts = {"architecture": json.dumps(architecture), "trained_on": json.dumps(module.trained_on)}
     with atomic_write(path) as beside:
         try:
-            save_file(state, beside, metadata=metadata)
+            save_file(state, beside, metadata={"format": file_format, **texts})
         except SafetensorError as error:
             raise OSError(f"{path} could not be written: {error}") from error
 
 
-def load_module(name: str | Path, file_format: str, build: Callable[[Path, str], Module], model: str = "") -> Module:
+def load_module(
+    name: str | Path, file_format: str, kind: str, build: Callable[[dict[str, Any]], Module], model: str = ""
+) -> Module:
     """Load a module that :func:`save_module` wrote, by name or file, in evaluation mode and the dtype of its weights.
 
-    ``build`` makes it of the path and the architecture, JSON, on the device ``meta``: weights take no memory before
-    their shapes are known to be those in the file. Errors name shipped weights of this format and two-view model.
+    ``build`` makes it from the architecture on the device ``meta``: weights take no memory before their shapes are
+    known to be those in the file. Errors name the kind, and shipped weights of this format and two-view model.
     """
     path = weights_path(name)
     if not path.is_file() and Path(name).is_file():
@@ -73,8 +71,11 @@ def load_module(name: str | Path, file_format: str, build: Callable[[Path, str],
         held = f"{got!r} of a {owner}" if owner else repr(got)
         expected = f"{file_format!r} of a {CLASSES.get((file_format, model), 'layer')}, such as {fitting}"
         raise ValueError(f"{name}: expected format {expected}, got {held}")
-    with torch.device("meta"):
-        module = build(path, metadata.get("architecture", ""))
+    try:
+        with torch.device("meta"):
+            module = build(dict(json.loads(metadata.get("architecture", ""))))
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"{path} describes no {kind} of this version: {error}") from error
     try:
         module.load_state_dict(state, strict=True, assign=True)
     except RuntimeError as error:

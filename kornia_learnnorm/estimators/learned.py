@@ -2,7 +2,6 @@ r"""The learned eight-point algorithm: a network weighs the correspondences and 
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Self
@@ -119,21 +118,17 @@ class LearnedLayer(MatchLayer):
     def from_pretrained(cls, name: str | Path) -> Self:
         """Load a trained estimator: one that ships with the package, by name, or a safetensors file."""
 
-        def build(path: Path, text: str) -> LearnedLayer:
-            try:
-                architecture = cls.added | dict(json.loads(text))
-                model = architecture.pop("model", Fundamental.name)  # files before the name was written
-                if model != cls.model_name:
-                    text = f"it is of the model {model!r}, expected {cls.model_name!r} for a {cls.__name__}"
-                    raise ValueError(text)
-                if set(architecture) != set(cls.architecture):
-                    raise ValueError(f"expected {', '.join(cls.architecture)}, got {', '.join(map(str, architecture))}")
-                check_architecture(architecture)
-                return cls(**architecture)
-            except (ValueError, TypeError, AttributeError, RuntimeError) as error:
-                raise ValueError(f"{path} describes no estimator of this version: {error}") from error
+        def build(held: dict[str, Any]) -> LearnedLayer:
+            architecture = cls.added | held
+            model = architecture.pop("model", Fundamental.name)  # files before the name was written
+            if model != cls.model_name:
+                raise ValueError(f"it is of the model {model!r}, expected {cls.model_name!r} for a {cls.__name__}")
+            if set(architecture) != set(cls.architecture):
+                raise ValueError(f"expected {', '.join(cls.architecture)}, got {', '.join(map(str, architecture))}")
+            check_architecture(architecture)
+            return cls(**architecture)
 
-        layer: Self = load_module(name, FORMAT, build, cls.model_name)  # type: ignore[assignment]
+        layer: Self = load_module(name, FORMAT, "estimator", build, cls.model_name)  # type: ignore[assignment]
         return layer
 
     def start_from(self, layer: LearnedEightPoint) -> Self:

@@ -2,9 +2,8 @@ r"""The learned refinement of matches: both points move so that the patches arou
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -245,15 +244,11 @@ class MatchRefiner(nn.Module):
 
         """
 
-        def build(path: Path, text: str) -> MatchRefiner:
-            try:
-                architecture = json.loads(text)
-                check_architecture(architecture)
-                return cls(**architecture)
-            except (ValueError, TypeError, AttributeError, RuntimeError) as error:
-                raise ValueError(f"{path} describes no refiner of this version: {error}") from error
+        def build(architecture: dict[str, Any]) -> MatchRefiner:
+            check_architecture(architecture)
+            return cls(**architecture)
 
-        return load_module(name, FORMAT, build)
+        return load_module(name, FORMAT, "refiner", build)
 
 
 def _check_image(name: str, image: Tensor, number: int) -> None:

@@ -1,6 +1,5 @@
 r"""The learned normaliser: a base normaliser, a network, and a builder that turns its output into transforms."""
 
-import json
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Self
@@ -132,23 +131,18 @@ class LearnedNormalizer(ProblemNormalizer):
             ValueError: if the file is not a normaliser of this package, names a part of another module, or its tensors
                 do not fit.
         """
-        return pretrained.load_module(name, FORMAT, lambda path, text: cls(**_build(path, text, own_modules)))
 
+        def build(parts: dict[str, Any]) -> Self:  # type: ignore[type-var]
+            base, network = dict(parts["base"]), dict(parts["network"])
+            pretrained.check_architecture(base, network)
+            max_points = parts.get("max_points")  # files of older versions have none
+            if not isinstance(max_points, int | None):
+                raise ValueError(f"max_points must be a whole number or null, got {max_points!r}")
+            return cls(
+                base=pretrained.find_part(base.pop("name"), own_modules, *BASES)(**base),
+                network=pretrained.find_part(network.pop("name"), own_modules, crossview, paper)(**network),
+                transform=pretrained.find_part(parts["transform"], own_modules, transforms),
+                max_points=max_points,
+            )
 
-def _build(path: Path, architecture: str, own_modules: Collection[str]) -> dict[str, Any]:
-    """Build the parts that a file names: public ones of this package, and those of the user's modules."""
-    try:
-        parts = json.loads(architecture)
-        base, network = dict(parts["base"]), dict(parts["network"])
-        pretrained.check_architecture(base, network)
-        max_points = parts.get("max_points")  # files of older versions have none
-        if not isinstance(max_points, int | None):
-            raise ValueError(f"max_points must be a whole number or null, got {max_points!r}")
-        return {
-            "base": pretrained.find_part(base.pop("name"), own_modules, *BASES)(**base),
-            "network": pretrained.find_part(network.pop("name"), own_modules, crossview, paper)(**network),
-            "transform": pretrained.find_part(parts["transform"], own_modules, transforms),
-            "max_points": max_points,
-        }
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise ValueError(f"{path} describes no normaliser of this version: {error}") from error
+        return pretrained.load_module(name, FORMAT, "normaliser", build)
