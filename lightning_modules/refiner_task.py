@@ -1,12 +1,9 @@
 """The training task of a refiner of matches: image pairs and their matches in, no labels needed."""
 
-from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
 
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.estimators.learned import LearnedEightPoint
@@ -15,7 +12,7 @@ from kornia_learnnorm.estimators.match_refiner import MatchRefiner, RefinedMatch
 from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.ransac.ransac import RANSAC
-from lightning_modules.task import EstimatorTask, Median, adamw, cameras_of
+from lightning_modules.task import EstimatorTask, Median, cameras_of
 
 TRUE_MATCH = 4.0  # pixels, the largest distance of the found matches that the validation's medians are of
 
@@ -99,24 +96,15 @@ class RefinerTask(EstimatorTask):
     Args:
         refiner: the refiner to train.
         loss: the loss, :class:`HeldOutLoss` when not given.
-        optimizer: builds the optimiser from the parameters; AdamW with a learning rate of 2e-3 when not given.
-        lr_scheduler: see :class:`~lightning_modules.task.EstimatorTask`.
-        warm_up: share of the cycle in which the learning rate rises.
+        options: ``optimizer``, ``lr_scheduler`` and ``warm_up`` of :class:`~lightning_modules.task.EstimatorTask`.
     """
 
     loss: HeldOutLoss
     trains = (MatchRefiner,)
     errors = ("median_moved",)
 
-    def __init__(
-        self,
-        refiner: MatchRefiner,
-        loss: HeldOutLoss | None = None,
-        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer] = adamw,
-        lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
-        warm_up: float = 0.05,
-    ) -> None:
-        super().__init__(refiner, loss or HeldOutLoss(), optimizer, lr_scheduler, warm_up)
+    def __init__(self, refiner: MatchRefiner, loss: HeldOutLoss | None = None, **options: Any) -> None:
+        super().__init__(refiner, loss or HeldOutLoss(), sample_gradient=None, **options)
         for name in ("found", "moved"):
             self.metrics[f"median_{name}"] = Median().set_dtype(torch.float64)
 
