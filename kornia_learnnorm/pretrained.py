@@ -81,7 +81,6 @@ def load_module(
     except RuntimeError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: the tensors do not fit the architecture: {text}") from error
-    module.to(next(iter(state.values())).dtype if state else None)
     if broken := [key for key, value in state.items() if not bool(value.isfinite().all())]:
         raise ValueError(f"{path}: NaN or infinite weights in {', '.join(broken[:3])}")
     if any(value.is_meta for value in (*module.parameters(), *module.buffers())):
