@@ -28,7 +28,6 @@ __all__ = ["export_layer", "export_networks", "load_layer"]
 
 MIN_DYNAMIC_POINTS = 9  # eight correspondences have a solver of their own
 EXAMPLE_BATCH = 2  # sets of the example that is traced; a dynamic size must not be one there
-DTYPES = {"mask": torch.bool}  # of inputs that are not float32
 ESTIMATORS = {layer.model_name: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedHomography)}
 OUTPUTS = ("F_mat", "H_mat", "determined", "weights")  # fields of an estimate, where it has them
 POSE_OUTPUTS = ("E_mat", "R", "t", "determined", "weights")
@@ -94,7 +93,7 @@ def export_layer(
     size = (EXAMPLE_BATCH, num_points or MIN_DYNAMIC_POINTS + 1)
     device = next(layer.parameters(), torch.empty(0)).device
     points = {name: torch.zeros(*size, 2, device=device) for name in ("points1", "points2")}
-    given = {name: torch.ones(size, device=device, dtype=DTYPES.get(name)) for name in inputs}
+    given = {name: torch.ones(size, device=device, dtype=torch.bool if name == "mask" else None) for name in inputs}
     shapes = dict.fromkeys([*points, *given], shape)
     if isinstance(layer, LearnedRelativePose):
         points |= {name: torch.eye(3, device=device).repeat(EXAMPLE_BATCH, 1, 1) for name in ("K1", "K2")}

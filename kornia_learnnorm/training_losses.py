@@ -33,7 +33,6 @@ class EpipolarLoss(nn.Module):
     ValueError if ``heldout_weight`` is outside 0 to 1, or a floor or the ceiling is not positive.
 
     Example:
-        >>> import torch
         >>> F_mat = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
         >>> points1, points2 = torch.zeros(1, 8, 2), torch.ones(1, 8, 2)
         >>> EpipolarLoss(log=False)(points1, points2, F_mat)
@@ -47,7 +46,7 @@ class EpipolarLoss(nn.Module):
         heldout_weight: float = 0.0,
         floor: float = 1e-3,
         heldout_floor: float = 0.1,
-        ceiling: float = 1e4,
+        ceiling: float = MAX_DISTANCE,
     ) -> None:
         super().__init__()
         if not 0 <= heldout_weight <= 1:

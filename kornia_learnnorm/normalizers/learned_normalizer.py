@@ -32,7 +32,8 @@ class LearnedNormalizer(ProblemNormalizer):
     Args:
         base: normaliser ``(points1, points2, weights) -> (T1, T2)``; :class:`~kornia_learnnorm.ReweightedWhitening`
             when not given, as in the shipped weights ``crossview``.
-        network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates; an untrained
+        network: ``(points1, points2, weights) -> (params1, params2)`` in base coordinates, also given the DLT's
+            ``null_matrix`` there if its attribute ``needs_null_matrix`` is true; an untrained
             :class:`~kornia_learnnorm.CrossViewNetwork` of their size when not given.
         transform: builder from parameters :math:`(B, P)` to transforms :math:`(B, 3, 3)`.
         max_points: sets of more correspondences get Hartley's transforms; None for no limit. It is 12 in ``crossview``.
@@ -45,7 +46,6 @@ class LearnedNormalizer(ProblemNormalizer):
         Fan et al., section 4.
 
     Example:
-        >>> import torch
         >>> normalizer = LearnedNormalizer.from_pretrained()
         >>> T1, T2 = normalizer(torch.rand(2, 8, 2) * 600, torch.rand(2, 8, 2) * 600)
         >>> T1.shape

@@ -1,10 +1,4 @@
-r"""Set networks that predict the parameters of both views' transforms from correspondences.
-
-The contract is ``(points1, points2, weights) -> (params1, params2)``: points :math:`(B, N, 2)` in the coordinates of
-the base normaliser, parameters :math:`(B, P)` for a transform builder. Zero parameters mean the base itself. A network
-whose attribute ``needs_null_matrix`` is true also gets the null matrix of the DLT in these coordinates, as
-``null_matrix``.
-"""
+"""The cross-view network: the parameters of both views' transforms from the correspondences of both."""
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
