@@ -13,9 +13,8 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        text = f"{purpose} needs {module}: run pip install 'kornia-learnnorm[{extra}]'"
-        text += f", in a checkout pip install '.[{extra}]'"
-        raise ImportError(text) from error
+        advice = f"run pip install 'kornia-learnnorm[{extra}]', in a checkout pip install '.[{extra}]'"
+        raise ImportError(f"{purpose} needs {module}: {advice}") from error
 
 
 @contextmanager
