@@ -51,7 +51,7 @@ class EpipolarLoss(nn.Module):
         super().__init__()
         if not 0 <= heldout_weight <= 1:
             raise ValueError(f"heldout_weight must be in [0, 1], got {heldout_weight}")
-        if min(floor, heldout_floor, ceiling) <= 0:
+        if not all(value > 0 for value in (floor, heldout_floor, ceiling)):
             raise ValueError(f"floors and ceiling must be positive, got {floor}, {heldout_floor} and {ceiling}")
         self.residual, self.log, self.heldout_weight = residual, log, heldout_weight
         self.floor, self.heldout_floor, self.ceiling = floor, heldout_floor, ceiling

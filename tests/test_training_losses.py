@@ -91,7 +91,7 @@ class TestEpipolarLoss:
     def test_exceptions(self):
         for name, value in [
             *(("heldout_weight", value) for value in (-0.1, 1.1, math.nan)),
-            *((name, value) for name in ("floor", "heldout_floor", "ceiling") for value in (0.0, -1.0)),
+            *((name, value) for name in ("floor", "heldout_floor", "ceiling") for value in (0.0, -1.0, math.nan)),
         ]:
             with pytest.raises(ValueError, match=f"must be .* got .*{value}"):
                 EpipolarLoss(**{name: value})

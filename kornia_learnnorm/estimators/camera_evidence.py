@@ -6,7 +6,7 @@ from torch import Tensor
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.dlt import normal_equations
+from kornia_learnnorm.geometry.dlt import normal_equations, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
@@ -33,8 +33,8 @@ def in_front_of_best_pose(evidence: Evidence, state: Calibrated, weights: Tensor
 
     between = times((C2.mT[:, None] @ R @ C1[:, None]).mT.flatten(2), evidence.rows)  # x2^T R x1 of directions
     along1, along2 = times(((R[:, 0] @ C1).mT @ t).mT, evidence.x1), times((C2.mT @ t).mT, evidence.x2)  # of either R
-    products1, products2 = evidence.products.chunk(2, 1)
-    square1, square2 = times((C1.mT @ C1).view(-1, 1, 9), products1), times((C2.mT @ C2).view(-1, 1, 9), products2)
+    views = (C1, evidence.x1), (C2, evidence.x2)  # the states of a set have the same cameras
+    square1, square2 = ((C[::number] @ x).square().sum(1)[:, None, None] for C, x in views)
     depth1, depth2 = along2 * between - along1 * square2, along2 * square1 - along1 * between
     front = torch.cat([(depth1 > 0) & (depth2 > 0), (depth1 < 0) & (depth2 < 0)], 2)
     best = (front.to(weights) @ weights[..., None]).argmax(2, keepdim=True)
@@ -60,7 +60,7 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
     F_mat = state.matrix()
     squares, factor = (value[:, 0] for value in evidence.squares(F_mat[:, None]))
     inner = weights * UNROLLED_LOSS(squares / square_scale)[1]
-    M, difference = evidence.forms((inner * factor)[:, None], squares[:, None])
+    M, difference = evidence.forms((inner * factor)[:, None], squares[:, None], row_products(evidence.products))
     cost = (inner * squares).sum(1)
     free = torch.linalg.matrix_norm(F_mat, keepdim=True) * Fundamental().state(F_mat).tangents()
     tangents = state.tangents()

@@ -34,7 +34,8 @@ def fit_samples(evidence: Evidence, weights: Tensor, order: Tensor, number: int)
 
 def _sample_rows(evidence: Evidence, weights: Tensor, order: Tensor, number: int, size: int) -> Tensor:
     """Return the design rows of samples, (B, S, 9, size)."""
-    rows = evidence.select(draw_matches(weights, order, number, size)).rows
+    drawn = draw_matches(weights, order, number, size)
+    rows = evidence.rows.gather(2, drawn[:, None].expand(-1, 9, -1))
     return torch.unflatten(rows, 2, (number, size)).permute(0, 2, 1, 3)
 
 

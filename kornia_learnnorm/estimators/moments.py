@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.dlt import normal_equations
+from kornia_learnnorm.geometry.dlt import normal_equations, point_products, row_moments, row_products
 
 __all__ = [
     "Evidence",
@@ -34,13 +34,12 @@ class Evidence(NamedTuple):
     x1: Tensor  # homogeneous points, (B, 3, N)
     x2: Tensor
     rows: Tensor  # of the design matrix, for column-major entries, (B, 9, N)
-    products: Tensor  # x1 x1^T and x2 x2^T, for the squared normals of lines, (B, 18, N)
+    products: Tensor  # different entries of x1 x1^T and x2 x2^T, for the squared normals of lines, (B, 12, N)
 
     @classmethod
     def from_points(cls, x1: Tensor, x2: Tensor) -> Evidence:
         """Return the evidence of homogeneous points (B, 3, N)."""
-        products = torch.cat([(x[:, :, None] * x[:, None]).flatten(1, 2) for x in (x1, x2)], 1)
-        return cls(x1, x2, (x1[:, :, None] * x2[:, None]).flatten(1, 2), products)
+        return cls(x1, x2, (x1[:, :, None] * x2[:, None]).flatten(1, 2), point_products(x1, x2))
 
     def select(self, index: Tensor) -> Evidence:
         """Return the correspondences of given indices (B, M)."""
@@ -68,21 +67,17 @@ class Evidence(NamedTuple):
         squares = self.squares(F_mat)[0]
         return squares.div_(squares + square_scale.to(F_mat))
 
-    def forms(self, share: Tensor, squares: Tensor) -> tuple[Tensor, Tensor]:
+    def forms(self, share: Tensor, squares: Tensor, products: Tensor) -> tuple[Tensor, Tensor]:
         """Return the matrices M and M - X of a step (:func:`descend`) over the trace of M, each (B S, 9, 9).
 
-        Of weights times gradient factors, and of squared distances, both (B, S, N).
+        Of weights times gradient factors, and of squared distances, both (B, S, N), and of :func:`row_products`.
         """
-        M = self.moments(share)
+        M = row_moments(share, products).flatten(0, 1)
         trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
         scale = (trace + (trace == 0)).reciprocal()
         M = M * scale
-        points = ((share * squares) @ self.products.mT).view(-1, 1, 18) * scale
+        points = ((share * squares) @ self.products.mT).view(-1, 1, 12) * scale
         return M, M - torch.unflatten(points @ _FORMS.to(M), 2, (9, 9))[:, 0]
-
-    def moments(self, weights: Tensor) -> Tensor:
-        """Return the second moments of the design rows under weights (B, S, N), (B S, 9, 9)."""
-        return ((self.rows[:, None] * weights[:, :, None]).flatten(1, 2) @ self.rows.mT).view(-1, 9, 9)
 
 
 def descend(
@@ -108,12 +103,12 @@ def descend(
         IEEE Transactions on Pattern Analysis and Machine Intelligence, 2000.
 
     """
-    F_mat = state.matrix()
+    F_mat, products = state.matrix(), row_products(evidence.products)
     for _ in range(steps):
         squares, factor = evidence.squares(torch.unflatten(F_mat, 0, (-1, weights.shape[1])))
         scale = square_scale(squares)
         slope = (scale / (scale + squares)).square()  # of Geman and McClure's loss
-        M, difference = evidence.forms(weights * slope * factor, squares)
+        M, difference = evidence.forms(weights * slope * factor, squares, products)
         e = F_mat.mT.reshape(-1, 9, 1)
         pull = difference @ e
         normal, gradient = normal_equations(M, pull, state.tangents())
@@ -167,7 +162,7 @@ def pick(state: Any, index: Tensor, number: int) -> Any:
 
 
 def _normal_forms() -> Tensor:
-    r"""Return the matrix (18, 81) from products :math:`x_1 x_1^\top, x_2 x_2^\top` to :math:`B` of :math:`e^\top B e`.
+    r"""Return the matrix (12, 81) from ``Evidence.products`` to :math:`B` of :math:`e^\top B e`.
 
     Of column-major entries :math:`e` of a matrix, the form is the sum of the squared norms of the normals of both lines
     and a small share of the squared norm of the matrix.
@@ -177,7 +172,9 @@ def _normal_forms() -> Tensor:
     normals1 = torch.einsum("ab,pk,ql->pqakbl", flat, eye, eye)  # (F^T)_{1:2} x2
     forms = torch.stack([normals2, normals1]).view(2, 3, 3, 81)
     forms[:, 2, 2] += NORMAL_FLOOR**2 / 2 * torch.eye(9, dtype=torch.float64).flatten()  # the third coordinate is one
-    return forms.view(18, 81)
+    first, second = torch.triu_indices(3, 3)
+    both = forms[:, first, second] + forms[:, second, first]
+    return torch.where((first == second)[:, None], both / 2, both).flatten(0, 1)
 
 
 _FORMS = _normal_forms()

@@ -25,6 +25,7 @@ from kornia_learnnorm.estimators.moments import (
 from kornia_learnnorm.estimators.optimize import choose, differentiable_state
 from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.geometry.checks import is_known_true
+from kornia_learnnorm.geometry.dlt import row_moments, row_products
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
@@ -202,8 +203,8 @@ def _moment_spans(evidence: Evidence, model: Essential, weights: Tensor) -> Tens
     """Return the four likeliest matrices of moments under weights (B, S, N), (B, S, 4, 3, 3), the likeliest last."""
     carry = torch.einsum("bik,bjl->bklij", model.C1, model.C2)  # of the entries of E to those of F
     carry = carry.flatten(3, 4).flatten(1, 2)[:, None]
-    moments = torch.unflatten(evidence.moments(weights), 0, weights.shape[:2])
-    basis = torch.linalg.eigh(carry.mT @ moments @ carry)[1][..., :4].flip(-1).mT
+    M = row_moments(weights, row_products(evidence.products))
+    basis = torch.linalg.eigh(carry.mT @ M @ carry)[1][..., :4].flip(-1).mT
     return torch.unflatten(basis, -1, (3, 3)).mT
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import sampson_scale
+from kornia_learnnorm.geometry.dlt import point_products, row_moments, row_products
 from kornia_learnnorm.geometry.matrices import cofactors
 
 Loss = Callable[[Tensor], tuple[Tensor, Tensor]]  # of squared distances: values and derivatives
@@ -62,7 +63,8 @@ def constrained_fit(
         raise ValueError("constrained_fit needs a loss for each step, got none")
     given = F_mat / torch.linalg.vector_norm(F_mat, dim=(1, 2), keepdim=True)
     F, xi = given, (x2[:, None] * x1).flatten(0, 1)
-    products, products1, products2 = ((x[:, None] * x).flatten(0, 1).mT for x in (xi, x1, x2))
+    products1, products2 = ((x[:, None] * x).flatten(0, 1).mT for x in (x1, x2))
+    products = row_products(point_products(x2, x1))
     # A point this close to the epipole has a line of no certain direction, and must not outweigh all others.
     floor1, floor2 = (EPIPOLE_FLOOR**2 * x.square().mean() for x in (x2, x1))
     system, right = F.new_zeros(len(F), 11, 11), F.new_zeros(len(F), 11)
@@ -77,7 +79,7 @@ def constrained_fit(
         g, slope1, slope2 = scale(sq_norm1.clamp_(min=floor1), sq_norm2.clamp_(min=floor2))
         algebraic, g_squared = (u @ xi).square_(), g.square()
         values, weights = loss(algebraic * g_squared)
-        X.copy_(torch.unflatten((weights * g_squared) @ products, 1, (9, 9)))
+        X.copy_(row_moments(weights * g_squared, products))
         if step:
             pull = (2 * weights).mul_(algebraic).mul_(g)
             in_view1.add_(torch.unflatten((pull * slope1) @ products2, 1, (3, 3))[..., None])

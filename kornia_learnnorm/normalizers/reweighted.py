@@ -51,7 +51,7 @@ class ReweightedWhitening(ProblemNormalizer):
 
     def __init__(self, iterations: int = 10, damping: float = 0.1) -> None:
         super().__init__()
-        if iterations < 0 or damping <= 0:
+        if iterations < 0 or not damping > 0:
             raise ValueError(f"iterations must be >= 0 and damping > 0, got {iterations} and {damping}")
         self.iterations, self.damping = iterations, damping
 

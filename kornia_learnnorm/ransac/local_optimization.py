@@ -1,7 +1,6 @@
 """Local optimisation of RANSAC's hypotheses, and the final fit of the best ones."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,7 +21,8 @@ FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; abo
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
 MANIFOLD_SCALES = (3.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps on the manifold
-MANIFOLD_RELAXATION = 1.3  # of these steps but the first, which comes from afar: bounded losses make them too short
+# So many of these steps are so many times longer: bounded losses make all too short but the first, which is from afar.
+MANIFOLD_STEPS = ((1, 1.0), (3, 1.3))
 LM_RELAXATION = 1.4  # of those of Levenberg-Marquardt on the manifold
 POSE_PIXELS = 2.0  # scale at which the pose of a matrix that left the cameras must still fit
 MANIFOLD_POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
@@ -43,9 +43,13 @@ def optimize_locally(scorer: PairScorer, M: Tensor, number: int) -> Hypotheses:
         every = math.ceil(scorer.terms.shape[-1] / PRESCORED)
         x1, x2 = (x[None, :, scorer.rows][..., ::every] for x in (scorer.x1, scorer.x2))
         evidence, weights = Evidence.from_points(x1, x2), torch.ones_like(x1[:, :1]).expand(-1, len(M), -1)
-        for step, scale in enumerate(MANIFOLD_SCALES):
-            relaxation = MANIFOLD_RELAXATION if step else 1.0
-            state = descend(evidence, state, weights, _fixed(scale * scorer.threshold), 1, relaxation)
+        scales = iter(MANIFOLD_SCALES)
+
+        def square_scale(squares: Tensor) -> Tensor:
+            return squares.new_full((1, 1, 1), (next(scales) * scorer.threshold) ** 2)
+
+        for steps, relaxation in MANIFOLD_STEPS:
+            state = descend(evidence, state, weights, square_scale, steps, relaxation)
         return scorer.best(state.matrix(), number)
     for scale in MANIFOLD_SCALES:
         cost = _cost(scorer, Truncated(scale * scorer.threshold), scorer.rows)
@@ -94,11 +98,6 @@ def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
     pose: Any = model.state(free.matrix())
     wide = square_scale.clamp(min=POSE_PIXELS**2)
     return free if bool(keeps_fit(evidence, state, pose, weights, wide)) else state
-
-
-def _fixed(scale: float) -> Callable[[Tensor], Tensor]:
-    """Return the function that gives a scale's square, whatever the squared distances."""
-    return lambda squares: squares.new_full((1, 1, 1), scale**2)
 
 
 def _cost(
