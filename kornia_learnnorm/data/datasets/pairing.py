@@ -1,8 +1,8 @@
 """Pairs of frames: neighbours in a sequence, pairs that a file lists, or images of a COLMAP model."""
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain, combinations, groupby, starmap
+from itertools import combinations, groupby, starmap
 from pathlib import Path
 
 from kornia_learnnorm.data.datasets.colmap import read_reconstruction
@@ -64,17 +64,13 @@ def covisible_pairs(model: str | Path, frames: Sequence[Frame], min_points: int 
     """Yield the pairs of frames that see at least ``min_points`` 3D points of a COLMAP model in common, by name."""
     if min_points < 1:
         raise ValueError(f"the frames of a pair must share at least 1 point, got min_points {min_points}")
-    named = {image.name: image for image in read_reconstruction(Path(model)).images.values()}
-    ordered = sorted(frames, key=lambda frame: frame.name)
-    seen: list[set[int]] = []
-    observers: defaultdict[int, list[int]] = defaultdict(list)
-    for index, frame in enumerate(ordered):
-        if frame.name not in named:
-            raise ValueError(f"no image {frame.name!r} among the {len(named)} of the model {model}")
-        seen.append({point.point3D_id for point in named[frame.name].get_observation_points2D()})
-        for point in seen[-1]:
-            observers[point].append(index)
-    for index, points in enumerate(seen):
-        shared = Counter(chain.from_iterable(observers[point] for point in points))
-        for other in sorted(other for other, count in shared.items() if other > index and count >= min_points):
-            yield FramePair(ordered[index], ordered[other])
+    reconstruction, named = read_reconstruction(Path(model)), {frame.name: frame for frame in frames}
+    images = {number: image.name for number, image in reconstruction.images.items()}
+    if unknown := sorted(named.keys() - set(images.values())):
+        raise ValueError(f"no image {unknown[0]!r} among the {len(images)} of the model {model}")
+    shared: Counter[tuple[str, str]] = Counter()
+    for point in reconstruction.points3D.values():
+        seen_by = {images[element.image_id] for element in point.track.elements}
+        shared.update(combinations(sorted(named.keys() & seen_by), 2))
+    for first, second in sorted(names for names, count in shared.items() if count >= min_points):
+        yield FramePair(named[first], named[second])
