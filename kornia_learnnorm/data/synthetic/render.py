@@ -132,8 +132,8 @@ def render_views(rng: Random, cv2: Any, planes: Sequence[Plane], R: Array, t: Ar
     """Render planes, given from back to front, from the origin and from a camera with :math:`X_2 = R X_1 + t`."""
     width, height = size
     K = np.array([[0.9 * width, 0, (width - 1) / 2], [0, 0.9 * width, (height - 1) / 2], [0, 0, 1]])
-    image1 = expose(render_planes(cv2, planes, K, np.eye(3), np.zeros(3), size), rng)
-    image2 = expose(render_planes(cv2, planes, K, R, t, size), rng)
+    image1 = render_view(rng, cv2, planes, K, np.eye(3), np.zeros(3), size)
+    image2 = render_view(rng, cv2, planes, K, R, t, size)
     F_mat = fundamental_from_motion(*map(torch.from_numpy, (K, K, R, t))).numpy()
     points1, points2 = correspondences(planes, K, R, t, size)
     return RenderedPair(image1, image2, K, R, t, F_mat, points1, points2)
@@ -148,8 +148,10 @@ def rotation(yaw: float, pitch: float, roll: float) -> Array:
     return np.asarray(Rz @ Rx @ Ry)
 
 
-def render_planes(cv2: Any, planes: Sequence[Plane], K: Array, R: Array, t: Array, size: Size) -> Texture:
-    """Render the planes from back to front on a finer grid and average it."""
+def render_view(
+    rng: Random, cv2: Any, planes: Sequence[Plane], K: Array, R: Array, t: Array, size: Size
+) -> NDArray[np.uint8]:
+    """Render the planes from back to front on a finer grid, average it, and add noise of one grey level."""
     fine = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
     centre = (SUPERSAMPLING - 1) / 2
     K_fine = np.array([[SUPERSAMPLING, 0, centre], [0, SUPERSAMPLING, centre], [0, 0, 1]]) @ K
@@ -163,13 +165,8 @@ def render_planes(cv2: Any, planes: Sequence[Plane], K: Array, R: Array, t: Arra
         painted = cv2.warpPerspective(plane.texture, H, fine, flags=cv2.INTER_LINEAR)
         cover = cv2.warpPerspective(np.ones_like(plane.texture), H, fine, flags=cv2.INTER_LINEAR)
         image = painted + (1 - cover) * image
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def expose(image: Texture, rng: Random) -> NDArray[np.uint8]:
-    """Return the grey levels of brightness in 0-1, with noise of one level."""
-    levels = 235 * image + 8 + rng.standard_normal(image.shape)
-    return levels.round().clip(0, 255).astype(np.uint8)
+    levels = 235 * cv2.resize(image, size, interpolation=cv2.INTER_AREA) + 8 + rng.standard_normal(size[::-1])
+    return np.asarray(levels.round().clip(0, 255), np.uint8)
 
 
 def correspondences(planes: Sequence[Plane], K: Array, R: Array, t: Array, size: Size) -> tuple[Array, Array]:
