@@ -22,14 +22,20 @@ def full_disk_names(path: str | Path) -> Iterator[None]:
         raise
 
 
-@contextmanager
-def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Give a temporary file beside ``path``, of its suffix, which takes its place only if the block succeeds."""
+def check_writable(path: str | Path) -> None:
+    """Raise FileNotFoundError or ValueError unless a path is in a folder, and new or a regular file's."""
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist")
     if path.exists() and not path.is_file():
         raise ValueError(f"cannot write {path}: it is not a regular file")
+
+
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """Give a temporary file beside ``path``, of its suffix, which takes its place only if the block succeeds."""
+    check_writable(path)
+    path = Path(path)
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
         temporary.touch()  # a new file shows the mode that the process' umask allows

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.store import FORMAT, LAYOUT, VERSION, CorrespondenceStore, read_store
-from kornia_learnnorm.files import atomic_write, write_text
+from kornia_learnnorm.files import atomic_write, check_writable, write_text
 from kornia_learnnorm.optional import import_extra
 
 OPTIONS = "options.json"  # file in the folder of the parts
@@ -64,11 +64,8 @@ def _append(dataset: Any, rows: NDArray[Any]) -> None:
 
 def check_target(path: str | Path) -> None:
     """Raise FileNotFoundError or ValueError if no store can be written to a path; nothing is written."""
-    path, folder = Path(path), _folder(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"cannot write {path}: it is not a regular file")
+    check_writable(path)
+    folder = _folder(Path(path))
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"cannot write {path}: its parts are written to {folder}, which is not a folder")
 
