@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
 from itertools import chain
@@ -20,7 +19,7 @@ from kornia_learnnorm.data.datasets.frames import Frame, FramePair, read_frame
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Features
 from kornia_learnnorm.data.matching.matchers import check_methods, match_lightglue, match_nearest, one_to_one
-from kornia_learnnorm.data.matching.workers import Workers, open_workers, restart_crashed
+from kornia_learnnorm.data.matching.workers import Workers, open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test
 from kornia_learnnorm.data.writer import StoreWriter
 from kornia_learnnorm.files import exclusive
@@ -34,6 +33,7 @@ METHOD = {"matches": "one-to-one"}
 WINDOW = 8  # pairs per process that are matched before unneeded features are deleted
 Found = Features | str  # or the reason why there are none
 Result = CorrespondenceStore | str  # of a pair, or the reason why there is none
+MAX_RESTARTS = 3  # consecutive worker crashes without progress
 LOG_INTERVAL = 30.0  # seconds between lines of progress where stderr is not a terminal
 
 
@@ -141,33 +141,36 @@ def _match_all(
     pairs: Sequence[FramePair], writer: StoreWriter, options: MatchOptions, about: Mapping[str, Any], workers: Workers
 ) -> dict[str, str]:
     """Match the pairs that are not done; continue after a worker was killed. Return the skipped pairs and why."""
-    done, skipped = writer.done(), dict[str, str]()
-
-    def match_rest() -> Generator[tuple[int, Result], None, None]:
-        todo = [place for place in range(len(pairs)) if place not in done]
-        return _match_some(pairs, todo, writer.folder, options, workers)
+    from joblib.externals.loky.process_executor import BrokenProcessPool
 
     tqdm = import_extra("tqdm", "images", "matching many pairs").tqdm
     often = {} if sys.stderr.isatty() else {"mininterval": LOG_INTERVAL, "maxinterval": LOG_INTERVAL}
-    with (
-        tqdm(total=len(pairs), initial=len(done), unit="pair", **often) as bar,
-        closing(restart_crashed(match_rest, partial(bar.write, file=sys.stderr))) as results,
-    ):
-        for place, result in results:
-            if isinstance(result, str):
-                skipped[" ".join(frame.name for frame in pairs[place])] = result
-            else:
-                writer.add(place, replace(result, **about))
-            done.add(place)
-            bar.update()
+    done, skipped, restarts = writer.done(), dict[str, str](), 0
+    with tqdm(total=len(pairs), initial=len(done), unit="pair", **often) as bar:
+        while len(done) < len(pairs):
+            try:
+                with closing(_match_rest(pairs, done, writer.folder, options, workers)) as results:
+                    for place, result in results:
+                        if isinstance(result, str):
+                            skipped[" ".join(frame.name for frame in pairs[place])] = result
+                        else:
+                            writer.add(place, replace(result, **about))
+                        done.add(place)
+                        restarts = 0
+                        bar.update()
+            except BrokenProcessPool as error:
+                restarts += 1
+                if restarts > MAX_RESTARTS:
+                    raise OSError(f"the worker processes were killed {restarts} times in a row: {error}") from error
+                bar.write("a worker process was killed; continuing with new ones", file=sys.stderr)
     return skipped
 
 
-def _match_some(
-    pairs: Sequence[FramePair], todo: Sequence[int], folder: Path, options: MatchOptions, workers: Workers
+def _match_rest(
+    pairs: Sequence[FramePair], done: set[int], folder: Path, options: MatchOptions, workers: Workers
 ) -> Generator[tuple[int, Result], None, None]:
-    """Yield each place of ``todo`` with the store of its pair, or the reason why there is none."""
-    window = WINDOW * workers.number
+    """Yield each place that is not ``done`` at the start, with the store of its pair or why there is none."""
+    todo, window = [place for place in range(len(pairs)) if place not in done], WINDOW * workers.number
     with TemporaryDirectory(prefix="features-", dir=folder) as features:
         cache = FeatureCache(Path(features), [pairs[place] for place in todo])
         for first in range(0, len(todo), window):

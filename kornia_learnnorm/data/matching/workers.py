@@ -1,4 +1,4 @@
-"""Worker processes on this machine or on a Dask cluster, and what comes after one of them crashed."""
+"""Worker processes on this machine or on a Dask cluster."""
 
 import gc
 import os
@@ -6,60 +6,31 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing, contextmanager
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 from kornia_learnnorm.optional import import_extra
-
-MAX_RESTARTS = 3  # consecutive worker crashes without progress
-
-Result = TypeVar("Result")
 
 
 class Workers:
     """Worker processes that call a function with many arguments; ``options`` are those of joblib's ``Parallel``."""
 
-    def __init__(self, **options: Any) -> None:
-        from joblib import effective_n_jobs
-
-        self.options, self.number = options, int(effective_n_jobs(options["n_jobs"]))
+    def __init__(self, joblib: Any, **options: Any) -> None:
+        self.joblib, self.options, self.number = joblib, options, int(joblib.effective_n_jobs(options["n_jobs"]))
 
     @contextmanager
     def results(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Iterator[Any]]:
         """Yield an iterator over the results in order; leaving the context cancels the remaining calls."""
-        from joblib import Parallel, delayed
-
         # A new Parallel for each list: after a killed process, an old one mixes late results into the next list.
-        parallel = Parallel(return_as="generator", batch_size=1, max_nbytes=None, **self.options)
-        results = parallel(delayed(function)(*some) for some in arguments)
+        parallel = self.joblib.Parallel(return_as="generator", batch_size=1, max_nbytes=None, **self.options)
+        results = parallel(self.joblib.delayed(function)(*some) for some in arguments)
         try:
             yield results
         finally:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # about cancelled tasks
                 results.close()
-
-
-def restart_crashed(
-    run: Callable[[], Generator[Result, None, None]], log: Callable[[str], Any]
-) -> Generator[Result, None, None]:
-    """Yield the results of ``run()``, called again for the rest after a worker crashed, a few times in a row."""
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    restarts = 0
-    while True:
-        try:
-            with closing(run()) as results:
-                for result in results:
-                    yield result
-                    restarts = 0
-                return
-        except BrokenProcessPool as error:
-            restarts += 1
-            if restarts > MAX_RESTARTS:
-                raise OSError(f"the worker processes were killed {restarts} times in a row: {error}") from error
-            log("a worker process was killed; continuing with new ones")
 
 
 def check_jobs(jobs: int) -> None:
@@ -74,7 +45,7 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
     joblib = import_extra("joblib", "images", "matching many pairs")
     check_jobs(jobs)
     if dask is None:
-        yield Workers(n_jobs=jobs, backend="loky", initializer=_end_with, initargs=(os.getpid(),))
+        yield Workers(joblib, n_jobs=jobs, backend="loky", initializer=_end_with, initargs=(os.getpid(),))
         return
     distributed = import_extra("distributed", "dask", "matching on a Dask cluster")
     try:
@@ -86,7 +57,7 @@ def open_workers(jobs: int, dask: str | None = None) -> Iterator[Workers]:
     client = distributed.Client(dask)
     try:
         with client, joblib.parallel_config("dask", client=client):
-            yield Workers(n_jobs=-1)
+            yield Workers(joblib, n_jobs=-1)
     except distributed.KilledWorker as error:
         raise OSError(f"one worker after another of {dask} was killed: {error}") from error
 

@@ -155,7 +155,7 @@ class TestProcesses:
             raise TerminatedWorkerError("killed")
             yield
 
-        monkeypatch.setattr(match_store, "_match_some", broken)
+        monkeypatch.setattr(match_store, "_match_rest", broken)
         with pytest.raises(OSError, match=r"were killed 4 times in a row: killed"):
             collect_matches(pairs_of(images), tmp_path / "store.h5", OPTIONS)
 
