@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from kornia_learnnorm.data.datasets.colmap import FIRST_DISTORTION, read_pinhole
 from kornia_learnnorm.data.datasets.kitti import read_calibration
 from kornia_learnnorm.data.datasets.textfiles import camera_matrix
-from kornia_learnnorm.data.images import focal_length_35mm, image_size
+from kornia_learnnorm.data.images import image_size, open_image
 
 KITTI_CAMERA = "P0"  # projection of image_0 in a calib.txt
 STRECHA_SIZE = 26  # numbers of a file: the camera matrix, distortion (3), rotation (9), centre (3), width and height
 FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
+EXIF_IFD, FOCAL_LENGTH_35MM = 0x8769, 0xA405  # tags, EXIF 2.32, sections 4.6.3 and 4.6.5; the latter in millimetres
 
 
 def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float64]:
@@ -60,7 +61,8 @@ def exif_camera(path: str | Path) -> NDArray[np.float64]:
     size = image_size(path)
     if size == (0, 0):
         raise ValueError(f"camera exif: {path} is not an image")
-    focal = focal_length_35mm(Path(path))
+    with open_image(Path(path)) as image:
+        focal = float(image.getexif().get_ifd(EXIF_IFD).get(FOCAL_LENGTH_35MM, 0))
     if not 0 < focal < math.inf:
         raise ValueError(f"camera exif: {path} has no focal length on 35 mm film; give fx,fy,cx,cy")
     pixels = focal * math.hypot(*size) / FILM_DIAGONAL

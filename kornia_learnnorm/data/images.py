@@ -25,8 +25,7 @@ Array = NDArray[Any]
 # of libpng, so that a PNG has the grey values that OpenCV reads.
 LUMA = (9797 / 32768, 19234 / 32768, 3737 / 32768, -0.5)
 REDUCING_GAP = 2.0  # the last step of reducing, which is filtered, is by this factor or more, where there are others
-# EXIF 2.32, sections 4.6.3 to 4.6.5
-ORIENTATION, EXIF_IFD, FOCAL_LENGTH_35MM = 0x0112, 0x8769, 0xA405  # tags
+ORIENTATION = 0x0112  # tag, EXIF 2.32, section 4.6.4
 QUARTER_TURNS = (5, 6, 7, 8)  # orientations that swap width and height
 MIRRORED_X, MIRRORED_Y = (2, 3, 7, 8), (3, 4, 6, 7)  # orientations of files whose x or y run the other way
 MAX_BLACK = 2  # largest grey value of a black frame
@@ -139,12 +138,6 @@ def stored_pixels(path: Path, points: Array, size: Sequence[int], turned: bool =
     x = width - 1 - x if turn in MIRRORED_X else x
     y = height - 1 - y if turn in MIRRORED_Y else y
     return np.stack([x, y], -1), (width, height)
-
-
-def focal_length_35mm(path: Path) -> float:
-    """Return a photograph's equivalent focal length on film of 36 x 24 mm, millimetres, by EXIF; 0 for unknown."""
-    with open_image(path) as image:
-        return float(image.getexif().get_ifd(EXIF_IFD).get(FOCAL_LENGTH_35MM, 0))
 
 
 def _reduce(image: Any, size: Size, box: tuple[float, float, float, float] | None = None) -> Any:
