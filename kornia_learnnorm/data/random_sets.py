@@ -2,19 +2,18 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
-import numpy as np
 import torch
 from kornia.geometry.epipolar import cross_product_matrix
-from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.sources import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
-from kornia_learnnorm.data.store import passes_ratio_test, read_store
+from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test, read_store
 from kornia_learnnorm.data.synthetic.draws import log_uniform, normal, uniform
 from kornia_learnnorm.data.synthetic.random_matches import SyntheticMatches, random_matches
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
@@ -90,6 +89,7 @@ class SetSource(Protocol):
         """Return sets of one size, which depend on nothing but the arguments and the generator's state."""
 
 
+@dataclass(eq=False)
 class StoreSets:
     """Random sets of matches of the image pairs of stores; half of the draws with the ratio test.
 
@@ -100,18 +100,18 @@ class StoreSets:
         labels: use the ground truth where there is one; pairs without are supervised by their own matches.
     """
 
-    def __init__(
-        self,
-        paths: Sequence[str],
-        num_heldout: int = 48,
-        max_ratios: Sequence[float | None] = (RATIO, None),
-        labels: bool = True,
-    ) -> None:
-        check_draws(paths, num_heldout, max_ratios)
-        self.paths, self.num_heldout, self.max_ratios = tuple(paths), num_heldout, tuple(max_ratios)
-        self._pairs = [pair for path in paths for pair in _read_pairs(path, labels)]
+    paths: Sequence[str]
+    num_heldout: int = 48
+    max_ratios: Sequence[float | None] = (RATIO, None)
+    labels: bool = True
+
+    def __post_init__(self) -> None:
+        check_draws(self.paths, self.num_heldout, self.max_ratios)
+        stores = (read_store(expand_path(path)) for path in self.paths)
+        pairs = (_Pair(store, index, self.labels) for store in stores for index in range(len(store)))
+        self._pairs = [pair for pair in pairs if len(pair.heldout) >= MIN_HELDOUT]
         if not self._pairs:
-            raise ValueError(f"no pair of {', '.join(paths)} has {MIN_HELDOUT} matches to hold out")
+            raise ValueError(f"no pair of {', '.join(self.paths)} has {MIN_HELDOUT} matches to hold out")
         self._sizes = [torch.tensor([len(pair.passing(ratio)) for pair in self._pairs]) for ratio in self.max_ratios]
 
     def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
@@ -120,65 +120,48 @@ class StoreSets:
         ratio, sizes = self.max_ratios[choice], self._sizes[choice]
         able = (sizes >= min(num_points, int(sizes.max()))).nonzero()[:, 0]
         chosen = able[torch.randint(len(able), (num_sets,), generator=generator)].tolist()
-        parts = [self._pairs[i].draw(i, num_points, self.num_heldout, ratio, generator) for i in chosen]
+        parts = [self._draw_set(index, num_points, ratio, generator) for index in chosen]
         return MatchSets(*(torch.stack(values) for values in zip(*parts, strict=True)))
 
+    def _draw_set(self, index: int, num_points: int, ratio: float | None, generator: Generator) -> Sequence[Tensor]:
+        """Return the fields of a :class:`MatchSets` of one set of the pair of this index."""
+        pair = self._pairs[index]
+        passing = pair.passing(ratio)
+        rows = passing[torch.randperm(len(passing), generator=generator)]
+        rows = rows[torch.arange(num_points) % len(rows)]
+        held = pair.points[pair.heldout[torch.randint(len(pair.heldout), (self.num_heldout,), generator=generator)]]
+        points, distance = pair.points[rows], pair.distance[rows]
+        inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
+        about = torch.tensor(index), pair.score[rows], inliers, pair.labelled, *pair.cameras
+        return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], *about
 
-class _Pair(NamedTuple):
-    """The matches of one image pair."""
 
-    points: Tensor  # (M, 4), pixels in both views
-    ratio: NDArray[np.float32]  # (M,), Lowe's ratio, or NaN
-    score: Tensor  # (M,), from 0 to 1
-    distance: Tensor  # (M,), pixels from the true epipolar lines, NaN if unknown
-    cameras: tuple[Tensor, Tensor, Tensor]  # K1, K2 and E, each (3, 3), NaN if unknown
-    names: tuple[str, str]  # of the images
-    sizes: tuple[Size, Size]  # of the images
+class _Pair:
+    """The matches of one pair of a store."""
+
+    def __init__(self, store: CorrespondenceStore, index: int, labels: bool) -> None:
+        rows = store.rows(index)
+        points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
+        F_mat = torch.from_numpy(store.F[index]) if labels else torch.full((3, 3), torch.nan, dtype=torch.float64)
+        K1, K2, R, t = (torch.from_numpy(value) for value in (*store.K[index], store.R[index], store.t[index]))
+        E_mat = cross_product_matrix(t[None])[0] @ R
+        self.points = torch.cat([points1, points2], -1).float()  # (M, 4), pixels in both views
+        self.ratio = store.ratio[rows]  # (M,), Lowe's ratio, or NaN
+        self.score = torch.from_numpy(store.score[rows])  # (M,), from 0 to 1
+        # (M,), pixels from the true epipolar lines, NaN if unknown
+        self.distance = symmetric_epipolar_distance(points1, points2, F_mat).float()
+        # K1, K2 and E, each (3, 3), NaN if unknown
+        self.cameras = K1.float(), K2.float(), (E_mat / torch.linalg.matrix_norm(E_mat)).float()
+        self.names = store.names[index]  # of the images
+        self.sizes: list[Size] = [(width, height) for width, height in store.image_size[index].tolist()]
+        self.labelled = ~self.distance.isnan().any()
+        filtered = self.passing(RATIO)
+        # indices of the matches that supervise
+        self.heldout = filtered[self.distance[filtered] < INLIER_THRESHOLD] if self.labelled else self.passing(None)
 
     def passing(self, max_ratio: float | None) -> Tensor:
         """Return the indices of the matches that pass the ratio test."""
         return torch.from_numpy(passes_ratio_test(self.ratio, max_ratio)).nonzero()[:, 0]
-
-    @property
-    def heldout(self) -> Tensor:
-        """The indices of the matches that supervise."""
-        if self.distance.isnan().any():
-            return self.passing(None)
-        passing = self.passing(RATIO)
-        return passing[self.distance[passing] < INLIER_THRESHOLD]
-
-    def draw(
-        self, index: int, num_points: int, num_heldout: int, ratio: float | None, generator: Generator
-    ) -> Sequence[Tensor]:
-        """Return the fields of a :class:`MatchSets` of one set, of the pair of this index."""
-        passing, heldout = self.passing(ratio), self.heldout
-        rows = passing[torch.randperm(len(passing), generator=generator)]
-        rows = rows[torch.arange(num_points) % len(rows)]
-        held = self.points[heldout[torch.randint(len(heldout), (num_heldout,), generator=generator)]]
-        points, distance = self.points[rows], self.distance[rows]
-        inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
-        about = torch.tensor(index), self.score[rows], inliers, ~distance.isnan().any(), *self.cameras
-        return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], *about
-
-
-def _read_pairs(path: str, labels: bool) -> list[_Pair]:
-    """Return the pairs of a store that have enough matches that supervise."""
-    store, pairs = read_store(expand_path(path)), []
-    for i in range(len(store)):
-        rows = store.rows(i)
-        points1, points2 = (torch.from_numpy(points[rows]).double() for points in (store.points1, store.points2))
-        F_mat = torch.from_numpy(store.F[i]) if labels else torch.full((3, 3), torch.nan, dtype=torch.float64)
-        distance = symmetric_epipolar_distance(points1, points2, F_mat)
-        points = torch.cat([points1, points2], -1).float()
-        K1, K2, R, t = (torch.from_numpy(value) for value in (*store.K[i], store.R[i], store.t[i]))
-        E_mat = cross_product_matrix(t[None])[0] @ R
-        cameras = K1.float(), K2.float(), (E_mat / torch.linalg.matrix_norm(E_mat)).float()
-        width1, height1, width2, height2 = store.image_size[i].ravel().tolist()
-        about = distance.float(), cameras, store.names[i], ((width1, height1), (width2, height2))
-        pair = _Pair(points, store.ratio[rows], torch.from_numpy(store.score[rows]), *about)
-        if len(pair.heldout) >= MIN_HELDOUT:
-            pairs.append(pair)
-    return pairs
 
 
 class SyntheticSets:
@@ -198,7 +181,7 @@ class SyntheticSets:
         labels: bool = True,
         coarse: float = 0.0,
     ) -> None:
-        self.num_heldout, self.labels, self.coarse = num_heldout, labels, coarse
+        self.num_heldout, self.labels = num_heldout, labels
         self.matches = partial(matches, coarse=coarse) if coarse else matches
 
     def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
@@ -217,6 +200,7 @@ class SyntheticSets:
         return MatchSets(points1, points2, heldout1, heldout2, pair, scores, inliers, labelled)
 
 
+@dataclass(eq=False)
 class RandomSets:
     """Batches of random sets, each of one source and one size; each block is a batch, so ``data.batch_size`` is null.
 
@@ -231,29 +215,27 @@ class RandomSets:
         batches: batches in an epoch.
     """
 
-    def __init__(
-        self,
-        sources: Sequence[SetSource],
-        shares: Sequence[float] | None = None,
-        sizes: tuple[int, int] = (8, 1000),
-        correspondences: int = 4096,
-        max_sets: int = 256,
-        augmented: float = 0.4,
-        scored: float = 0.5,
-        batches: int = 500,
-    ) -> None:
-        if not sources:
+    sources: Sequence[SetSource]
+    shares: Sequence[float] | None = None
+    sizes: tuple[int, int] = (8, 1000)
+    correspondences: int = 4096
+    max_sets: int = 256
+    augmented: float = 0.4
+    scored: float = 0.5
+    batches: int = 500
+
+    def __post_init__(self) -> None:
+        number, sizes = len(self.sources), self.sizes
+        if number == 0:
             raise ValueError("sources is empty: give at least one source of sets")
-        shares = [1.0] * len(sources) if shares is None else list(shares)
-        if len(shares) != len(sources) or min(shares) < 0 or not sum(shares) > 0:
-            raise ValueError(f"shares must be one non-negative number for each of {len(sources)} sources, got {shares}")
+        shares = [1.0] * number if self.shares is None else [*self.shares]
+        if len(shares) != number or min(shares) < 0 or not sum(shares) > 0:
+            raise ValueError(f"shares must be one non-negative number for each of {number} sources, got {shares}")
         if not 4 <= sizes[0] <= sizes[1]:
             raise ValueError(f"sizes must be a range of at least 4 matches, the fewest of a homography, got {sizes}")
-        if batches < 1:
-            raise ValueError(f"batches must be at least 1, got {batches}")
-        self.sources, self.shares = list(sources), shares
-        self.sizes, self.correspondences, self.max_sets = tuple(sizes), correspondences, max_sets
-        self.augmented, self.scored, self.batches = augmented, scored, batches
+        if self.batches < 1:
+            raise ValueError(f"batches must be at least 1, got {self.batches}")
+        self._bounds = torch.tensor(shares).cumsum(0)
 
     def blocks(self, seed: int) -> list[Block]:
         """Return the largest size of each block."""
@@ -263,8 +245,7 @@ class RandomSets:
         """Return the sets of a block."""
         generator = block_generator(*divmod(seed, SEEDS_PER_RUN), block, 0)
         chance, size, augmented, scored = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
-        shares = torch.tensor(self.shares).cumsum(0)
-        source = self.sources[int((shares < chance * shares[-1]).sum())]
+        source = self.sources[int((self._bounds < chance * self._bounds[-1]).sum())]
         low, high = self.sizes
         num_points = round(low * math.exp(size * math.log(high / low)))
         sets = source.draw(max(1, min(self.max_sets, self.correspondences // num_points)), num_points, generator)

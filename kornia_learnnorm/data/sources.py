@@ -6,6 +6,7 @@ A block depends only on the seed of the draw and its own number, so any process 
 import os
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -44,6 +45,7 @@ def block_generator(*key: int) -> torch.Generator:
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
 
 
+@dataclass(eq=False)
 class StoreSamples:
     """Samples from stores on disk; a draw uses each image pair once per ratio test, in a random block.
 
@@ -56,23 +58,20 @@ class StoreSamples:
         block_pairs: largest number of image pairs in a block.
     """
 
-    def __init__(
-        self,
-        paths: Sequence[str],
-        max_ratios: Sequence[float | None] = (RATIO,),
-        size: int | tuple[int, int] = 8,
-        num_heldout: int = 0,
-        max_residual: float | None = MAX_RESIDUAL,
-        block_pairs: int = 1024,
-    ) -> None:
-        self.sizes = (size, size) if isinstance(size, int) else tuple(size)
-        if len(self.sizes) != 2 or not 8 <= self.sizes[0] <= self.sizes[1] or block_pairs < 1:
-            got = f"size={size}, block_pairs={block_pairs}"
+    paths: Sequence[str]
+    max_ratios: Sequence[float | None] = (RATIO,)
+    size: int | tuple[int, int] = 8
+    num_heldout: int = 0
+    max_residual: float | None = MAX_RESIDUAL
+    block_pairs: int = 1024
+
+    def __post_init__(self) -> None:
+        self.sizes = (self.size, self.size) if isinstance(self.size, int) else self.size
+        if len(self.sizes) != 2 or not 8 <= self.sizes[0] <= self.sizes[1] or self.block_pairs < 1:
+            got = f"size={self.size}, block_pairs={self.block_pairs}"
             raise ValueError(f"a sample needs at least 8 correspondences, a block at least one pair, got {got}")
-        check_draws(paths, num_heldout, max_ratios)
-        self.paths, self.max_ratios = tuple(paths), tuple(max_ratios)
-        self.stores = [StoreReader(expand_path(path)) for path in paths]
-        self.num_heldout, self.max_residual, self.block_pairs = num_heldout, max_residual, block_pairs
+        check_draws(self.paths, self.num_heldout, self.max_ratios)
+        self.stores = [StoreReader(expand_path(path)) for path in self.paths]
         self._first = np.cumsum([0, *map(len, self.stores)])
         self._passing = [np.concatenate([store.passing(ratio) for store in self.stores]) for ratio in self.max_ratios]
         if max(int(passing.max()) for passing in self._passing) < self.sizes[1]:
