@@ -18,6 +18,8 @@ from kornia_learnnorm.geometry.transforms import transform_points
 CACHED_IMAGES = 512  # in memory, in the size of the store
 SYMMETRIES = 8  # of a square: flips and transposition
 
+read_cached = lru_cache(CACHED_IMAGES)(read_image)
+
 
 class ImageSets(StoreSets):
     """Random sets of matches without labels, as many held-out ones of the same pair, and both images, in grey.
@@ -88,7 +90,7 @@ class ImageSets(StoreSets):
         symmetry = int(torch.randint(SYMMETRIES, (), generator=generator)) if self.symmetries else 0
         images, cameras = [], [*pair.cameras]
         for view, (path, size) in enumerate(zip(self._files[index], pair.sizes, strict=True)):
-            image, A = _mapped(_read(path, size), symmetry)
+            image, A = _mapped(read_cached(path, max(size)), symmetry)
             images.append(image)
             views[view], cameras[view] = transform_points(views[view][None], A[None])[0], A @ cameras[view]
         return torch.cat(views, 1), images, (cameras[0], cameras[1], cameras[2])
@@ -111,11 +113,6 @@ def find_images(folders: Sequence[str]) -> Callable[[str, Size], Path | None]:
         return path if path is not None and reduced_size(image_size(path), max(size)) == size else None
 
     return find
-
-
-@lru_cache(CACHED_IMAGES)
-def _read(path: Path, size: Size) -> NDArray[np.uint8]:
-    return read_image(path, max(size))
 
 
 def _mapped(image: NDArray[np.uint8], symmetry: int) -> tuple[NDArray[np.uint8], Tensor]:

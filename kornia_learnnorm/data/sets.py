@@ -80,30 +80,29 @@ def draw_samples(
     if len(rows) == 0:
         limit = "" if max_ratio is None else f" with ratio below {max_ratio}"
         raise ValueError(f"no pair of the store has {size} correspondences{limit}, which a sample needs")
-    sample_pair, passes = pair[rows[:, 0]], torch.from_numpy(passes_ratio_test(store.ratio, RATIO))
-    passing = torch.bincount(pair[passes], minlength=len(store))[sample_pair]
+    pool = torch.from_numpy(passes_ratio_test(store.ratio, RATIO)).nonzero()[:, 0]  # pair after pair
+    count, sample_pair = torch.bincount(pair[pool], minlength=len(store)), pair[rows[:, 0]]
+    first, passing = (count.cumsum(0) - count)[sample_pair], count[sample_pair]
     if num_heldout and require_heldout and (few := int(passing.min())) <= size:
         expected = f"more than the {size} of a sample expected"
         raise ValueError(f"held-out correspondences: a pair has only {few} with ratio below {RATIO}, {expected}")
     cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
     drawable = passing > size
-    rest[drawable] = points[_draw_heldout(rows[drawable], sample_pair[drawable], pair, passes, num_heldout, generator)]
+    samples, first, count = rows[drawable], first[drawable, None], passing[drawable, None]
+    rest[drawable] = points[_draw_others(samples, pool, first, count, num_heldout, generator)]
     return MatchSets(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)
 
 
-def _draw_heldout(
-    rows: Tensor, sample_pair: Tensor, pair: Tensor, passes: Tensor, number: int, generator: torch.Generator
+def _draw_others(
+    samples: Tensor, pool: Tensor, first: Tensor, count: Tensor, number: int, generator: torch.Generator
 ) -> Tensor:
-    """Draw ``number`` rows for each sample from its pair that pass the ratio test and are not in the sample."""
-    pool = torch.nonzero(passes)[:, 0]
-    count = torch.bincount(pair[pool], minlength=int(pair.max()) + 1)
-    start = count.cumsum(0) - count
+    """Draw ``number`` rows for each sample (S, N), of ``count`` in the pool from ``first`` on, not its own."""
 
     def draw() -> Tensor:
-        u = torch.rand(len(rows), number, generator=generator, dtype=torch.float64)
-        return pool[(u * count[sample_pair, None]).long() + start[sample_pair, None]]
+        u = torch.rand(len(samples), number, generator=generator, dtype=torch.float64)
+        return pool[(u * count).long() + first]
 
     drawn = draw()
-    while bool((own := (drawn[..., None] == rows[:, None, :]).any(-1)).any()):
+    while bool((own := (drawn[..., None] == samples[:, None, :]).any(-1)).any()):
         drawn = torch.where(own, draw(), drawn)
     return drawn

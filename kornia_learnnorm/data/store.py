@@ -1,8 +1,4 @@
-r"""Stores: correspondences of many image pairs in one HDF5 file of ragged arrays.
-
-A file without scores, as of earlier versions, has 1 minus the ratio. Where a command or a configuration takes a store,
-``file.h5@3:10`` means the pairs 3 to 9 of the file.
-"""
+"""Stores: correspondences of many image pairs in one HDF5 file of ragged arrays; ``file.h5@3:10`` is its pairs 3-9."""
 
 import json
 import re
@@ -108,11 +104,11 @@ class StoreReader:
             raise FileNotFoundError(f"no store at {self.path}{hint}")
         with open_hdf5(self.path) as file:
             offsets = _read_offsets(self.path, file)
-        first, stop = (int(part[2]), int(part[3])) if part else (0, len(offsets) - 1)
-        if not first < stop < len(offsets):
-            raise ValueError(f"{self.path}: pairs {first}:{stop} were asked for, the store has 0:{len(offsets) - 1}")
-        self._first = first
-        self.offsets = offsets[first : stop + 1]
+        self._first, stop = (int(part[2]), int(part[3])) if part else (0, len(offsets) - 1)
+        if not self._first < stop < len(offsets):
+            asked = f"pairs {self._first}:{stop} were asked for"
+            raise ValueError(f"{self.path}: {asked}, the store has 0:{len(offsets) - 1}")
+        self.offsets = offsets[self._first : stop + 1]
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
