@@ -216,31 +216,27 @@ class FeatureCache:
     def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
         self.folder = folder
         self.uses = Counter(frame.name for frame in chain(*pairs))
-        self.held: dict[str, Path | str] = {}  # by the frame's name: a file, or the reason why there are no features
+        self.held: dict[str, Path] = {}  # by the frame's name
 
     def put(self, frame: Frame, found: Found) -> None:
         """Keep the features of a frame, or the reason why it has none; OSError on a full disk."""
-        if isinstance(found, str):
-            self.held[frame.name] = found
-            return
         path = self.held[frame.name] = self.folder / f"{len(self.held)}.npz"
+        arrays: dict[str, Any] = {"reason": found} if isinstance(found, str) else found._asdict()
         try:
-            np.savez(path, **{name: value for name, value in found._asdict().items() if value is not None})
+            np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
         except OSError as error:  # NumPy's message does not name the file
             raise OSError(f"cannot write the features of {frame.name}, is the disk full? {error}") from error
 
     def get(self, frame: Frame) -> Found:
         """Return the features of a frame, or the reason why there are none."""
-        held = self.held[frame.name]
-        if isinstance(held, str):
-            return held
-        with np.load(held) as data:
+        with np.load(self.held[frame.name]) as data:
+            if "reason" in data:
+                return str(data["reason"])
             return Features(data["points"], data["descriptors"], tuple(data["size"].tolist()), data.get("lafs"))
 
     def release(self, pair: FramePair) -> None:
         """Mark a pair as done and delete features that no other pair needs."""
         for frame in pair:
             self.uses[frame.name] -= 1
-            held = self.held[frame.name]
-            if self.uses[frame.name] == 0 and isinstance(held, Path):
-                held.unlink()
+            if self.uses[frame.name] == 0:
+                self.held[frame.name].unlink()
