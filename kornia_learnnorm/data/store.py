@@ -175,7 +175,7 @@ def own_dataset(group: Any, name: str) -> Any:
 
 
 def _layout(file: Any) -> dict[str, tuple[tuple[int, ...], str, str]]:
-    """Return the layout without the scores, where a file has none."""
+    """Return the layout of a file; one of an earlier version has no scores, which then are 1 minus the ratio."""
     return {name: entry for name, entry in LAYOUT.items() if name != "score" or name in file}
 
 
