@@ -47,7 +47,7 @@ def augment(sets: MatchSets, generator: Generator) -> MatchSets:
     scores = None if sets.scores is None else torch.where(replaced, 0.2 * sets.scores, sets.scores)
     cameras: list[Tensor | None] = [sets.K1, sets.K2, sets.E_mat]
     if sets.K1 is not None and sets.K2 is not None and sets.E_mat is not None:
-        shift = affine_transform(torch.eye(2).to(centre).expand(batch_size, 2, 2), -centre)
+        shift = affine_transform(torch.eye(2).to(centre).expand(batch_size, 2, 2), centre)
         K1, K2 = (A.to(K) @ shift.to(K) @ K for A, K in ((A1, sets.K1), (A2, sets.K2)))
         cameras = [torch.where(swap, a, b) for a, b in ((K2, K1), (K1, K2), (sets.E_mat.mT, sets.E_mat))]
     return MatchSets(points1, points2, heldout1, heldout2, sets.pair, scores, inliers, sets.labelled, *cameras)

@@ -7,7 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.geometry.epipolar import cross_product_matrix
-from scenes import correspondences, scenes, seeded
+from references import true_essential
+from scenes import scenes, seeded
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets, augment
@@ -151,11 +152,12 @@ def test_wrong_options():
 class TestAugment:
     @given(seed=st.integers(0, 2**20))
     def test_keeps_the_epipolar_geometry(self, seed):
-        """Exact correspondences stay exact: eight of them predict all others."""
-        points, nothing = correspondences("handheld", 4, 40, noise=0.0), torch.zeros(4, 40)
-        sets = MatchSets(*points, *points, torch.arange(4), nothing, nothing + 1, nothing[:, 0] > 0)
-        moved = augment(sets, seeded(seed))
-        F_mat = kln.find_fundamental(moved.heldout1, moved.heldout2)
+        """Exact correspondences stay exact, in cameras that take the maps."""
+        scene, zero = scenes("handheld", 4, 40, noise=0.0), torch.zeros(4, 40)
+        views = scene.points1, scene.points2
+        known = zero, zero + 1, zero[:, 0] > 0, scene.K1, scene.K2, true_essential(scene)
+        moved = augment(MatchSets(*views, *views, torch.arange(4), *known), seeded(seed))
+        F_mat = torch.linalg.inv(moved.K2).mT @ moved.E_mat @ torch.linalg.inv(moved.K1)
         assert kln.symmetric_epipolar_distance(moved.heldout1, moved.heldout2, F_mat).max() < 1e-3
         kept = moved.inliers > 0
         assert kln.symmetric_epipolar_distance(moved.points1, moved.points2, F_mat)[kept].max() < 1e-3
