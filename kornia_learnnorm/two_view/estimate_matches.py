@@ -22,13 +22,12 @@ from kornia_learnnorm.two_view.inputs import Points, check_settings, read_camera
 from kornia_learnnorm.two_view.model_choice import choose_model
 from kornia_learnnorm.two_view.pair_warnings import PairWarning, find_warnings
 from kornia_learnnorm.two_view.plane_pose import angle_between, plane_poses
-from kornia_learnnorm.two_view.predicted_error import CAMERA_ERROR, PredictedError
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
 # Fields of PairEstimate, those of a pose only where there is one; standard errors; reasons for doubt.
-Answer = tuple[dict[str, Any], PredictedError, tuple[PairWarning, ...]]
+Answer = tuple[dict[str, Any], predicted_error.PredictedError, tuple[PairWarning, ...]]
 
 
 def estimate_matches(
@@ -101,7 +100,7 @@ def estimate_matches(
         points1=points1,
         points2=points2,
         scores=scores,
-        predicted_error=min(math.hypot(error.distance, CAMERA_ERROR * max(size2)), float(max(size2))),
+        predicted_error=min(math.hypot(error.distance, predicted_error.CAMERA_ERROR * max(size2)), float(max(size2))),
         warnings=(*find_warnings(*about), *doubts),
         size1=size1,
         size2=size2,
@@ -128,7 +127,8 @@ def _usable(points1: Tensor, points2: Tensor, scores: Tensor, threshold: float) 
 
 
 def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, size2: Size) -> Answer:
-    F_mat, inliers, matches = found.matrix, solver.inliers(found.matrix), (solver.points1, solver.points2)
+    F_mat, matches = found.matrix, (solver.points1, solver.points2)
+    inliers = solver.distance(F_mat) < solver.threshold
     cameras = solver.cameras or (predicted_error.nominal_camera(size1), predicted_error.nominal_camera(size2))
     error = predicted_error.predict_error(found.parts, found.part_size, *matches, F_mat, inliers, *cameras)
     weights = inliers.double() if solver.layer is None else found.weights

@@ -29,7 +29,7 @@ def choose_model(
     homography's inliers, all of which agree with some fundamental matrix.
     """
     H_mat = None if model == "fundamental" else solver.homography(size2)
-    agree = None if H_mat is None else int((solver.parallax(H_mat) < solver.threshold).sum())
+    agree = None if H_mat is None else int(solver.support(H_mat, "homography"))
     if model == "homography":
         if H_mat is None:
             text = f"fewer than {MIN_MATCHES} of {len(solver.scores)} matches agree on a homography within "
@@ -50,17 +50,17 @@ def choose_model(
 
 def _compare(solver: TwoViewSolver, F_mat: Tensor, H_mat: Tensor | None, size1: Size, size2: Size) -> ModelChoice:
     """Return the choice between a fundamental matrix and a homography (3, 3)."""
-    points1, points2, threshold = solver.points1, solver.points2, solver.threshold
-    inliers = int(solver.inliers(F_mat).sum())
-    parallax = measure_parallax(points1, points2, F_mat, threshold, size1, size2)
+    matches, threshold = (solver.points1, solver.points2), solver.threshold
+    inliers = int(solver.support(F_mat))
+    parallax = measure_parallax(*matches, F_mat, threshold, size1, size2)
     reason = parallax.describe(threshold)
     if H_mat is None:
         return ModelChoice("fundamental", reason, parallax, inliers)
-    agree = int((solver.parallax(H_mat) < threshold).sum())
+    agree = int(solver.support(H_mat, "homography"))
     if inliers < MIN_SUPPORT * agree:
         reason = f"{agree} matches agree on it, only {inliers} on a fundamental matrix"
         return ModelChoice("homography", reason, parallax, inliers, agree)
-    gric = compute_gric(points1, points2, F_mat, H_mat, threshold, solver.cameras is not None)
+    gric = compute_gric(*matches, F_mat, H_mat, threshold, solver.cameras is not None)
     model = "homography" if parallax.planar and gric[1] < gric[0] else "fundamental"
     if parallax.planar and model == "fundamental":
         reason += ", but GRIC prefers the fundamental matrix"

@@ -99,10 +99,8 @@ class PairEstimate:
     @property
     def median_distance(self) -> float:
         """Median distance of the inliers to the matrix, pixels."""
-        inlying = self.points1[self.inliers], self.points2[self.inliers]
-        if self.model == "homography":
-            return median(parallax(*inlying, self.matrix)).item()
-        return median(symmetric_epipolar_distance(*inlying, self.matrix)).item()
+        distance = parallax if self.model == "homography" else symmetric_epipolar_distance
+        return median(distance(self.points1[self.inliers], self.points2[self.inliers], self.matrix)).item()
 
     def as_dict(self, matches: bool = True) -> dict[str, Any]:
         """Return all of it, or all but what each match has, as what JSON can hold."""

@@ -18,19 +18,13 @@ from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
+from kornia_learnnorm.two_view import parallax
 from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.pair_warnings import MAX_LOG_FALSE_ALARMS, log_false_alarms, log_false_samples
-from kornia_learnnorm.two_view.parallax import (
-    MAX_LOG_CHANCE_PARALLAX,
-    MIN_PLANAR_SHARE,
-    find_main_plane,
-    fit_plane_and_parallax,
-    parallax,
-    parallax_evidence,
-)
 from kornia_learnnorm.two_view.predicted_error import drop_failed_parts, random_parts
 from kornia_learnnorm.two_view.result import NoReliableMatrixError
 
+Model = Literal["fundamental", "homography"]
 MIN_MATCHES = 9  # eight are explained by some matrix whatever they are
 MIN_SCORE_GAIN = 1.02  # of another hypothesis over the one found first, which otherwise stays
 MIN_SCORE = 1e-3  # a match of weight zero would never be sampled
@@ -68,10 +62,10 @@ class TwoViewSolver:
     def search(self, first: Solution, size2: Size) -> Solution:
         """Return the best matrix of :meth:`solve` and random parts; raise NoReliableMatrixError for few inliers."""
         F_mat, weights = first.matrix, first.weights
-        parts = random_parts(len(weights), int(self.inliers(F_mat).sum()), self.seed)
+        parts = random_parts(len(weights), int(self.support(F_mat)), self.seed)
         F_parts = self._solve_parts(F_mat, parts, size2)
         F_mat = self.improve(F_mat, F_parts)
-        agree = int(self.inliers(F_mat).sum())
+        agree = int(self.support(F_mat))
         if agree < MIN_MATCHES:
             text = f"{agree} of {len(weights)} matches agree on a fundamental matrix within {self.threshold:g} px"
             raise NoReliableMatrixError("no_consensus", f"{text}, at least {MIN_MATCHES} are needed")
@@ -80,20 +74,20 @@ class TwoViewSolver:
     def homography(self, size2: Size) -> Tensor | None:
         """Return the homography (3, 3) that most matches agree with; None for fewer than nine, or as many by chance."""
         H_mat = self._ransac("homography").F_mat
-        matches, agree = len(self.scores), int((self.parallax(H_mat) < self.threshold).sum())
-        by_chance = log_false_alarms(matches, agree, self.threshold, size2, "homography") > MAX_LOG_FALSE_ALARMS
-        return None if agree < MIN_MATCHES or by_chance else H_mat
+        agree = int(self.support(H_mat, "homography"))
+        log_number = log_false_alarms(len(self.scores), agree, self.threshold, size2, "homography")
+        return None if agree < MIN_MATCHES or log_number > MAX_LOG_FALSE_ALARMS else H_mat
 
     def check_homography(self, H_mat: Tensor) -> Solution:
         """Return a homography (3, 3) of all matches with those of the matches near it in random parts."""
-        distance = self.parallax(H_mat)
+        distance = self.distance(H_mat, "homography")
         inliers, near = distance < self.threshold, distance < NEAR * self.threshold
         agree = int(inliers.sum())
         parts = random_parts(len(inliers), agree, self.seed)
         solvers = [self.part(rows[near[rows]]) for rows in parts if int(near[rows].sum()) >= Homography.min_points]
         H_parts = torch.stack([solver._ransac("homography").F_mat for solver in solvers])  # noqa: SLF001 (its own class)
-        support = (self.parallax(H_parts) < self.threshold).sum(-1)
-        return Solution(H_mat, inliers.double(), drop_failed_parts(H_parts, support, agree), parts.shape[1])
+        solved = drop_failed_parts(H_parts, self.support(H_parts, "homography"), agree)
+        return Solution(H_mat, inliers.double(), solved, parts.shape[1])
 
     def solve(self) -> Solution:
         """Return the fundamental matrix of the matches without a look at parts of them."""
@@ -121,22 +115,14 @@ class TwoViewSolver:
             other = self._search_near(other)
         return other if self._score(other) > least else F_mat
 
-    def distance(self, F_mat: Tensor) -> Tensor:
-        """Return the symmetric epipolar distances of the matches to a matrix (3, 3), (N,), pixels."""
-        return symmetric_epipolar_distance(self.points1, self.points2, F_mat)
+    def distance(self, M: Tensor, model: Model = "fundamental") -> Tensor:
+        """Return the distances (*, N) of the matches to matrices (*, 3, 3), pixels: epipolar, or from H x1 to x2."""
+        distance = parallax.parallax if model == "homography" else symmetric_epipolar_distance
+        return distance(self.points1, self.points2, M)
 
-    def parallax(self, H_mat: Tensor) -> Tensor:
-        """Return the distances (*, N) of points2 from where homographies (*, 3, 3) move points1, pixels."""
-        return parallax(self.points1, self.points2, H_mat)
-
-    def inliers(self, F_mat: Tensor) -> Tensor:
-        """Return which matches lie within the threshold of a matrix (3, 3), (N,) bool."""
-        return self.distance(F_mat) < self.threshold
-
-    def support(self, F_mat: Tensor) -> Tensor:
-        """Return how many matches lie within the threshold of each matrix (P, 3, 3), (P,)."""
-        points1, points2 = (points.expand(len(F_mat), -1, -1) for points in (self.points1, self.points2))
-        return (symmetric_epipolar_distance(points1, points2, F_mat) < self.threshold).sum(-1)
+    def support(self, M: Tensor, model: Model = "fundamental") -> Tensor:
+        """Return how many matches lie within the threshold of matrices (*, 3, 3)."""
+        return (self.distance(M, model) < self.threshold).sum(-1)
 
     def part(self, rows: Tensor) -> Self:
         """Return the solver of some matches, from their rows or a mask."""
@@ -151,22 +137,21 @@ class TwoViewSolver:
         """Return the MSAC score of a matrix (3, 3); zero for a matrix of zeros."""
         return float(self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1).score.sum())
 
-    def _ransac(self, model: Literal["fundamental", "homography"] = "fundamental") -> RansacResult:
+    def _ransac(self, model: Model = "fundamental") -> RansacResult:
         ransac = RANSAC(inl_th=self.threshold, seed=self.seed, model=model)
         cameras = self.cameras or () if model == "fundamental" else ()
         return ransac.estimate(self.points1, self.points2, self.scores.clamp(min=MIN_SCORE), *cameras)
 
     def _solve_parts(self, F_mat: Tensor, parts: Tensor, size2: Size) -> Tensor:
         """Return the matrices of the parts; of few matches, only of the first where these find no more than chance."""
-        matches, found = len(self.scores), F_mat[None]
-        for rows in parts:
+        found = F_mat[None]
+        for tried, rows in enumerate(parts, 1):
             found = torch.cat([found, self.part(rows).solve().matrix[None]])
-            if matches > FEW_MATCHES:  # a late part can find what all others missed
+            if len(self.scores) > FEW_MATCHES:  # a late part can find what all others missed
                 continue
-            most, failed = int(self.support(found).max()), len(found) - 1
-            empty = log_false_samples(matches, most, self.threshold, size2) > 0
-            by_chance = log_false_alarms(matches, most, self.threshold, size2) > MAX_LOG_FALSE_ALARMS
-            if (failed == MAX_EMPTY_PARTS and empty) or (failed == MAX_FAILED_PARTS and by_chance):
+            about = len(self.scores), int(self.support(found).max()), self.threshold, size2
+            empty = tried == MAX_EMPTY_PARTS and log_false_samples(*about) > 0
+            if empty or (tried == MAX_FAILED_PARTS and log_false_alarms(*about) > MAX_LOG_FALSE_ALARMS):
                 break
         return found[1:]
 
@@ -200,25 +185,25 @@ class TwoViewSolver:
 
     def _try_plane_and_parallax(self, F_mat: Tensor) -> Tensor:
         """Return the matrix of a plane and parallax where one homography explains most inliers and it scores higher."""
-        inliers = self.inliers(F_mat)
+        inliers = self.distance(F_mat) < self.threshold
         if int(inliers.sum()) < 8:
             return F_mat
-        H = find_main_plane(self.points1[inliers], self.points2[inliers], self.threshold)
+        H = parallax.find_main_plane(self.points1[inliers], self.points2[inliers], self.threshold)
         if H is None:
             return F_mat
-        off_plane = parallax(self.points1, self.points2, H)
-        if float((off_plane[inliers] < 3 * self.threshold).double().mean()) <= MIN_PLANAR_SHARE:
+        off_plane = self.distance(H, "homography")
+        if float((off_plane[inliers] < 3 * self.threshold).double().mean()) <= parallax.MIN_PLANAR_SHARE:
             return F_mat
-        other = fit_plane_and_parallax(self.points1, self.points2, H, self.threshold, self.seed)
+        other = parallax.fit_plane_and_parallax(self.points1, self.points2, H, self.threshold, self.seed)
         if other is not None and self._score(other) > MIN_SCORE_GAIN * self._score(F_mat):
             F_mat = other
         distance = self.distance(F_mat)
         inliers = distance < self.threshold
-        evidence = parallax_evidence(self.points1, self.points2, F_mat, off_plane, self.threshold, (1.0,))
-        if evidence <= MAX_LOG_CHANCE_PARALLAX or not bool(inliers.any()):
+        matches = self.points1, self.points2
+        evidence = parallax.parallax_evidence(*matches, F_mat, off_plane, self.threshold, (1.0,))
+        if evidence <= parallax.MAX_LOG_CHANCE_PARALLAX or not bool(inliers.any()):
             return F_mat
         # Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would
         # the inliers of largest error, if the scale of the loss were not the median distance of the inliers.
-        noise = float(distance[inliers].median())
-        scale = min(max(noise, MIN_LOSS_SCALE * self.threshold), FINAL_LOSS_SCALE * self.threshold)
-        return self._refine_at(scale, F_mat)
+        scale = distance[inliers].median().clamp(MIN_LOSS_SCALE * self.threshold, FINAL_LOSS_SCALE * self.threshold)
+        return self._refine_at(float(scale), F_mat)
