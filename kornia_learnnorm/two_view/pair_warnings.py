@@ -9,8 +9,6 @@ from torch import Tensor
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["PairWarning", "find_warnings", "log_false_alarms", "log_false_samples"]
-
 MAX_ANGLE = 8.0  # degrees; a pose that moves by more in half of the parts is unstable
 MIN_INLIERS = 16  # with fewer, no estimate of the error is reliable either
 MIN_SPREAD = 0.02  # of the image diagonal; standard deviation of the inliers across their longest direction
@@ -39,8 +37,7 @@ def find_warnings(
         found["chance"] = f"{total} of {matches} matches agree within {threshold:g} px, no more than chance would give"
     spread = min(_spread(points[inliers]) for points in (points1, points2)) / math.hypot(*size2)
     if spread < MIN_SPREAD:
-        text = f"the inliers lie close to one line or one point: {spread:.1%} of the image diagonal apart"
-        found["clustered"] = text
+        found["clustered"] = f"the inliers lie close to one line or one point: {spread:.1%} of the image diagonal apart"
     if angle > MAX_ANGLE:
         found["unstable"] = f"the pose changes by {angle:.0f} degrees when the matches are drawn anew"
     return tuple(PairWarning(*item) for item in found.items())

@@ -22,13 +22,11 @@ from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
+from kornia_learnnorm.geometry.transforms import affine_transform
 from kornia_learnnorm.models.contract import Residuals
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
-
-__all__ = ["MAX_LOG_CHANCE_PARALLAX", "MIN_PLANAR_SHARE", "Parallax", "distances_from_plane", "find_main_plane"]
-__all__ += ["fit_plane_and_parallax", "parallax", "parallax_evidence"]
 
 OFF_PLANE = 2.0  # thresholds, or standard deviations; a match that the homography misses by more is off the plane
 MAX_SAMPLES = 1000  # pairs of matches off the plane that are tried
@@ -144,15 +142,12 @@ def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshol
     off = (parallax(points1, points2, H) > OFF_PLANE * threshold).nonzero()[:, 0]
     if len(off) < MIN_PARALLAX_INLIERS:
         return None
-    generator = torch.Generator().manual_seed(seed)
-    first, second = torch.triu_indices(len(off), len(off), 1)
-    chosen = torch.randperm(len(first), generator=generator)[:MAX_SAMPLES]
-    x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
-    lines = torch.linalg.cross(x1[off] @ H.mT, x2[off])
-    epipole = torch.linalg.cross(lines[first[chosen]], lines[second[chosen]])
-    F_mat = unit_matrix(cross_product_matrix(epipole) @ H)
+    pairs = torch.combinations(off)
+    chosen = pairs[torch.randperm(len(pairs), generator=torch.Generator().manual_seed(seed))[:MAX_SAMPLES]]
+    x1, x2 = (convert_points_to_homogeneous(points[chosen]) for points in (points1, points2))
+    epipole = torch.linalg.cross(*torch.linalg.cross(x1 @ H.mT, x2).unbind(1))
     scorer = PairScorer(points1, points2, threshold, Fundamental())
-    found = scorer.best(scorer.from_pixels(F_mat[F_mat.isfinite().flatten(1).all(1)]), 1).F_mat
+    found = scorer.best(scorer.from_pixels(unit_matrix(cross_product_matrix(epipole) @ H)), 1).F_mat
     if len(found) == 0:
         return None
     loss = GemanMcClure(FINAL_LOSS_SCALE * threshold)
@@ -170,11 +165,10 @@ def distances_from_plane(
     infinity are infinitely far.
     """
     T1, T2 = _from_pixels(size1), _from_pixels(size2)
-    ones = torch.ones_like(points1.mT[:1])
-    x1, x2 = (T @ torch.cat([points.mT, ones]) for T, points in ((T1, points1), (T2, points2)))
+    x1, x2 = (T @ convert_points_to_homogeneous(x).mT[None] for T, x in ((T1, points1), (T2, points2)))
     H = T2 @ H @ torch.linalg.inv(T1)
     start = _Parameters(torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])[None])
-    cost = RobustCost(_BentPlane(), x1[None], x2[None], ones, GemanMcClure(threshold * float(T2[0, 0])))
+    cost = RobustCost(_BentPlane(), x1, x2, torch.ones_like(x1[:, 0]), GemanMcClure(threshold * float(T2[0, 0])))
     _, optimum = minimize(cost, start, MAX_LM_STEPS, TOLERANCE)
     distance = cost.squares(optimum.state.matrix())[0].sqrt()
     return torch.where(distance < AT_INFINITY, distance / T2[0, 0], math.inf)
@@ -223,6 +217,4 @@ class _BentPlane(Residuals):
 
 def _from_pixels(size: Size) -> Tensor:
     """Return the transform (3, 3) from pixels to halves of the diagonal, from the centre."""
-    radius = math.hypot(*size) / 2
-    x, y = (side / 2 / radius for side in size)
-    return torch.tensor([[1 / radius, 0, -x], [0, 1 / radius, -y], [0, 0, 1]], dtype=torch.float64)
+    return affine_transform(2 / math.hypot(*size) * torch.eye(2).double(), torch.tensor(size).double() / 2)

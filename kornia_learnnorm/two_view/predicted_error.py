@@ -14,8 +14,6 @@ from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view.parallax import parallax
 
-__all__ = ["PredictedError", "predict_error", "predict_transfer_error"]
-
 NUM_PARTS = 12  # random parts of the matches that are solved again
 PART_INLIERS = 48  # expected in a part, where these are more than half and less than four fifths of all inliers
 MIN_SUPPORT = 0.75  # of the inliers; the matrix of a part with fewer is that of a search that failed
@@ -64,13 +62,11 @@ def predict_error(
     lines = convert_points_to_homogeneous(x1) @ F_mat.mT
     normal = lines[:, :2]
     x2 = x2 - (((normal * x2).sum(-1) + lines[:, 2]) / normal.square().sum(-1))[:, None] * normal  # onto their lines
-    x1, x2 = (x.expand(len(F_parts), -1, -1) for x in (x1, x2))
     distance = symmetric_epipolar_distance(x1, x2, F_parts).nan_to_num(nan=math.inf).median()
-    cameras = K1.expand_as(F_parts), K2.expand_as(F_parts)
-    R, t = relative_pose(F_mat[None], *(value[:1] for value in (*cameras, x1, x2)))
-    R_parts, t_parts = relative_pose(F_parts, *cameras, x1, x2)
-    angles = pose_error(R_parts, t_parts, R.expand_as(R_parts), t.expand_as(t_parts))
-    return _scale_to_all(distance, angles.nan_to_num(nan=180.0), size, len(points1))
+    matrices = torch.cat([F_mat[None], F_parts])
+    R, t = relative_pose(matrices, *(value.expand(len(matrices), -1, -1) for value in (K1, K2, x1, x2)))
+    angles = pose_error(R[1:], t[1:], R[:1], t[:1]).nan_to_num(nan=180.0)
+    return _scale_to_all(distance, angles, size, len(points1))
 
 
 def predict_transfer_error(
