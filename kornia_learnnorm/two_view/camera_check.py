@@ -34,8 +34,11 @@ def find_camera_doubt(
     Sizes are None where they are not known, F_mat (3, 3) where the matches may be those of a plane.
     """
     for name, K, size in zip(("K1", "K2"), cameras, sizes, strict=True):
-        if size is not None and is_of_other_size(K, size):
-            x, y = (K[:2, 2] / K[2, 2] / torch.tensor(size)).tolist()
+        if size is None:
+            continue
+        x, y = centre = K[:2, 2] / K[2, 2] / torch.tensor(size)
+        offset = (centre - 0.5).abs()
+        if bool((offset > 0.5).any() or (offset > MAX_OFFSET).all()):
             text = f"the principal point of {name} is at {x:.0%} of the width and {y:.0%} of the height of its image"
             return (PairWarning("cameras", f"{text}: {name} may be that of another image size"),)
     if F_mat is None:
@@ -49,12 +52,6 @@ def find_camera_doubt(
 def drop_contradiction(warnings: tuple[PairWarning, ...]) -> tuple[PairWarning, ...]:
     """Return the warnings without that of matches that contradict their cameras."""
     return tuple(warning for warning in warnings if not warning.text.startswith(CONTRADICTION))
-
-
-def is_of_other_size(K: Tensor, size: Size) -> bool:
-    """Return whether the principal point of a camera (3, 3) is outside of its image, or far from its centre."""
-    offset = (K[:2, 2] / K[2, 2] / torch.tensor(size) - 0.5).abs()
-    return bool((offset > 0.5).any() or (offset > MAX_OFFSET).all())
 
 
 def camera_misfit(
