@@ -18,7 +18,7 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental, transfor
 from kornia_learnnorm.models.homography import Homography
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
-from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, check_whole, read_cameras
+from kornia_learnnorm.two_view.inputs import Points, check_number, check_settings, read_cameras
 from kornia_learnnorm.two_view.repeated_texture import mutual_share, resolve_ambiguity
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 
@@ -165,30 +165,29 @@ def match_two_images(
     if not isinstance(refiner, MatchRefiner | None):
         raise TypeError(f"refiner must be a MatchRefiner or None, got {type(refiner).__name__}")
     path1, path2 = (Path(image) if isinstance(image, str | Path) else None for image in (image1, image2))
-    pixels1, full_size1 = _pixels(image1, max_size, detector in READS_COLOUR)
-    pixels2, full_size2 = _pixels(image2, max_size, detector in READS_COLOUR)
-    features1 = _features(pixels1, full_size1, mask1, detector)
-    features2 = _features(pixels2, full_size2, mask2, detector)
-    for number, features in enumerate((features1, features2), 1):
-        if len(features.points) < 2:
-            text = f"image {number} is blank, nearly so, or masked: {len(features.points)} features, expected 2 or more"
+    colour = detector in READS_COLOUR
+    pixels, full_sizes = zip(*(_pixels(image, max_size, colour) for image in (image1, image2)), strict=True)
+    features = [_features(*view, detector) for view in zip(pixels, full_sizes, (mask1, mask2), strict=True)]
+    for number, found in enumerate(features, 1):
+        if len(found.points) < 2:
+            text = f"image {number} is blank, nearly so, or masked: {len(found.points)} features, expected 2 or more"
             raise _named(NoReliableMatrixError("blank", text), (path1, path2))
-    about = features1.size, features2.size, full_size1, full_size2
-    if matcher != "nearest":
-        points1, points2, scores = (part.double() for part in match_lightglue(features1, features2, detector))
-        found = MatchedPair(points1, points2, scores, scores >= 0, *about, None, path1, path2)
+    limit: float | None = None
+    if matcher == "nearest":
+        matches, back = match_both_ways(*features)
+        limit, kept = float(ratio), matches.ratio.double() < ratio
+        points1, points2, ratios = (x[kept].double() for x in (*matches[:2], torch.maximum(matches.ratio, back)))
+        scores, mutual = 1 - ratios, ratios < ratio
     else:
-        matches, back = match_both_ways(features1, features2)
-        larger = torch.maximum(matches.ratio, back)
-        kept = matches.ratio.double() < ratio
-        points1, points2, ratios = (value[kept].double() for value in (matches.points1, matches.points2, larger))
-        found = MatchedPair(points1, points2, 1 - ratios, ratios < ratio, *about, float(ratio), path1, path2)
-    if refiner is None:
-        return found
-    views = (torch.from_numpy(np.atleast_3d(pixels)).permute(2, 0, 1)[None] for pixels in (pixels1, pixels2))
-    with torch.no_grad():
-        moved = refiner(*views, points1[None], points2[None])
-    return replace(found, points1=moved.points1[0], points2=moved.points2[0])
+        points1, points2, scores = (part.double() for part in match_lightglue(*features, detector))
+        mutual = torch.ones_like(scores, dtype=torch.bool)
+    if refiner is not None:
+        views = (torch.from_numpy(np.atleast_3d(values)).permute(2, 0, 1)[None] for values in pixels)
+        with torch.no_grad():
+            moved = refiner(*views, points1[None], points2[None])
+        points1, points2 = moved.points1[0], moved.points2[0]
+    sizes = (*(found.size for found in features), *full_sizes)
+    return MatchedPair(points1, points2, scores, mutual, *sizes, limit, path1, path2)
 
 
 def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> None:
@@ -196,7 +195,7 @@ def check_matching(ratio: float, max_size: int, detector: str, matcher: str) -> 
     check_number("ratio", ratio)
     if not 0 < ratio <= 1:
         raise ValueError(f"ratio must be above 0 and at most 1, got {ratio:g}")
-    check_whole("max_size", max_size)
+    check_number("max_size", max_size, whole=True)
     if max_size < MIN_SIZE:
         raise ValueError(f"max_size must be at least {MIN_SIZE} pixels, got {max_size}")
     check_methods(detector, matcher)

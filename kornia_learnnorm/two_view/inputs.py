@@ -46,7 +46,7 @@ def read_size(name: str, size: Size | None, points: Tensor) -> Size:
         width, height = (points.amax(0).clamp(min=1.0).ceil() + 1).tolist()
         return int(width), int(height)
     for value in size:
-        check_whole(f"width and height of {name}", value)
+        check_number(f"width and height of {name}", value, whole=True)
     if len(size) != 2 or min(size) < 1:
         raise ValueError(f"{name} must be a positive width and height, got {tuple(size)}")
     return int(size[0]), int(size[1])
@@ -57,7 +57,7 @@ def check_settings(threshold: float, seed: int, layer: object = None, model: str
     check_number("threshold", threshold)
     if not 0 < threshold < float("inf"):
         raise ValueError(f"threshold must be positive and finite, got {threshold:g} px")
-    check_whole("seed", seed)
+    check_number("seed", seed, whole=True)
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed must lie in [0, 2^63), got {seed}")
     if not isinstance(layer, LearnedEightPoint | None):
@@ -67,16 +67,10 @@ def check_settings(threshold: float, seed: int, layer: object = None, model: str
         raise ValueError("layer estimates fundamental matrices: leave it out with model homography")
 
 
-def check_number(name: str, value: object) -> None:
-    """Raise a TypeError for anything but a real number."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise TypeError(f"{name} must be a number, got {value!r}")
-
-
-def check_whole(name: str, value: object) -> None:
-    """Raise a TypeError for anything but a whole number."""
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise TypeError(f"{name} must be a whole number, got {value!r}")
+def check_number(name: str, value: object, whole: bool = False) -> None:
+    """Raise a TypeError for anything but a real number, or a whole one."""
+    if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
+        raise TypeError(f"{name} must be a {'whole ' if whole else ''}number, got {value!r}")
 
 
 def _as_float64(name: str, value: object) -> Tensor:

@@ -25,7 +25,7 @@ from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.two_view.estimate_pair import MAX_SIZE, check_matching, estimate_pair
-from kornia_learnnorm.two_view.inputs import check_settings, check_whole
+from kornia_learnnorm.two_view.inputs import check_number, check_settings
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, package_versions
 
 RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
@@ -57,7 +57,7 @@ class PairOptions:
     def __post_init__(self) -> None:
         check_settings(self.threshold, self.seed, model=self.model)
         check_matching(self.ratio, self.max_size, self.detector, self.matcher)
-        check_whole("refine", self.refine)
+        check_number("refine", self.refine, whole=True)
         if self.refine < 0:
             raise ValueError(f"refine must be 0 or more passes, got {self.refine}")
 
