@@ -1,16 +1,15 @@
 """The page of ``learnnorm demo``: two images, their matches and epipolar lines, made of Gradio's components."""
 
 import atexit
-import io
 import json
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import gradio as gr
@@ -58,8 +57,7 @@ log = logging.getLogger(__name__)
 Pixels = NDArray[np.uint8]  # RGB, (H, W, 3)
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
+class Result(NamedTuple):
     """Two images, reduced to be shown, and their estimate in pixels of the full images."""
 
     images: tuple[Pixels, Pixels]
@@ -135,10 +133,9 @@ def draw_result(result: Result, pixel: Sequence[float] | None = None) -> Pixels:
         figure.add_artist(import_matplotlib().collections.LineCollection(ends, transform=None, **style))
     else:
         _mark(views, found, (pixel[0] + 0.5, figure.bbox.height - pixel[1] - 0.5))
-    with io.BytesIO() as file:
-        figure.savefig(file, format="rgba", dpi=DPI)
-        drawn = np.frombuffer(file.getvalue(), np.uint8)
-    return drawn.reshape(round(figure.bbox.height), round(figure.bbox.width), 4)[..., :3].copy()
+    canvas = import_matplotlib().backends.backend_agg.FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())[..., :3]
 
 
 def _views(sizes: tuple[tuple[int, int], tuple[int, int]]) -> tuple[Any, list[Any]]:
@@ -186,14 +183,13 @@ def example_files() -> tuple[str, str]:
 
 def make_app(detector: str = PairOptions.detector, matcher: str = PairOptions.matcher) -> gr.Blocks:
     """Return the page, which :func:`launch` serves, with a detector and a matcher that are chosen at first."""
-    app: gr.Blocks
     with gr.Blocks(title="Two-view geometry", analytics_enabled=False, delete_cache=CACHE) as app:
         gr.Markdown("# Two-view geometry\nFundamental matrix or homography of two images, with its predicted error.")
         with gr.Row():
-            files = []
-            for number, file in enumerate(example_files(), 1):
-                about: dict[str, Any] = {"elem_id": f"image{number}", "label": f"Image {number}, at most {LIMIT}"}
-                files.append(gr.File(file, height=130, min_width=300, **about))
+            files = [
+                gr.File(file, height=130, min_width=300, elem_id=f"image{n}", label=f"Image {n}, at most {LIMIT}")
+                for n, file in enumerate(example_files(), 1)
+            ]
         with gr.Row():
             options: list[Any] = [
                 gr.Dropdown([*names], value=value, label=label, min_width=150)
@@ -264,21 +260,19 @@ def _point(result: Result | None, event: gr.SelectData) -> Any:
     return gr.skip() if result is None else draw_result(result, event.index)
 
 
-class OwnPages:
-    """Middleware that answers this computer alone, and no pages of other sites that its browser shows."""
+def own_pages(app: Any) -> Any:
+    """Return middleware that answers this computer alone, and no pages of other sites that its browser shows."""
 
-    def __init__(self, app: Any) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """Refuse a request to another host name, and one whose page does not come from the host itself."""
+    async def answer_own(scope: Any, receive: Any, send: Any) -> None:
         headers = Headers(scope=scope) if scope["type"] == "http" else {"host": ADDRESS}
         host = headers.get("host", "")
         own = headers.get("origin", f"http://{host}") == f"http://{host}"
         if own and urlsplit(f"//{host}").hostname in (ADDRESS, "localhost"):
-            await self._app(scope, receive, send)
+            await app(scope, receive, send)
         else:
             await PlainTextResponse("only pages of this computer are answered", 403)(scope, receive, send)
+
+    return answer_own
 
 
 def launch(app: gr.Blocks, port: int | None = None) -> None:
@@ -290,6 +284,6 @@ def launch(app: gr.Blocks, port: int | None = None) -> None:
     options: dict[str, Any] = dict.fromkeys(OFF, False) | {"quiet": True, "footer_links": [], "show_error": True}
     if port is not None:
         options |= {"server_name": ADDRESS, "server_port": port, "prevent_thread_lock": True}
-        options["app_kwargs"] = {"middleware": [Middleware(OwnPages)]}
+        options["app_kwargs"] = {"middleware": [Middleware(own_pages)]}
     theme = gr.themes.Default(font=("system-ui", "sans-serif"), font_mono=("ui-monospace", "monospace"))
     app.launch(theme=theme, css=CSS, max_file_size=MAX_BYTES, **options)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from kornia.geometry.conversions import convert_points_to_homogeneous
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.images import import_cv2, scaling
@@ -40,9 +41,9 @@ COLUMNS = 120  # characters in a line of text
 
 
 def import_matplotlib() -> Any:
-    """Return the package ``matplotlib`` with its modules ``collections``, ``colors`` and ``figure``."""
+    """Return the package ``matplotlib`` with the modules that pictures need."""
     matplotlib = import_extra("matplotlib", "report", "drawing pictures")
-    for name in ("collections", "colors", "figure"):
+    for name in ("backends.backend_agg", "collections", "colors", "figure"):
         importlib.import_module(f"matplotlib.{name}")
     return matplotlib
 
@@ -73,10 +74,8 @@ def draw_pair(image1: Pixels, image2: Pixels, estimate: PairEstimate, path: str 
     else:
         shown = f"{min(NUM_LINES, estimate.num_inliers)} epipolar lines; predicted error of F"
     outliers = estimate.num_matches - estimate.num_inliers
-    above = (
-        f"Image 1: {estimate.num_inliers} inliers and their motion in blue, {outliers} outliers in red\n"
-        f"Image 2: {shown}: typically {estimate.predicted_error:.2f} px"
-    )
+    above = f"Image 1: {estimate.num_inliers} inliers and their motion in blue, {outliers} outliers in red\n"
+    above += f"Image 2: {shown}: typically {estimate.predicted_error:.2f} px"
     below = [f"Warning ({warning.code}): {warning.text}." for warning in estimate.warnings]
     below = [line for text in below for line in textwrap.wrap(text, COLUMNS)]
     figure, (axes1, axes2) = _panels((image1, image2), (estimate.size1, estimate.size2), LINE * (3 + len(below)))
@@ -135,12 +134,10 @@ def blend_images(image1: Pixels, image2: Pixels, estimate: PairEstimate) -> Pixe
 
 
 def _draw_lines(axes: Axes, estimate: PairEstimate) -> None:
-    rows = torch.nonzero(estimate.inliers).flatten().numpy()
-    chosen = np.random.default_rng(0).permutation(rows)[:NUM_LINES]
-    points1, points2 = estimate.points1[chosen].numpy(), estimate.points2[chosen].numpy()
-    lines = np.pad(points1, ((0, 0), (0, 1)), constant_values=1.0) @ estimate.matrix.numpy().T
+    chosen = np.random.default_rng(0).permutation(np.flatnonzero(estimate.inliers))[:NUM_LINES]
+    lines = convert_points_to_homogeneous(estimate.points1[chosen]) @ estimate.matrix.mT
     hues = np.linspace(0, 1, len(chosen), endpoint=False)
-    rgb = import_matplotlib().colors.hsv_to_rgb(np.stack([hues, np.full_like(hues, 0.6), np.ones_like(hues)], 1))
-    for line, color in zip(lines, rgb, strict=True):
-        draw_line(axes, line, color=color, linewidth=1.0)
-    axes.scatter(points2[:, 0], points2[:, 1], s=20, c=rgb, edgecolors="black", linewidths=0.7, zorder=3)
+    colours = [import_matplotlib().colors.hsv_to_rgb((hue, 0.6, 1.0)) for hue in hues]
+    for line, colour in zip(lines.numpy(), colours, strict=True):
+        draw_line(axes, line, color=colour, linewidth=1.0)
+    axes.scatter(*estimate.points2[chosen].mT, s=20, c=colours, edgecolors="black", linewidths=0.7, zorder=3)
