@@ -17,10 +17,9 @@ from kornia_learnnorm.protocol import INLIER_THRESHOLD
 from kornia_learnnorm.ransac.ransac import RANSAC
 from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view import predicted_error
-from kornia_learnnorm.two_view.camera_check import find_camera_doubt
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.model_choice import choose_model
-from kornia_learnnorm.two_view.pair_warnings import PairWarning, find_warnings
+from kornia_learnnorm.two_view.pair_warnings import PairWarning, find_camera_doubt, find_warnings
 from kornia_learnnorm.two_view.plane_pose import angle_between, plane_poses
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver

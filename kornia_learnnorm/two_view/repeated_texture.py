@@ -15,8 +15,7 @@ from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
-from kornia_learnnorm.two_view.camera_check import drop_contradiction
-from kornia_learnnorm.two_view.pair_warnings import MIN_INLIERS, PairWarning
+from kornia_learnnorm.two_view.pair_warnings import MIN_INLIERS, PairWarning, drop_contradiction
 from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX, find_main_plane, parallax, parallax_evidence
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 

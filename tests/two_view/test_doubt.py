@@ -13,7 +13,7 @@ from scenes import seeded
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
-from kornia_learnnorm.two_view import camera_check, predicted_error
+from kornia_learnnorm.two_view import pair_warnings, predicted_error
 from kornia_learnnorm.two_view.pair_warnings import find_warnings, log_false_alarms, log_false_samples
 
 
@@ -148,7 +148,9 @@ def test_warnings_of_an_estimate():
         warned = [warning.text for warning in found.warnings if warning.code == "cameras"]
         assert len(warned) == (text is not None)
         assert text is None or text in warned[0]
-        assert len(camera_check.drop_contradiction(found.warnings)) == len(found.warnings) - ("contradict" in str(text))
+        assert len(pair_warnings.drop_contradiction(found.warnings)) == len(found.warnings) - (
+            "contradict" in str(text)
+        )
 
 
 def test_principal_points():
@@ -160,7 +162,7 @@ def test_principal_points():
         ((320, 500), True),  # outside
     ]:
         camera = torch.tensor([[600.0, 0, centre[0]], [0, 600, centre[1]], [0, 0, 1]])
-        doubt = camera_check.find_camera_doubt((K, camera), (None, (640, 480)), *POINTS, None, 1.0)
+        doubt = pair_warnings.find_camera_doubt((K, camera), (None, (640, 480)), *POINTS, None, 1.0)
         assert ["K2" in warning.text for warning in doubt] == [True] * expected
 
 
@@ -172,13 +174,13 @@ class TestCameraMisfit:
         tied = kln.refine_essential(*points, E_mat, *cameras).F_mat
         free = kln.refine_fundamental(*points, F_MAT[None]).F_mat
         more, less = (kln.sampson_distance(*points, F_mat)[0].square() for F_mat in (tied, free))
-        found, log_chance = camera_check.camera_misfit(*POINTS, F_MAT, 30.0, cameras)  # so that all count alike
+        found, log_chance = pair_warnings.camera_misfit(*POINTS, F_MAT, 30.0, cameras)  # so that all count alike
         medians = (more.median() - less.median()).item() / 0.455
         assert found == pytest.approx(min((more - less).mean().item(), medians) ** 0.5, rel=0.05)
         assert log_chance < -20
 
     def test_grows_with_the_error_of_the_focal_length(self):
-        found = [camera_check.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(f),) * 2) for f in (1.0, 1.1, 1.2, 1.4)]
+        found = [pair_warnings.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(f),) * 2) for f in (1.0, 1.1, 1.2, 1.4)]
         assert found == sorted(found, key=lambda pair: (pair[0], -pair[1]))
         assert found[0][1] > -3
 
@@ -186,17 +188,17 @@ class TestCameraMisfit:
         """A third as many, of another motion."""
         other = handheld(1, 100, seeded(5), noise=0.3)
         points = (torch.cat([x, y[0]]) for x, y in zip(POINTS, (other.points1, other.points2), strict=True))
-        assert camera_check.camera_misfit(*points, F_MAT, 1.0, (K, K))[0] < 0.03
+        assert pair_warnings.camera_misfit(*points, F_MAT, 1.0, (K, K))[0] < 0.03
 
     def test_few_matches_tell_nothing(self):
         cameras = (with_focal(1.4),) * 2
-        assert camera_check.camera_misfit(*(x[:12] for x in POINTS), F_MAT, 1.0, cameras)[1] > -3
-        assert camera_check.camera_misfit(*(x[:8] for x in POINTS), F_MAT, 1e-6, cameras) == (0.0, 0.0)
+        assert pair_warnings.camera_misfit(*(x[:12] for x in POINTS), F_MAT, 1.0, cameras)[1] > -3
+        assert pair_warnings.camera_misfit(*(x[:8] for x in POINTS), F_MAT, 1e-6, cameras) == (0.0, 0.0)
 
     @given(scale=st.floats(0.2, 5))
     def test_has_the_unit_of_the_points(self, scale):
         S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
         F_mat = torch.linalg.inv(S) @ F_MAT @ torch.linalg.inv(S)
-        found = camera_check.camera_misfit(*(scale * x for x in POINTS), F_mat, scale, (S @ with_focal(1.3),) * 2)
-        misfit, log_chance = camera_check.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(1.3),) * 2)
+        found = pair_warnings.camera_misfit(*(scale * x for x in POINTS), F_mat, scale, (S @ with_focal(1.3),) * 2)
+        misfit, log_chance = pair_warnings.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(1.3),) * 2)
         assert found == pytest.approx((scale * misfit, log_chance), rel=1e-3)
