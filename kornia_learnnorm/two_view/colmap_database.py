@@ -51,8 +51,7 @@ class DatabaseCounts(NamedTuple):
 class _Pair(NamedTuple):
     names: tuple[str, str]
     sizes: tuple[Size, Size]  # (width, height)
-    points1: Array  # (N, 2)
-    points2: Array
+    points: tuple[Array, Array]  # (N, 2) in each image
     scores: Array  # (N,)
 
 
@@ -72,7 +71,6 @@ def export_colmap(
     layer: LearnedEightPoint | None = None,
     threshold: float = THRESHOLD,
     seed: int = 0,
-    ratio: float = RATIO,
     turned: bool = True,
     jobs: int = -1,
 ) -> DatabaseCounts:
@@ -84,7 +82,8 @@ def export_colmap(
     ``colmap mapper`` reconstruct from the database.
 
     Args:
-        store: matches of images at full size; of two pairs of the same images, the first counts.
+        store: matches of images at full size, of which those that fail the ratio test are left out; of two pairs of the
+            same images, the first counts.
         images: folder that the names in the store start from.
         path: the database to write; there must be none yet.
         K: camera (3, 3) of all images, pixels, without distortion. When not given, COLMAP derives cameras from EXIF, or
@@ -93,7 +92,6 @@ def export_colmap(
         layer: estimates the fundamental matrix in the place of RANSAC.
         threshold: RANSAC's largest symmetric epipolar distance, pixels; inliers are the matches within twice of it.
         seed: seed of RANSAC.
-        ratio: largest ratio of the nearest to the second-nearest descriptor distance, of matches that have one.
         turned: whether the points are those of images turned by EXIF, as a store has them, or of the files as they are,
             as hloc and COLMAP read them.
         jobs: number of processes, -1 for one a core.
@@ -115,7 +113,7 @@ def export_colmap(
     if missing := [name for name in names if not (images / name).is_file()]:
         raise FileNotFoundError(f"{len(missing)} of {len(names)} images are not in {images}, the first is {missing[0]}")
     camera = None if K is None else K + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]])
-    pairs = _read_pairs(store, images, ratio, turned)
+    pairs = _read_pairs(store, images, turned)
     with atomic_write(path) as temporary:
         ids = _write_images(pycolmap, temporary, images, pairs, camera, single_camera)
         arguments = ((pair, layer, threshold, seed, camera) for pair in pairs)
@@ -135,18 +133,17 @@ def check_database(path: Path) -> None:
     check_target(path)
 
 
-def _read_pairs(store: CorrespondenceStore, images: Path, ratio: float, turned: bool) -> list[_Pair]:
+def _read_pairs(store: CorrespondenceStore, images: Path, turned: bool) -> list[_Pair]:
     """Return the pairs of a store, each two images once, in pixels of the files as they are."""
     pairs: dict[frozenset[str], _Pair] = {}
     for place, names in enumerate(store.names):
-        rows = store.rows(place, ratio)
+        rows = store.rows(place, RATIO)
         (points1, size1), (points2, size2) = [
             stored_pixels(images / name, points[rows], size, turned)
             for name, points, size in zip(names, (store.points1, store.points2), store.image_size[place], strict=True)
         ]
-        scores = store.score[rows].astype(np.float64)
-        pair = _Pair(names, (size1, size2), points1 + CORNER, points2 + CORNER, scores)
-        pairs.setdefault(frozenset(names), pair)
+        points, scores = (points1 + CORNER, points2 + CORNER), store.score[rows].astype(np.float64)
+        pairs.setdefault(frozenset(names), _Pair(names, (size1, size2), points, scores))
     return [*pairs.values()]
 
 
@@ -156,7 +153,7 @@ def _estimate(
     """Return the geometry of a pair, or None where too few matches agree."""
     if len(pair.scores) < MIN_INLIERS:
         return None
-    points1, points2, scores = (torch.from_numpy(value) for value in (pair.points1, pair.points2, pair.scores))
+    points1, points2, scores = map(torch.from_numpy, (*pair.points, pair.scores))
     K = None if camera is None else torch.from_numpy(camera)
     options: dict[str, Any] = {"inl_th": threshold, "distance": "symmetric", "seed": seed}
     matches = points1, points2, scores.clamp(min=MIN_SCORE)
@@ -215,7 +212,7 @@ def _write_pairs(
     """Write keypoints, which are all matched points of an image, matches and geometries to a database."""
     seen: defaultdict[str, list[Array]] = defaultdict(list)
     for pair in pairs:
-        for name, points in zip(pair.names, (pair.points1, pair.points2), strict=True):
+        for name, points in zip(pair.names, pair.points, strict=True):
             seen[name].append(points)
     keypoints = {name: np.unique(np.concatenate(parts), axis=0) for name, parts in seen.items()}
     places = {name: {tuple(point): n for n, point in enumerate(points.tolist())} for name, points in keypoints.items()}
@@ -224,8 +221,7 @@ def _write_pairs(
         for name, points in keypoints.items():
             file.write_keypoints(ids[name], points.astype(np.float32))
         for pair, found in zip(pairs, geometries, strict=True):
-            numbers = ids[pair.names[0]], ids[pair.names[1]]
-            views = zip(pair.names, (pair.points1, pair.points2), strict=True)
+            numbers, views = [ids[name] for name in pair.names], zip(pair.names, pair.points, strict=True)
             columns = [[places[name][tuple(point)] for point in points.tolist()] for name, points in views]
             matches = np.array(columns, np.uint32).T
             file.write_matches(*numbers, matches)

@@ -164,7 +164,9 @@ def distances_from_plane(
     minimise Geman and McClure's loss at the scale of the threshold, from the given ones on. Points that are moved to
     infinity are infinitely far.
     """
-    T1, T2 = _from_pixels(size1), _from_pixels(size2)
+    sizes = torch.tensor([size1, size2]).double()
+    # To halves of the diagonal, from the centre.
+    T1, T2 = affine_transform(torch.eye(2).double() / (sizes.norm(dim=1) / 2)[:, None, None], sizes / 2)
     x1, x2 = (T @ convert_points_to_homogeneous(x).mT[None] for T, x in ((T1, points1), (T2, points2)))
     H = T2 @ H @ torch.linalg.inv(T1)
     start = _Parameters(torch.cat([(H / torch.linalg.matrix_norm(H)).flatten(), H.new_zeros(1)])[None])
@@ -213,8 +215,3 @@ class _BentPlane(Residuals):
         finite = (J.isfinite().all(0) & offsets.isfinite()).all(0)
         offsets, J = torch.where(finite, offsets, AT_INFINITY), torch.where(finite, J, 0.0)
         return offsets.flatten()[None], J.flatten(1)[None]
-
-
-def _from_pixels(size: Size) -> Tensor:
-    """Return the transform (3, 3) from pixels to halves of the diagonal, from the centre."""
-    return affine_transform(2 / math.hypot(*size) * torch.eye(2).double(), torch.tensor(size).double() / 2)
