@@ -73,11 +73,9 @@ def estimate_pair(
         refiner: moves the matches to sub-pixel accuracy before the matrix is estimated.
 
     Raises:
+        NoReliableMatrixError, TypeError, ValueError: as :func:`~kornia_learnnorm.estimate_matches`; the first one too
+            for a blank image, a ValueError for a file that is not an image.
         FileNotFoundError: if a file does not exist.
-        NoReliableMatrixError: if the images do not determine a matrix: a blank image, no motion, or fewer than nine
-            matches or inliers.
-        TypeError: if an argument is not of the kinds above.
-        ValueError: if a file is not an image, an argument is out of range, or there is no second camera.
         ImportError: if OpenCV is not installed.
     """
     check_settings(threshold, seed, layer, model)
