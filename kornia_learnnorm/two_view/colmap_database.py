@@ -178,8 +178,7 @@ def _estimate(
             pose = R[0].numpy(), t[0].numpy()
     if int(on_plane.sum()) > PLANAR_SHARE * number:
         config = "PLANAR_OR_PANORAMIC"
-    arrays = {name: matrix.numpy() for name, matrix in matrices.items()}
-    return _Geometry(config, arrays, pose, inliers.numpy())
+    return _Geometry(config, {name: matrix.numpy() for name, matrix in matrices.items()}, pose, inliers.numpy())
 
 
 def _write_images(
@@ -227,11 +226,9 @@ def _write_pairs(
             file.write_matches(*numbers, matches)
             if found is None:
                 continue
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.config = int(getattr(pycolmap.TwoViewGeometryConfiguration, found.config))
-            geometry.inlier_matches = matches[found.inliers]
-            for name, matrix in found.matrices.items():
-                setattr(geometry, name, matrix)
+            config = int(getattr(pycolmap.TwoViewGeometryConfiguration, found.config))
+            inliers = matches[found.inliers]
+            geometry = pycolmap.TwoViewGeometry(config=config, inlier_matches=inliers, **found.matrices)
             if found.pose is not None:
                 R, t = found.pose
                 geometry.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(R), t)
