@@ -50,10 +50,9 @@ def run(args: argparse.Namespace) -> int:
     estimation = {"layer": layer, "threshold": args.threshold, "seed": args.seed, "jobs": args.jobs}
     store, turned = _matches(args), len(args.matches) != 2
     counts = export_colmap(store, args.root, args.out, K, args.single_camera, turned=turned, **estimation)
-    print(
-        f"wrote {args.out}: {counts.images} images; {counts.verified} of {counts.pairs} pairs verified, "
-        f"{counts.inliers} of {counts.matches} matches are their inliers"
-    )
+    verified = f"{counts.verified} of {counts.pairs} pairs verified"
+    inliers = f"{counts.inliers} of {counts.matches} matches are their inliers"
+    print(f"wrote {args.out}: {counts.images} images; {verified}, {inliers}")
     print(NEXT.format(args.out, args.root), file=sys.stderr)
     return 0
 
@@ -68,7 +67,6 @@ def _matches(args: argparse.Namespace) -> CorrespondenceStore:
     print(f"{len(frames)} images; {len(pairs)} pairs ({pairing})", file=sys.stderr)
     store = args.out.with_suffix(".h5")
     options = MatchOptions(args.detector, args.num_features, args.matcher, max_matches=None)
-    print_skipped(
-        collect_matches(pairs, store, options, {"dataset": str(args.root), "pairs": pairing}, args.jobs, args.dask)
-    )
+    about = {"dataset": str(args.root), "pairs": pairing}
+    print_skipped(collect_matches(pairs, store, options, about, args.jobs, args.dask))
     return read_store(store)

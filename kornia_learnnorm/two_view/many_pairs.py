@@ -139,14 +139,13 @@ def estimate_pairs(
             open_workers(jobs, dask) as workers,
             full_disk_names(folder / RESULTS),
             (folder / RESULTS).open("a", encoding="utf-8") as file,
-            tqdm(total=len(pairs), initial=len(pairs) - len(todo), unit="pair", file=sys.stderr) as bar,
             workers.results(_estimate, ((*pair, options) for pair in todo)) as results,
         ):
-            for pair, line in zip(todo, results, strict=True):
+            shown = tqdm(results, initial=len(pairs) - len(todo), total=len(pairs), unit="pair", file=sys.stderr)
+            for pair, line in zip(todo, shown, strict=True):
                 file.write(json.dumps(line, allow_nan=False) + "\n")
                 file.flush()
                 done[pair] = line
-                bar.update()
         _write_table(folder / TABLE, [done[pair] for pair in pairs])
     return [done[pair] for pair in pairs]
 

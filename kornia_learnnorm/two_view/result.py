@@ -149,10 +149,9 @@ class PairEstimate:
             name, equation, distance = "F", "x2^T F x1 = 0", "symmetric epipolar distance"
             meaning = "typical error of epipolar lines where true matches lie"
         lines = [f"{name} ({equation} in pixels, unit Frobenius norm)", *rows(self.matrix)]
-        if self.R is not None:
-            lines += ["R (X2 = R X1 + t)", *rows(self.R)]
-        lines += ["t (direction)", *rows(self.t[None])] if self.t is not None else []
-        lines += ["n (normal of the plane in camera 1)", *rows(self.n[None])] if self.n is not None else []
+        motion = {"R (X2 = R X1 + t)": self.R, "t (direction)": self.t, "n (normal of the plane in camera 1)": self.n}
+        for text, value in motion.items():
+            lines += [] if value is None else [text, *rows(value.view(-1, 3))]
         ratio = "" if self.ratio is None else f" (ratio test {self.ratio:g})"
         share = self.num_inliers / self.num_matches
         within = f"{distance} < {self.threshold:.3g} px, median {self.median_distance:.2f} px"
