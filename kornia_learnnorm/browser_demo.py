@@ -183,6 +183,7 @@ def example_files() -> tuple[str, str]:
 
 def make_app(detector: str = PairOptions.detector, matcher: str = PairOptions.matcher) -> gr.Blocks:
     """Return the page, which :func:`launch` serves, with a detector and a matcher that are chosen at first."""
+    app: gr.Blocks
     with gr.Blocks(title="Two-view geometry", analytics_enabled=False, delete_cache=CACHE) as app:
         gr.Markdown("# Two-view geometry\nFundamental matrix or homography of two images, with its predicted error.")
         with gr.Row():

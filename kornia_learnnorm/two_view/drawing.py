@@ -140,4 +140,5 @@ def _draw_lines(axes: Axes, estimate: PairEstimate) -> None:
     colours = [import_matplotlib().colors.hsv_to_rgb((hue, 0.6, 1.0)) for hue in hues]
     for line, colour in zip(lines.numpy(), colours, strict=True):
         draw_line(axes, line, color=colour, linewidth=1.0)
-    axes.scatter(*estimate.points2[chosen].mT, s=20, c=colours, edgecolors="black", linewidths=0.7, zorder=3)
+    x, y = estimate.points2[chosen].mT
+    axes.scatter(x, y, s=20, c=colours, edgecolors="black", linewidths=0.7, zorder=3)

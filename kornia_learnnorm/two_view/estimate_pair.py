@@ -119,13 +119,11 @@ class MatchedPair:
             return estimate_matches(points1, points2, scores, *sizes, layer, threshold, seed, K1, K2, model)
 
         try:
-            first = solve(model, self.points1[self.mutual], self.points2[self.mutual], self.scores[self.mutual])
+            first = solve(model, *(x[self.mutual] for x in (self.points1, self.points2, self.scores)))
         except NoReliableMatrixError as error:
             raise _named(error, (self.path1, self.path2)) from error
-        found, unique = first, 1.0
-        if first.model == "fundamental":
-            unique = mutual_share(self.points1, self.points2, self.mutual, first.matrix, threshold)
-        if unique < MIN_MUTUAL_SHARE:
+        found, given = first, (self.points1, self.points2, self.mutual)
+        if first.model == "fundamental" and mutual_share(*given, first.matrix, threshold) < MIN_MUTUAL_SHARE:
             false = self.points1[~self.mutual], self.points2[~self.mutual]
             matches = first.points1, first.points2, first.scores
             found = resolve_ambiguity(first, *false, lambda kept: solve("fundamental", *(x[kept] for x in matches)))
@@ -164,27 +162,28 @@ def match_two_images(
         raise TypeError(f"refiner must be a MatchRefiner or None, got {type(refiner).__name__}")
     path1, path2 = (Path(image) if isinstance(image, str | Path) else None for image in (image1, image2))
     colour = detector in READS_COLOUR
-    pixels, full_sizes = zip(*(_pixels(image, max_size, colour) for image in (image1, image2)), strict=True)
-    features = [_features(*view, detector) for view in zip(pixels, full_sizes, (mask1, mask2), strict=True)]
-    for number, found in enumerate(features, 1):
-        if len(found.points) < 2:
-            text = f"image {number} is blank, nearly so, or masked: {len(found.points)} features, expected 2 or more"
+    (pixels1, full_size1), (pixels2, full_size2) = (_pixels(image, max_size, colour) for image in (image1, image2))
+    features1 = _features(pixels1, full_size1, mask1, detector)
+    features2 = _features(pixels2, full_size2, mask2, detector)
+    for number, features in enumerate((features1, features2), 1):
+        if len(features.points) < 2:
+            text = f"image {number} is blank, nearly so, or masked: {len(features.points)} features, expected 2 or more"
             raise _named(NoReliableMatrixError("blank", text), (path1, path2))
     limit: float | None = None
     if matcher == "nearest":
-        matches, back = match_both_ways(*features)
+        matches, back = match_both_ways(features1, features2)
         limit, kept = float(ratio), matches.ratio.double() < ratio
         points1, points2, ratios = (x[kept].double() for x in (*matches[:2], torch.maximum(matches.ratio, back)))
         scores, mutual = 1 - ratios, ratios < ratio
     else:
-        points1, points2, scores = (part.double() for part in match_lightglue(*features, detector))
+        points1, points2, scores = (part.double() for part in match_lightglue(features1, features2, detector))
         mutual = torch.ones_like(scores, dtype=torch.bool)
     if refiner is not None:
-        views = (torch.from_numpy(np.atleast_3d(values)).permute(2, 0, 1)[None] for values in pixels)
+        views = (torch.from_numpy(np.atleast_3d(values)).permute(2, 0, 1)[None] for values in (pixels1, pixels2))
         with torch.no_grad():
             moved = refiner(*views, points1[None], points2[None])
         points1, points2 = moved.points1[0], moved.points2[0]
-    sizes = (*(found.size for found in features), *full_sizes)
+    sizes = features1.size, features2.size, full_size1, full_size2
     return MatchedPair(points1, points2, scores, mutual, *sizes, limit, path1, path2)
 
 
