@@ -54,11 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--max-size", metavar="PX", type=int, default=options.max_size, help=f"longer side of the images {default}")
     passes = f"passes of MatchRefiner, 2 for XFeat {default}"
     add("--refine", metavar="PASSES", type=int, default=options.refine, help=passes)
-    mask = "one or two: features count where it is white"
-    add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help=mask)
+    add("--mask", metavar="FILE", type=Path, nargs="+", default=[], help="one or two: features count where it is white")
     many = parser.add_argument_group("many pairs")
-    listed = "two files a line, or a folder; results in --out"
-    many.add_argument("--pairs", metavar="LIST", type=Path, help=listed)
+    many.add_argument("--pairs", metavar="LIST", type=Path, help="two files a line, or a folder; results in --out")
     add = many.add_mutually_exclusive_group().add_argument
     add("--gap", metavar="N", type=int, default=1, help=f"of a folder: images N apart {default}")
     add("--exhaustive", dest="gap", action="store_const", const=None, help="of a folder: all pairs")

@@ -122,13 +122,11 @@ def _panels(images: Sequence[Pixels], sizes: Sequence[tuple[int, int]], margin: 
 def blend_images(image1: Pixels, image2: Pixels, estimate: PairEstimate) -> Pixels:
     """Return the mean of image 2 and image 1 moved by the homography, RGB; image 2 alone where image 1 ends."""
     colours = [np.broadcast_to(np.atleast_3d(image), (*image.shape[:2], 3)) for image in (image1, image2)]
-    S1, S2 = (
-        scaling(full, (image.shape[1], image.shape[0]))
-        for full, image in ((estimate.size1, image1), (estimate.size2, image2))
-    )
+    (height1, width1), (height2, width2) = image1.shape[:2], image2.shape[:2]
+    S1, S2 = scaling(estimate.size1, (width1, height1)), scaling(estimate.size2, (width2, height2))
     H_mat = (S2 @ estimate.matrix @ torch.linalg.inv(S1)).numpy()
-    covered = np.dstack([colours[0], np.full(image1.shape[:2], 255, np.uint8)])
-    moved = import_cv2().warpPerspective(covered, H_mat, image2.shape[1::-1])
+    covered = np.dstack([colours[0], np.full((height1, width1), 255, np.uint8)])
+    moved = import_cv2().warpPerspective(covered, H_mat, (width2, height2))
     share = moved[..., 3:] / 510
     return np.asarray(share * moved[..., :3] + (1 - share) * colours[1], np.uint8)
 
