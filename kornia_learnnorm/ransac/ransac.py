@@ -30,7 +30,7 @@ FIRST_BATCH = 64  # samples in the first batch; each batch is four times as larg
 MAX_BATCH = 1024  # samples in a batch
 MAX_SCORED = 4096  # correspondences that hypotheses are scored on, drawn once
 POOL_SIZE = 12  # best hypotheses of a batch, which local optimisation fits, and of all, which the final fit does
-CONFIDENCE, CALIBRATED_CONFIDENCE = 0.999999, 0.9999  # unless another one is asked for
+CONFIDENCE, CALIBRATED_CONFIDENCE = 0.999999, 0.999  # unless another one is asked for
 Cameras = tuple[Tensor, Tensor]
 
 
@@ -78,7 +78,7 @@ class RANSAC(nn.Module):
             result depends on the machine.
         confidence: probability, in :math:`(0, 1]`, that sampling does not stop before a sample without outliers, if the
             best matrix so far has found all inliers; 1 draws all ``max_samples`` samples. By default 0.999999, since a
-            sample must not have much noise either, and 0.9999 with cameras, which leave noise less room.
+            sample must not have much noise either, and 0.999 with cameras, which leave noise less room.
         distance: ``"sampson"``, or ``"symmetric"`` (Fan et al., Eq. 7).
         rank2: how the singularity constraint is enforced on samples of eight: ``"projection"`` in the normaliser's
             coordinates (Hartley's when not given), the default with a ``normalizer``, or ``"optimal"`` correction.

@@ -10,6 +10,8 @@ from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import sampson_distance
+from kornia_learnnorm.geometry.pose import relative_pose
+from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.two_view.inputs import Cameras
@@ -22,6 +24,7 @@ SEARCH_SAMPLES = 50_000  # minimal samples of a search that finds nothing
 MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of random models with as much support
 MIN_MISFIT = 5e-5  # of the largest coordinate, about the longer side; photographs called undistorted have up to 3e-5
 MAX_LOG_CHANCE_MISFIT = -3.0  # log10 of the probability that noise alone adds as much
+MIN_POSE_CHANGE = 5.0  # degrees; a lens that distorts a little contradicts its camera too, and does less harm
 CONTRADICTION = "the matches contradict K1 and K2"
 MAX_OFFSET = 0.2  # of both sides of an image; a principal point is closer to the centre
 
@@ -114,10 +117,10 @@ def find_camera_doubt(
             return (PairWarning("cameras", f"{text}: {name} may be that of another image size"),)
     if F_mat is None:
         return ()
-    misfit, log_chance = camera_misfit(points1, points2, F_mat, threshold, cameras)
-    if misfit < MIN_MISFIT * float(points2.max()) or log_chance > MAX_LOG_CHANCE_MISFIT:
+    misfit, log_chance, angle = camera_misfit(points1, points2, F_mat, threshold, cameras)
+    if misfit < MIN_MISFIT * float(points2.max()) or log_chance > MAX_LOG_CHANCE_MISFIT or angle < MIN_POSE_CHANGE:
         return ()
-    return (PairWarning("cameras", f"{CONTRADICTION}, which add {misfit:.2f} px to their epipolar distances"),)
+    return (PairWarning("cameras", f"{CONTRADICTION}: without them the pose differs by {angle:.0f} degrees"),)
 
 
 def drop_contradiction(warnings: tuple[PairWarning, ...]) -> tuple[PairWarning, ...]:
@@ -127,11 +130,13 @@ def drop_contradiction(warnings: tuple[PairWarning, ...]) -> tuple[PairWarning, 
 
 def camera_misfit(
     points1: Tensor, points2: Tensor, F_mat: Tensor, threshold: float, cameras: Cameras
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """Return the root mean square distance that cameras add to matches (N, 2), pixels, and log10 of its probability.
 
-    It is the difference between the essential matrix next to F_mat (3, 3) and the fundamental matrix next to it. Only
-    matches that agree with the cameras count, and the median must grow as much as the mean: false matches may agree on
+    The third number is the angle by which they change rotation or translation, degrees.
+
+    Compared are the essential matrix next to F_mat (3, 3) and the fundamental matrix next to it. Only matches that
+    agree with the cameras count, and the median distance must grow as much as the mean: false matches may agree on
     another matrix. Noise alone makes the likelihood ratio of both matrices twice an F-distributed number of 2, for as
     many more parameters, and :math:`m` degrees of freedom: it is above :math:`2x` with probability
     :math:`(1 + 2x / m)^{-m / 2}`.
@@ -141,7 +146,7 @@ def camera_misfit(
     near = sampson_distance(x1, x2, refine_essential(x1, x2, E_mat, *cameras, loss=loss).F_mat)[0] < threshold
     freedom = int(near.sum()) - Fundamental.dof
     if freedom < 2:
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     x1, x2 = x1[:, near], x2[:, near]
     tied = refine_essential(x1, x2, E_mat, *cameras, loss=loss)
     free = refine_fundamental(x1, x2, tied.F_mat, loss=loss)
@@ -149,4 +154,7 @@ def camera_misfit(
     added = max(0.0, float(tied.cost - free.cost)) / freedom
     noise = max(median2 / MEDIAN_SQUARE, (MIN_NOISE * threshold) ** 2)
     misfit = min(added, max(0.0, median1 - median2) / MEDIAN_SQUARE)
-    return math.sqrt(misfit), -freedom / 2 * math.log10(1 + added / noise)
+    K1, K2 = (K[None] for K in cameras)
+    poses = [relative_pose(F_mat, K1, K2, x1, x2) for F_mat in (free.F_mat, tied.F_mat)]
+    angle = pose_error(*poses[0], *poses[1]).nan_to_num(nan=180.0, posinf=180.0).item()
+    return math.sqrt(misfit), -freedom / 2 * math.log10(1 + added / noise), angle

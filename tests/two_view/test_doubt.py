@@ -13,6 +13,7 @@ from scenes import seeded
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
+from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view import pair_warnings, predicted_error
 from kornia_learnnorm.two_view.pair_warnings import find_warnings, log_false_alarms, log_false_samples
 
@@ -173,14 +174,16 @@ class TestCameraMisfit:
         tied = kln.refine_essential(*points, E_mat, *cameras).F_mat
         free = kln.refine_fundamental(*points, F_MAT[None]).F_mat
         more, less = (kln.sampson_distance(*points, F_mat)[0].square() for F_mat in (tied, free))
-        found, log_chance = pair_warnings.camera_misfit(*POINTS, F_MAT, 30.0, cameras)  # so that all count alike
+        found, log_chance, angle = pair_warnings.camera_misfit(*POINTS, F_MAT, 30.0, cameras)  # so that all count alike
         medians = (more.median() - less.median()).item() / 0.455
         assert found == pytest.approx(min((more - less).mean().item(), medians) ** 0.5, rel=0.05)
         assert log_chance < -20
+        poses = [kln.relative_pose(F_mat, *(K[None] for K in cameras), *points) for F_mat in (tied, free)]
+        assert angle == pytest.approx(pose_error(*poses[0], *poses[1]).item(), abs=0.2)
 
     def test_grows_with_the_error_of_the_focal_length(self):
         found = [pair_warnings.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(f),) * 2) for f in (1.0, 1.1, 1.2, 1.4)]
-        assert found == sorted(found, key=lambda pair: (pair[0], -pair[1]))
+        assert found == sorted(found, key=lambda triple: (triple[0], -triple[1], triple[2]))
         assert found[0][1] > -3
 
     def test_false_matches_that_agree_do_not_count(self):
@@ -190,14 +193,14 @@ class TestCameraMisfit:
         assert pair_warnings.camera_misfit(*points, F_MAT, 1.0, (K, K))[0] < 0.03
 
     def test_few_matches_tell_nothing(self):
-        cameras = (with_focal(1.4),) * 2
-        assert pair_warnings.camera_misfit(*(x[:12] for x in POINTS), F_MAT, 1.0, cameras)[1] > -3
-        assert pair_warnings.camera_misfit(*(x[:8] for x in POINTS), F_MAT, 1e-6, cameras) == (0.0, 0.0)
+        options = F_MAT, 1.0, (with_focal(1.4),) * 2
+        assert pair_warnings.camera_misfit(*(x[:12] for x in POINTS), *options)[1] > -3
+        assert pair_warnings.camera_misfit(*(x[:8] for x in POINTS), *options) == (0.0, 0.0, 0.0)
 
     @given(scale=st.floats(0.2, 5))
     def test_has_the_unit_of_the_points(self, scale):
         S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
         F_mat = torch.linalg.inv(S) @ F_MAT @ torch.linalg.inv(S)
         found = pair_warnings.camera_misfit(*(scale * x for x in POINTS), F_mat, scale, (S @ with_focal(1.3),) * 2)
-        misfit, log_chance = pair_warnings.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(1.3),) * 2)
-        assert found == pytest.approx((scale * misfit, log_chance), rel=1e-3)
+        misfit, *others = pair_warnings.camera_misfit(*POINTS, F_MAT, 1.0, (with_focal(1.3),) * 2)
+        assert found == pytest.approx((scale * misfit, *others), rel=1e-3)

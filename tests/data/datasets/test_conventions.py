@@ -30,8 +30,7 @@ def test_a_point_of_the_world_projects_through_every_camera(kitti):
     frame = read_kitti(kitti, ["00"], "image_2")[0]
     point = np.array([0.2, -0.4, 3.0])
     world = R @ point + t
-    through = frame.K @ (np.linalg.inv(frame.pose) @ [*world, 1])[:3]
-    assert np.allclose(through, P @ [*point, 1])
+    assert np.allclose(frame.K @ (np.linalg.inv(frame.pose) @ [*world, 1])[:3], P @ [*point, 1])
 
 
 def test_frames_are_in_order_of_their_numbers(kitti):

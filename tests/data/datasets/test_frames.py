@@ -81,8 +81,7 @@ class TestReadFrame:
         assert image.shape == size[::-1]
         rays = np.linalg.solve(SMALL_CAMERA, np.column_stack([self.GRID, np.ones(len(self.GRID))]).T)
         want = (frame.K @ rays)[:2].T
-        reach = int(14 * max(size[0] / 240, size[1] / 180))
-        assert np.abs(centroids(image, want, reach) - want).max() < 0.05
+        assert np.abs(centroids(image, want, int(14 * max(size[0] / 240, size[1] / 180))) - want).max() < 0.05
 
     def test_wrong_size_or_camera(self, tmp_path):
         with pytest.raises(ValueError, match="positive width and height, got 5 x -1"):
