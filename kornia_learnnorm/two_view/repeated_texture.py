@@ -94,7 +94,7 @@ def resolve_ambiguity(
 
 
 def _agree(first: PairEstimate, second: PairEstimate, H: Tensor) -> bool:
-    """Return whether most inliers of either matrix off the plane of a homography, if there are any, fit the other."""
+    """Return whether most inliers of either matrix off the plane of a homography fit the other; false without any."""
     for own, other in ((first, second), (second, first)):
         points1, points2 = own.points1[own.inliers], own.points2[own.inliers]
         off = parallax(points1, points2, H) > PARALLAX * own.threshold
