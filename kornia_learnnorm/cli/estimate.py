@@ -164,8 +164,8 @@ def _check_options(args: argparse.Namespace) -> None:
     if args.pairs is not None:
         _check_many(args)
         return
-    defaults = {"jobs": -1, "dask": None, "gap": 1}
-    if many := [f"--{name}" for name, default in defaults.items() if getattr(args, name) != default]:
+    defaults = {"jobs": -1, "dask": None, "gap or --exhaustive": 1}
+    if many := [f"--{name}" for name, default in defaults.items() if getattr(args, name.split()[0]) != default]:
         raise ValueError(f"{' and '.join(many)}: only for --pairs LIST, which was not given")
     if len(args.images) != 2:
         raise ValueError(f"two image files expected, got {len(args.images)}; --pairs LIST for many")

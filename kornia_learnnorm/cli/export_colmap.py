@@ -18,7 +18,8 @@ from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database,
 EXAMPLES = """\
 learnnorm export-colmap PHOTOS --out photos.db --single-camera
 learnnorm export-colmap PHOTOS --out photos.db --matches photos.h5"""
-NEXT = "to reconstruct: python -c \"import pycolmap; pycolmap.incremental_mapping('{}', '{}', 'sparse')\""
+NEXT = "to reconstruct: python -c \"import pycolmap; pycolmap.incremental_mapping('{}', '{}', 'sparse'{})\""
+KEEP_CAMERA = ", pycolmap.IncrementalPipelineOptions(ba_refine_focal_length=False)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +54,9 @@ def run(args: argparse.Namespace) -> int:
     verified = f"{counts.verified} of {counts.pairs} pairs verified"
     inliers = f"{counts.inliers} of {counts.matches} matches are their inliers"
     print(f"wrote {args.out}: {counts.images} images; {verified}, {inliers}")
-    print(NEXT.format(args.out, args.root), file=sys.stderr)
+    if counts.unverified:
+        print(f"no verified pair: {', '.join(counts.unverified)}", file=sys.stderr)
+    print(NEXT.format(args.out, args.root, "" if K is None else KEEP_CAMERA), file=sys.stderr)
     return 0
 
 

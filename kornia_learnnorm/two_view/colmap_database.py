@@ -46,6 +46,7 @@ class DatabaseCounts(NamedTuple):
     matches: int
     verified: int  # pairs with a two-view geometry
     inliers: int  # of the verified pairs
+    unverified: tuple[str, ...]  # names of the images without a verified pair
 
 
 class _Pair(NamedTuple):
@@ -120,9 +121,10 @@ def export_colmap(
         with open_workers(jobs) as workers, workers.results(_estimate, arguments) as results:
             found = [*tqdm(results, "estimating", len(pairs), unit="pair", file=sys.stderr)]
         _write_pairs(pycolmap, temporary, ids, pairs, found)
-    inliers = [int(geometry.inliers.sum()) for geometry in found if geometry is not None]
-    matches = sum(len(pair.scores) for pair in pairs)
-    return DatabaseCounts(len(ids), len(pairs), matches, len(inliers), sum(inliers))
+    verified = [(pair, geometry) for pair, geometry in zip(pairs, found, strict=True) if geometry is not None]
+    unverified = tuple(sorted(ids.keys() - {name for pair, _ in verified for name in pair.names}))
+    matches, inliers = sum(len(pair.scores) for pair in pairs), sum(int(part.inliers.sum()) for _, part in verified)
+    return DatabaseCounts(len(ids), len(pairs), matches, len(verified), inliers, unverified)
 
 
 def check_database(path: Path) -> None:

@@ -13,6 +13,7 @@ from kornia_learnnorm.estimators.learned import LearnedEightPoint
 from kornia_learnnorm.geometry.checks import check_cameras, check_choice
 
 MODELS = ("auto", "fundamental", "homography")
+MAX_THRESHOLD = 1000.0  # pixels
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]
 
@@ -34,9 +35,15 @@ def read_matches(points1: Points, points2: Points, scores: Points | None) -> tup
 
 
 def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
-    """Return the cameras (3, 3) of both images in float64, or None where none is given; see ``check_cameras``."""
+    """Return the cameras (3, 3) of both images in float64, or None where none is given.
+
+    Errors are those of ``check_cameras``, and a ValueError for a focal length that is not positive.
+    """
     camera1, camera2 = (None if K is None else _as_float64(name, K) for name, K in (("K1", K1), ("K2", K2)))
     check_cameras(camera1, camera2)
+    for name, camera in (("K1", camera1), ("K2", camera2)):
+        if camera is not None and not bool((camera.diagonal()[:2] > 0).all()):
+            raise ValueError(f"{name} must have positive focal lengths, got {camera.diagonal()[:2].tolist()}")
     return None if camera1 is None or camera2 is None else (camera1, camera2)
 
 
@@ -55,8 +62,8 @@ def read_size(name: str, size: Size | None, points: Tensor) -> Size:
 def check_settings(threshold: float, seed: int, layer: object = None, model: str = "auto") -> None:
     """Raise a clear error for a threshold that is not positive, a seed out of range, or another layer or model."""
     check_number("threshold", threshold)
-    if not 0 < threshold < float("inf"):
-        raise ValueError(f"threshold must be positive and finite, got {threshold:g} px")
+    if not 0 < threshold <= MAX_THRESHOLD:
+        raise ValueError(f"threshold must be positive and at most {MAX_THRESHOLD:g} px, got {threshold:g} px")
     check_number("seed", seed, whole=True)
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed must lie in [0, 2^63), got {seed}")

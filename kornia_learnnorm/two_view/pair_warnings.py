@@ -24,7 +24,7 @@ SEARCH_SAMPLES = 50_000  # minimal samples of a search that finds nothing
 MAX_LOG_FALSE_ALARMS = -2.0  # log10 of the expected number of random models with as much support
 MIN_MISFIT = 5e-5  # of the largest coordinate, about the longer side; photographs called undistorted have up to 3e-5
 MAX_LOG_CHANCE_MISFIT = -3.0  # log10 of the probability that noise alone adds as much
-MIN_POSE_CHANGE = 5.0  # degrees; a lens that distorts a little contradicts its camera too, and does less harm
+MIN_POSE_CHANGE = 3.0  # degrees; a lens that distorts a little contradicts its camera too, and does less harm
 CONTRADICTION = "the matches contradict K1 and K2"
 MAX_OFFSET = 0.2  # of both sides of an image; a principal point is closer to the centre
 

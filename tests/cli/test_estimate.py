@@ -115,7 +115,7 @@ class TestOnePair:
             (["--K", "a", "b", "c"], ValueError, "--K: one value for both images or one for each expected, got 3"),
             (["--estimator", "learned", "--model", "homography"], ValueError, "only for fundamental matrices"),
             (["--dask", "tcp://a:1"], ValueError, "--dask: only for --pairs"),
-            (["--gap", "2"], ValueError, "--gap: only for --pairs"),
+            (["--gap", "2"], ValueError, "--gap or --exhaustive: only for --pairs"),
             (["--pairs", "l.txt", "--json", "-"], ValueError, "cannot be combined with image files and --json$"),
             (["--weights", "robust"], ValueError, "--weights robust: only --estimator learned has weights"),
             ([*MANY, "--out", "list.txt"], ValueError, r"--out list\.txt: a folder expected with --pairs, got a file"),

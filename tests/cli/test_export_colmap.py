@@ -38,6 +38,7 @@ def test_a_folder(photos, tmp_path, capsys, args, pairs):
 def test_matches_are_kept_beside_and_taken_again(photos, tmp_path, capsys):
     out = tmp_path / "photos.db"
     assert main(command(photos, out, "--K", "100,100,80,60")) == 0
+    assert "ba_refine_focal_length=False" in capsys.readouterr().err
     out.unlink()
     assert main(command(photos, out, "--weights", "robust-tiny")) == 0
     assert "photos.h5 exists already" in capsys.readouterr().err

@@ -138,8 +138,7 @@ class TestMaxSize:
         reduced = images.reduced_size(size, max_size)
         assert max(reduced) == min(max(size), max_size)
         assert min(reduced) >= 1
-        wanted = np.array(size) * max(reduced) / max(size)
-        assert np.abs(np.maximum(wanted, 1) - reduced).max() <= 0.5
+        assert np.abs(np.maximum(np.array(size) * max(reduced) / max(size), 1) - reduced).max() <= 0.5
 
     @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="there is no /proc")
     def test_memory_of_a_large_jpeg(self, tmp_path):

@@ -73,7 +73,7 @@ def test_reference(images):
     """Matrices and pose are those of the cameras, in COLMAP's pixels."""
     store = make_store()
     counts, path = export(images, store, K=K)
-    assert counts._replace(inliers=0) == (4, 6, 6 * MATCHES, 6, 0)
+    assert counts._replace(inliers=0) == (4, 6, 6 * MATCHES, 6, 0, ())
     matched, inliers, geometry = read_pair(path)
     rows = slice(2 * MATCHES, 3 * MATCHES)
     np.testing.assert_allclose(matched, [store.points1[rows] + 0.5, store.points2[rows] + 0.5], atol=1e-4)
@@ -134,9 +134,9 @@ def test_cameras_of_its_own(images):
 
 def test_images_that_do_not_match_have_no_geometry(images):
     store = make_store()
-    store.points2[:MATCHES] = np.random.default_rng(2).uniform(0, 480, (MATCHES, 2))
+    store.points2[: 3 * MATCHES] = np.random.default_rng(2).uniform(0, 480, (3 * MATCHES, 2))  # of the first image
     counts, path = export(images, store)
-    assert counts.verified == 5
+    assert (counts.verified, counts.unverified) == (3, (NAMES[0],))
     matched, inliers, geometry = read_pair(path, *NAMES[:2])
     assert (len(matched[0]), len(inliers[0])) == (MATCHES, 0)
     assert geometry.config == pycolmap.TwoViewGeometryConfiguration.UNDEFINED
@@ -145,8 +145,7 @@ def test_images_that_do_not_match_have_no_geometry(images):
 def test_a_pair_that_comes_twice(images):
     store = make_store()
     store.names[5] = NAMES[1], NAMES[0]
-    counts, _ = export(images, store)
-    assert counts.pairs == 5
+    assert export(images, store)[0].pairs == 5
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
