@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from kornia.feature import LightGlue
 from torch import Generator, Tensor, nn
+from tqdm import tqdm
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.images import read_colour
@@ -102,7 +103,7 @@ def train(layer: nn.Module, weigh: nn.Module, pairs: Sequence[Pair], steps: int,
     """Train the weights on random pairs."""
     optimizer, generator = torch.optim.AdamW(weigh.parameters(), 2e-3), Generator().manual_seed(1)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-    for _ in range(steps):
+    for _ in tqdm(range(steps), "training", unit="step", disable=None):
         chosen = torch.randint(len(pairs), (batch,), generator=generator).tolist()
         optimizer.zero_grad()
         halves_loss(layer, weigh, [pairs[i] for i in chosen], generator).backward()
@@ -123,6 +124,7 @@ def read_pairs(lightglue: LightGlue, folders: Sequence[Path]) -> list[Pair]:
     pairs = []
     for neighbours in [list(pairwise(sorted(folder.glob("*.*g")))) for folder in folders]:
         chosen = [neighbours[i] for i in even_pairs(len(neighbours), MAX_PAIRS)]
+        chosen = tqdm(chosen, "matching", unit="pair", disable=None)
         pairs += [match(lightglue, features([read_colour(path, 1024) for path in paths])) for paths in chosen]
     return [pair for pair in pairs if len(pair.points) >= MIN_MATCHES]
 
