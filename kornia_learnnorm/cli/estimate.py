@@ -138,7 +138,9 @@ def _print_pairs(found: list[dict[str, Any]], folder: Path) -> None:
     print(text + (f"; {warned} solved with warnings" if warned else ""))
     for line in failed[:MAX_FAILURES]:
         reasons = "; ".join(f"{warning['text']} ({warning['code']})" for warning in line["warnings"])
-        print(f"failed: {line['image1']['file']} {line['image2']['file']}: {reasons}", file=sys.stderr)
+        names = [line[name]["file"] for name in ("image1", "image2")]
+        named = "" if reasons.startswith(" and ".join(names)) else f"{' '.join(names)}: "
+        print(f"failed: {named}{reasons}", file=sys.stderr)
     if len(failed) > MAX_FAILURES:
         print(f"and {len(failed) - MAX_FAILURES} more: lines of pairs.jsonl whose model is null", file=sys.stderr)
 
