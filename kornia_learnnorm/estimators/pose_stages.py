@@ -182,8 +182,8 @@ def _most_consistent(
     E_mat, own_real = _suggested(spans, (E_mat, real[:, :number]), before)
     E_mat = least_cost(E_mat, own_real, _losses(evidence, model, E_mat, scale), present, 2)
     real = real[:, number:] & used.repeat_interleave(10, 1)
-    half = 5 * samples
-    if is_known_true((real.sum(1) <= half).all()):  # as usual: the others need not be compared
+    half = 5 * samples  # of the candidates
+    if is_known_true((real.sum(1) <= half).all()):  # usually true; the other half is then not scored
         first = real.argsort(dim=1, descending=True, stable=True)[:, :half]
         drawn, real = drawn.gather(1, first[..., None, None].expand(-1, -1, 3, 3)), real.gather(1, first)
     some = evenly_ranked(order, present, MAX_SCORED)

@@ -15,7 +15,7 @@ from kornia_learnnorm.data.synthetic import handheld
 from kornia_learnnorm.data.synthetic.random_matches import random_planes
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view import pair_warnings, predicted_error
-from kornia_learnnorm.two_view.pair_warnings import find_warnings, log_false_alarms, log_false_samples
+from kornia_learnnorm.two_view.pair_warnings import drop_contradiction, find_warnings, log_false_alarms
 
 
 def test_failed_searches_do_not_count():
@@ -94,9 +94,9 @@ def test_false_samples():
     strip, others = 2 * 800 / (640 * 480), 300 - 8
     for inliers in (12, 18, 24):
         terms = [math.comb(others, k) * strip**k * (1 - strip) ** (others - k) for k in range(inliers - 8, others)]
-        value, exact = log_false_samples(300, inliers, 1.0, (640, 480)), math.log10(50_000 * sum(terms))
+        value, exact = pair_warnings.log_false_samples(300, inliers, 1.0, (640, 480)), math.log10(50_000 * sum(terms))
         assert exact < value < exact + 1
-    assert log_false_samples(5, 0, 1.0, (640, 480)) > 0
+    assert pair_warnings.log_false_samples(5, 0, 1.0, (640, 480)) > 0
 
 
 @pytest.mark.parametrize("number", [40, 200])
@@ -141,7 +141,7 @@ def test_warnings_of_an_estimate():
     pytest.importorskip("cv2", reason="OpenCV is not installed")
     for camera, text in [
         (K, None),
-        (with_focal(1.02), None),
+        (with_focal(1.1), None),  # which they contradict too, but the pose hardly changes
         (with_focal(1.5), "the matches contradict K1 and K2"),
         (torch.diag(torch.tensor([2.0, 2, 1])).double() @ K, "the principal point of K1 is at 100% of the width"),
     ]:
@@ -149,8 +149,7 @@ def test_warnings_of_an_estimate():
         warned = [warning.text for warning in found.warnings if warning.code == "cameras"]
         assert len(warned) == (text is not None)
         assert text is None or text in warned[0]
-        kept = pair_warnings.drop_contradiction(found.warnings)
-        assert len(kept) == len(found.warnings) - ("contradict" in str(text))
+        assert len(drop_contradiction(found.warnings)) == len(found.warnings) - ("contradict" in str(text))
 
 
 def test_principal_points():

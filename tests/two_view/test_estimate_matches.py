@@ -175,6 +175,7 @@ def test_wrong_arguments():
         ({"scores": torch.full((9,), 2.0)}, ValueError, "from 0 to 1, got 9 others, the first 2"),
         ({"points1": [[0.0, 1.0]]}, TypeError, r"points1 must be .* got <class 'list'>; numpy\.array\(points1"),
         ({"points1": np.full((9, 2), "a")}, TypeError, "points1 must be .* of <U1"),
+        ({"threshold": -1.0}, ValueError, "threshold must be positive"),
         ({"threshold": 1e9}, ValueError, r"threshold must be positive and at most 1000 px, got 1e\+09 px"),
         ({"K1": torch.eye(3), "K2": -torch.eye(3)}, ValueError, r"K2 must have positive focal .* got \[-1.0, -1.0\]"),
         ({"seed": -1}, ValueError, r"seed must lie in \[0, 2\^63\), got -1"),
