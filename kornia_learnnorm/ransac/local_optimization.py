@@ -21,7 +21,7 @@ FINAL_GAIN = 1e-3  # share of the cost that least squares may leave to gain; abo
 MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
 LM_TOLERANCE = 1e-3  # cosine of distances and derivatives at which it has converged
 MANIFOLD_SCALES = (3.0, 1.5, 1.0, 1.0)  # thresholds of local optimisation's steps on the manifold
-# So many of these steps are so many times longer: bounded losses make all too short but the first, which is from afar.
+# Number of these steps and their relaxation: bounded losses make them too short, but the first one comes from afar.
 MANIFOLD_STEPS = ((1, 1.0), (3, 1.3))
 LM_RELAXATION = 1.4  # of those of Levenberg-Marquardt on the manifold
 POSE_PIXELS = 2.0  # scale at which the pose of a matrix that left the cameras must still fit
