@@ -42,6 +42,8 @@ def correspondences_from_matches(
         matches, scores = _from_mapping(matches)
     if isinstance(matches, Tensor):
         matches, scores = _pairs_of_matches(keypoints1, matches, scores)
+    if not isinstance(matches, Sequence):
+        raise TypeError(f"matches must be a tensor, a list of tensors or a mapping, got {type(matches)}")
     if not len(matches) == len(keypoints1) == len(keypoints2):
         raise ValueError(
             f"matches of every pair are needed, got {len(matches)} for {len(keypoints1)} and {len(keypoints2)} pairs"

@@ -19,12 +19,20 @@ from kornia_learnnorm.ransac.scoring import finite_and_bounded
 from kornia_learnnorm.two_view import predicted_error
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.model_choice import choose_model
-from kornia_learnnorm.two_view.pair_warnings import PairWarning, find_camera_doubt, find_warnings
+from kornia_learnnorm.two_view.pair_warnings import (
+    MAX_LOG_FALSE_ALARMS,
+    PairWarning,
+    find_camera_doubt,
+    find_warnings,
+    log_false_alarms,
+)
 from kornia_learnnorm.two_view.plane_pose import angle_between, plane_poses
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
+MIN_RIVAL_SHARE = 0.6  # of the inliers; as many of the other matches agree on a matrix that may as well be the true one
+MIN_RIVAL_ANGLE = 15.0  # degrees, if its pose differs by more
 # Fields of PairEstimate, those of a pose only where there is one; standard errors; reasons for doubt.
 Answer = tuple[dict[str, Any], predicted_error.PredictedError, tuple[PairWarning, ...]]
 
@@ -132,15 +140,34 @@ def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, siz
     error = predicted_error.predict_error(found.parts, found.part_size, *matches, F_mat, inliers, *cameras)
     weights = inliers.double() if solver.layer is None else found.weights
     fields: dict[str, Any] = {"F_mat": F_mat, "inliers": inliers, "weights": weights}
+    doubts = _find_rival(solver, F_mat, inliers, size2, *cameras)
     if solver.cameras is None:
-        return fields, error, ()
+        return fields, error, doubts
     fields["E_mat"] = nearest_essential(transform_fundamental(F_mat, *cameras)[None])[0]
     K1, K2, x1, x2 = (value[None] for value in (*cameras, *matches))
     R, t = relative_pose(F_mat[None], K1, K2, x1, x2, inliers[None])
     if not bool(R.isfinite().all()):
         text = "the matches do not decide between the four poses of the essential matrix"
-        return fields, error, (PairWarning("no_pose", text),)
-    return fields | {"R": R[0], "t": t[0], "front": in_front(R, t, K1, K2, x1, x2)[0]}, error, ()
+        return fields, error, (*doubts, PairWarning("no_pose", text))
+    return fields | {"R": R[0], "t": t[0], "front": in_front(R, t, K1, K2, x1, x2)[0]}, error, doubts
+
+
+def _find_rival(
+    solver: TwoViewSolver, F_mat: Tensor, inliers: Tensor, size2: Size, K1: Tensor, K2: Tensor
+) -> tuple[PairWarning, ...]:
+    """Return a warning where other matches agree on a matrix of another pose, about as many and more than by chance."""
+    rival, agree = solver.rival(inliers), int(inliers.sum())
+    if rival is None or rival[1] < MIN_RIVAL_SHARE * agree:
+        return ()
+    other, support = rival
+    if log_false_alarms(len(inliers) - agree, support, solver.threshold, size2) > MAX_LOG_FALSE_ALARMS:
+        return ()
+    matches = solver.points1[inliers], solver.points2[inliers]
+    angle = float(predicted_error.pose_angles(F_mat, other[None], *matches, K1, K2))
+    if angle < MIN_RIVAL_ANGLE:
+        return ()
+    text = f"{agree} matches agree on this matrix, {support} others on one whose pose differs by {angle:.0f} degrees"
+    return (PairWarning("ambiguous", text),)
 
 
 def _answer_homography(solver: TwoViewSolver, H_mat: Tensor, F_mat: Tensor | None) -> Answer:

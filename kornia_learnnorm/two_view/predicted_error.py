@@ -63,10 +63,18 @@ def predict_error(
     normal = lines[:, :2]
     x2 = x2 - (((normal * x2).sum(-1) + lines[:, 2]) / normal.square().sum(-1))[:, None] * normal  # onto their lines
     distance = symmetric_epipolar_distance(x1, x2, F_parts).nan_to_num(nan=math.inf).median()
-    matrices = torch.cat([F_mat[None], F_parts])
-    R, t = relative_pose(matrices, *(value.expand(len(matrices), -1, -1) for value in (K1, K2, x1, x2)))
-    angles = pose_error(R[1:], t[1:], R[:1], t[:1]).nan_to_num(nan=180.0)
-    return _scale_to_all(distance, angles, size, len(points1))
+    return _scale_to_all(distance, pose_angles(F_mat, F_parts, x1, x2, K1, K2), size, len(points1))
+
+
+def pose_angles(F_mat: Tensor, others: Tensor, points1: Tensor, points2: Tensor, K1: Tensor, K2: Tensor) -> Tensor:
+    """Return the angles (P,) from the pose of ``F_mat`` (3, 3) to those of ``others`` (P, 3, 3), degrees.
+
+    Each is the larger one of the rotations and of the directions of translation; of the four poses of a matrix, that
+    with most of the matches (N, 2) in front of the cameras counts, and 180 degrees for a matrix without a pose.
+    """
+    matrices = torch.cat([F_mat[None], others])
+    R, t = relative_pose(matrices, *(value.expand(len(matrices), -1, -1) for value in (K1, K2, points1, points2)))
+    return pose_error(R[1:], t[1:], R[:1], t[:1]).nan_to_num(nan=180.0, posinf=180.0)
 
 
 def predict_transfer_error(

@@ -105,8 +105,9 @@ def _agree(first: PairEstimate, second: PairEstimate, H: Tensor) -> bool:
 
 
 def _with_doubt(estimate: PairEstimate, reason: str) -> PairEstimate:
+    others = (warning for warning in estimate.warnings if warning.code != "ambiguous")
     warning = PairWarning("ambiguous", f"{reason}: texture that repeats")
-    return replace(estimate, warnings=(*estimate.warnings, warning))
+    return replace(estimate, warnings=(*others, warning))
 
 
 def coherent_matches(points1: Tensor, points2: Tensor, H: Tensor, threshold: float) -> Tensor:

@@ -104,6 +104,14 @@ class TwoViewSolver:
             F_mat = self._refine(F_mat)
         return Solution(F_mat, weights, F_mat.new_zeros(0, 3, 3), 0)
 
+    def rival(self, inliers: Tensor) -> tuple[Tensor, int] | None:
+        """Return the matrix (3, 3) of the matches that are no inliers, and its support; None where most are inliers."""
+        others = self.part(~inliers)
+        if len(others.scores) < max(MIN_MATCHES, int(inliers.sum())):
+            return None
+        F_mat = others._ransac().F_mat  # noqa: SLF001 (its own class)
+        return F_mat, int(others.support(F_mat))
+
     def improve(self, F_mat: Tensor, F_parts: Tensor) -> Tensor:
         """Return the matrix (3, 3) of all matches, or that of a part (P, 3, 3), refined, where it scores higher."""
         best = self.scorer.best(self.scorer.from_pixels(F_parts), 1)

@@ -98,6 +98,7 @@ def test_wrong_matches_and_scores():
         (FIRST[:1], None, ValueError, "got 1 for 2 and 2 pairs"),
         ([torch.zeros(1, 2)] * 2, None, TypeError, r"integers, got torch\.float32"),
         ([[[0, 0]]] * 2, None, TypeError, "integers, got <class 'list'>"),
+        (None, None, TypeError, "tensor, a list of tensors or a mapping, got <class 'NoneType'>"),
         ([torch.zeros(2, dtype=torch.int64)] * 2, None, ValueError, r"pair 0 .* \[S, 2\], got \[2\]"),
         *(([torch.tensor([pair])] * 2, None, ValueError, "30 and 25 keypoints") for pair in ([0, 25], [-1, 2])),
         (torch.zeros(2, 25, dtype=torch.int64), None, ValueError, r"\[2, 30\] .*, got \[2, 25\]"),

@@ -119,6 +119,13 @@ class TestEstimateMatches:
         found = kln.estimate_matches(*MATCHES, K1=SCENE.K1[0], K2=SCENE.K2[0])
         assert (found.R, found.t, found.front, codes(found)) == (None, None, None, ["no_pose"])
 
+    def test_another_motion(self):
+        """Most matches of the others agree on it, as many as on that of the scene."""
+        other = handheld(1, 160, seeded(2), noise=0.3)
+        points = [torch.cat([x, y[0, :150]]) for x, y in zip(MATCHES, (other.points1, other.points2), strict=True)]
+        ((code, text),) = kln.estimate_matches(*points).warnings
+        assert (code, "others on one whose pose differs by" in text) == ("ambiguous", True)
+
     def test_order_has_no_effect(self):
         scores, order = uniform(200, seed=1), torch.randperm(200, generator=seeded(2))
         first, second = (kln.estimate_matches(*(x[o] for x in (*MATCHES, scores))) for o in (slice(None), order))
@@ -134,13 +141,10 @@ class TestEstimateMatches:
 
     def test_arrays_of_any_number_type(self):
         points = [x.round().numpy() for x in MATCHES]
-        for convert in [
-            lambda points: points.astype(np.int32),
-            lambda points: points[::-1, ::-1].copy()[::-1, ::-1],
-            lambda points: torch.from_numpy(points).int(),
-            lambda points: torch.from_numpy(points).requires_grad_(),
-        ]:
-            read = module.read_matches(*map(convert, points), None)
+        turned = [x[::-1, ::-1].copy()[::-1, ::-1] for x in points]
+        tensors = [[torch.from_numpy(x).int() for x in points], [torch.from_numpy(x).requires_grad_() for x in points]]
+        for given in ([x.astype(np.int32) for x in points], turned, *tensors):
+            read = module.read_matches(*given, None)
             assert all(torch.equal(found, torch.from_numpy(x)) for found, x in zip(read, points, strict=False))
             assert not any(found.requires_grad for found in read)
 
@@ -170,8 +174,7 @@ def test_no_matrix():
 def test_wrong_arguments():
     points = dict(zip(("points1", "points2"), torch.rand(2, 9, 2) * 100, strict=True))
     for changes, error, message in [
-        ({"points1": torch.zeros(9, 3)}, ValueError, "shape"),
-        ({"points2": torch.zeros(8, 2)}, ValueError, "shape"),
+        *(({name: torch.zeros(*s)}, ValueError, "shape") for name, s in (("points1", (9, 3)), ("points2", (8, 2)))),
         ({"scores": torch.full((9,), 2.0)}, ValueError, "from 0 to 1, got 9 others, the first 2"),
         ({"points1": [[0.0, 1.0]]}, TypeError, r"points1 must be .* got <class 'list'>; numpy\.array\(points1"),
         ({"points1": np.full((9, 2), "a")}, TypeError, "points1 must be .* of <U1"),
