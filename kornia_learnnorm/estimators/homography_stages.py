@@ -11,10 +11,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.even_samples import draw_matches, evenly_ranked
 from kornia_learnnorm.estimators.match_features import CommonFrame
-from kornia_learnnorm.estimators.moments import (
-    geometric_scale,
-    least_cost,
-)
+from kornia_learnnorm.estimators.moments import geometric_scale, least_cost
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.problem import LinearProblem

@@ -17,13 +17,7 @@ from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
 from kornia_learnnorm.geometry.dlt import normal_equations, point_products, row_moments, row_products
 
-__all__ = [
-    "Evidence",
-    "descend",
-    "geometric_scale",
-    "least_cost",
-    "pick",
-]
+__all__ = ["Evidence", "descend", "geometric_scale", "least_cost", "pick"]
 
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
 

@@ -15,13 +15,7 @@ from kornia_learnnorm.estimators.match_features import (
     match_features,
     residual_features,
 )
-from kornia_learnnorm.estimators.moments import (
-    Evidence,
-    descend,
-    geometric_scale,
-    least_cost,
-    pick,
-)
+from kornia_learnnorm.estimators.moments import Evidence, descend, geometric_scale, least_cost, pick
 from kornia_learnnorm.estimators.optimize import choose, differentiable_state
 from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.geometry.checks import is_known_true
@@ -139,12 +133,7 @@ def _losses(evidence: Evidence, model: Essential, E_mat: Tensor, scale: Tensor) 
 
 
 def _likeliest(
-    evidence: Evidence,
-    model: Essential,
-    unit: Tensor,
-    weights: Tensor,
-    suggested: Tensor,
-    before: Candidates | None,
+    evidence: Evidence, model: Essential, unit: Tensor, weights: Tensor, suggested: Tensor, before: Candidates | None
 ) -> Calibrated:
     """Return the states of least weighted cost among those that the weights suggest."""
     spans = _moment_spans(evidence, model, suggested[:, None])

@@ -122,12 +122,7 @@ class Refinement:
     min_searched = 0  # matches of a set that is searched
 
     def __init__(
-        self,
-        model: TwoViewModel,
-        problem: LinearProblem,
-        frame: CommonFrame,
-        samples: int = 0,
-        settle: bool = False,
+        self, model: TwoViewModel, problem: LinearProblem, frame: CommonFrame, samples: int = 0, settle: bool = False
     ) -> None:
         self.model, self.weights = model, problem.weights
         self.x1, self.x2 = convert_points_to_homogeneous(torch.stack([frame.x1, frame.x2])).mT.contiguous()
