@@ -20,6 +20,7 @@ from kornia_learnnorm.two_view import predicted_error
 from kornia_learnnorm.two_view.inputs import Points, check_settings, read_cameras, read_matches, read_size
 from kornia_learnnorm.two_view.model_choice import choose_model
 from kornia_learnnorm.two_view.pair_warnings import (
+    CONTRADICTION,
     MAX_LOG_FALSE_ALARMS,
     PairWarning,
     find_camera_doubt,
@@ -33,6 +34,8 @@ from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolve
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
 MIN_RIVAL_SHARE = 0.6  # of the inliers; as many of the other matches agree on a matrix that may as well be the true one
 MIN_RIVAL_ANGLE = 15.0  # degrees, if its pose differs by more
+MIN_FREE_GAIN = 1.25  # of the inliers with cameras; as many without them contradict these
+MIN_FREE_SHARE = 0.25  # of the matches; among more outliers, false matches agree on a matrix without cameras
 # Fields of PairEstimate, those of a pose only where there is one; standard errors; reasons for doubt.
 Answer = tuple[dict[str, Any], predicted_error.PredictedError, tuple[PairWarning, ...]]
 
@@ -94,8 +97,9 @@ def estimate_matches(
     else:
         fields, error, doubts = _answer_fundamental(solver, cast(Solution, found), size1, size2)
     relief = choice.model == "fundamental" and choice.parallax is not None and not choice.parallax.planar
-    if cameras is not None:  # a plane contradicts no cameras
-        doubts += find_camera_doubt(cameras, given, points1, points2, F_mat if relief else None, threshold)
+    if cameras is not None:  # a plane contradicts no cameras, unless these made a scene with relief look like one
+        doubt = find_camera_doubt(cameras, given, points1, points2, F_mat if relief else None, threshold)
+        doubts += doubt or _compare_free(solver, fields["F_mat"])
     elif choice.model == "fundamental" and choice.parallax is not None and not relief:
         doubts += (PairWarning("planar", choice.parallax.describe(threshold)),)
     about = points1, points2, fields["inliers"], threshold, size2, error.angle
@@ -150,6 +154,16 @@ def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, siz
         text = "the matches do not decide between the four poses of the essential matrix"
         return fields, error, (*doubts, PairWarning("no_pose", text))
     return fields | {"R": R[0], "t": t[0], "front": in_front(R, t, K1, K2, x1, x2)[0]}, error, doubts
+
+
+def _compare_free(solver: TwoViewSolver, F_mat: Tensor | None) -> tuple[PairWarning, ...]:
+    """Return a warning where many more matches agree on a matrix without cameras than on F_mat (3, 3)."""
+    if F_mat is None:
+        return ()
+    agree, free = int(solver.support(F_mat)), solver.free_support()
+    if free < max(MIN_FREE_GAIN * agree, MIN_FREE_SHARE * len(solver.scores)):
+        return ()
+    return (PairWarning("cameras", f"{CONTRADICTION}: without them {free} matches agree, with them {agree}"),)
 
 
 def _find_rival(

@@ -112,6 +112,10 @@ class TwoViewSolver:
         F_mat = others._ransac().F_mat  # noqa: SLF001 (its own class)
         return F_mat, int(others.support(F_mat))
 
+    def free_support(self) -> int:
+        """Return how many matches agree on the matrix that RANSAC finds without their cameras."""
+        return int(self.support(replace(self, cameras=None)._ransac().F_mat))  # noqa: SLF001 (its own class)
+
     def improve(self, F_mat: Tensor, F_parts: Tensor) -> Tensor:
         """Return the matrix (3, 3) of all matches, or that of a part (P, 3, 3), refined, where it scores higher."""
         best = self.scorer.best(self.scorer.from_pixels(F_parts), 1)

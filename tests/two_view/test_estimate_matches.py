@@ -121,9 +121,9 @@ class TestEstimateMatches:
 
     def test_another_motion(self):
         """Most matches of the others agree on it, as many as on that of the scene."""
-        other = handheld(1, 160, seeded(2), noise=0.3)
-        points = [torch.cat([x, y[0, :150]]) for x, y in zip(MATCHES, (other.points1, other.points2), strict=True)]
-        ((code, text),) = kln.estimate_matches(*points).warnings
+        other = handheld(1, 150, seeded(2), noise=0.3)
+        points1, points2 = torch.cat([MATCHES[0], other.points1[0]]), torch.cat([MATCHES[1], other.points2[0]])
+        ((code, text),) = kln.estimate_matches(points1, points2).warnings
         assert (code, "others on one whose pose differs by" in text) == ("ambiguous", True)
 
     def test_order_has_no_effect(self):
@@ -181,8 +181,7 @@ def test_wrong_arguments():
         ({"threshold": -1.0}, ValueError, "threshold must be positive"),
         ({"threshold": 1e9}, ValueError, r"threshold must be positive and at most 1000 px, got 1e\+09 px"),
         ({"K1": torch.eye(3), "K2": -torch.eye(3)}, ValueError, r"K2 must have positive focal .* got \[-1.0, -1.0\]"),
-        ({"seed": -1}, ValueError, r"seed must lie in \[0, 2\^63\), got -1"),
-        ({"seed": None}, TypeError, "seed must be a whole number, got None"),
+        *(({"seed": n}, error, f"seed must .* got {n}") for n, error in ((-1, ValueError), (None, TypeError))),
         ({"layer": "robust"}, TypeError, "layer must be a LearnedEightPoint or None, got <class 'str'>"),
         ({"model": "affine"}, ValueError, "model must be 'auto' or 'fundamental' or 'homography', got 'affine'"),
         ({"layer": TINY, "model": "homography"}, ValueError, "layer estimates fundamental matrices: leave it out"),
