@@ -48,15 +48,21 @@ def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
 
 
 def read_size(name: str, size: Size | None, points: Tensor) -> Size:
-    """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given."""
-    if size is None:
-        width, height = (points.amax(0).clamp(min=1.0).ceil() + 1).tolist()
-        return int(width), int(height)
-    for value in size:
+    """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given.
+
+    Points that an undistorted image has beyond its borders are few: most of them must lie inside.
+    """
+    given = (points.amax(0).clamp(min=1.0).ceil() + 1).tolist() if size is None else size
+    for value in size or ():
         check_number(f"width and height of {name}", value, whole=True)
-    if len(size) != 2 or min(size) < 1:
-        raise ValueError(f"{name} must be a positive width and height, got {tuple(size)}")
-    return int(size[0]), int(size[1])
+    if len(given) != 2 or min(given) < 1:
+        raise ValueError(f"{name} must be a positive width and height, got {tuple(given)}")
+    width, height = int(given[0]), int(given[1])
+    inside = ((points >= -1) & (points <= points.new_tensor([width, height]))).all(-1)
+    if 2 * int(inside.sum()) < len(points):
+        text = f"{int(inside.sum())} of {len(points)} points lie in the image of {name}, {width} x {height} pixels"
+        raise ValueError(f"{text}: points are pixels from its upper left corner")
+    return width, height
 
 
 def check_settings(threshold: float, seed: int, layer: object = None, model: str = "auto") -> None:
