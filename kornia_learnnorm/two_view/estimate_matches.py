@@ -82,7 +82,8 @@ def estimate_matches(
     Raises:
         NoReliableMatrixError: if there are fewer than nine matches or inliers, or no motion.
         TypeError: if an argument is not of its type.
-        ValueError: if shapes do not pair up, a value is out of range, or a camera is missing or not invertible.
+        ValueError: if shapes do not pair up, a value is out of range, most points lie outside of their image, or a
+            camera is missing or not invertible.
     """
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)

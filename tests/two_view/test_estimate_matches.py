@@ -120,11 +120,11 @@ class TestEstimateMatches:
         assert (found.R, found.t, found.front, codes(found)) == (None, None, None, ["no_pose"])
 
     def test_another_motion(self):
-        """Most matches of the others agree on it, as many as on that of the scene."""
         other = handheld(1, 150, seeded(2), noise=0.3)
         points1, points2 = torch.cat([MATCHES[0], other.points1[0]]), torch.cat([MATCHES[1], other.points2[0]])
         ((code, text),) = kln.estimate_matches(points1, points2).warnings
         assert (code, "others on one whose pose differs by" in text) == ("ambiguous", True)
+        assert codes(kln.estimate_matches(*make_matches(outliers=400))) == []  # others of no common motion
 
     def test_order_has_no_effect(self):
         scores, order = uniform(200, seed=1), torch.randperm(200, generator=seeded(2))
