@@ -32,10 +32,10 @@ from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
 
 MIN_MOTION = 0.1  # pixels, median over the matches; below, the camera has not moved
-MIN_RIVAL_SHARE = 0.6  # of the inliers; as many of the other matches agree on a matrix that may as well be the true one
-MIN_RIVAL_ANGLE = 15.0  # degrees, if its pose differs by more
-MIN_FREE_GAIN = 1.25  # of the inliers with cameras; as many without them contradict these
-MIN_FREE_SHARE = 0.25  # of the matches; among more outliers, false matches agree on a matrix without cameras
+MIN_RIVAL_SHARE = 0.6  # of the inliers; number of outliers that must agree on a second matrix for a warning
+MIN_RIVAL_ANGLE = 15.0  # degrees between the poses of both matrices for a warning
+MIN_FREE_GAIN = 1.25  # inliers without cameras over inliers with them for a warning of wrong cameras
+MIN_FREE_SHARE = 0.25  # of the matches; inliers without cameras for this warning, as false matches agree on some matrix
 # Fields of PairEstimate, those of a pose only where there is one; standard errors; reasons for doubt.
 Answer = tuple[dict[str, Any], predicted_error.PredictedError, tuple[PairWarning, ...]]
 
@@ -98,7 +98,7 @@ def estimate_matches(
     else:
         fields, error, doubts = _answer_fundamental(solver, cast(Solution, found), size1, size2)
     relief = choice.model == "fundamental" and choice.parallax is not None and not choice.parallax.planar
-    if cameras is not None:  # a plane contradicts no cameras, unless these made a scene with relief look like one
+    if cameras is not None:  # a plane contradicts no cameras, but wrong cameras can make a scene look like a plane
         doubt = find_camera_doubt(cameras, given, points1, points2, F_mat if relief else None, threshold)
         doubts += doubt or _compare_free(solver, fields["F_mat"])
     elif choice.model == "fundamental" and choice.parallax is not None and not relief:
@@ -170,7 +170,7 @@ def _compare_free(solver: TwoViewSolver, F_mat: Tensor | None) -> tuple[PairWarn
 def _find_rival(
     solver: TwoViewSolver, F_mat: Tensor, inliers: Tensor, size2: Size, K1: Tensor, K2: Tensor
 ) -> tuple[PairWarning, ...]:
-    """Return a warning where other matches agree on a matrix of another pose, about as many and more than by chance."""
+    """Return a warning where nearly as many outliers agree on a matrix of another pose, and more than by chance."""
     rival, agree = solver.rival(inliers), int(inliers.sum())
     if rival is None or rival[1] < MIN_RIVAL_SHARE * agree:
         return ()

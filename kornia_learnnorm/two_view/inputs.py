@@ -50,7 +50,7 @@ def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
 def read_size(name: str, size: Size | None, points: Tensor) -> Size:
     """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given.
 
-    Points that an undistorted image has beyond its borders are few: most of them must lie inside.
+    Most points must lie inside; undistortion moves only a few beyond the borders.
     """
     given = (points.amax(0).clamp(min=1.0).ceil() + 1).tolist() if size is None else size
     for value in size or ():

@@ -105,7 +105,7 @@ class TwoViewSolver:
         return Solution(F_mat, weights, F_mat.new_zeros(0, 3, 3), 0)
 
     def rival(self, inliers: Tensor) -> tuple[Tensor, int] | None:
-        """Return the matrix (3, 3) of the matches that are no inliers, and its support; None where most are inliers."""
+        """Return the matrix (3, 3) of the outliers, and how many of them agree; None where most matches are inliers."""
         others = self.part(~inliers)
         if len(others.scores) < max(MIN_MATCHES, int(inliers.sum())):
             return None
