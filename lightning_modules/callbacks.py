@@ -64,7 +64,8 @@ class Checkpoints(ModelCheckpoint):
         self._restore_handler()
         if trainer.state.fn == TrainerFn.FITTING and self._started:
             last = self.last_model_path
-            how = f"to go on, repeat the command with --ckpt_path {last}" if last else "no checkpoint was written"
+            how = f"to go on, repeat the command with --ckpt_path {last}"
+            how = how if Path(last).is_file() else "no checkpoint was written"
             _print_above_bar(f"stopped at step {trainer.global_step}; {how}")
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:

@@ -91,7 +91,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError) as error:
         text = str(error)
         if isinstance(error, OSError) and error.strerror and error.filename:  # in words, not as Python shows it
-            text = f"{error.filename}: {error.strerror}"
+            text = f"{error.filename2 or error.filename}: {error.strerror}"  # the second is the target of a move
         print(f"learnnorm {words[0]}: error: {' '.join(text.split())}", file=sys.stderr)
         return 2
 

@@ -49,7 +49,8 @@ def check_grey(image: NDArray[np.uint8], colour: bool = False) -> None:
         raise TypeError(f"an image must be an array of uint8, got {getattr(image, 'dtype', type(image))}")
     if image.size == 0 or not (image.ndim == 2 or (colour and image.ndim == 3 and image.shape[2] == 3)):
         expected = "grey or RGB with shape (H, W) or (H, W, 3)" if colour else "grey with shape (H, W)"
-        raise ValueError(f"an image must be {expected}, got {image.shape}")
+        hint = "; .movedim(0, -1) brings the colours of a tensor to the end" if image.shape[:1] == (3,) else ""
+        raise ValueError(f"an image must be {expected}, got {image.shape}{hint}")
 
 
 def read_image(path: str | Path, max_size: int | None = None) -> NDArray[np.uint8]:

@@ -137,6 +137,7 @@ class MatchRefiner(nn.Module):
             ValueError: if numbers of images and points differ, or a value is not finite or out of its range.
 
         """
+        check_whole_number("passes", self.passes, 1)
         views = [points1, points2]
         if mask is not None:
             check_mask(mask, points1, points2)

@@ -76,7 +76,8 @@ class PerView(nn.Module):
 def check_normalizer(normalizer: object) -> None:
     """Raise a TypeError for anything but a module or function; a class is neither."""
     if isinstance(normalizer, type) or not callable(normalizer):
-        raise TypeError(f"normalizer must be a module or function, got {normalizer!r}")
+        hint = f"; a model is model={normalizer!r}" if normalizer in ("fundamental", "homography") else ""
+        raise TypeError(f"normalizer must be a module or function, got {normalizer!r}{hint}")
 
 
 def transforms_of(normalizer: Normalizer, problem: LinearProblem) -> tuple[Tensor, Tensor]:

@@ -44,8 +44,8 @@ def estimate_matches(
     points1: Points,
     points2: Points,
     scores: Points | None = None,
-    size1: Size | None = None,
-    size2: Size | None = None,
+    size1: Size | Points | None = None,
+    size2: Size | Points | None = None,
     layer: LearnedEightPoint | None = None,
     threshold: float = INLIER_THRESHOLD,
     seed: int = 0,
@@ -65,7 +65,8 @@ def estimate_matches(
             than 1e6 median distances from the other points, are left out.
         points2: pixels in image 2 with shape (N, 2).
         scores: from 0 to 1 with shape (N,), 1 minus Lowe's ratio or a matcher's confidence; all equal when not given.
-        size1: width and height of image 1, pixels; as large as its points need when not given.
+        size1: width and height of image 1, pixels, or LightGlue's ``image_size[0]``; as large as its points need when
+            not given.
         size2: width and height of image 2.
         layer: estimates the fundamental matrix in the place of RANSAC.
         threshold: RANSAC's threshold, and the largest distance of an inlier, pixels: the symmetric epipolar distance,
@@ -88,8 +89,9 @@ def estimate_matches(
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)
     points1, points2, scores = _usable(*read_matches(points1, points2, scores), threshold)
-    given = size1, size2
+    unknown = size1 is None, size2 is None
     size1, size2 = read_size("size1", size1, points1), read_size("size2", size2, points2)
+    given = None if unknown[0] else size1, None if unknown[1] else size2
     solver = TwoViewSolver(points1, points2, scores, threshold, seed, layer, cameras)
     choice, found, H_mat = choose_model(solver, model, size1, size2)
     F_mat = None if found is None else found.matrix

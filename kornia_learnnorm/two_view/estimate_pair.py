@@ -224,7 +224,8 @@ def _pixels(image: Image, max_size: int, colour: bool) -> tuple[NDArray[np.uint8
         return (images.read_colour if colour else images.read_image)(image, max_size), images.image_size(image)
     values = image.cpu().numpy() if isinstance(image, Tensor) else image
     if not isinstance(values, np.ndarray) or values.dtype != np.uint8:
-        raise TypeError(f"an image must be a path or an array of uint8, got {getattr(values, 'dtype', type(values))}")
+        hint = f"got {getattr(values, 'dtype', type(values))}; values from 0 to 1 times 255 in uint8 make one"
+        raise TypeError(f"an image must be a path or an array of uint8, {hint}")
     images.check_grey(values, colour=True)
     values = np.ascontiguousarray(values if colour else _grey(values))
     return images.resize_image(values, max_size), (values.shape[1], values.shape[0])

@@ -47,13 +47,15 @@ def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
     return None if camera1 is None or camera2 is None else (camera1, camera2)
 
 
-def read_size(name: str, size: Size | None, points: Tensor) -> Size:
+def read_size(name: str, size: Size | Points | None, points: Tensor) -> Size:
     """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given.
 
     Most points must lie inside; undistortion moves only a few beyond the borders.
     """
-    given = (points.amax(0).clamp(min=1.0).ceil() + 1).tolist() if size is None else size
-    for value in size or ():
+    given: Any = points.amax(0).clamp(min=1.0).ceil() + 1 if size is None else size
+    if isinstance(given, np.ndarray | Tensor):  # LightGlue's are float32
+        given = tuple(int(value) if value.is_integer() else value for value in map(float, given.reshape(-1)))
+    for value in given:
         check_number(f"width and height of {name}", value, whole=True)
     if len(given) != 2 or min(given) < 1:
         raise ValueError(f"{name} must be a positive width and height, got {tuple(given)}")

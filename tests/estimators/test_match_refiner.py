@@ -212,13 +212,16 @@ def test_exceptions():
     ):
         with pytest.raises(error, match=match):
             refiner(*wrong)
-    for options, match in (
-        ({"patch_size": 8}, "odd, got 8"),
-        ({"patch_size": 3}, "at least 5"),
-        ({"width": 0}, "at least 1"),
-        ({"bound": 0.0}, "positive, got 0"),
+    refiner.passes = 0
+    with pytest.raises(ValueError, match="passes must be a whole number, at least 1, got 0"):
+        refiner(image1, image2, points1, points2)
+    for name, value, text in (
+        ("patch_size", 8, "odd"),
+        ("patch_size", 3, "5, got"),
+        ("width", 0, "1"),
+        ("bound", 0, "0"),
     ):
-        with pytest.raises(ValueError, match=match):
-            kln.MatchRefiner(**options)
+        with pytest.raises(ValueError, match=text):
+            kln.MatchRefiner(**{name: value})
     with pytest.raises(FileNotFoundError, match=r"no weights 'none': .* one of refiner$"):
         kln.MatchRefiner.from_pretrained("none")

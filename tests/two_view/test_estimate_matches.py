@@ -147,6 +147,7 @@ class TestEstimateMatches:
             read = module.read_matches(*given, None)
             assert all(torch.equal(found, torch.from_numpy(x)) for found, x in zip(read, points, strict=False))
             assert not any(found.requires_grad for found in read)
+        assert module.read_size("size1", torch.tensor([640.0, 480.0]), tensors[0][0]) == (640, 480)
 
     def test_what_stands_still_is_left_out(self):
         overlay = uniform(60, 2, high=400)
