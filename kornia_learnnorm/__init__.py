@@ -8,12 +8,12 @@ Example:
     torch.Size([4, 3, 3])
 """
 
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_homography import LearnedHomography
+from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.linear import EightPoint, find_fundamental, find_homography
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.estimators.refinement import refine_essential, refine_fundamental
-from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.robust_losses import Cauchy, GemanMcClure, Huber, Truncated
 from kornia_learnnorm.geometry.distances import (
     algebraic_distance,

@@ -6,10 +6,11 @@ from typing import Any, Self
 
 from torch import nn
 
-from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_homography import LearnedHomography
+from kornia_learnnorm.estimators.learned_layer import LearnedLayer
+from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner
-from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
 

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
-from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_homography import LearnedHomography
+from kornia_learnnorm.estimators.learned_layer import LearnedLayer
+from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.linear import EightPoint
-from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.normalizers.learned_normalizer import FORMAT as NORMALIZER_FORMAT
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
@@ -107,10 +108,10 @@ def export_networks(layer: EightPoint | LearnedLayer) -> dict[str, Any]:
     """Return the networks of a layer as ONNX programs, without the steps around them.
 
     The networks of learned layers, ``stage1`` and so on, map ``features`` (B, N, C), see
-    :mod:`kornia_learnnorm.estimators.match_features`, and ``absent`` (B, N) to ``logits`` (B, N) and ``params`` (B, P).
-    The ``network`` of a learned normaliser maps ``points1`` and ``points2`` (B, N, 2) in the base's coordinates, and
-    ``null_matrix`` (B, 3, 3) where it needs one, to ``params1`` and ``params2`` (B, P). ImportError if onnx or
-    onnxscript is not installed, ValueError if the layer has no network.
+    :mod:`~kornia_learnnorm.estimators.network_features`, and ``absent`` (B, N) to ``logits`` (B, N) and ``params``
+    (B, P). The ``network`` of a learned normaliser maps ``points1`` and ``points2`` (B, N, 2) in the base's
+    coordinates, and ``null_matrix`` (B, 3, 3) where it needs one, to ``params1`` and ``params2`` (B, P). ImportError if
+    onnx or onnxscript is not installed, ValueError if the layer has no network.
     """
     import_extra("onnx", "onnx", "ONNX export")
     import_extra("onnxscript", "onnx", "ONNX export")

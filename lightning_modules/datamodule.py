@@ -13,7 +13,7 @@ import torch
 from pytorch_lightning.utilities import rank_zero_info
 from torch.utils.data import DataLoader
 
-from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.data.match_sets import MatchSets
 from kornia_learnnorm.data.sources import SEEDS_PER_RUN, BlockSource, block_generator
 
 EVALUATION_SEED = 4_000_000_007  # far from the seeds of training epochs, below 2^32 as the generator needs it

@@ -5,11 +5,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kornia_learnnorm.data.sets import MatchSets
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.data.match_sets import MatchSets
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner, RefinedMatches
-from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.ransac.ransac import RANSAC
 from lightning_modules.task import EstimatorTask, Median, cameras_of

@@ -12,10 +12,10 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 from torchmetrics import CatMetric, MeanMetric, Metric, SumMetric
 
-from kornia_learnnorm.data.sets import MatchSets
-from kornia_learnnorm.estimators.learned import LearnedLayer
+from kornia_learnnorm.data.match_sets import MatchSets
+from kornia_learnnorm.estimators.learned_layer import LearnedLayer
+from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.linear import EightPoint
-from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.metrics.statistics import comparable

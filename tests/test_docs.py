@@ -110,7 +110,8 @@ def lightglue_output():
     scene = handheld(1, 100, torch.Generator().manual_seed(0), noise=0.3, outliers=0.2)
     scores = torch.ones(100, dtype=torch.float64, requires_grad=True)
     found = {"matches": [torch.arange(100)[:, None].expand(-1, 2)], "scores": [scores]}
-    sides = {f"side{view}": {"keypoints": points} for view, points in ((1, scene.points1), (2, scene.points2))}
+    views = scene.points1, scene.points2
+    sides = {f"side{n}": {"keypoints": x, "image_size": 2 * x.amax(1).ceil()} for n, x in enumerate(views, 1)}
     return {**sides, "lightglue": lambda _: found, "K1": scene.K1[0], "K2": scene.K2[0], "R_true": scene.R}
 
 

@@ -12,7 +12,7 @@ from kornia_learnnorm.data.hloc import read_hloc
 from kornia_learnnorm.data.matching.match_store import MatchOptions, collect_matches
 from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, export_colmap
 
 EXAMPLES = """\

@@ -193,7 +193,7 @@ def _run_tool(words: list[str]) -> int:
 
 def _run_training(words: list[str]) -> int:
     """Run a training command; ``--json`` takes the metrics that it prints."""
-    training = import_extra("lightning_modules.training", "train", "training")
+    training = import_extra("lightning_modules.training_command", "train", "training")
     words = ["--help" if word == "--help-all" else word for word in words]
     if words[0] not in MEASURED:
         training.run(words)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from kornia_learnnorm.data.images import Size, image_size, read_image, reduced_size
+from kornia_learnnorm.data.match_sets import MatchSets
 from kornia_learnnorm.data.random_sets import StoreSets
-from kornia_learnnorm.data.sets import MatchSets
 from kornia_learnnorm.data.sources import expand_path
 from kornia_learnnorm.geometry.transforms import transform_points
 

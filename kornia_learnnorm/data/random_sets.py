@@ -11,7 +11,7 @@ from kornia.geometry.epipolar import cross_product_matrix
 from torch import Generator, Tensor
 
 from kornia_learnnorm.data.images import Size
-from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.data.match_sets import MatchSets
 from kornia_learnnorm.data.sources import SEEDS_PER_RUN, Block, block_generator, check_draws, expand_path
 from kornia_learnnorm.data.store import CorrespondenceStore, passes_ratio_test, read_store
 from kornia_learnnorm.data.synthetic.draws import log_uniform, normal, uniform

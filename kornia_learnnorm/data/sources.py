@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kornia_learnnorm.data.sets import MatchSets, draw_samples
+from kornia_learnnorm.data.match_sets import MatchSets, draw_samples
 from kornia_learnnorm.data.store import StoreReader
 from kornia_learnnorm.data.synthetic import TwoViewScene, random_scenes
 from kornia_learnnorm.protocol import MAX_RESIDUAL, RATIO

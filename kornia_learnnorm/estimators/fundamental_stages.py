@@ -5,9 +5,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.even_samples import evenly_ranked, fit_samples, sample_null_spaces
 from kornia_learnnorm.estimators.moments import Evidence, descend, geometric_scale, least_cost, pick
 from kornia_learnnorm.estimators.stages import Refinement
+from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, fit_samples, sample_null_spaces
 from kornia_learnnorm.geometry.checks import is_known_true
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.fundamental import Rank2

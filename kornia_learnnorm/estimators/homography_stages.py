@@ -9,11 +9,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.even_samples import draw_matches, evenly_ranked
-from kornia_learnnorm.estimators.match_features import CommonFrame
 from kornia_learnnorm.estimators.moments import geometric_scale, least_cost
+from kornia_learnnorm.estimators.network_features import CommonFrame
 from kornia_learnnorm.estimators.optimize import UNROLLED_LOSS
 from kornia_learnnorm.estimators.stages import Refinement
+from kornia_learnnorm.estimators.weighted_samples import draw_matches, evenly_ranked
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.homography import Homography, solve_four_points, squared_distances
 

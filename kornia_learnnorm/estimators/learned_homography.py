@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.homography_stages import HomographyRefinement
-from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer, inlier_probability
-from kornia_learnnorm.estimators.match_features import CommonFrame
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_layer import LearnedLayer, inlier_probability
+from kornia_learnnorm.estimators.network_features import CommonFrame
 from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.checks import check_whole_number
 from kornia_learnnorm.geometry.problem import LinearProblem

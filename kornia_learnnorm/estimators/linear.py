@@ -18,9 +18,9 @@ from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
 from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitening
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer, normalizing_transforms
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening

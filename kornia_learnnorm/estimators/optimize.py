@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss
 from kornia_learnnorm.geometry.checks import needs_gradient
-from kornia_learnnorm.models.contract import Residuals, State, TwoViewModel
+from kornia_learnnorm.models.two_view_model import Residuals, State, TwoViewModel
 
 __all__ = [
     "UNROLLED_LOSS",

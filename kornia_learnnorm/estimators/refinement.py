@@ -12,9 +12,9 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_correspondence
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import hartley_coordinates
 from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 __all__ = ["EssentialRefinement", "Refinement", "refine_essential", "refine_fundamental"]
 

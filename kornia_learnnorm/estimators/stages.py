@@ -10,13 +10,13 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
-from kornia_learnnorm.estimators.match_features import CommonFrame, match_features, residual_features
+from kornia_learnnorm.estimators.network_features import CommonFrame, match_features, residual_features
 from kornia_learnnorm.estimators.optimize import refine_unrolled
 from kornia_learnnorm.geometry.checks import is_known_true, weighted_mean
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform
-from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 __all__ = ["TRANSFORM_PARAMS", "Refinement", "few_outliers", "in_pieces", "run_stages"]
 

@@ -11,10 +11,10 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from kornia_learnnorm.estimators.learned import FORMAT as LAYER_FORMAT
+from kornia_learnnorm.estimators.learned_layer import FORMAT as LAYER_FORMAT
 from kornia_learnnorm.estimators.linear import solve_in_coordinates
 from kornia_learnnorm.estimators.refinement import refine_fundamental
-from kornia_learnnorm.evaluation.search import SearchedNormalizer
+from kornia_learnnorm.evaluation.searched_normalizer import SearchedNormalizer
 from kornia_learnnorm.files import short_name
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.fundamental import Fundamental

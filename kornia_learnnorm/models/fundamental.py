@@ -21,7 +21,7 @@ from kornia_learnnorm.geometry.matrices import inverse, nearest_rank2
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.rank2 import correct_rank2
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
-from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 SIDEWAYS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, -(0.5**0.5), 0.0)  # F whose epipolar lines are the image's rows
 MIN_PIVOT = 1e-6  # of the largest one, of a sample of seven correspondences that is not degenerate

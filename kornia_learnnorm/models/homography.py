@@ -16,7 +16,7 @@ from kornia_learnnorm.geometry.checks import check_choice, safe_divisor
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
 from kornia_learnnorm.geometry.dlt import normal_equations
 from kornia_learnnorm.geometry.matrices import cofactors, determinant, inverse
-from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 IDENTITY = (3**-0.5, 0.0, 0.0, 0.0, 3**-0.5, 0.0, 0.0, 0.0, 3**-0.5)
 MAX_DETERMINANT = 3**-1.5  # of a matrix of unit norm

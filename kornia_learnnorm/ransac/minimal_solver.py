@@ -5,7 +5,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.linear import solve_linear
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.normalizer import Normalizer
 from kornia_learnnorm.ransac.scoring import PairScorer
 

@@ -13,10 +13,10 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_choice, solve_
 from kornia_learnnorm.geometry.distinct_points import distinct_points
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
-from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.arguments import check_matches, check_numbers

@@ -7,8 +7,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.essential import Essential
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 MAX_MEDIAN_DISTANCES = 1e6  # largest distance from the median point, in median distances or thresholds
 BLOCK = 1 << 16  # distances computed at once, which stay in a core's cache

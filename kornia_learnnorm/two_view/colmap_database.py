@@ -17,7 +17,7 @@ from kornia_learnnorm.data.images import Size, stored_pixels
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.data.store import CorrespondenceStore
 from kornia_learnnorm.data.writer import check_target
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance, transfer_distance
 from kornia_learnnorm.geometry.pose import relative_pose

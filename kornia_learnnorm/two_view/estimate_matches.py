@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
 from kornia_learnnorm.data.matching.matchers import one_to_one
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.geometry.pose import in_front, relative_pose
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.metrics.statistics import median

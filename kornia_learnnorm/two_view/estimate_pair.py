@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_learnnorm.data import images
 from kornia_learnnorm.data.matching.features import DETECTORS, READS_COLOUR, Features, check_mask, keep_features
 from kornia_learnnorm.data.matching.matchers import check_methods, match_both_ways, match_lightglue
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental, transform_points

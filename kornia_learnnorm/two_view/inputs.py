@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.geometry.checks import check_cameras, check_choice
 
 MODELS = ("auto", "fundamental", "homography")

@@ -18,7 +18,7 @@ from kornia_learnnorm.data.datasets.textfiles import text_lines
 from kornia_learnnorm.data.images import image_size, import_cv2
 from kornia_learnnorm.data.matching.features import MissingWeightsError
 from kornia_learnnorm.data.matching.workers import open_workers
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner
 from kornia_learnnorm.files import atomic_write, exclusive, full_disk_names, write_text
 from kornia_learnnorm.optional import import_extra

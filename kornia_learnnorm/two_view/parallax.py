@@ -23,8 +23,8 @@ from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import affine_transform
-from kornia_learnnorm.models.contract import Residuals
 from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.two_view_model import Residuals
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 

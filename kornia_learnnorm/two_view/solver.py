@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.data.images import Size
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.refinement import refine_fundamental
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance

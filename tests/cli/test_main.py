@@ -236,7 +236,7 @@ def test_errors_are_one_line_and_exit_code_2(arguments, bad, message, tmp_path, 
     ("command", "blocked", "extra"),
     [
         ("evaluate s.h5", "h5py", "images"),
-        ("fit", "lightning_modules.training", "train"),
+        ("fit", "lightning_modules.training_command", "train"),
         ("completion bash", "shtab", "completion"),
         ("export paper --format onnx --out a.onnx", "onnx", "onnx"),
         ("export-colmap . --out a.db", "pycolmap", "colmap"),
@@ -357,7 +357,7 @@ def test_help_fits_a_screen_and_ends_with_examples_that_parse(command, monkeypat
 
 def test_help_of_a_training_lists_all_options_or_needs_no_extra(monkeypatch):
     assert "--trainer.gradient_clip_val" in help_of("fit", "--help-all")
-    for module in ("lightning_modules.training", "pytorch_lightning", "jsonargparse", "yaml"):
+    for module in ("lightning_modules.training_command", "pytorch_lightning", "jsonargparse", "yaml"):
         monkeypatch.setitem(sys.modules, module, None)
     assert "--help-all" in help_of("fit", "--config", "crossview", "-h")
 

@@ -8,9 +8,9 @@ import torch
 from references import eight_point, epipolar_distances
 from scenes import seeded
 
-from kornia_learnnorm.data import sets
+from kornia_learnnorm.data import match_sets
+from kornia_learnnorm.data.match_sets import draw_samples, plain_residual
 from kornia_learnnorm.data.random_sets import StoreSets
-from kornia_learnnorm.data.sets import draw_samples, plain_residual
 from kornia_learnnorm.data.sources import Block, StoreSamples, SyntheticSamples, block_generator
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic import handheld
@@ -176,7 +176,7 @@ def test_filter_agrees_with_numpy(store, monkeypatch):
     points = samples.points1.double(), samples.points2.double()
     expected = epipolar_distances(*points, eight_point(*points, np.eye(3), np.eye(3))).mean(-1)
     assert len(samples.with_residual_below(60.0).pair) == (expected < 60).sum()
-    monkeypatch.setattr(sets, "RESIDUAL_BATCH", 7)
+    monkeypatch.setattr(match_sets, "RESIDUAL_BATCH", 7)
     near = expected < 1e3
     np.testing.assert_allclose(plain_residual(*samples[:2]).numpy()[near], expected[near], rtol=1e-3)
 

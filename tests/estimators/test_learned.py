@@ -15,8 +15,8 @@ from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators import pose_stages
-from kornia_learnnorm.estimators.learned import inlier_probability
-from kornia_learnnorm.estimators.match_features import masked_median
+from kornia_learnnorm.estimators.learned_layer import inlier_probability
+from kornia_learnnorm.estimators.network_features import masked_median
 from kornia_learnnorm.geometry.problem import LinearProblem
 
 CLASSES = {"fundamental": kln.LearnedEightPoint, "pose": kln.LearnedRelativePose, "homography": kln.LearnedHomography}

@@ -6,9 +6,9 @@ import torch
 from pairwise import pairwise
 from scenes import uniform
 
-from kornia_learnnorm.estimators.even_samples import draw_matches, evenly_ranked, fit_samples, sample_null_spaces
 from kornia_learnnorm.estimators.moments import Evidence, geometric_scale
 from kornia_learnnorm.estimators.set_network import MIN_VARIANCE, AttentiveContextBlock
+from kornia_learnnorm.estimators.weighted_samples import draw_matches, evenly_ranked, fit_samples, sample_null_spaces
 
 FEW, MANY = 6, 12  # correspondences, for a block of width 8: with many, statistics go into the weights
 NUMBER = 5  # samples of each set

@@ -11,8 +11,8 @@ from torch.nn.functional import normalize
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.estimators import camera_evidence, moments
-from kornia_learnnorm.estimators.match_features import CommonFrame
 from kornia_learnnorm.estimators.moments import Evidence
+from kornia_learnnorm.estimators.network_features import CommonFrame
 from kornia_learnnorm.estimators.optimize import RobustCost, minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.metrics.poses import pose_error

@@ -11,7 +11,7 @@ from references import check_refuses
 from scenes import DTYPES, correspondences, paper, shaken, uniform
 
 import kornia_learnnorm as kln
-from kornia_learnnorm.evaluation.search import SearchedNormalizer
+from kornia_learnnorm.evaluation.searched_normalizer import SearchedNormalizer
 
 
 def crossview(**options):

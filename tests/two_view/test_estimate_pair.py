@@ -8,7 +8,7 @@ from references import epipolar_distances
 import kornia_learnnorm as kln
 from kornia_learnnorm.data.datasets.frames import FramePair
 from kornia_learnnorm.data.datasets.reading import read_dataset
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.two_view import estimate_pair as pair_module
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair, match_two_images
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate

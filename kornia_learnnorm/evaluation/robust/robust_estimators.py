@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_learnnorm.estimators.learned import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.refinement import refine_fundamental
-from kornia_learnnorm.estimators.relative_pose import LearnedRelativePose
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure
 from kornia_learnnorm.evaluation.methods import REFINED, base_name, find_method, identify_method, short_name_of
 from kornia_learnnorm.evaluation.robust.peers import CALIBRATED, PEERS, Peer, find_peer, peer_version

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.data.sets import MatchSets, draw_samples, plain_residual
+from kornia_learnnorm.data.match_sets import MatchSets, draw_samples, plain_residual
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.evaluation.diagnostics import diagnose_in_coordinates
 from kornia_learnnorm.evaluation.methods import Method, find_method, identify_method, short_name_of

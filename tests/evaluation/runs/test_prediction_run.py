@@ -15,7 +15,7 @@ from references import epipolar_distances
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
-from kornia_learnnorm.data.sets import MatchSets
+from kornia_learnnorm.data.match_sets import MatchSets
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.methods import find_method

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.learned import LearnedEightPoint, LearnedLayer, check_scores, inlier_probability
+from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
+from kornia_learnnorm.estimators.learned_layer import LearnedLayer, check_scores, inlier_probability
 from kornia_learnnorm.estimators.linear import prepare_problem
 from kornia_learnnorm.estimators.pose_stages import (
     POSE_OUTPUTS,

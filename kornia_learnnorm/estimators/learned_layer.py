@@ -1,23 +1,22 @@
-r"""The learned eight-point algorithm: a network weighs the correspondences and chooses the transforms, in stages."""
+"""What the learned layers share: networks weigh the correspondences and choose the transforms of a DLT, in stages."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.fundamental_stages import SQUARE_FLOOR, FundamentalRefinement
-from kornia_learnnorm.estimators.linear import essential_matrix, prepare_problem, solve_undetermined
-from kornia_learnnorm.estimators.match_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
+from kornia_learnnorm.estimators.fundamental_stages import SQUARE_FLOOR
+from kornia_learnnorm.estimators.linear import prepare_problem, solve_undetermined
 from kornia_learnnorm.estimators.matches import MatchLayer
+from kornia_learnnorm.estimators.network_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
 from kornia_learnnorm.estimators.stages import TRANSFORM_PARAMS, Refinement, in_pieces, run_stages
 from kornia_learnnorm.geometry.checks import (
-    check_cameras,
     check_tensor,
     check_whole_number,
     inference_mode,
@@ -25,18 +24,11 @@ from kornia_learnnorm.geometry.checks import (
     weighted_mean,
 )
 from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
-from kornia_learnnorm.models.contract import TwoViewModel
 from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
-__all__ = [
-    "LearnedEightPoint",
-    "LearnedEstimate",
-    "LearnedLayer",
-    "StageEstimate",
-    "check_scores",
-    "inlier_probability",
-]
+__all__ = ["LearnedLayer", "StageEstimate", "check_scores", "inlier_probability"]
 
 FORMAT = "kornia_learnnorm.eight_point.v1"
 # A normal variable's variance over the geometric mean of its squared length, by its number of components.
@@ -131,7 +123,7 @@ class LearnedLayer(MatchLayer):
         layer: Self = load_module(name, FORMAT, "estimator", build, cls.model_name)  # type: ignore[assignment]
         return layer
 
-    def start_from(self, layer: LearnedEightPoint) -> Self:
+    def start_from(self, layer: LearnedLayer) -> Self:
         """Load the first networks of an estimator of fundamental matrices; what only the own ones read is zero."""
         columns = torch.tensor([*range(POINT_FEATURES), *range(self.features, self.features + RESIDUAL_FEATURES)])
         for own, other in zip(self.networks, layer.networks, strict=False):
@@ -169,158 +161,6 @@ class LearnedLayer(MatchLayer):
 
     def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
         return Refinement(self.model, problem, frame)
-
-
-class LearnedEstimate(NamedTuple):
-    """Fundamental matrices of a batch of image pairs, and what the layer makes of their correspondences."""
-
-    F_mat: Tensor  # of rank 2 and unit Frobenius norm, x2^T F x1 = 0, (B, 3, 3)
-    E_mat: Tensor | None  # K2^T F K1 with unit Frobenius norm, (B, 3, 3), or None without cameras
-    determined: Tensor  # whether the correspondences determine a matrix, (B,) bool; see TwoViewEstimate
-    gap: Tensor  # relative gap of the design matrix that `determined` is decided on, (B,)
-    # Probability of each correspondence to be an inlier of the matrix, (B, N); zero for absent ones, one half in sets
-    # that do not determine their matrix.
-    weights: Tensor
-    stages: tuple[StageEstimate, ...]  # what each stage gives, before its refinement, the last one last
-
-
-class LearnedEightPoint(LearnedLayer):
-    r"""Estimate the fundamental matrix from matches with outliers in one differentiable pass.
-
-    Each stage reads the correspondences and, from the second on, their distances under the matrix of the stage before.
-    It predicts a logit for every correspondence and the parameters of two transforms. The weighted eight-point
-    algorithm follows, with weights
-
-    .. math:: w_i = \frac{\sigma(l_i)}{\|(F x_1)_{1:2}\|^2 + \|(F^\top x_2)_{1:2}\|^2}
-
-    (in the first stage :math:`\sigma(l_i)`) and transforms :math:`T = B(p)\, T_{Hartley}`, where :math:`B` builds an
-    SPD transform and Hartley's is that of the weighted points. A few robust steps of Levenberg-Marquardt on the Sampson
-    distances, weighted by :math:`\sigma(l_i)`, end each stage unless a search does
-    (:func:`~kornia_learnnorm.estimators.optimize.refine_unrolled`).
-
-    In the last stage of sets of 16 correspondences and more, with :math:`\sum_i \sigma(l_i) \ge 8`, samples are drawn
-    by :math:`\sigma(l_i)`: minimal ones of seven, and a third as many of 20, which average the noise. Of their matrices
-    and the network's, the one of least robust cost over all correspondences is fitted to all of them, weighted by
-    :math:`\sigma(l_i)^{0.2}`. In evaluation, those of them with a mean :math:`\sigma(l_i)` above 0.7 in the first stage
-    leave the other stages and the minimal samples out.
-
-    Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
-    their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
-    eight more than 1 % of their mean distance from the centroid away: some of them are outliers then. The networks
-    get a gradient of zero.
-
-    The order of the correspondences has no effect. Swapping the views gives :math:`F^\top` up to sign. Moving both
-    images by one translation and scaling them by one factor moves :math:`F` along; rotations and different factors are
-    only trained.
-
-    Args:
-        width: channels of the networks.
-        depth: blocks of each stage's network.
-        stages: number of stages.
-        learn_transforms: predict transforms; without, they are Hartley's of the weighted points, and the heads of the
-            networks get no gradient (``find_unused_parameters=True`` of DistributedDataParallel).
-        rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
-        refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
-        samples: minimal samples in the last stage; without (0), there are none of 20 either, and the last fit is that
-            of the other stages.
-
-    Attributes:
-        detach_stages: send no gradient from a stage into the one before and don't refine the last, as when the layer
-            itself is trained; a loss of every stage takes its place.
-        trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
-
-    Raises:
-        ValueError: if a number is not whole or too small, ``learn_transforms`` is no bool, or ``rank2`` is neither
-            ``"projection"`` nor ``"optimal"``.
-
-    Example:
-        >>> layer = LearnedEightPoint(width=16, depth=2)
-        >>> layer(torch.rand(2, 100, 2), torch.rand(2, 100, 2)).shape
-        torch.Size([2, 3, 3])
-
-    """
-
-    model_name = Fundamental.name
-    architecture = ("width", "depth", "stages", "learn_transforms", "rank2", "refine_steps", "samples")
-    added: ClassVar[dict[str, Any]] = {"samples": 64}
-
-    def __init__(
-        self,
-        width: int = 48,
-        depth: int = 4,
-        stages: int = 2,
-        learn_transforms: bool = True,
-        rank2: Literal["projection", "optimal"] = "projection",
-        refine_steps: int = 10,
-        samples: int = 96,
-    ) -> None:
-        super().__init__(Fundamental(rank2), width, depth, stages, learn_transforms, refine_steps)
-        check_whole_number("samples", samples, 0)
-        self.rank2, self.samples = rank2, samples
-
-    def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
-        return FundamentalRefinement(self.model, problem, frame, self.samples, not self.training)
-
-    @classmethod
-    def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:
-        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
-
-        Args:
-            name: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
-
-        Returns:
-            the estimator, in evaluation mode.
-
-        Raises:
-            FileNotFoundError: if there are no such weights; the message lists those that ship.
-            ValueError: if the file is not an estimator of this package or its tensors do not fit.
-
-        """
-        return super().from_pretrained(name)  # configurations need the name of the class, not Self
-
-    def extra_repr(self) -> str:
-        """Return the parameters."""
-        return f"learn_transforms={self.learn_transforms}, rank2={self.rank2!r}, trained_on={self.trained_on}"
-
-    def estimate(
-        self,
-        points1: Tensor,
-        points2: Tensor,
-        *,
-        weights: Tensor | None = None,
-        mask: Tensor | None = None,
-        scores: Tensor | None = None,
-        K1: Tensor | None = None,
-        K2: Tensor | None = None,
-    ) -> LearnedEstimate:
-        r"""Return the fundamental matrices, the weights of the correspondences and what each stage gives.
-
-        Shapes and errors are those of :meth:`~kornia_learnnorm.EightPoint.estimate`, but for those of the scores.
-
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 8`.
-            points2: pixels in the second view.
-            weights: optional; they multiply the predicted ones.
-            mask: optional, true for the rows that are correspondences.
-            scores: optional scores of the matches with shape :math:`(B, N)`, 1 minus Lowe's ratio or a matcher's
-                confidence, from 0 to 1, which the networks read.
-            K1: optional cameras of the first view.
-            K2: optional cameras of the second view; both or none.
-
-        Returns:
-            the matrices, weights and stages, in the dtype of the points.
-
-        Raises:
-            TypeError: if the scores are not floating-point.
-            ValueError: if the scores do not have the shape of the matches, or one is outside of 0 to 1.
-
-        """
-        problem, stages = self._estimate(points1, points2, weights, mask, scores)
-        check_cameras(K1, K2, points1.shape[0])
-        F_mat, logits = stages[-1]
-        probability = inlier_probability(self.model, problem, F_mat, logits, problem.determined).to(F_mat.dtype)
-        E_mat = essential_matrix(F_mat, K1, K2)
-        return LearnedEstimate(F_mat, E_mat, problem.determined, problem.gap, probability, stages[: self.stages])
 
 
 def inlier_probability(

@@ -10,7 +10,7 @@ from references import eight_point, epipolar_distances
 from scenes import SCENES, correspondences, shaken, uniform
 
 from kornia_learnnorm import Hartley, ReweightedWhitening, Whitening
-from kornia_learnnorm.evaluation.search import SearchedNormalizer
+from kornia_learnnorm.evaluation.searched_normalizer import SearchedNormalizer
 from kornia_learnnorm.geometry.transforms import spd_transform
 
 BASES = {"hartley": Hartley(), "whitening": Whitening(), "reweighted": ReweightedWhitening(), "learned": shaken()}

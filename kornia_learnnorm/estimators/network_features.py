@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.checks import safe_divisor, weighted_mean
-from kornia_learnnorm.models.contract import TwoViewModel
+from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 __all__ = ["POINT_FEATURES", "RESIDUAL_FEATURES", "CommonFrame", "masked_median", "match_features", "residual_features"]
 
