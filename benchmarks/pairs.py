@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from kornia.metrics import angle_error_mat
 from rendered import KINDS, render_kind
 from shared import make_parser, write_csv, write_json
 from torch import Tensor
@@ -39,7 +40,7 @@ from kornia_learnnorm.data.synthetic.render import RenderedPair
 from kornia_learnnorm.evaluation.tables import format_table
 from kornia_learnnorm.files import atomic_write
 from kornia_learnnorm.geometry.pose import relative_pose
-from kornia_learnnorm.metrics.poses import pose_error, rotation_error
+from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.two_view.estimate_matches import estimate_matches
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair, match_two_images
 from kornia_learnnorm.two_view.inputs import MODELS
@@ -129,7 +130,7 @@ def error_of_pose(case: Case, found: PairEstimate) -> float:
     if found.R is None:
         return math.nan
     if found.t is None:
-        return math.inf if case.t.any() else rotation_error(found.R, case.R).item()
+        return math.inf if case.t.any() else angle_error_mat(found.R, case.R).item()
     return pose_error(found.R, found.t, case.R, case.t).nan_to_num(nan=math.inf).item()
 
 

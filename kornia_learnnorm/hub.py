@@ -18,8 +18,6 @@ import_extra("huggingface_hub", "hub", "kornia_learnnorm.hub")
 
 from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download  # noqa: E402
 
-__all__ = ["HubModel"]
-
 CLASSES = LearnedEightPoint, LearnedRelativePose, LearnedHomography, LearnedNormalizer, MatchRefiner
 LAYERS = {layer.__name__: layer for layer in CLASSES}  # what a repository may hold
 WEIGHTS_FILE = "model.safetensors"

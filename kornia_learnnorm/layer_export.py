@@ -25,8 +25,6 @@ from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.pretrained import shipped_weights, weights_format, weights_model
 
-__all__ = ["export_layer", "export_networks", "load_layer"]
-
 MIN_DYNAMIC_POINTS = 9  # eight correspondences have a solver of their own
 EXAMPLE_BATCH = 2  # sets of the example that is traced; a dynamic size must not be one there
 ESTIMATORS = {layer.model_name: layer for layer in (LearnedEightPoint, LearnedRelativePose, LearnedHomography)}

@@ -9,8 +9,6 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from kornia_learnnorm.geometry.checks import solve_dtype
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 
-__all__ = ["BoundedEpipolarLoss", "EpipolarLoss", "InlierLoss", "LogEpipolarLoss", "LogEssentialLoss"]
-
 Residual = Callable[[Tensor, Tensor, Tensor], Tensor]  # distances (B, N) of points (B, N, 2) x 2 under (B, 3, 3)
 MAX_DISTANCE = 1e4  # pixels; larger distances count as this and send no gradient
 

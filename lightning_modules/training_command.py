@@ -15,7 +15,6 @@ from jsonargparse import ArgumentError
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from pytorch_lightning.callbacks import ModelCheckpoint, ProgressBar, Timer, TQDMProgressBar
 from pytorch_lightning.cli import LightningCLI
-from pytorch_lightning.utilities import rank_zero_only
 from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
@@ -143,11 +142,6 @@ def _state_dict(path: str) -> dict[str, Tensor]:
     except Exception as error:  # a broken or forged file can raise anything
         raise ValueError(f"{path} is not a checkpoint of a training run, or not a whole one") from error
     return dict(state)
-
-
-def is_first_process() -> bool:
-    """Return whether this process is the only one or, of several that train together, the one that prints."""
-    return bool(rank_zero_only.rank == 0)  # type: ignore[attr-defined]
 
 
 def _short_message(error: BaseException) -> str:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from kornia.metrics import angle_error_mat
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import TRAINING, make_parser
 from kornia_learnnorm.data.synthetic import handheld
-from kornia_learnnorm.metrics.poses import rotation_error
 
 results_tables = pytest.importorskip("results_tables")
 ROOT = Path(__file__).parents[1]
@@ -122,7 +122,7 @@ def test_the_code_of_the_readme_runs():
     with redirect_stdout(StringIO()):
         for block in blocks:
             exec(compile(block, "README.md", "exec"), namespace)
-    assert rotation_error(namespace["pair"].R[None], namespace["R_true"]).item() < 1
+    assert angle_error_mat(namespace["pair"].R[None], namespace["R_true"]).item() < 1
     assert namespace["scores"].grad.abs().sum() > 0
 
 

@@ -198,6 +198,8 @@ def _run_training(words: list[str]) -> int:
     if words[0] not in MEASURED:
         training.run(words)
         return 0
+    from pytorch_lightning.utilities import rank_zero_only
+
     from kornia_learnnorm.cli.evaluate import add_json_argument, json_tables
     from kornia_learnnorm.evaluation.tables import Number, Table
 
@@ -206,7 +208,7 @@ def _run_training(words: list[str]) -> int:
     add_json_argument(parser)
     args, options = parser.parse_known_args(words)
     args.command_line = shlex.join(["learnnorm", *words])
-    if not training.is_first_process():
+    if rank_zero_only.rank != 0:  # type: ignore[attr-defined]  # the first process prints
         args.json = None
     with json_tables(args, [word.rpartition("=")[2] for word in options]) as tables:
         with redirect_stdout(sys.stderr if args.json == "-" else sys.stdout):

@@ -201,13 +201,13 @@ def scaling(size_from: Size, size_to: Size) -> Tensor:
     return torch.tensor([[x, 0.0, x / 2 - 0.5], [0.0, y, y / 2 - 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
-def read_mask(path: str | Path, size: Size, max_size: int | None = None) -> NDArray[np.bool_]:
+def read_mask(path: str | Path, size: Size) -> NDArray[np.bool_]:
     """Return which pixels of an image count by a mask file, (H, W) bool: those above 127, not transparent.
 
-    ``max_size`` is the limit that the image was read with. A mask without a pixel that counts, or without the (width,
-    height) of the image file, turned by EXIF, is a ValueError.
+    A mask without a pixel that counts, or without the (width, height) of the image file, turned by EXIF, is a
+    ValueError.
     """
-    mask = read_image(path, max_size) >= MIN_USED
+    mask = read_image(path) >= MIN_USED
     got = image_size(path)
     if got != size:
         raise ValueError(f"mask {path} has {got[0]} x {got[1]} pixels, its image {size[0]} x {size[1]}")

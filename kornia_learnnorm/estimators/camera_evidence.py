@@ -10,8 +10,6 @@ from kornia_learnnorm.geometry.dlt import normal_equations, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["contradict_cameras", "in_front_of_best_pose", "keeps_fit"]
-
 SIGNIFICANCE = 1e-3  # probability that noise alone speaks against cameras as much
 MIN_EFFECT = 0.05  # share of the noise that two more parameters must explain: errors of matches are not independent
 MIN_NOISE = 0.01  # of the loss's scale: where inliers have no noise, the pull of outliers is no evidence
@@ -55,7 +53,6 @@ def contradict_cameras(evidence: Evidence, state: Calibrated, weights: Tensor, s
 
     Reference:
         F. Hampel, E. Ronchetti, P. Rousseeuw, W. Stahel, Robust Statistics, 1986, section 7.2.
-
     """
     F_mat = state.matrix()
     squares, factor = (value[:, 0] for value in evidence.squares(F_mat[:, None]))

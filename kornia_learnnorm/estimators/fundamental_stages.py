@@ -12,8 +12,6 @@ from kornia_learnnorm.geometry.checks import is_known_true
 from kornia_learnnorm.geometry.seven_point import fundamental_in_span
 from kornia_learnnorm.models.fundamental import Rank2
 
-__all__ = ["FundamentalRefinement"]
-
 COMPARED_SCALE, FIT_SCALE = 2.2, 3.0  # of comparisons and of fits on moments, in geometric means of the distances
 LAST_FLOOR = 0.002  # of the frame's unit, about half a pixel, added to the last scale
 LAST_POWER = 0.2  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers

@@ -17,8 +17,6 @@ from kornia_learnnorm.estimators.weighted_samples import draw_matches, evenly_ra
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.homography import Homography, solve_four_points, squared_distances
 
-__all__ = ["HomographyRefinement"]
-
 # Of the robust loss, in geometric means of the inliers' distances: of early stages, comparisons and the last fit.
 EARLY_SCALE, COMPARED_SCALE, LAST_SCALE = 3.0, 1.5, 6.0
 NEAR = 3.0  # geometric means, up to about which distances count in the mean itself in evaluation

@@ -16,8 +16,6 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["LearnedEightPoint", "LearnedEstimate"]
-
 
 class LearnedEstimate(NamedTuple):
     """Fundamental matrices of a batch of image pairs, and what the layer makes of their correspondences."""
@@ -86,7 +84,6 @@ class LearnedEightPoint(LearnedLayer):
         >>> layer = LearnedEightPoint(width=16, depth=2)
         >>> layer(torch.rand(2, 100, 2), torch.rand(2, 100, 2)).shape
         torch.Size([2, 3, 3])
-
     """
 
     model_name = Fundamental.name
@@ -112,18 +109,10 @@ class LearnedEightPoint(LearnedLayer):
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-synthetic") -> LearnedEightPoint:
-        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
+        """Load a trained estimator for evaluation: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or a file.
 
-        Args:
-            name: ``"robust-synthetic"``, ``"robust"``, ``"robust-tiny"``, or the path of a ``.safetensors`` file.
-
-        Returns:
-            the estimator, in evaluation mode.
-
-        Raises:
-            FileNotFoundError: if there are no such weights; the message lists those that ship.
-            ValueError: if the file is not an estimator of this package or its tensors do not fit.
-
+        FileNotFoundError if there are no such weights, with a list of those that ship; ValueError if the file is not
+        an estimator of this package or its tensors do not fit.
         """
         return super().from_pretrained(name)  # configurations need the name of the class, not Self
 
@@ -162,7 +151,6 @@ class LearnedEightPoint(LearnedLayer):
         Raises:
             TypeError: if the scores are not floating-point.
             ValueError: if the scores do not have the shape of the matches, or one is outside of 0 to 1.
-
         """
         problem, stages = self._estimate(points1, points2, weights, mask, scores)
         check_cameras(K1, K2, points1.shape[0])

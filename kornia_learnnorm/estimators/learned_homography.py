@@ -17,8 +17,6 @@ from kornia_learnnorm.geometry.checks import check_whole_number
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.homography import Homography
 
-__all__ = ["HomographyEstimate", "HomographyStage", "LearnedHomography"]
-
 
 class HomographyStage(NamedTuple):
     """What one stage gives."""
@@ -64,19 +62,12 @@ class LearnedHomography(LearnedLayer):
             steps: more steps bring them closer to those of the optimum.
         samples: minimal samples in the last stage; without (0), the last fit begins at the network's matrix.
 
-    Attributes:
-        detach_stages: send no gradient from a stage into the one before and don't refine the last, as when the layer
-            itself is trained; a loss of every stage takes its place.
-        trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
-
-    Raises:
-        ValueError: if a number is not whole or too small.
+    Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`.
 
     Example:
         >>> layer = LearnedHomography(width=16, depth=2)
         >>> layer(torch.rand(2, 100, 2), torch.rand(2, 100, 2)).shape
         torch.Size([2, 3, 3])
-
     """
 
     model: Homography
@@ -93,18 +84,10 @@ class LearnedHomography(LearnedLayer):
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-homography") -> LearnedHomography:
-        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
+        """Load a trained estimator in evaluation mode: ``"robust-homography"``, or the path of a ``.safetensors`` file.
 
-        Args:
-            name: ``"robust-homography"``, or the path of a ``.safetensors`` file.
-
-        Returns:
-            the estimator, in evaluation mode.
-
-        Raises:
-            FileNotFoundError: if there are no such weights; the message lists those that ship.
-            ValueError: if the file is not an estimator of this package or its tensors do not fit.
-
+        FileNotFoundError if there are no such weights, with a list of those that ship; ValueError if the file is not
+        an estimator of this package or its tensors do not fit.
         """
         return super().from_pretrained(name)  # configurations need the name of the class, not Self
 
@@ -129,27 +112,13 @@ class LearnedHomography(LearnedLayer):
     ) -> HomographyEstimate:
         r"""Return the homographies, the weights of the correspondences and what each stage gives.
 
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 4`, float32 or float64.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            weights: optional non-negative weights with shape :math:`(B, N)`, which multiply the predicted ones.
-            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows
-                may hold any value, NaN too, and get a gradient of zero; without a mask NaN is an error.
-            scores: optional scores of the matches with shape :math:`(B, N)`, from 0 to 1: a matcher's confidence, or 1
-                minus Lowe's ratio, which the networks read.
+        Arguments, shapes and errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.estimate`, but for the
+        cameras, with :math:`N \ge 4`.
 
         Returns:
             the matrices, weights and stages, in the dtype of the points. Sets that do not determine an invertible
             matrix, such as fewer than four different correspondences or four of which three are on a line, get the
             identity, without gradient.
-
-        Raises:
-            TypeError: if the points are not floating-point tensors of one dtype, weights or scores not floating-point,
-                or the mask not boolean.
-            ShapeError: if a shape is wrong.
-            ValueError: if there are fewer than four rows, shapes do not pair up, an unmasked value is not finite, a
-                weight is negative, or a score is outside of 0 to 1.
-
         """
         problem, found = self._estimate(points1, points2, weights, mask, scores)
         stages = tuple(HomographyStage(*stage) for stage in found)

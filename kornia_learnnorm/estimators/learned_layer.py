@@ -28,8 +28,6 @@ from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
-__all__ = ["LearnedLayer", "StageEstimate", "check_scores", "inlier_probability"]
-
 FORMAT = "kornia_learnnorm.eight_point.v1"
 # A normal variable's variance over the geometric mean of its squared length, by its number of components.
 VARIANCE = {1: 3.562, 2: 0.8905}
@@ -92,15 +90,9 @@ class LearnedLayer(MatchLayer):
         return self._estimate(points1, points2, weights, mask, scores)[1][-1].F_mat
 
     def save_pretrained(self, path: str | Path) -> None:
-        """Write weights and architecture to one safetensors file, beside the target and then renamed.
+        """Write weights and architecture to one ``.safetensors`` file, whole or not at all.
 
-        Args:
-            path: the file to write.
-
-        Raises:
-            ValueError: if ``path`` does not end in ``.safetensors``.
-            OSError: if it cannot be written.
-
+        ValueError for another suffix, OSError if it cannot be written.
         """
         save_module(
             path, self, FORMAT, {"model": self.model.name} | {key: getattr(self, key) for key in self.architecture}

@@ -26,8 +26,6 @@ from kornia_learnnorm.geometry.problem import LinearProblem, generic_points
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["LearnedRelativePose", "PoseStage", "RelativePoseEstimate"]
-
 
 class PoseStage(NamedTuple):
     """What one stage gives."""
@@ -80,20 +78,14 @@ class LearnedRelativePose(LearnedLayer):
             more steps bring them closer to those of the optimum.
         samples: minimal samples in the last stage.
 
-    Attributes:
-        detach_stages: send no gradient from a stage into the one before and draw no minimal samples, as when the layer
-            itself is trained; a loss of every stage takes its place.
-        trained_on: names of the data that the weights were trained on, saved with them; empty where not known.
-
-    Raises:
-        ValueError: if a number is not whole or too small.
+    Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`; with ``detach_stages`` there are no
+    minimal samples.
 
     Example:
         >>> layer = LearnedRelativePose(width=16, depth=2)
         >>> K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
         >>> layer(500 * torch.rand(2, 100, 2), 500 * torch.rand(2, 100, 2), K, K).shape
         torch.Size([2, 3, 3])
-
     """
 
     model_name = Essential.name
@@ -110,18 +102,10 @@ class LearnedRelativePose(LearnedLayer):
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "robust-pose-synthetic") -> LearnedRelativePose:
-        """Load a trained estimator: one that ships with the package, by name, or a safetensors file.
+        """Load a trained estimator in evaluation mode: ``"robust-pose-synthetic"``, ``"robust-pose"``, or a file.
 
-        Args:
-            name: ``"robust-pose-synthetic"``, ``"robust-pose"``, or the path of a ``.safetensors`` file.
-
-        Returns:
-            the estimator, in evaluation mode.
-
-        Raises:
-            FileNotFoundError: if there are no such weights; the message lists those that ship.
-            ValueError: if the file is not an estimator of this package or its tensors do not fit.
-
+        FileNotFoundError if there are no such weights, with a list of those that ship; ValueError if the file is not
+        an estimator of this package or its tensors do not fit.
         """
         return super().from_pretrained(name)  # configurations need the name of the class, not Self
 
@@ -167,30 +151,14 @@ class LearnedRelativePose(LearnedLayer):
     ) -> RelativePoseEstimate:
         r"""Return essential matrices, poses, the weights of the correspondences and what each stage gives.
 
-        Args:
-            points1: pixels in the first view with shape :math:`(B, N, 2)`, :math:`N \ge 5`, float32 or float64.
-            points2: pixels in the second view with shape :math:`(B, N, 2)`.
-            K1: cameras of the first view with shape :math:`(3, 3)` or :math:`(B, 3, 3)`.
-            K2: cameras of the second view.
-            weights: optional non-negative weights with shape :math:`(B, N)`, which multiply the predicted ones.
-            mask: optional, true for the rows that are correspondences, boolean with shape :math:`(B, N)`. Masked rows
-                may hold any value, NaN too, and get a gradient of zero; without a mask NaN is an error.
-            scores: optional scores of the matches with shape :math:`(B, N)`, from 0 to 1: a matcher's confidence, or 1
-                minus Lowe's ratio, which the networks read.
+        Arguments, shapes and errors are those of :meth:`~kornia_learnnorm.LearnedEightPoint.estimate`, with
+        :math:`N \ge 5`; the cameras are needed.
 
         Returns:
             the matrices, poses, weights and stages, in the dtype of the points. Of the four poses of an essential
             matrix it is the one with most weight of correspondences in front of both cameras. Sets that do not
             determine a matrix, such as fewer than five different correspondences, get one of a sideways motion,
             without gradient.
-
-        Raises:
-            TypeError: if the points are not floating-point tensors of one dtype, weights, scores or cameras not
-                floating-point, or the mask not boolean.
-            ShapeError: if a shape is wrong.
-            ValueError: if a camera is missing or not invertible, there are fewer than five rows, shapes do not pair up,
-                an unmasked value is not finite, a weight is negative, or a score is outside of 0 to 1.
-
         """
         problem, cameras, determined, gap, states, logits = self._pose_stages(
             points1, points2, K1, K2, weights, mask, scores

@@ -25,18 +25,6 @@ from kornia_learnnorm.normalizers.closed_form import Hartley, Identity, Whitenin
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer, normalizing_transforms
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 
-__all__ = [
-    "EightPoint",
-    "LinearLayer",
-    "TwoViewEstimate",
-    "essential_matrix",
-    "find_fundamental",
-    "find_homography",
-    "prepare_problem",
-    "solve_linear",
-    "solve_undetermined",
-]
-
 CLOSED_FORMS = (Identity, Hartley, Whitening, ReweightedWhitening)
 
 
@@ -87,7 +75,6 @@ def find_fundamental(
         >>> points1, points2 = torch.rand(4, 8, 2) * 600, torch.rand(4, 8, 2) * 600
         >>> find_fundamental(points1, points2).shape
         torch.Size([4, 3, 3])
-
     """
     check_correspondences(points1, points2, weights)
     problem = LinearProblem.from_points(points1, points2, weights, Fundamental(rank2))
@@ -191,7 +178,6 @@ def find_homography(
         >>> H_mat = find_homography(points1, 2 * points1 + 3)
         >>> (H_mat / H_mat[:, 2:, 2:])[0].diagonal().round(decimals=3)
         tensor([2., 2., 1.])
-
     """
     H_mat: Tensor = LinearLayer(Homography(), normalizer)(points1, points2, weights, mask)
     return H_mat
@@ -243,7 +229,6 @@ class EightPoint(LinearLayer):
         >>> points = torch.rand(2, 1, 2).expand(2, 8, 2)
         >>> layer.estimate(points, points).determined
         tensor([False, False])
-
     """
 
     def __init__(
@@ -287,7 +272,6 @@ class EightPoint(LinearLayer):
             ShapeError: if a shape is wrong.
             ValueError: if there are fewer than eight rows, shapes do not pair up, an unmasked value is not finite, a
                 weight is negative, or only one camera is given or one is not invertible.
-
         """
         with _inference_mode(self.normalizer):
             problem = prepare_problem(self.model, points1, points2, weights, mask)

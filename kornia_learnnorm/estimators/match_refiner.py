@@ -19,8 +19,6 @@ from kornia_learnnorm.geometry.checks import (
 )
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module
 
-__all__ = ["MatchRefiner", "RefinedMatches", "local_frames"]
-
 FORMAT = "kornia_learnnorm.match_refiner.v1"
 WINDOWS = (1.0, 1.7, 3.0)  # pixels, standard deviations of the windows of Lucas-Kanade before training
 RANGE_ROUNDING = 1e-5  # by which interpolated grey values may exceed one
@@ -86,7 +84,6 @@ class MatchRefiner(nn.Module):
         >>> points1, points2, scale = MatchRefiner()(*images, *points)
         >>> points1.shape, scale.shape
         (torch.Size([1, 100, 2]), torch.Size([1, 100]))
-
     """
 
     def __init__(self, patch_size: int = 11, width: int = 64, bound: float = 1.5) -> None:
@@ -135,7 +132,6 @@ class MatchRefiner(nn.Module):
             TypeError: if an argument is no tensor of the right kind.
             ShapeError: if an argument does not have its shape.
             ValueError: if numbers of images and points differ, or a value is not finite or out of its range.
-
         """
         check_whole_number("passes", self.passes, 1)
         views = [points1, points2]
@@ -217,32 +213,18 @@ class MatchRefiner(nn.Module):
         return _bounded(step, LARGEST_STEP), torch.cat(statistics, 1)
 
     def save_pretrained(self, path: str | Path) -> None:
-        """Write weights and architecture to one safetensors file, beside the target and then renamed.
+        """Write weights and architecture to one ``.safetensors`` file, whole or not at all.
 
-        Args:
-            path: the file to write.
-
-        Raises:
-            ValueError: if ``path`` does not end in ``.safetensors``.
-            OSError: if it cannot be written.
-
+        ValueError for another suffix, OSError if it cannot be written.
         """
         save_module(path, self, FORMAT, {key: getattr(self, key) for key in ("patch_size", "width", "bound")})
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "refiner") -> MatchRefiner:
-        """Load a trained refiner: one that ships with the package, by name, or a safetensors file.
+        """Load a trained refiner in evaluation mode: ``"refiner"``, or the path of a ``.safetensors`` file.
 
-        Args:
-            name: ``"refiner"``, or the path of a ``.safetensors`` file.
-
-        Returns:
-            the refiner, in evaluation mode.
-
-        Raises:
-            FileNotFoundError: if there are no such weights; the message lists those that ship.
-            ValueError: if the file is not a refiner of this package or its tensors do not fit.
-
+        FileNotFoundError if there are no such weights, with a list of those that ship; ValueError if the file is not
+        a refiner of this package or its tensors do not fit.
         """
 
         def build(architecture: dict[str, Any]) -> MatchRefiner:

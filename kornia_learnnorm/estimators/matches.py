@@ -10,8 +10,6 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kornia_learnnorm.geometry.checks import check_tensor
 
-__all__ = ["Correspondences", "MatchLayer", "correspondences_from_matches", "refuse_jit"]
-
 
 class Correspondences(NamedTuple):
     """Padded correspondences of a batch of image pairs."""
@@ -110,7 +108,6 @@ class MatchLayer(nn.Module):
             TypeError: if keypoints, matches or scores are no tensors, matches no integers or scores not floating-point.
             ShapeError: if the keypoints do not have the shape above.
             ValueError: if the matches do not fit the keypoints, or the scores not the matches, or as :meth:`estimate`.
-
         """
         points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
         cameras = {name: K for name, K in (("K1", K1), ("K2", K2)) if K is not None}  # homographies have none

@@ -17,8 +17,6 @@ from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
 from kornia_learnnorm.geometry.dlt import normal_equations, point_products, row_moments, row_products
 
-__all__ = ["Evidence", "descend", "geometric_scale", "least_cost", "pick"]
-
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
 
 
@@ -95,7 +93,6 @@ def descend(
     Reference:
         W. Chojnacki, M. Brooks, A. van den Hengel, D. Gawley, On the fitting of surfaces to data with covariances,
         IEEE Transactions on Pattern Analysis and Machine Intelligence, 2000.
-
     """
     F_mat, products = state.matrix(), row_products(evidence.products)
     for _ in range(steps):

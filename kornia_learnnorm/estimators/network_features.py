@@ -14,8 +14,6 @@ from torch import Tensor
 from kornia_learnnorm.geometry.checks import safe_divisor, weighted_mean
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
-__all__ = ["POINT_FEATURES", "RESIDUAL_FEATURES", "CommonFrame", "masked_median", "match_features", "residual_features"]
-
 POINT_FEATURES, RESIDUAL_FEATURES = 9, 5  # numbers of a correspondence
 RESIDUAL_FLOOR = 1e-5  # of the frame's unit, added to distances before their logarithm
 DEVIATION_FLOOR = 1e-5  # of the frame's unit: the rounding of an exact shift of the image says nothing

@@ -16,17 +16,6 @@ from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss
 from kornia_learnnorm.geometry.checks import needs_gradient
 from kornia_learnnorm.models.two_view_model import Residuals, State, TwoViewModel
 
-__all__ = [
-    "UNROLLED_LOSS",
-    "Optimum",
-    "RobustCost",
-    "attach_gradient",
-    "choose",
-    "differentiable_state",
-    "minimize",
-    "refine_unrolled",
-]
-
 FIRST_DAMPING = 1e-3  # of the diagonal of the normal matrix, added to it in the first step
 MAX_DAMPING = 1e8  # no step that is damped this much changes the cost by more than rounding
 MIN_PIVOT = 1e-5  # smallest diagonal entry of the Hessian's Cholesky factor, of unit rows, where it is definite

@@ -25,8 +25,6 @@ from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
 from kornia_learnnorm.models.fundamental import Fundamental
 
-__all__ = ["POSE_OUTPUTS", "POSE_POINT_FEATURES", "POSE_RESIDUAL_FEATURES", "run_pose_stages"]
-
 POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
 EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of candidates, twice if not settled

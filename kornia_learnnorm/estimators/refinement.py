@@ -16,8 +16,6 @@ from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
-__all__ = ["EssentialRefinement", "Refinement", "refine_essential", "refine_fundamental"]
-
 Distance = Literal["sampson", "symmetric"]
 
 
@@ -101,7 +99,6 @@ def refine_fundamental(
         >>> refinement = refine_fundamental(points1, points2, torch.rand(4, 3, 3))
         >>> bool((refinement.cost < refinement.cost_before).all())
         True
-
     """
     model = Fundamental(distance=distance)
     _check(points1, points2, weights, "F_mat", F_mat, model.min_points, loss, max_iterations, tolerance)
@@ -170,7 +167,6 @@ def refine_essential(
         >>> refinement = refine_essential(scene.points1, scene.points2, E_mat, scene.K1, scene.K2)
         >>> bool((refinement.cost < refinement.cost_before).all())
         True
-
     """
     _check(points1, points2, weights, "E_mat", E_mat, Essential.sample_size, loss, max_iterations, tolerance)
     check_cameras(K1, K2, len(E_mat))

@@ -21,7 +21,6 @@ def squared_loss(squares: Tensor) -> tuple[Tensor, Tensor]:
     Example:
         >>> squared_loss(torch.tensor([4.0]))
         (tensor([4.]), tensor([1.]))
-
     """
     return squares, torch.ones_like(squares)
 
@@ -47,7 +46,6 @@ class Huber(_RobustLoss):
     Example:
         >>> Huber(1.0)(torch.tensor([0.25, 4.0]))
         (tensor([0.2500, 3.0000]), tensor([1.0000, 0.5000]))
-
     """
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
@@ -66,7 +64,6 @@ class Cauchy(_RobustLoss):
     Example:
         >>> Cauchy(2.0)(torch.tensor([0.0, 4.0]))
         (tensor([0.0000, 2.7726]), tensor([1.0000, 0.5000]))
-
     """
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,7 +81,6 @@ class GemanMcClure(_RobustLoss):
     Example:
         >>> GemanMcClure(2.0)(torch.tensor([0.0, 4.0]))
         (tensor([0., 2.]), tensor([1.0000, 0.2500]))
-
     """
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,7 +101,6 @@ class Truncated(_RobustLoss):
     Example:
         >>> Truncated(2.0)(torch.tensor([1.0, 9.0]))
         (tensor([1., 4.]), tensor([1., 0.]))
-
     """
 
     def __call__(self, squares: Tensor) -> tuple[Tensor, Tensor]:

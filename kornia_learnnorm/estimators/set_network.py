@@ -9,8 +9,6 @@ from torch.nn.functional import adaptive_max_pool1d
 
 from kornia_learnnorm.normalizers.networks.crossview import set_maximum
 
-__all__ = ["SetWeightingNetwork"]
-
 MIN_VARIANCE = 1e-3  # added to the variance of a feature over the set
 
 
@@ -23,7 +21,6 @@ class SetWeightingNetwork(nn.Module):
     Reference:
         W. Sun, W. Jiang, E. Trulls, A. Tagliasacchi, K. M. Yi, ACNe: Attentive context normalization for robust
         permutation-equivariant learning, CVPR 2020.
-
     """
 
     def __init__(self, features: int, width: int, depth: int, outputs: int) -> None:

@@ -18,8 +18,6 @@ from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.transforms import spd_transform
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
-__all__ = ["TRANSFORM_PARAMS", "Refinement", "few_outliers", "in_pieces", "run_stages"]
-
 EARLY_STEPS = 3  # largest number of refinement steps in all stages but the last
 MAX_MINIMAL_DISTANCE = 0.01  # of the frame's unit; quadratic mean that the best fit of `min_points` inliers leaves
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one

@@ -6,8 +6,6 @@ from torch import Tensor
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.geometry.dlt import null_space
 
-__all__ = ["draw_matches", "evenly_ranked", "fit_samples", "sample_null_spaces"]
-
 MIN_PIVOT = 1e-6  # of the largest one, of a minimal sample that is not degenerate, such as by drawing a match twice
 LARGE_SAMPLE = 20  # matches of a sample that averages their noise: most are right in sets of few outliers
 # Roots of x^(d + 1) = x + 1, by the size d of a sample.

@@ -45,27 +45,13 @@ def design_matrix(x1: Tensor, x2: Tensor) -> Tensor:
     return (x2.mT.unsqueeze(-2) * x1.mT.unsqueeze(-3)).flatten(-3, -2).mT
 
 
-def null_vector(A: Tensor, weights: Tensor | None = None) -> Tensor:
-    r"""Return the unit vector :math:`h` that minimises :math:`\sum_i w_i (A_i h)^2`.
-
-    Eight rows have an exact null vector, whatever the positive weights.
-
-    Args:
-        A: design matrix with shape :math:`(*, N, 9)`, :math:`N \ge 8`.
-        weights: optional non-negative weights with shape :math:`(*, N)`.
-
-    Returns:
-        unit vectors with shape :math:`(*, 9)`, sign arbitrary; without gradient where the rows are linearly dependent.
-    """
-    return solve_rows(A, weights)[0]
-
-
 def solve_rows(
     A: Tensor, weights: Tensor | None = None, product: Callable[[Tensor], Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
     r"""Return the null vectors :math:`(*, 9)` of design matrices :math:`(*, N, 9)`, and how unique they are.
 
-    Of eight rows, the relative gap :math:`(*)`, from 0 to 1, is the smallest pivot over the largest of the LU
+    They are the unit vectors :math:`h` of least :math:`\sum_i w_i (A_i h)^2`, of any sign. Eight rows have exact ones,
+    whatever the positive weights; their relative gap, from 0 to 1, is the smallest pivot over the largest of the LU
     factorisation of :math:`A^\top` with partial pivoting. Of more, it is the eighth singular value of :math:`\sqrt w A`
     over the first. Derivatives of the null vector grow as its inverse; the gap has none.
 

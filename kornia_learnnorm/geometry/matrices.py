@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import needs_gradient, safe_divisor
+from kornia_learnnorm.geometry.checks import needs_gradient
 
 RANK1_WEIGHT = 1e-27  # of the complement of the rows, above the square of what rounding leaves of vanishing cofactors
 EPSILON = 1e-15  # of the mean eigenvalue, which a threefold one leaves of itself
@@ -55,16 +55,6 @@ def unit_matrix(M: Tensor) -> Tensor:
     sign = torch.where(large @ powers < 0, -1.0, 1.0)[..., None, None]
     unit: Tensor = M * (sign / torch.linalg.matrix_norm(M, keepdim=True))
     return unit
-
-
-def smallest_singular_vectors(A: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return the left and right singular vectors of the smallest singular value, twice differentiable.
-
-    As :func:`smallest_right_singular_vector`, with :math:`u \propto C v`.
-    """
-    v, C = smallest_right_singular_vector(A)
-    u = (C @ v[..., None])[..., 0]
-    return u / safe_divisor(torch.linalg.vector_norm(u, dim=-1, keepdim=True)), v
 
 
 def smallest_right_singular_vector(A: Tensor) -> tuple[Tensor, Tensor]:

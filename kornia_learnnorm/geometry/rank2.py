@@ -9,13 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_learnnorm.geometry.checks import (
-    check_correspondences,
-    check_matrices,
-    check_tensor,
-    safe_divisor,
-    solve_dtype,
-)
+from kornia_learnnorm.geometry.checks import check_correspondences, check_matrices, safe_divisor, solve_dtype
 from kornia_learnnorm.geometry.distances import line_norms
 from kornia_learnnorm.geometry.dlt import design_matrix
 from kornia_learnnorm.geometry.matrices import cofactors, inverse, nearest_rank2, unit_matrix
@@ -24,28 +18,6 @@ from kornia_learnnorm.geometry.transforms import transform_fundamental
 
 ITERATIONS = 3  # steps of the optimal correction
 EPIPOLE_FLOOR = 1e-5  # of the mean norm of a line's normal, added to each in the covariance
-
-
-def rank2_projection(F_mat: Tensor) -> Tensor:
-    r"""Project matrices on the nearest rank-2 matrices in Frobenius norm.
-
-    :math:`F - F v v^\top`, with :math:`v` the right singular vector of the smallest singular value (the singularity
-    constraint, Fan et al., section 3, step 2b).
-
-    Args:
-        F_mat: matrices with shape :math:`(*, 3, 3)`.
-
-    Returns:
-        matrices of rank 2 with shape :math:`(*, 3, 3)`.
-
-    Example:
-        >>> rank2_projection(torch.diag(torch.tensor([3.0, 2.0, 1.0])))
-        tensor([[3., 0., 0.],
-                [0., 2., 0.],
-                [0., 0., 0.]])
-    """
-    check_tensor("F_mat", F_mat, ["*", "3", "3"])
-    return nearest_rank2(F_mat)
 
 
 def optimal_rank2(F_mat: Tensor, points1: Tensor, points2: Tensor, weights: Tensor | None = None) -> Tensor:

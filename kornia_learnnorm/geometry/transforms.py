@@ -4,15 +4,8 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-__all__ = [
-    "affine_transform",
-    "inverse_sqrt",
-    "paper_transform",
-    "spd_transform",
-    "transform_fundamental",
-    "transform_points",
-    "whitening_from_moments",
-]
+__all__ = ["affine_transform", "inverse_sqrt", "paper_transform", "spd_transform", "transform_fundamental"]
+__all__ += ["transform_points", "whitening_from_moments"]
 
 
 def affine_transform(linear: Tensor, origin: Tensor) -> Tensor:

@@ -8,39 +8,10 @@ from collections.abc import Sequence
 from math import inf
 
 import torch
-from kornia.metrics import auc_from_errors
+from kornia.metrics import angle_error_mat, angle_error_vec, auc_from_errors
 from torch import Tensor
 
-from kornia_learnnorm.geometry.checks import check_tensor, solve_dtype
-
-__all__ = ["mean_average_accuracy", "pose_auc", "pose_error", "rotation_error", "translation_error"]
-
-
-def rotation_error(R: Tensor, R_true: Tensor) -> Tensor:
-    r"""Return the angle between rotations :math:`(*, 3, 3)`, degrees from 0 to 180; NaN where a rotation is.
-
-    :math:`\operatorname{atan2}(\|\Delta - \Delta^\top\|_F / \sqrt 2, \operatorname{tr} \Delta - 1)` of
-    :math:`\Delta = R R_{true}^\top`; an arc cosine of the trace would lose half of the digits near 0 and 180.
-    """
-    check_tensor("R", R, ["*", "3", "3"])
-    check_tensor("R_true", R_true, ["*", "3", "3"])
-    delta = R @ R_true.mT
-    sine = torch.linalg.matrix_norm(delta - delta.mT) / 2**0.5
-    cosine = delta.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
-    return torch.rad2deg(torch.atan2(sine, cosine))
-
-
-def translation_error(t: Tensor, t_true: Tensor) -> Tensor:
-    r"""Return the angle between directions :math:`(*, 3)` with signs, degrees from 0 to 180; NaN for a zero vector.
-
-    :math:`2 \operatorname{atan2}(\|t - t_{true}\|, \|t + t_{true}\|)` of unit vectors. Opposite directions are 180
-    degrees apart, as in NG-RANSAC: the points in front of the cameras decide the sign. SuperGlue's evaluation and the
-    Image Matching Benchmark leave the sign open, which is ``torch.minimum(error, 180 - error)``.
-    """
-    check_tensor("t", t, ["*", "3"])
-    check_tensor("t_true", t_true, ["*", "3"])
-    t, t_true = t / t.norm(dim=-1, keepdim=True), t_true / t_true.norm(dim=-1, keepdim=True)
-    return torch.rad2deg(2 * torch.atan2((t - t_true).norm(dim=-1), (t + t_true).norm(dim=-1)))
+from kornia_learnnorm.geometry.checks import solve_dtype
 
 
 def pose_error(R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> Tensor:
@@ -49,13 +20,18 @@ def pose_error(R: Tensor, t: Tensor, R_true: Tensor, t_true: Tensor) -> Tensor:
     Rotations have shape :math:`(*, 3, 3)`, translations :math:`(*, 3)` and any length. The error is infinite where the
     estimate is NaN or has no direction, NaN where the truth is or has none. ShapeError if a shape is wrong.
 
+    Opposite translations are 180 degrees apart, as in NG-RANSAC: the points in front of the cameras decide the sign.
+    SuperGlue's evaluation and the Image Matching Benchmark leave it open.
+
     Example:
         >>> R, t = torch.eye(3).repeat(2, 1, 1), torch.tensor([[0.0, 0.0, 1.0], [torch.nan, 0.0, 1.0]])
         >>> pose_error(R, t, torch.eye(3), torch.tensor([0.0, 1.0, 1.0]))
         tensor([45., inf])
     """
-    error = torch.maximum(rotation_error(R, R_true), translation_error(t, t_true))
-    unknown = (rotation_error(R_true, R_true) + translation_error(t_true, t_true)).isnan()
+    R, t = R.expand_as(R + R_true), t.expand_as(t + t_true)  # Kornia's functions take equal shapes
+    R_true, t_true = R_true.expand_as(R), t_true.expand_as(t)
+    error = torch.maximum(angle_error_mat(R, R_true), angle_error_vec(t, t_true))
+    unknown = (angle_error_mat(R_true, R_true) + angle_error_vec(t_true, t_true)).isnan()
     return torch.where(unknown, torch.nan, error.nan_to_num(nan=inf))
 
 
@@ -74,17 +50,15 @@ def pose_auc(errors: Tensor, thresholds: Sequence[float] = (5, 10, 20)) -> tuple
     return tuple(areas[float(threshold)] / 100 for threshold in thresholds)
 
 
-def mean_average_accuracy(errors: Tensor, limit: int = 10) -> float:
-    """Return the share of pose errors (P,) below 1, 2, ..., ``limit`` degrees, averaged: mAA(10).
+def mean_average_accuracy(errors: Tensor) -> float:
+    """Return the share of pose errors (P,) below 1, 2, ..., 10 degrees, averaged: mAA(10).
 
     Reference:
         Y. Jin et al., Image Matching across Wide Baselines: From Paper to Practice, IJCV 2021. Its histogram also
         counts an error of exactly 10 degrees.
     """
     errors = _checked(errors)
-    if limit < 1:
-        raise ValueError(f"limit must be one degree or more, got {limit}")
-    return (errors[:, None] < torch.arange(1, limit + 1, device=errors.device)).to(errors.dtype).mean().item()
+    return (errors[:, None] < torch.arange(1, 11, device=errors.device)).to(errors.dtype).mean().item()
 
 
 def _checked(errors: Tensor) -> Tensor:

@@ -5,9 +5,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["BetterRate", "PairedDifference", "better_rate", "bootstrap_interval", "comparable", "median"]
-__all__ += ["paired_bootstrap"]
-
 
 def median(values: Tensor, dim: int = -1) -> Tensor:
     """Return the median over ``dim``: the middle value, or the mean of the two middle ones.
@@ -54,10 +51,8 @@ def comparable(residual: Tensor, baseline: Tensor) -> Tensor:
     return ~(residual.isnan() | baseline.isnan() | (residual.isinf() & baseline.isinf()))
 
 
-def bootstrap_interval(
-    values: Tensor, groups: Tensor, level: float = 0.95, draws: int = 2000, seed: int = 0
-) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of a mean whose samples come in groups.
+def bootstrap_interval(values: Tensor, groups: Tensor, draws: int = 2000) -> tuple[float, float]:
+    """Return the 95 % percentile bootstrap interval of a mean whose samples come in groups.
 
     The groups are drawn with replacement, each with all its samples (the cluster bootstrap). The interval of few groups
     is too narrow; reports have none for fewer than eight.
@@ -65,11 +60,9 @@ def bootstrap_interval(
     Args:
         values: one value per sample with shape (S,).
         groups: index of each sample's group, its image pair, with shape (S,), integers.
-        level: share of the draws within the interval, from lower to upper end.
         draws: number of draws.
-        seed: seed of the draws.
 
-    ValueError if the shapes differ, there are fewer than two groups, or ``level`` is not between 0 and 1.
+    ValueError if the shapes differ or there are fewer than two groups.
 
     Reference:
         A. Davison, D. Hinkley, Bootstrap Methods and their Application, 1997, sections 3.8 and 5.3.
@@ -78,13 +71,11 @@ def bootstrap_interval(
         >>> bootstrap_interval(torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([0, 0, 1, 1]))
         (0.0, 1.0)
     """
-    return _bootstrap(values, groups, level, draws, seed)[1:]
+    return _bootstrap(values, groups, draws)[1:]
 
 
-def _bootstrap(values: Tensor, groups: Tensor, level: float, draws: int, seed: int) -> tuple[Tensor, float, float]:
-    """Return the mean of each draw of whole groups, (draws,) float64, and the ends of their middle share ``level``."""
-    if not 0 < level < 1:
-        raise ValueError(f"level must be between 0 and 1, got {level}")
+def _bootstrap(values: Tensor, groups: Tensor, draws: int) -> tuple[Tensor, float, float]:
+    """Return the mean of each draw of whole groups, (draws,) float64, and the ends of their middle 95 %."""
     if values.shape != groups.shape or values.ndim != 1:
         raise ValueError(f"values and groups must be two (S,) tensors, got {[*values.shape]} and {[*groups.shape]}")
     present, group = torch.unique(groups, return_inverse=True)
@@ -92,10 +83,10 @@ def _bootstrap(values: Tensor, groups: Tensor, level: float, draws: int, seed: i
         raise ValueError(f"at least two groups are needed, got {len(present)}")
     counts = torch.bincount(group).double()
     sums = torch.zeros_like(counts).index_add_(0, group, values.double())
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     drawn = torch.randint(len(present), (draws, len(present)), generator=generator).to(counts.device)
     means = sums[drawn].sum(1) / counts[drawn].sum(1)
-    return means, means.quantile((1 - level) / 2).item(), means.quantile((1 + level) / 2).item()
+    return means, means.quantile(0.025).item(), means.quantile(0.975).item()
 
 
 class PairedDifference(NamedTuple):
@@ -107,9 +98,7 @@ class PairedDifference(NamedTuple):
     p_value: float  # two-sided, of no difference
 
 
-def paired_bootstrap(
-    values: Tensor, baseline: Tensor, groups: Tensor, level: float = 0.95, draws: int = 2000, seed: int = 0
-) -> PairedDifference:
+def paired_bootstrap(values: Tensor, baseline: Tensor, groups: Tensor, draws: int = 2000) -> PairedDifference:
     r"""Compare the means of two methods on the same samples, (S,) each, by drawing whole image pairs with replacement.
 
     The p-value is that of the percentile interval which just reaches zero: with :math:`\bar d^*` the mean difference of
@@ -125,6 +114,6 @@ def paired_bootstrap(
     difference = values.double() - baseline.double()
     if bad := int((~difference.isfinite()).sum()):
         raise ValueError(f"differences must be finite, got {bad} NaN or infinite ones of {len(difference)}")
-    means, low, high = _bootstrap(difference, groups, level, draws, seed)
+    means, low, high = _bootstrap(difference, groups, draws)
     fewest = min(int((means <= 0).sum()), int((means >= 0).sum()))
     return PairedDifference(difference.mean().item(), low, high, min(1.0, 2 * (1 + fewest) / (1 + draws)))

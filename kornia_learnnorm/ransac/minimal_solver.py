@@ -1,5 +1,7 @@
 """The matrices of RANSAC's minimal samples."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -32,7 +34,7 @@ def solve_minimal_samples(
         if bool(determined.any()):
             return _solve(scorer, rows[determined], linear, normalizer)
     rows = torch.unique(rows)[None]
-    if rows.shape[1] < linear.min_points or any(_on_a_line(points, shift) for points in scorer.pixels):
+    if rows.shape[1] < linear.min_points or any(spread_across(points) < shift for points in scorer.pixels):
         return x1.new_zeros(0, 3, 3)
     return _solve(scorer, rows, linear, normalizer)
 
@@ -54,7 +56,6 @@ def are_independent(R: Tensor, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
     return independent
 
 
-def _on_a_line(points: Tensor, shift: float) -> bool:
-    """Return whether points (N, 2) are less than ``shift`` pixels from one line, in root mean square."""
-    distance = torch.linalg.svdvals(points - points.mean(0))[1] / len(points) ** 0.5
-    return bool(distance < shift)
+def spread_across(points: Tensor) -> float:
+    """Return the standard deviation of points (N, 2) across the direction in which they spread most, pixels."""
+    return float(torch.linalg.svdvals(points - points.mean(0))[-1]) / math.sqrt(len(points))

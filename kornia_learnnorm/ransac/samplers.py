@@ -1,23 +1,11 @@
 r"""Minimal samples of eight correspondences or any size: uniform, and in proportion to squared weights."""
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
 SAMPLE_SIZE = 8  # correspondences in a sample unless another size is asked for
 MAX_RANDOM_NUMBERS = 1 << 22  # random numbers in memory at once
 MIN_WEIGHT = 1e-30  # smallest positive weight, relative to the largest
-
-
-class Sampler(Protocol):
-    """Protocol of a sampler for RANSAC."""
-
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return the indices of the next ``count`` minimal samples, (count, size) int64."""
-
-    def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
-        """Return the probability that a sample holds no outlier, from the inliers (M,) among ``rows``."""
 
 
 def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tensor:
@@ -39,7 +27,7 @@ def draw_distinct(totals: Tensor, size: int, generator: torch.Generator) -> Tens
 
 
 class UniformSampler:
-    """Uniform samples of so many correspondences."""
+    """Uniform samples of so many correspondences; those of both samplers are indices, (count, size) int64."""
 
     def __init__(self, total: int, device: torch.device, size: int = SAMPLE_SIZE) -> None:
         self.total, self.device, self.size = total, device, size
@@ -57,7 +45,7 @@ class UniformSampler:
         return torch.cat([drawn, draw_distinct(totals, self.size, generator)])
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
-        """Return the share of inliers to the power of the sample's size."""
+        """Return the probability of a sample without outliers, from the inliers (M,) among some rows."""
         return float(inliers.float().mean()) ** self.size
 
 
@@ -65,11 +53,7 @@ class WeightedSampler:
     """Samples with probability in proportion to the squares of weights, without replacement.
 
     The square draws the best correspondences more often where most are outliers, and still all of them where few are.
-
-    Args:
-        weights: non-negative weights, (N,), at least as many of them positive as a sample holds. Weight zero is never
-            drawn.
-        size: correspondences in a sample.
+    Weights (N,) are non-negative, at least as many of them positive as a sample holds; weight zero is never drawn.
 
     Reference:
         P. Efraimidis, P. Spirakis, Weighted random sampling with a reservoir, Information Processing Letters 2006.
@@ -101,6 +85,9 @@ class WeightedSampler:
         return (uniform.clamp_(min=MIN_WEIGHT).log() / self.weights.float()).topk(self.size).indices
 
     def hit_rate(self, inliers: Tensor, rows: Tensor | slice) -> float:
-        """Return the share of the squared weights that inliers have to the power of the size."""
+        """Return the probability of a sample without outliers, from the inliers (M,) among some rows."""
         weights = self.weights[rows].cpu()
         return float(((weights * inliers.cpu()).sum() / weights.sum()) ** self.size)
+
+
+Sampler = UniformSampler | WeightedSampler

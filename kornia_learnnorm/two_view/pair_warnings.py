@@ -14,6 +14,7 @@ from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
+from kornia_learnnorm.ransac.minimal_solver import spread_across
 from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
 
@@ -48,17 +49,12 @@ def find_warnings(
         found["few_inliers"] = f"only {total} of {matches} matches agree on the matrix"
     if log_false_alarms(matches, total, threshold, size2) > MAX_LOG_FALSE_ALARMS:
         found["chance"] = f"{total} of {matches} matches agree within {threshold:g} px, no more than chance would give"
-    spread = min(_spread(points[inliers]) for points in (points1, points2)) / math.hypot(*size2)
+    spread = min(spread_across(points[inliers]) for points in (points1, points2)) / math.hypot(*size2)
     if spread < MIN_SPREAD:
         found["clustered"] = f"the inliers lie close to one line or one point: {spread:.1%} of the image diagonal apart"
     if angle > MAX_ANGLE:
         found["unstable"] = f"the pose changes by {angle:.0f} degrees when the matches are drawn anew"
     return tuple(PairWarning(*item) for item in found.items())
-
-
-def _spread(points: Tensor) -> float:
-    """Return the standard deviation of points (N, 2) across the direction in which they spread most, pixels."""
-    return float(torch.linalg.svdvals(points - points.mean(0))[-1]) / math.sqrt(len(points))
 
 
 def log_false_alarms(matches: int, inliers: int, threshold: float, size: Size, model: str = "fundamental") -> float:

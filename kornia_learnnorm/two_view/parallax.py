@@ -111,13 +111,8 @@ def parallax_evidence(
     so the two that agree best do not count. Of one epipole, chance gives a ratio of :math:`\Lambda` with a probability
     of at most :math:`1 / \Lambda` (Markov's inequality).
 
-    Args:
-        points1: pixels in image 1, (N, 2).
-        points2: pixels in image 2, (N, 2).
-        F_mat: fundamental matrix (3, 3).
-        distance: :math:`r`, that of :func:`parallax` or :func:`distances_from_plane`, pixels, (N,).
-        threshold: largest distance of an inlier, pixels.
-        noises: standard deviations, as shares of the threshold.
+    Matches are pixels (N, 2); ``distance`` is :math:`r`, (N,), that of :func:`parallax` or
+    :func:`distances_from_plane`; ``noises`` are standard deviations, as shares of the threshold.
     """
     across = left_to_right_epipolar_distance(points1[None], points2[None], F_mat[None])[0]
     shares, evidence = torch.arange(0.05, 1.0, 0.1).to(F_mat), math.inf

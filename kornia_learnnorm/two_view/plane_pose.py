@@ -10,12 +10,13 @@ from typing import NamedTuple, cast
 import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import cross_product_matrix
+from kornia.metrics import angle_error_mat
 from torch import Tensor
 
 from kornia_learnnorm.data.images import import_cv2
 from kornia_learnnorm.geometry.matrices import determinant, unit_matrix
 from kornia_learnnorm.geometry.transforms import transform_fundamental
-from kornia_learnnorm.metrics.poses import pose_error, rotation_error
+from kornia_learnnorm.metrics.poses import pose_error
 
 MIN_BASELINE = 0.01  # of the distance to the plane; inexact cameras explain less
 MIN_IN_FRONT = 0.95  # of the points, under a pose that they allow
@@ -70,5 +71,5 @@ def angle_between(pose: PlanePose, others: Sequence[PlanePose]) -> float:
         if pose.t is not None and other.t is not None:
             angles.append(pose_error(other.R, other.t, pose.R, pose.t).item())
         elif pose.t is other.t:
-            angles.append(rotation_error(other.R, pose.R).item())
+            angles.append(angle_error_mat(other.R, pose.R).item())
     return min(angles)

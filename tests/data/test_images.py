@@ -208,7 +208,6 @@ class TestReadMask:
         cv2.imwrite(str(tmp_path / "m.png"), np.repeat([127, 128], 120).astype(np.uint8)[None].repeat(180, 0))
         mask = images.read_mask(tmp_path / "m.png", (240, 180))
         assert np.array_equal(mask, (np.arange(240) >= 120)[None].repeat(180, 0))
-        assert images.read_mask(tmp_path / "m.png", (240, 180), max_size=100).shape == (75, 100)
 
     def test_wrong(self, tmp_path):
         cv2.imwrite(str(tmp_path / "m.png"), np.ones((4, 5), np.uint8))

@@ -1,4 +1,4 @@
-"""Inlier share, F1 and epipolar error against sets of correspondences."""
+"""F1 and epipolar error against sets of correspondences."""
 
 import numpy as np
 import pytest
@@ -9,15 +9,15 @@ from kornia.core.exceptions import ShapeError
 from references import epipolar_distances
 from scenes import scenes, seeded
 
-from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
+from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score
 
 INF, NAN = float("inf"), float("nan")
 ROWS = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]], dtype=torch.float64)  # y1 - y2
-METRICS = {"share": lambda *values: inlier_share(*values[:3], values[4]), "f1": f1_score, "error": epipolar_error}
+METRICS = {"f1": f1_score, "error": epipolar_error}
 
 
 def by_hand(points1, points2, F, true, threshold):
-    """All three of one pair, precision and recall apart."""
+    """Both of one pair, precision and recall apart."""
     estimated, actual = (epipolar_distances(points1, points2, matrix) for matrix in (F, true))
     chosen, right = ({i for i, d in enumerate(ds) if d < threshold} for ds in (estimated, actual))
     hits, f1 = len(chosen & right), NAN
@@ -25,7 +25,7 @@ def by_hand(points1, points2, F, true, threshold):
         precision, recall = hits / max(len(chosen), 1), hits / len(right)
         f1 = 2 * precision * recall / (precision + recall) if hits else 0.0
     error = np.mean([estimated[i] for i in sorted(right)]) if right else NAN
-    return {"share": len(chosen) / len(estimated), "f1": f1, "error": error}
+    return {"f1": f1, "error": error}
 
 
 def pairs(seed=0, batch_size=6, num_points=40, jitter=1e-3):
@@ -74,7 +74,7 @@ class TestAll:
     def test_failed_estimate(self, name, value):
         points1, points2, F, true = pairs()
         found = METRICS[name](points1, points2, torch.full_like(F, value), true, 1.0)
-        assert (found == {"share": 0.0, "f1": 0.0, "error": INF}[name]).all()
+        assert (found == {"f1": 0.0, "error": INF}[name]).all()
 
     def test_no_correspondences(self, name):
         points1, points2, F, true = pairs()
@@ -99,7 +99,6 @@ def test_by_rows():
         points1 = torch.tensor([[[5.0, 7.0]] * len(differences)], dtype=torch.float64)
         return points1, points1 + torch.tensor([[[3.0, d / 2] for d in differences]], dtype=torch.float64)
 
-    assert inlier_share(*points(0.5, 1.0, 1.5, 3.0), ROWS, 1.0).item() == 0.25
     estimate, apart = ROWS + torch.tensor([0.0, 0, 1]).diag(), points(0.0, 2.0)  # sets that do not meet
     matrices = (estimate, ROWS), (ROWS, estimate), (ROWS, ROWS)
     assert [f1_score(*apart, *pair, 1.0).item() for pair in matrices] == [0.0, 0.0, 1.0]

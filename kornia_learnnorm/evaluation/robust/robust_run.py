@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from kornia.metrics import angle_error_mat, angle_error_vec
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
@@ -18,8 +19,7 @@ from kornia_learnnorm.evaluation.runs import results_store
 from kornia_learnnorm.evaluation.runs.results_store import About, Arrays, Job, Stores, array_path, read_arrays
 from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
-from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, inlier_share
-from kornia_learnnorm.metrics.poses import rotation_error, translation_error
+from kornia_learnnorm.metrics.inliers import epipolar_error, f1_score, finite_distance
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, MAX_FILTERED, PROTOCOLS, THRESHOLDS
 
 DEFAULT_OPTIONS = {
@@ -132,13 +132,13 @@ def measure(pair: EvaluatedPair, F_mat: Tensor, threshold: float) -> dict[str, f
     x1, x2 = pair.points1, pair.points2
     near = symmetric_epipolar_distance(x1, x2, F_mat) < INLIER_THRESHOLD
     pose = relative_pose(F_mat[None], pair.K[:1], pair.K[1:], x1[None], x2[None], near[None])
-    known = (rotation_error(pair.R, pair.R) + translation_error(pair.t, pair.t)).isfinite()
+    known = (angle_error_mat(pair.R, pair.R) + angle_error_vec(pair.t, pair.t)).isfinite()
     results = {
-        "inliers": inlier_share(x1, x2, F_mat, threshold),
+        "inliers": (finite_distance(x1, x2, F_mat) < threshold).double().mean(),
         "f1": f1_score(x1, x2, F_mat, pair.F_mat, threshold),
         "error": epipolar_error(x1, x2, F_mat, pair.F_mat),
-        "rotation_error": rotation_error(pose[0][0], pair.R).nan_to_num(torch.inf).where(known, torch.nan),
-        "translation_error": translation_error(pose[1][0], pair.t).nan_to_num(torch.inf).where(known, torch.nan),
+        "rotation_error": angle_error_mat(pose[0][0], pair.R).nan_to_num(torch.inf).where(known, torch.nan),
+        "translation_error": angle_error_vec(pose[1][0], pair.t).nan_to_num(torch.inf).where(known, torch.nan),
     }
     return {name: float(value) for name, value in results.items()}
 

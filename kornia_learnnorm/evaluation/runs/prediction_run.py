@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
+from kornia.metrics import angle_error_mat, angle_error_vec
 from torch import Tensor
 
 from kornia_learnnorm.data.match_sets import MatchSets, draw_samples, plain_residual
@@ -22,7 +23,6 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.metrics.inliers import f1_from_masks, finite_distance
-from kornia_learnnorm.metrics.poses import rotation_error, translation_error
 from kornia_learnnorm.metrics.statistics import median
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.normalizers.normalizer import normalizing_transforms
@@ -93,8 +93,8 @@ def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStor
         "own": symmetric_epipolar_distance(x1, x2, F_mat).mean(-1),
         "heldout": median_distance(torch.cat([samples.heldout1, samples.heldout2], -1).double(), F_mat),
         "truth": median_distance(truth[samples.pair], F_mat),
-        "rotation_error": rotation_error(found[0], R),
-        "translation_error": translation_error(found[1], t),
+        "rotation_error": angle_error_mat(found[0], R),
+        "translation_error": angle_error_vec(found[1], t),
         **dict(zip(DIAGNOSTICS, diagnose_in_coordinates(problem, T1, T2), strict=True)),
     }
 

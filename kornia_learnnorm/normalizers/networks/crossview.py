@@ -6,8 +6,8 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from kornia_learnnorm.geometry.checks import weighted_mean
-from kornia_learnnorm.geometry.dlt import design_matrix, null_vector
-from kornia_learnnorm.geometry.matrices import smallest_singular_vectors
+from kornia_learnnorm.geometry.dlt import design_matrix, solve_rows
+from kornia_learnnorm.geometry.matrices import smallest_right_singular_vector
 
 __all__ = ["CrossViewNetwork", "SetNetwork"]
 
@@ -89,11 +89,12 @@ class CrossViewNetwork(nn.Module):
             return points, torch.ones_like(points[:, 0, :1])
         x1, x2 = convert_points_to_homogeneous(points1), convert_points_to_homogeneous(points2)
         if null_matrix is None:
-            null_matrix = torch.unflatten(null_vector(design_matrix(x1, x2), weights), -1, (3, 3))
+            null_matrix = torch.unflatten(solve_rows(design_matrix(x1, x2), weights)[0], -1, (3, 3))
         # The sign that makes the largest entry positive is equal for a matrix and its transpose.
         entries = null_matrix.detach().flatten(-2)
         F = null_matrix * entries.gather(-1, entries.abs().argmax(-1, keepdim=True)).sign()[..., None]
-        u, v = smallest_singular_vectors(F)
+        v, C = smallest_right_singular_vector(F)
+        u = normalize((C @ v[..., None])[..., 0], dim=-1)  # of the smallest singular value too
         own, other, doubled = torch.stack([x1, x2]), torch.stack([x2, x1]), torch.stack([F, F.mT])
         points, sets = _epipolar_features(own, other, doubled, torch.stack([v, u]), torch.stack([u, v]), weights)
         return points.flatten(0, 1), sets.flatten(0, 1)
