@@ -14,6 +14,7 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_choice
 
 MODELS = ("auto", "fundamental", "homography")
 MAX_THRESHOLD = 1000.0  # pixels
+FAR = 3.0  # times what nine of ten coordinates stay below; a farther point says nothing of its image's size
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]
 
@@ -52,7 +53,8 @@ def read_size(name: str, size: Size | Points | None, points: Tensor) -> Size:
 
     Most points must lie inside; undistortion moves only a few beyond the borders.
     """
-    given: Any = points.amax(0).clamp(min=1.0).ceil() + 1 if size is None else size
+    near = points <= FAR * points.quantile(0.9, dim=0)
+    given: Any = torch.where(near, points, 1.0).amax(0).clamp(min=1.0).ceil() + 1 if size is None else size
     if isinstance(given, np.ndarray | Tensor):  # LightGlue's are float32
         given = tuple(int(value) if value.is_integer() else value for value in map(float, given.reshape(-1)))
     for value in given:

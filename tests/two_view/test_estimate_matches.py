@@ -147,7 +147,9 @@ class TestEstimateMatches:
             read = module.read_matches(*given, None)
             assert all(torch.equal(found, torch.from_numpy(x)) for found, x in zip(read, points, strict=False))
             assert not any(found.requires_grad for found in read)
-        assert module.read_size("size1", torch.tensor([640.0, 480.0]), tensors[0][0]) == (640, 480)
+        assert module.read_size("size1", torch.tensor([640.0, 480.0]), MATCHES[0]) == (640, 480)
+        outlier = torch.cat([MATCHES[0], torch.tensor([[5e4, -3e4]])])
+        assert module.read_size("size1", None, outlier) == module.read_size("size1", None, MATCHES[0])
 
     def test_what_stands_still_is_left_out(self):
         overlay = uniform(60, 2, high=400)
