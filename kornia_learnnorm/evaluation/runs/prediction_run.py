@@ -6,7 +6,7 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from kornia.metrics import angle_error_mat, angle_error_vec
@@ -106,16 +106,11 @@ def consensus(F_mat: Tensor, pair: Tensor, store: CorrespondenceStore, max_ratio
     for index in torch.unique(pair).tolist():
         rows = torch.nonzero(pair == index).flatten()
         points1, points2 = pair_matches(store, index, max_ratio)
-        true, found = (_within(points1, points2, F) for F in (torch.from_numpy(store.F[index]), F_mat[rows]))
-        inliers[rows] = found.double().mean(-1)
-        f1[rows] = f1_from_masks(found, true)
+        distance = finite_distance(points1, points2, torch.cat([torch.from_numpy(store.F[[index]]), F_mat[rows]]))
+        within = distance[:, None] < distance.new_tensor(THRESHOLDS)[:, None]  # of the truth and of each matrix
+        inliers[rows] = within[1:].double().mean(-1)
+        f1[rows] = f1_from_masks(within[1:], within[0])
     return {"inliers": inliers, "f1": f1}
-
-
-def _within(points1: Tensor, points2: Tensor, F_mat: Tensor) -> Tensor:
-    """Return which points lie within each threshold, (..., thresholds, N); none do under a matrix of NaN."""
-    distance = finite_distance(points1, points2, F_mat)
-    return distance[..., None, :] < distance.new_tensor(THRESHOLDS)[:, None]
 
 
 def pair_matches(store: CorrespondenceStore, pair: int, max_ratio: float | None) -> tuple[Tensor, Tensor]:
@@ -238,18 +233,13 @@ def read_run(folder: str | Path, complete: bool = True) -> Run:
         raise FileNotFoundError(f"no run at {folder}: learnnorm evaluate STORE --out {folder} makes one")
     cells = []
     for store, protocol in product(about["stores"], PROTOCOLS):
-        absent = ["all methods"]
-        if array_path(folder, store, protocol, "samples").is_file():
-            cells.append(_read_cell(folder, about, store, protocol, complete))
-            absent = [name for name in about["methods"] if name not in cells[-1].predictions]
+        path, absent = partial(array_path, folder, store, protocol), ["all methods"]
+        if path("samples").is_file():
+            samples = read_arrays(path("samples"), SAMPLES)
+            kept = samples["plain_residual"] < about["max_residual"]
+            pair, there = samples["pair"][kept], [name for name in about["methods"] if path(name).is_file()]
+            found = {name: read_arrays(path(name), KEYS[complete], len(pair)) for name in there}
+            cells.append(RunCell(store, protocol, pair, len(kept), found))
+            absent = [name for name in about["methods"] if name not in there]
         missing += [f"{name} on {store}, {protocol}" for name in absent]
     return Run(about, cells, missing)
-
-
-def _read_cell(folder: Path, about: dict[str, Any], store: str, protocol: str, complete: bool) -> RunCell:
-    samples = read_arrays(array_path(folder, store, protocol, "samples"), SAMPLES)
-    kept = samples["plain_residual"] < about["max_residual"]
-    pair = samples["pair"][kept]
-    paths = {name: array_path(folder, store, protocol, name) for name in about["methods"]}
-    predictions = {name: read_arrays(path, KEYS[complete], len(pair)) for name, path in paths.items() if path.is_file()}
-    return RunCell(store, protocol, pair, len(kept), predictions)
