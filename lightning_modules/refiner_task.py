@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from kornia.geometry.epipolar import fundamental_from_essential
 from torch import Tensor, nn
 
 from kornia_learnnorm.data.match_sets import MatchSets
@@ -66,8 +67,7 @@ class HeldOutLoss(nn.Module):
         F_mat = self._estimate(sets, halves1, halves2).roll(len(points1), 0)
         F_mat = F_mat.detach() if self.detach else F_mat
         if self.labels and sets.E_mat is not None:
-            inverse1, inverse2 = (torch.linalg.inv_ex(K)[0] for K in cameras_of(sets))
-            true = (inverse2.mT @ sets.E_mat.double() @ inverse1).repeat(2, 1, 1)
+            true = fundamental_from_essential(sets.E_mat.double(), *cameras_of(sets)).repeat(2, 1, 1)
             F_mat = torch.where(true.isfinite().all(-1).all(-1)[:, None, None], true, F_mat)
         return torch.cat(symmetric_epipolar_distance(halves1, halves2, F_mat).chunk(2), 1)
 

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, cast
 
 import pytorch_lightning as pl
 import torch
+from kornia.geometry.epipolar import fundamental_from_essential
 from pytorch_lightning.utilities import rank_zero_warn
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -208,10 +209,9 @@ class EstimatorTask(pl.LightningModule):
         try:
             if not isinstance(layer, LearnedRelativePose):
                 return [*layer.estimate(*points, scores=batch.scores).stages]
-            K1, K2 = cameras_of(batch)
-            stages = layer.estimate(*points, K1, K2, scores=batch.scores).stages
-            inverse1, inverse2 = (torch.linalg.inv_ex(K)[0] for K in (K1, K2))
-            return [(inverse2.mT @ stage.E_mat @ inverse1, stage.logits) for stage in stages]
+            cameras = cameras_of(batch)
+            stages = layer.estimate(*points, *cameras, scores=batch.scores).stages
+            return [(fundamental_from_essential(stage.E_mat, *cameras), stage.logits) for stage in stages]
         finally:
             layer.detach_stages = before
 

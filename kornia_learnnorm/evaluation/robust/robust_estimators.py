@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from kornia.geometry.epipolar import fundamental_from_essential
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -142,8 +143,7 @@ def _learned(
     if isinstance(layer, LearnedRelativePose):
         if not bool(pair.K.isfinite().all()):
             return None, math.nan
-        inverse1, inverse2 = torch.linalg.inv_ex(pair.K)[0]
-        return inverse2.mT @ layer(points1, points2, *pair.K, scores=scores)[0] @ inverse1, math.nan
+        return fundamental_from_essential(layer(points1, points2, *pair.K, scores=scores)[0], *pair.K), math.nan
     F_mat = layer(points1, points2, scores=scores)
     if method.endswith(REFINED):
         F_mat = refine_fundamental(points1, points2, F_mat, loss=GemanMcClure(threshold)).F_mat
