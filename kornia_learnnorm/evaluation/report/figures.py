@@ -118,8 +118,7 @@ def _conditions(figure: Figure, cell: RunCell, colors: Colors) -> str:
         axes.plot(middle, place, "o", color=colors[name], markersize=8)
         axes.annotate(f"{middle:.3g}", (middle, place), (0, 8), textcoords="offset points", ha="center", color=INK)
     axes.set_yticks(range(len(names)), names)
-    axes.set(xscale="log", xlabel="condition number of the design matrix (no unit)")
-    axes.set_ylim(-0.6, len(names) - 0.2)
+    axes.set(xscale="log", xlabel="condition number of the design matrix (no unit)", ylim=(-0.6, len(names) - 0.2))
     return f"Largest over eighth singular value of the design matrix. Dot: median; bar: quartiles. {cell.title}."
 
 

@@ -51,7 +51,7 @@ def _better_rates(run: Run, cells: list[RunCell], baseline: str) -> Table:
     rows: list[list[Cell]] = [
         [name, *rates, ", ".join(trained[name]) or "-"]
         for name in run.about["methods"]
-        if name != baseline and any(rates := [_rate(cell, name, baseline, trained[name]) for cell in cells])
+        if name != baseline and any(rates := [better_share(c, name, baseline, "own", trained[name]) for c in cells])
     ]
     found = [
         better_rate(prediction["own"], cell.predictions[baseline]["own"])
@@ -79,17 +79,14 @@ def _better_rates(run: Run, cells: list[RunCell], baseline: str) -> Table:
     return Table(title, text, header, rows)
 
 
-def _rate(cell: RunCell, name: str, baseline: str, trained_on: Iterable[str]) -> Cell:
-    """Return a better rate, marked if the method was trained on the store; unknown without predictions."""
-    rate = better_share(cell, name, baseline, "own") if name in cell.predictions else ""
-    return rate._replace(trained_on=was_trained_on(cell.store, trained_on)) if isinstance(rate, Number) else rate
-
-
-def better_share(cell: RunCell, name: str, baseline: str, quantity: str) -> Cell:
-    """Return a better rate against a baseline with its interval, %."""
+def better_share(cell: RunCell, name: str, baseline: str, quantity: str, trained_on: Iterable[str] = ()) -> Cell:
+    """Return a better rate with its interval, %, marked if the method was trained on the store; unknown if absent."""
+    if name not in cell.predictions:
+        return ""
     value, other = cell.predictions[name][quantity], cell.predictions[baseline][quantity]
     valid = comparable(value, other)
-    return tables.mean_share((value < other)[valid].double(), cell.pair[valid])
+    rate = tables.mean_share((value < other)[valid].double(), cell.pair[valid])
+    return rate._replace(trained_on=was_trained_on(cell.store, trained_on)) if isinstance(rate, Number) else rate
 
 
 def was_trained_on(store: str, trained_on: Iterable[str]) -> bool:
@@ -110,8 +107,8 @@ def method_rows(predictions: Mapping[str, Mapping[str, Tensor]]) -> list[list[Ce
         if name == baseline or baseline not in predictions:
             return "-"
         errors, other = predictions[name][quantity], predictions[baseline][quantity]
-        known = comparable(errors, other).any()
-        return Number(100 * better_rate(errors, other).rate, ".1f") if known else "-"
+        better = (errors < other)[comparable(errors, other)].double()
+        return tables.number(100 * better.mean().item(), ".1f") or "-"
 
     finite = torch.stack([errors["own"] for errors in predictions.values()]).isfinite().all(0)
     return [

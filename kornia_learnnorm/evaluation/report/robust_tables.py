@@ -32,7 +32,7 @@ def pairs_with_truth(cell: RobustCell, threshold: float) -> Tensor:
     return results["f1"][:, 0].isfinite() & ~results["error"][:, 0].isnan()
 
 
-def _kept(cell: RobustCell, threshold: float) -> Tensor:
+def kept_pairs(cell: RobustCell, threshold: float) -> Tensor:
     """Return a mask of the pairs of the means, (P,): those with ground truth, all where no pair has one."""
     known = pairs_with_truth(cell, threshold)
     return known | ~known.any()
@@ -47,7 +47,7 @@ def _agreement(cell: RobustCell, run: RobustRun) -> Table:
     for name, by_threshold in cell.estimates.items():
         cells: list[Cell] = []
         for threshold in THRESHOLDS:
-            inliers, f1, error = (by_threshold[threshold][key][_kept(cell, threshold)] for key in SCALES)
+            inliers, f1, error = (by_threshold[threshold][key][kept_pairs(cell, threshold)] for key in SCALES)
             error = error.clamp(max=MAX_ERROR)
             cells += [_mean(100 * inliers, 2), _mean(100 * f1, 2), _mean(error, 3)]
         rows.append([name, *cells, median_number(error)])
@@ -117,6 +117,6 @@ def _tests(cell: RobustCell) -> list[Table]:
 
 
 def _test(cell: RobustCell, name: str, threshold: float, key: str) -> Cell:
-    both = [cell.estimates[n][threshold][key][_kept(cell, threshold)] for n in (name, BASELINE)]
+    both = [cell.estimates[n][threshold][key][kept_pairs(cell, threshold)] for n in (name, BASELINE)]
     runs = min(values.shape[1] for values in both)
     return tables.paired_change(*(values[:, :runs].clamp(max=MAX_ERROR).mean(1) * SCALES[key] for values in both))

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kornia_learnnorm.evaluation.methods import SHIPPED, base_name
 from kornia_learnnorm.evaluation.report.method_tables import BASELINE, MIN_DISTANCE
-from kornia_learnnorm.evaluation.report.robust_tables import MAX_ERROR, pairs_with_truth
+from kornia_learnnorm.evaluation.report.robust_tables import MAX_ERROR, kept_pairs, pairs_with_truth
 from kornia_learnnorm.evaluation.robust.robust_estimators import TRUTH
 from kornia_learnnorm.evaluation.robust.robust_run import RobustCell, RobustRun
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, RunCell
@@ -113,9 +113,7 @@ def _about_estimators(cell: RobustCell) -> str:
     found = {name: by[INLIER_THRESHOLD] for name, by in cell.estimates.items() if name != TRUTH}
     if not found:
         return ""
-    known = pairs_with_truth(cell, INLIER_THRESHOLD)
-    truth = bool(known.any())
-    kept = known if truth else torch.ones_like(known)
+    truth, kept = bool(pairs_with_truth(cell, INLIER_THRESHOLD).any()), kept_pairs(cell, INLIER_THRESHOLD)
     key, sign = ("error", 1) if truth else ("inliers", -1)
     scores = {name: sign * r[key][kept].clamp(max=MAX_ERROR).mean(1) for name, r in found.items()}
     ranking = _rank({n: s.mean().item() for n, s in scores.items()}, scores, torch.arange(int(kept.sum())))
