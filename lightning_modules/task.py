@@ -183,15 +183,14 @@ class EstimatorTask(pl.LightningModule):
 
     def compute_loss(self, batch: MatchSets) -> Tensor:
         """Return the loss of a batch, of all stages, each set's gradient limited where it enters the networks."""
-        points = batch.points1.double(), batch.points2.double()
-        heldout = batch.heldout1.double(), batch.heldout2.double()
+        points1, points2, *heldout = (points.double() for points in batch[:4])
         arrived: list[Tensor] = []
         with self._limited_gradients(arrived):
             stages = self._stages(batch)
-        total = points[0].new_zeros(())
+        total = points1.new_zeros(())
         of_sets = isinstance(self.loss, SetLoss)
         for number, (F_mat, logits) in enumerate(stages, 1):
-            loss = self.loss(batch, F_mat, logits) if of_sets else self.loss(*points, F_mat, *heldout)
+            loss = self.loss(batch, F_mat, logits) if of_sets else self.loss(points1, points2, F_mat, *heldout)
             if not of_sets and (not isinstance(loss, Tensor) or loss.shape not in ((), F_mat.shape[:1])):
                 got = [*loss.shape] if isinstance(loss, Tensor) else type(loss)
                 raise ValueError(f"a loss must return a scalar or one number for each of {len(F_mat)} sets, got {got}")

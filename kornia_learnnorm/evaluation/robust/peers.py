@@ -33,8 +33,7 @@ def _poselib(poselib: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, thresh
 
 
 def _opencv_calibrated(cv2: Any, x1: Array, x2: Array, sizes: Sizes, seed: int, threshold: float, K: Array) -> Any:
-    options = {"method": cv2.USAC_MAGSAC, "threshold": threshold}
-    E = cv2.findEssentialMat(x1, x2, K[0], None, K[1], None, **options)[0]
+    E = cv2.findEssentialMat(x1, x2, K[0], None, K[1], None, method=cv2.USAC_MAGSAC, threshold=threshold)[0]
     return None if E is None or E.shape != (3, 3) else _to_pixels(E, K)
 
 
