@@ -82,7 +82,7 @@ def predict(
 
 
 def _predict_batch(method: Method, samples: MatchSets, store: CorrespondenceStore, truth: Tensor) -> dict[str, Tensor]:
-    problem = LinearProblem.from_points(samples.points1, samples.points2, None, Fundamental())
+    problem = LinearProblem.from_points(samples.points1, samples.points2, None, Fundamental(method.rank2))
     x1, x2 = problem.points1, problem.points2
     T1, T2 = normalizing_transforms(method.normalizer, problem)
     F_mat = method.solve(problem, T1, T2)
