@@ -27,6 +27,7 @@ from kornia_learnnorm.two_view.pair_warnings import (
     find_warnings,
     log_false_alarms,
 )
+from kornia_learnnorm.two_view.parallax import MAX_LOG_CHANCE_PARALLAX
 from kornia_learnnorm.two_view.plane_pose import angle_between, plane_poses
 from kornia_learnnorm.two_view.result import NoReliableMatrixError, PairEstimate
 from kornia_learnnorm.two_view.solver import MIN_MATCHES, Solution, TwoViewSolver
@@ -83,8 +84,8 @@ def estimate_matches(
     Raises:
         NoReliableMatrixError: if there are fewer than nine matches or inliers, or no motion.
         TypeError: if an argument is not of its type.
-        ValueError: if shapes do not pair up, a value is out of range, most points lie outside of their image, or a
-            camera is missing or not invertible.
+        ValueError: if shapes do not pair up, a value is out of range, over a fifth of the points lies outside of its
+            image, or a camera is missing or not invertible.
     """
     check_settings(threshold, seed, layer, model)
     cameras = read_cameras(K1, K2)
@@ -105,6 +106,8 @@ def estimate_matches(
         doubts += doubt or _compare_free(solver, fields["F_mat"])
     elif choice.model == "fundamental" and choice.parallax is not None and not relief:
         doubts += (PairWarning("planar", choice.parallax.describe(threshold)),)
+    if model == "homography" and choice.parallax is not None and choice.parallax.log_chance <= MAX_LOG_CHANCE_PARALLAX:
+        doubts += (PairWarning("relief", f"{choice.parallax.describe(threshold)}: H holds for one plane of the scene"),)
     about = points1, points2, fields["inliers"], threshold, size2, error.angle
     return PairEstimate(
         choice=choice,
@@ -132,7 +135,8 @@ def _usable(points1: Tensor, points2: Tensor, scores: Tensor, threshold: float) 
     motion = (points2 - points1).norm(dim=-1)[kept]
     if len(kept) >= MIN_MATCHES and median(motion).item() < MIN_MOTION:
         text = f"no motion between the images (median displacement {median(motion):.2g} px of {len(kept)} matches)"
-        raise NoReliableMatrixError("no_motion", f"{text}: the fundamental matrix is not determined")
+        hint = "; the points are smaller than 2, pixels are expected" if float(points2.abs().max()) < 2 else ""
+        raise NoReliableMatrixError("no_motion", f"{text}: the fundamental matrix is not determined{hint}")
     kept = kept[motion >= MIN_MOTION]  # what stands still lies on an overlay or a dirty lens
     if len(kept) < MIN_MATCHES:
         text = f"{len(kept)} distinct matches of {given} are left, at least {MIN_MATCHES} are needed"
@@ -148,6 +152,9 @@ def _answer_fundamental(solver: TwoViewSolver, found: Solution, size1: Size, siz
     weights = inliers.double() if solver.layer is None else found.weights
     fields: dict[str, Any] = {"F_mat": F_mat, "inliers": inliers, "weights": weights}
     doubts = _find_rival(solver, F_mat, inliers, size2, *cameras)
+    if (motion := median((matches[1] - matches[0]).norm(dim=-1)).item()) < solver.threshold:
+        text = f"half of the matches move by less than {motion:.2g} px, which any motion fits within the threshold"
+        doubts += (PairWarning("small_motion", text),)
     if solver.cameras is None:
         return fields, error, doubts
     fields["E_mat"] = nearest_essential(transform_fundamental(F_mat, *cameras)[None])[0]

@@ -167,7 +167,9 @@ def match_two_images(
     features2 = _features(pixels2, full_size2, mask2, detector)
     for number, features in enumerate((features1, features2), 1):
         if len(features.points) < 2:
-            text = f"image {number} is blank, nearly so, or masked: {len(features.points)} features, expected 2 or more"
+            (width, height), number_found = features.size, len(features.points)
+            text = f"image {number} is blank, nearly so, masked or too small: {number_found} features in {width} x "
+            text += f"{height} pixels, expected 2 or more"
             raise _named(NoReliableMatrixError("blank", text), (path1, path2))
     limit: float | None = None
     if matcher == "nearest":
@@ -224,8 +226,9 @@ def _pixels(image: Image, max_size: int, colour: bool) -> tuple[NDArray[np.uint8
         return (images.read_colour if colour else images.read_image)(image, max_size), images.image_size(image)
     values = image.cpu().numpy() if isinstance(image, Tensor) else image
     if not isinstance(values, np.ndarray) or values.dtype != np.uint8:
-        hint = f"got {getattr(values, 'dtype', type(values))}; values from 0 to 1 times 255 in uint8 make one"
-        raise TypeError(f"an image must be a path or an array of uint8, {hint}")
+        hint = "values from 0 to 1 times 255 in uint8" if hasattr(values, "dtype") else "numpy.asarray(image)"
+        got = f"got {getattr(values, 'dtype', type(values))}: try {hint}"
+        raise TypeError(f"an image must be a path or an array of uint8, {got}")
     images.check_grey(values, colour=True)
     values = np.ascontiguousarray(values if colour else _grey(values))
     return images.resize_image(values, max_size), (values.shape[1], values.shape[0])

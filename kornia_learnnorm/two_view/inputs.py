@@ -14,6 +14,7 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_choice
 
 MODELS = ("auto", "fundamental", "homography")
 MAX_THRESHOLD = 1000.0  # pixels
+MIN_INSIDE = 0.8  # of the points of an image
 FAR = 3.0  # times what nine of ten coordinates stay below; a farther point says nothing of its image's size
 Points = Tensor | NDArray[Any]
 Cameras = tuple[Tensor, Tensor]
@@ -51,7 +52,7 @@ def read_cameras(K1: Points | None, K2: Points | None) -> Cameras | None:
 def read_size(name: str, size: Size | Points | None, points: Tensor) -> Size:
     """Return the width and height of an image, pixels; as large as its points (N, 2) need when not given.
 
-    Most points must lie inside; undistortion moves only a few beyond the borders.
+    Four of five points must lie inside; undistortion moves only a few beyond the borders.
     """
     near = points <= FAR * points.quantile(0.9, dim=0)
     given: Any = torch.where(near, points, 1.0).amax(0).clamp(min=1.0).ceil() + 1 if size is None else size
@@ -63,7 +64,7 @@ def read_size(name: str, size: Size | Points | None, points: Tensor) -> Size:
         raise ValueError(f"{name} must be a positive width and height, got {tuple(given)}")
     width, height = int(given[0]), int(given[1])
     inside = ((points >= -1) & (points <= points.new_tensor([width, height]))).all(-1)
-    if 2 * int(inside.sum()) < len(points):
+    if int(inside.sum()) < MIN_INSIDE * len(points):
         text = f"{int(inside.sum())} of {len(points)} points lie in the image of {name}, {width} x {height} pixels"
         raise ValueError(f"{text}: points are pixels from its upper left corner")
     return width, height

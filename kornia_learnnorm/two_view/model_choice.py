@@ -34,7 +34,10 @@ def choose_model(
         if H_mat is None:
             text = f"fewer than {MIN_MATCHES} of {len(solver.scores)} matches agree on a homography within "
             raise NoReliableMatrixError("no_consensus", f"{text}{solver.threshold:g} px, or no more than by chance")
-        return ModelChoice(model, ASKED, homography_inliers=agree), None, H_mat
+        F_mat = solver.solve().matrix  # its parallax tells whether the scene is a plane
+        matches = solver.points1, solver.points2, F_mat, solver.threshold, size1, size2
+        parallax = measure_parallax(*matches) if int(solver.support(F_mat)) >= MIN_MATCHES else None
+        return ModelChoice(model, ASKED, parallax, homography_inliers=agree), None, H_mat
     found = solver.solve()
     choice = _compare(solver, found.matrix, H_mat, size1, size2)
     if choice.model == "fundamental" or choice.by_gric is None:

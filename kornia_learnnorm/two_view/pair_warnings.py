@@ -34,7 +34,7 @@ MAX_OFFSET = 0.2  # of both sides of an image; a principal point is closer to th
 class PairWarning(NamedTuple):
     """A reason to doubt a matrix."""
 
-    code: str  # few_inliers, chance, clustered, planar, unstable, ambiguous, no_pose or cameras
+    code: str  # few_inliers, chance, clustered, planar, relief, small_motion, unstable, ambiguous, no_pose or cameras
     text: str  # one sentence for people
 
 

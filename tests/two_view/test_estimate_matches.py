@@ -95,6 +95,7 @@ class TestEstimateMatches:
         assert found.t.numpy() @ t / np.linalg.norm(t) > np.cos(np.radians(3))
         assert found.other_pose.t.numpy() @ t / np.linalg.norm(t) < np.cos(np.radians(6))
         assert {*found.as_dict()["other_pose"]} == {"R", "t", "n"}
+        assert codes(found) == ["relief"]
 
     def test_a_camera_that_turns(self):
         R = cv2.Rodrigues(np.array([0.02, -0.1, 0.01]))[0]
@@ -104,9 +105,9 @@ class TestEstimateMatches:
         json.dumps(found.as_dict(), allow_nan=False)
 
     def test_a_homography_that_is_asked_for(self):
-        """Of a scene with relief: it moves few matches right. Of a mirror with cameras: no pose."""
+        """Of a plane: no warning. Of a mirror with cameras: no pose."""
         found = kln.estimate_matches(*see_plane(np.eye(3), [0.8, 0.1, 0.1]), **SIZES, model="homography")
-        assert (found.F_mat, found.choice.parallax, found.estimator) == (None, None, "RANSAC")
+        assert (found.F_mat, found.choice.parallax.planar, found.estimator, codes(found)) == (None, True, "RANSAC", [])
         json.dumps(found.as_dict(), allow_nan=False)
         points1 = uniform(60, 2, high=400)
         points2 = points1 * torch.tensor([-1.0, 1]) + torch.tensor([400.0, 0])
@@ -125,6 +126,10 @@ class TestEstimateMatches:
         ((code, text),) = kln.estimate_matches(points1, points2).warnings
         assert (code, "others on one whose pose differs by" in text) == ("ambiguous", True)
         assert codes(kln.estimate_matches(*make_matches(outliers=400))) == []  # others of no common motion
+
+    def test_a_camera_that_stands_still(self):
+        still = MATCHES[0], MATCHES[0] + 0.3 * torch.randn(200, 2, generator=seeded(3), dtype=torch.float64)
+        assert "small_motion" in codes(kln.estimate_matches(*still, model="fundamental"))
 
     def test_order_has_no_effect(self):
         scores, order = uniform(200, seed=1), torch.randperm(200, generator=seeded(2))

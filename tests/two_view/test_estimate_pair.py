@@ -157,7 +157,8 @@ class TestErrors:
 
     def test_what_is_no_image(self, planes, images):
         for image, error, message in [
-            *((values, TypeError, "an image must .* times 255") for values in (np.zeros((8, 8)), 3)),
+            (np.zeros((8, 8)), TypeError, "an image must .* got float64: try values from 0 to 1 times 255"),
+            (3, TypeError, r"an image must .* got <class 'int'>: try numpy\.asarray"),
             *((np.zeros(s, np.uint8), ValueError, text) for s, text in (((8, 8, 4), "must"), ((3, 8, 8), "movedim"))),
             ("no.png", FileNotFoundError, r"no\.png does not exist"),
             ("half.png", ValueError, r"half\.png.*truncated or corrupt"),

@@ -51,7 +51,7 @@ class TestChooseModel:
         choice, found, H_mat = choose_model(solver, "fundamental", SIZE, SIZE)
         assert (choice.model, choice.parallax.planar, H_mat) == ("fundamental", True, None)
         choice, found, H_mat = choose_model(solver, "homography", SIZE, SIZE)
-        assert (choice.model, choice.parallax, found) == ("homography", None, None)
+        assert (choice.model, choice.parallax.planar, found) == ("homography", True, None)
         assert np.allclose(H_mat / H_mat[2, 2], [[1, 0, 40], [0, 1, 10], [0, 0, 1]], atol=0.5)
 
     @pytest.mark.parametrize("missed", ["all", "most"])
