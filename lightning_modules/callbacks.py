@@ -19,9 +19,10 @@ from tqdm import tqdm
 
 from kornia_learnnorm.data.random_sets import RandomSets, StoreSets, SyntheticSets
 from kornia_learnnorm.data.sources import StoreSamples, SyntheticSamples
+from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.files import atomic_write, short_name
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
-from lightning_modules.task import EstimatorTask
+from lightning_modules.task import EstimatorTask, SetLoss
 
 MEASURED_STEPS = 10  # steps whose mean time is multiplied, after one that does not count
 
@@ -169,8 +170,8 @@ def _duration(seconds: float) -> str:
 class ExportWeights(Callback):
     """Write the trained module to ``weights.safetensors`` in the trainer's default root directory when training ends.
 
-    What cannot be saved and loaded again is refused before the training. The file names the stores of the training data
-    and ``synthetic scenes``.
+    What cannot be saved, loaded again and used is refused before the training. The file names the stores of the
+    training data and ``synthetic scenes``.
     """
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
@@ -185,9 +186,11 @@ class ExportWeights(Callback):
                 trained.save_pretrained(path := Path(folder) / "weights.safetensors")
                 if isinstance(trained, LearnedNormalizer):
                     parts = [trained.transform, *map(type, trained.modules())]
-                    LearnedNormalizer.from_pretrained(path, {part.__module__ for part in parts})
+                    loaded = LearnedNormalizer.from_pretrained(path, {part.__module__ for part in parts})
         except (TypeError, ValueError) as error:
             raise ValueError(f"the trained weights could not be saved: {error}") from error
+        if isinstance(trained, LearnedNormalizer):
+            _try_out(loaded, pl_module.loss)
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the module; a ValueError in the place of untrained weights."""
@@ -200,6 +203,20 @@ class ExportWeights(Callback):
             pl_module.trained.trained_on = tuple(dict.fromkeys(_names_of(source)))
             pl_module.trained.save_pretrained(path)
             print(f"wrote {path}")
+
+
+def _try_out(normalizer: LearnedNormalizer, loss: Any) -> None:
+    """Raise a ValueError in one line where an own network or loss fails on an example, or sends no gradient."""
+    points1, points2 = 500 * torch.rand(2, 2, 8, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    try:
+        F_mat = EightPoint(normalizer)(points1, points2)
+        value = F_mat if isinstance(loss, SetLoss) else loss(points1, points2, F_mat, points1, points2)
+    except Exception as error:  # code that is not this package's can raise anything
+        text = " ".join(str(error).split())
+        hint = ": register its tensors as buffers" if " meta " in text else ""
+        raise ValueError(f"network or loss failed on float64 points: {type(error).__name__}: {text}{hint}") from error
+    if not F_mat.requires_grad or not value.requires_grad:
+        raise ValueError(f"the {'loss' if F_mat.requires_grad else 'network'} sends no gradient: it cannot be trained")
 
 
 def _names_of(source: Any) -> list[str]:

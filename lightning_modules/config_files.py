@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-import yaml
-
 OPTIONS = ("-c", "--config")
 PACKAGED = Path(__file__).parent / "configs"  # where a wheel has them
 FOLDER = PACKAGED if PACKAGED.is_dir() else Path(__file__).parents[1] / "configs"  # of the repository
@@ -37,6 +35,8 @@ def with_config_paths(args: Sequence[str]) -> list[str]:
 
 def names_task(args: Sequence[str]) -> bool:
     """Return whether a configuration of :func:`with_config_paths` names the class of its task."""
+    import yaml
+
     for path in (after for before, after in pairwise(args) if before in OPTIONS):
         try:
             with Path(path).open(encoding="utf-8") as file:  # whose name is in the messages of yaml

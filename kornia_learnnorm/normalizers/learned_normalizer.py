@@ -92,6 +92,8 @@ class LearnedNormalizer(ProblemNormalizer):
         if not isinstance(params, (tuple, list)) or len(params) != 2:
             got = f"{len(params)} values" if isinstance(params, (tuple, list)) else type(params)
             raise ValueError(f"a network must return (params1, params2), got {got}")
+        if any(part.ndim != 2 for part in params):
+            raise ValueError(f"params1 and params2 must have shape (B, P), got {[[*part.shape] for part in params]}")
         return self.transform(params[0]) @ T1, self.transform(params[1]) @ T2
 
     def extra_repr(self) -> str:

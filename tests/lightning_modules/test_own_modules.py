@@ -36,6 +36,21 @@ class Constant(PointNetwork):
 class Single(PointNetwork):
     def forward(self, points1, points2, weights=None):
         return self.view(points1, points2, weights)
+class Hidden(PointNetwork):
+    def __init__(self):
+        super().__init__()
+        self.hidden = torch.ones(2)
+    def forward(self, points1, points2, weights=None):
+        return [params * self.hidden[:1] for params in super().forward(points1, points2, weights)]
+class Detached(PointNetwork):
+    def forward(self, *values):
+        return [params.detach() for params in super().forward(*values)]
+class Flat(PointNetwork):
+    def forward(self, *values):
+        return [params[0] for params in super().forward(*values)]
+class TwoArguments(MedianLoss):
+    def forward(self, points1, points2):
+        return points1.sum()
 class ThreeSets(MedianLoss):
     def forward(self, *points):
         return super().forward(*points)[:3]
@@ -120,6 +135,8 @@ def test_what_cannot_be_saved_is_refused_before_the_first_step(run, tmp_path, mo
         ("broken_modules.Listed", "sizes is [1], not a number or a text"),
         ("broken_modules.Constant", "a tensor that state_dict does not hold"),
         ("broken_modules.make", "cannot be imported by its name"),
+        ("broken_modules.Hidden", "expected device cpu!: register its tensors as buffers"),
+        ("broken_modules.Detached", "the network sends no gradient"),
         ("gone_modules.Network", "No module named 'gone_modules'"),
     ]:
         options = [*SMALL, f"--trainer.default_root_dir={tmp_path}", f"{NETWORK}={network}"]
@@ -131,6 +148,8 @@ def test_what_returns_another_shape_is_named(run, tmp_path, monkeypatch, capsys)
     monkeypatch.chdir(run)
     for option, message in [
         (f"{NETWORK}=broken_modules.Single", "must return (params1, params2), got <class 'torch.Tensor'>"),
+        (f"{NETWORK}=broken_modules.Flat", "params1 and params2 must have shape (B, P), got [[5], [5]]"),
+        ("--model.loss=broken_modules.TwoArguments", "TypeError: TwoArguments.forward() takes 3 positional arguments"),
         ("--model.loss=broken_modules.ThreeSets", "sets, got [3]"),
     ]:
         assert main(["fit", "--config", "own", *SMALL, f"--trainer.default_root_dir={tmp_path}", option]) == 2
