@@ -236,6 +236,8 @@ class MatchRefiner(nn.Module):
 
 def _check_image(name: str, image: Tensor, number: int) -> None:
     """Raise a clear error for anything but images (B, 1 or 3, H, W) of floating-point numbers or bytes."""
+    if isinstance(image, Tensor) and image.dtype != torch.uint8 and not image.is_floating_point():
+        raise TypeError(f"{name} must hold floating-point numbers from 0 to 1, or uint8, got {image.dtype}")
     if not isinstance(image, Tensor) or image.dtype != torch.uint8:
         check_tensor(name, image, ["B", "C", "H", "W"])
     if image.ndim != 4 or len(image) != number or image.shape[1] not in (1, 3) or 0 in image.shape[2:]:

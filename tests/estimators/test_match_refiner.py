@@ -202,7 +202,7 @@ def test_exceptions():
     nan[0, 0, 0] = torch.nan
     for wrong, error, match in (
         ((255 * image1, image2, points1, points2), ValueError, "from 0 to 1, got"),
-        ((image1.long(), image2, points1, points2), TypeError, "image1 must be a floating-point tensor"),
+        ((image1.long(), image2, points1, points2), TypeError, "image1 must hold floating-point numbers from 0"),
         ((image1[0], image2, points1, points2), Exception, "image1"),
         ((image1, image2.expand(2, -1, -1, -1), points1, points2), ValueError, r"image2 must have shape \[1, 1 or 3"),
         ((image1.expand(1, 2, -1, -1), image2, points1, points2), ValueError, r"got \[1, 2, 90, 120\]"),

@@ -106,7 +106,7 @@ def test_wrong_matches_and_scores():
         (torch.zeros(2, 30).long(), torch.rand(2, 3), ValueError, r"\[2, 30\], got \[2, 3\]"),
         (torch.zeros(2, 9, 3).long(), None, ValueError, r"\[2, 'S', 2\] .*, got \[2, 9, 3\]"),
         (torch.zeros(2, 9, 2).long(), torch.rand(2, 8), ValueError, r"\[2, 9\], got \[2, 8\]"),
-        ({"scores": torch.rand(1)}, None, ValueError, "'matches0' expected, got one with 'scores'"),
+        ({"scores": torch.rand(1)}, None, ValueError, "'matches' expected, got one with 'scores'"),
         ({"matches": FIRST}, FIRST, ValueError, "scores must be those of the mapping"),
         (FIRST, [torch.rand(1), None], TypeError, "scores must be floating-point"),
         (FIRST, [torch.rand(1)], ValueError, "scores .* got 1 for 2 pairs"),
