@@ -23,7 +23,7 @@ from kornia_learnnorm.estimators.linear import EightPoint
 from kornia_learnnorm.normalizers.learned_normalizer import FORMAT as NORMALIZER_FORMAT
 from kornia_learnnorm.normalizers.learned_normalizer import LearnedNormalizer
 from kornia_learnnorm.optional import import_extra
-from kornia_learnnorm.pretrained import shipped_weights, weights_format, weights_model
+from kornia_learnnorm.pretrained import own_weights, shipped_weights, weights_format, weights_model
 
 MIN_DYNAMIC_POINTS = 9  # eight correspondences have a solver of their own
 EXAMPLE_BATCH = 2  # sets of the example that is traced; a dynamic size must not be one there
@@ -35,19 +35,21 @@ POSE_OUTPUTS = ("E_mat", "R", "t", "determined", "weights")
 def load_layer(name: str | Path) -> EightPoint | LearnedLayer:
     """Load trained weights, by name or file, as a layer in evaluation mode; a normaliser's inside :class:`EightPoint`.
 
+    ``MODULE:FILE`` are those of a normaliser with parts of that module of your own, which is then imported.
     FileNotFoundError if there are no such weights, ValueError if the file is not one of this package.
 
     Example:
         >>> load_layer("crossview").normalizer.max_points
         12
     """
-    file_format = weights_format(name)
+    module, path = own_weights(name)
+    file_format = weights_format(path)
     if file_format is None:
         known = ", ".join(shipped_weights())
         raise FileNotFoundError(f"no weights {str(name)!r}: expected a .safetensors file or one of {known}")
     if file_format == NORMALIZER_FORMAT:
-        return EightPoint(LearnedNormalizer.from_pretrained(name)).eval()
-    return ESTIMATORS.get(weights_model(name), LearnedEightPoint).from_pretrained(name)
+        return EightPoint(LearnedNormalizer.from_pretrained(path, [module] if module else ())).eval()
+    return ESTIMATORS.get(weights_model(path), LearnedEightPoint).from_pretrained(path)
 
 
 def export_layer(

@@ -101,6 +101,12 @@ def shipped_weights(file_format: str | None = None) -> list[str]:
     return sorted(path.stem for path in paths if file_format in (None, _metadata(path)["format"]))
 
 
+def own_weights(name: str | Path) -> tuple[str, str]:
+    """Return the module and the file of ``MODULE:FILE.safetensors``, weights of own parts; no module elsewhere."""
+    module, _, path = str(name).rpartition(":")
+    return (module, path) if Path(path).suffix == ".safetensors" else ("", str(name))
+
+
 def weights_format(name: str | Path) -> str | None:
     """Return the format of shipped weights or of a file: "" of a file of no format, None where there is no file."""
     path = weights_path(name)

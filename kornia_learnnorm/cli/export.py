@@ -17,7 +17,7 @@ learnnorm export robust --format onnx --out robust.onnx"""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``learnnorm export`` to a parser."""
     add = parser.add_argument
-    add("weights", metavar="NAME_OR_PATH", help="weights that ship with the package, or a file of them")
+    add("weights", metavar="NAME_OR_PATH", help="weights that ship, a file of them, or MODULE:FILE of your own parts")
     add("--format", choices=["pt2", "onnx"], required=True, help="pt2: the layer, in minutes; onnx: its networks")
     text = "file to write, .pt2 or .onnx; of several networks, FILE-stage1.onnx and so on"
     add("--out", metavar="FILE", type=Path, required=True, help=text)

@@ -23,7 +23,7 @@ from kornia_learnnorm.normalizers.learned_normalizer import FORMAT, LearnedNorma
 from kornia_learnnorm.normalizers.normalizer import Normalizer, normalizing_transforms
 from kornia_learnnorm.normalizers.reweighted import ReweightedWhitening
 from kornia_learnnorm.optional import working_folder_importable
-from kornia_learnnorm.pretrained import shipped_weights, weights_format, weights_path
+from kornia_learnnorm.pretrained import own_weights, shipped_weights, weights_format, weights_path
 
 __all__ = ["Method", "default_methods", "find_method"]
 
@@ -97,7 +97,7 @@ def base_name(name: str) -> str:
 def _find_normalizer(name: str) -> Normalizer:
     if name in CLOSED_FORMS:
         return CLOSED_FORMS[name]()
-    module, path = _own_weights(name)
+    module, path = own_weights(name)
     if module:
         return LearnedNormalizer.from_pretrained(path, [module])
     if ":" in name:
@@ -114,12 +114,6 @@ def _find_normalizer(name: str) -> Normalizer:
         suffixes = f"each without suffix or with {REFINED} or {OPTIMAL}"
         raise FileNotFoundError(f"no weights {name!r} and no such normalisation: expected {expected}, {suffixes}")
     return LearnedNormalizer.from_pretrained(name)
-
-
-def _own_weights(name: str) -> tuple[str, str]:
-    """Return the module and the file of ``MODULE:FILE.safetensors``, weights of own parts; no module elsewhere."""
-    module, _, path = name.rpartition(":")
-    return (module, path) if Path(path).suffix == ".safetensors" else ("", name)
 
 
 def _own_normalizer(name: str) -> Normalizer:
@@ -158,7 +152,7 @@ def identify_method(name: str) -> str:
     base = base_name(name)
     if base in CLOSED_FORMS:
         return name
-    module, path = _own_weights(base)
+    module, path = own_weights(base)
     if module:
         files = [Path(path), Path(_import(f"{module}:__file__"))]
     elif ":" in base:  # the module in the import path, and the one that defines the class or function
@@ -173,4 +167,4 @@ def identify_method(name: str) -> str:
 def short_name_of(name: str) -> str:
     """Return a method's name for tables and files: for a path, that of the run's folder or of the file."""
     base = base_name(name)
-    return short_name(_own_weights(base)[1]) + name[len(base) :] if Path(base).suffix == ".safetensors" else name
+    return short_name(own_weights(base)[1]) + name[len(base) :] if Path(base).suffix == ".safetensors" else name

@@ -198,7 +198,7 @@ def _write_images(
         found = {image.name: image for image in file.read_all_images()}
         if missing := sorted(sizes.keys() - found.keys()):
             text = f"COLMAP leaves out {len(missing)} of {len(sizes)} images, the first is {missing[0]}: a file that it"
-            raise ValueError(f"{text} cannot read or, where all share one camera, of another size")
+            raise ValueError(f"{text} cannot read or, where all share one camera, of another size or orientation")
         for name, image in found.items():
             stored = file.read_camera(image.camera_id)
             if sizes[name] != (stored.width, stored.height):

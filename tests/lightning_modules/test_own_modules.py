@@ -14,6 +14,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
 from kornia_learnnorm.data.writer import write_store
+from kornia_learnnorm.layer_export import load_layer
 
 PAGE = Path(__file__).parents[2] / "docs/own-modules.md"
 SMALL = ["--trainer.max_steps=20", "--trainer.enable_progress_bar=false", "--trainer.default_root_dir=run"]
@@ -125,6 +126,7 @@ def test_evaluate_shows_them(weights, capsys, refused):
     assert main(["evaluate", "s.h5", "--methods", "Hartley", "--weights", name, f"{name}+LM"]) == 0
     out = capsys.readouterr().out
     assert out.count("| run ") == out.count("| run+LM ") == 2
+    assert type(load_layer(name).normalizer.network).__module__ == "own_modules"
     refused(["evaluate", "s.h5", "--methods", "Hartley", weights], "own_modules.PointNetwork is not of this package")
 
 
