@@ -49,8 +49,9 @@ def check_cameras(K1: Tensor | None, K2: Tensor | None, batch_size: int | None =
         check_tensor(name, K)
         if [*K.shape] not in shapes:
             raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {[*K.shape]}")
-        if read_condition(~(K.isfinite().all() & (torch.linalg.det(K.detach().to(solve_dtype(K.device))) != 0).all())):
-            raise ValueError(f"{name} must be finite and invertible")
+        wrong = ~K.isfinite().flatten(-2).all(-1) | (torch.linalg.det(K.detach().to(solve_dtype(K.device))) == 0)
+        if read_condition(wrong.any()):
+            raise ValueError(f"{name} must be finite and invertible, got {K.detach()[wrong][0].tolist()}")
         if read_condition((K[..., 2, :2] != 0).any()):
             rows = K.detach().reshape(-1, 3, 3)[:, 2]
             got = " ".join(f"{value:g}" for value in rows[(rows[:, :2] != 0).any(-1)][0].tolist())

@@ -51,6 +51,7 @@ class Report(NamedTuple):
 
 def write_report(folder: Path) -> Report:
     """Write ``report.md``, ``report.html`` and the pictures into the folder of ``evaluate``, ``robust`` or both."""
+    import_extra("markdown_it", "report", "writing a report")  # before the work begins
     summary, about, tables = list[str](), list[str](), list[Table]()
     pictures, missing = list[ReportPicture](), list[str]()
     robust = read_robust(folder)
