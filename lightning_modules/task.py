@@ -27,6 +27,7 @@ from kornia_learnnorm.training_losses import BoundedEpipolarLoss, InlierLoss, Lo
 __all__ = ["EstimatorTask", "Median", "SetLoss", "adamw", "cameras_of"]
 
 EARLY_STAGE = 0.3  # weight of the losses of all stages but the last
+MAX_SKIPPED = 20  # steps in a row without a finite gradient, after which a training ends
 RESIDUAL_FLOOR = 1e-3  # pixels, added to the residuals under the logarithm of the validation
 BASELINES = {"hartley": EightPoint(Hartley()), "whitening": EightPoint(Whitening())}
 SIZES = {32: "32", 256: "256", 10**9: "1000"}  # largest number of matches in a set, and the name of its median
@@ -93,7 +94,8 @@ class EstimatorTask(pl.LightningModule):
     With :class:`SetLoss`, validation and test log the median distance of the held-out matches by the size of the sets;
     with another loss, the mean log residual of the samples' own points and the better rates against Hartley and
     whitening. Sets with a NaN or infinite coordinate are left out and counted: ``train/left_out``. A step without any
-    other set, or with a gradient that is not finite, changes nothing, warns, and is counted: ``train/skipped``.
+    other set, or with a gradient that is not finite, changes nothing, warns, and is counted: ``train/skipped``; twenty
+    in a row are a ValueError.
 
     Args:
         estimator: the estimator to train: a :class:`~kornia_learnnorm.LearnedEightPoint`, a
@@ -137,6 +139,7 @@ class EstimatorTask(pl.LightningModule):
         metrics |= {f"median_{name}": Median() for name in SIZES.values()}
         self.metrics = nn.ModuleDict({name: metric.set_dtype(torch.float64) for name, metric in metrics.items()})
         self._sets = 0  # of all processes since the last step
+        self._skipped = 0  # steps in a row
 
     @property
     def trained(self) -> LearnedLayer | LearnedNormalizer:
@@ -179,7 +182,11 @@ class EstimatorTask(pl.LightningModule):
             rank_zero_warn(f"a step was skipped: {'non-finite gradient' if self._sets else 'no samples'}")
             self.zero_grad()  # to None, which an optimiser leaves alone
         self.log("train/skipped", float(skipped))
-        self._sets = 0
+        self._sets, self._skipped = 0, self._skipped + 1 if skipped else 0
+        if self._skipped == MAX_SKIPPED:
+            raise ValueError(
+                f"{MAX_SKIPPED} steps in a row were skipped: no samples, or no finite gradient of the loss"
+            )
 
     def compute_loss(self, batch: MatchSets) -> Tensor:
         """Return the loss of a batch, of all stages, each set's gradient limited where it enters the networks."""

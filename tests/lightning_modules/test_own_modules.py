@@ -52,6 +52,9 @@ class Flat(PointNetwork):
 class TwoArguments(MedianLoss):
     def forward(self, points1, points2):
         return points1.sum()
+class Broken(MedianLoss):
+    def forward(self, *points):
+        return super().forward(*points) * (torch.nan if len(points[0]) > 2 else 1.0)
 class ThreeSets(MedianLoss):
     def forward(self, *points):
         return super().forward(*points)[:3]
@@ -146,12 +149,14 @@ def test_what_cannot_be_saved_is_refused_before_the_first_step(run, tmp_path, mo
         assert not [*tmp_path.rglob("*.safetensors"), *tmp_path.rglob("*.ckpt")]
 
 
-def test_what_returns_another_shape_is_named(run, tmp_path, monkeypatch, capsys):
+@pytest.mark.filterwarnings("ignore:a step was skipped")
+def test_what_fails_in_training_is_named(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(run)
     for option, message in [
         (f"{NETWORK}=broken_modules.Single", "must return (params1, params2), got <class 'torch.Tensor'>"),
         (f"{NETWORK}=broken_modules.Flat", "params1 and params2 must have shape (B, P), got [[5], [5]]"),
         ("--model.loss=broken_modules.TwoArguments", "TypeError: TwoArguments.forward() takes 3 positional arguments"),
+        ("--model.loss=broken_modules.Broken", "20 steps in a row were skipped: no samples, or no finite gradient"),
         ("--model.loss=broken_modules.ThreeSets", "sets, got [3]"),
     ]:
         assert main(["fit", "--config", "own", *SMALL, f"--trainer.default_root_dir={tmp_path}", option]) == 2
