@@ -46,13 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     distance = f"largest distance of inliers {default}"
     add("--threshold", metavar="PX", type=float, default=options.threshold, help=distance)
     add("--seed", metavar="N", type=int, default=options.seed, help=default)
-    add(
-        "--K",
-        metavar="CAMERA",
-        nargs="+",
-        default=[],
-        help="one or two: fx,fy,cx,cy, a file, exif; adds R, t, in JSON E",
-    )
+    add("--K", metavar="CAMERA", nargs="+", default=[], help="1 or 2: fx,fy,cx,cy, a file, exif; adds R, t, in JSON E")
     group = parser.add_argument_group("matching")
     add_feature_arguments(group)
     add = group.add_argument

@@ -167,9 +167,8 @@ def match_two_images(
     features2 = _features(pixels2, full_size2, mask2, detector)
     for number, features in enumerate((features1, features2), 1):
         if len(features.points) < 2:
-            (width, height), number_found = features.size, len(features.points)
-            text = f"image {number} is blank, nearly so, masked or too small: {number_found} features in {width} x "
-            text += f"{height} pixels, expected 2 or more"
+            text = f"image {number} is blank, nearly so, masked or too small: {len(features.points)} features in "
+            text += "{} x {} pixels, expected 2 or more".format(*features.size)
             raise _named(NoReliableMatrixError("blank", text), (path1, path2))
     limit: float | None = None
     if matcher == "nearest":

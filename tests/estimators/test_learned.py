@@ -214,8 +214,12 @@ DEGENERATE = {
     "no motion": lambda p: (p, p),
     "zero": lambda p: (0 * p, 0 * p),
     "unrelated": lambda p: (p, p.flip(1)),
+    "huge": lambda p: (1e12 * p, 1e12 * (p.flip(1) + p)),
 }
-DETERMINED = {"pose": ["no motion", "unrelated"], "homography": ["four places", "no motion", "unrelated"]}
+DETERMINED = {
+    "pose": ["no motion", "unrelated", "huge"],
+    "homography": ["four places", "no motion", "unrelated", "huge"],
+}
 
 
 @siblings
