@@ -47,7 +47,7 @@ class Evidence(NamedTuple):
         The factors turn squared algebraic residuals into squared distances.
         """
         e = F_mat.mT.flatten(2)
-        forms = (e[..., None] * e[..., None, :]).flatten(2) @ _FORMS.mT.to(e)
+        forms = (e.unsqueeze(-1) * e.unsqueeze(-2)).flatten(2) @ _FORMS.mT.to(e)
         # In place: for large batches, new memory costs more than the arithmetic.
         factor = (forms @ self.products).add_(torch.finfo(e.dtype).tiny).reciprocal_()
         residual = e @ self.rows
@@ -64,12 +64,10 @@ class Evidence(NamedTuple):
 
         Of weights times gradient factors, and of squared distances, both (B, S, N), and of :func:`row_products`.
         """
-        M = row_moments(share, products).flatten(0, 1)
-        trace = M.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
-        scale = (trace + (trace == 0)).reciprocal()
-        M = M * scale
-        points = ((share * squares) @ self.products.mT).view(-1, 1, 12) * scale
-        return M, M - torch.unflatten(points @ _FORMS.to(M), 2, (9, 9))[:, 0]
+        M, points = row_moments(share, products).flatten(0, 1), (share * squares) @ self.products.mT
+        X = (points @ _FORMS.to(M)).view_as(M)
+        size = (M.diagonal(dim1=-2, dim2=-1).sum(-1) + torch.finfo(M.dtype).tiny).view(-1, 1, 1)
+        return M / size, (M - X) / size
 
 
 def descend(

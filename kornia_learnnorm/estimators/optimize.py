@@ -207,7 +207,8 @@ def choose(chosen: Tensor, states: Any, others: Any) -> Any:
     """Return the states of a manifold where chosen, (B,) bool, else the other ones."""
     tensors = []
     for own, other in zip(states, others, strict=True):
-        tensors.append(torch.where(chosen.view(-1, *[1] * (own.ndim - 1)), own, other))
+        shape = -1, *[1] * (own.ndim - 1)
+        tensors.append(own if own is other else torch.where(chosen.view(shape), own, other))
     return type(states)(*tensors)
 
 

@@ -52,7 +52,7 @@ def run_stages(
     dtype = next(networks.parameters()).dtype
     settled: Tensor | None = None
     for network in networks:
-        if settled is not None and is_known_true(settled.all()):
+        if refine.all_settled:
             found.append(found[0])
             continue
         seen = features
@@ -128,6 +128,7 @@ class Refinement:
         searched = torch.compiler.is_compiling() or self.x1.shape[-1] >= self.min_searched
         self.samples, self.settle = samples if searched else 0, settle
         self.few_outliers: Tensor | None = None
+        self.all_settled = False
         self.minimal: Tensor | None = None
         self.is_minimal: Tensor | None = None
         if problem.x1.shape[1] > model.min_points and problem.weights is None:
@@ -150,6 +151,7 @@ class Refinement:
         """Return which sets need no stage but the first and its refinement, (B,) bool; None if all stages are run."""
         if self.settle and self.samples:
             self.few_outliers = few_outliers(logits, None if self.weights is None else self.weights > 0)
+            self.all_settled = is_known_true(self.few_outliers.all())
         return self.few_outliers
 
     def optimize(self, M: Tensor, probability: Tensor, steps: int, last: bool) -> Tensor:

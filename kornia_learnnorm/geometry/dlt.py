@@ -208,9 +208,9 @@ def normal_equations(M: Tensor, pull: Tensor, tangents: Tensor) -> tuple[Tensor,
     """
     along = tangents.mT
     normal = along @ M @ tangents
-    damping = DAMPING * normal.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] + torch.finfo(M.dtype).tiny
-    eye = torch.eye(normal.shape[-1], dtype=M.dtype, device=M.device)
-    return normal + damping * eye, along @ pull
+    diagonal = normal.diagonal(dim1=-2, dim2=-1)
+    diagonal += DAMPING * diagonal.mean(-1, keepdim=True) + torch.finfo(M.dtype).tiny
+    return normal, along @ pull
 
 
 def _row_entries() -> Tensor:
