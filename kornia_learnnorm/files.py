@@ -4,9 +4,10 @@ import errno
 import os
 import platform
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT)  # error numbers
 
@@ -97,3 +98,8 @@ def short_name(path: str | Path) -> str:
     path = Path(path)
     name = path.resolve().parent.name if path.name == "weights.safetensors" else path.name
     return name.removesuffix(".safetensors").replace(".h5", "")
+
+
+def changed_options(had: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return the options that are not what they were before, with both values; empty for equal ones."""
+    return "; ".join(f"{k} {had.get(k)!r}, now {now.get(k)!r}" for k in {**had, **now} if had.get(k) != now.get(k))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_learnnorm.data.store import FORMAT, LAYOUT, VERSION, CorrespondenceStore, read_store
-from kornia_learnnorm.files import atomic_write, check_writable, write_text
+from kornia_learnnorm.files import atomic_write, changed_options, check_writable, write_text
 from kornia_learnnorm.optional import import_extra
 
 OPTIONS = "options.json"  # file in the folder of the parts
@@ -140,10 +140,8 @@ def _folder(path: Path) -> Path:
 def _check_options(path: Path, had: Any, options: dict[str, Any]) -> None:
     if not isinstance(had, dict):
         raise ValueError(f"{path} exists, but was not made by this command: remove it or write elsewhere")
-    other = [key for key in {**had, **options} if had.get(key) != options.get(key)]
-    differ = ", ".join(f"{key} was {had.get(key)!r} and is {options.get(key)!r}" for key in other if key != DIGEST)
-    if differ:
+    if differ := changed_options({**had, DIGEST: None}, {**options, DIGEST: None}):
         raise ValueError(f"{path} was made with other options, remove it or write elsewhere: {differ}")
-    if other:
+    if had != options:
         changed = "the images, their cameras, their poses or the pairs have changed since"
         raise ValueError(f"{path} was made from other data, remove it or write elsewhere: {changed}")

@@ -11,7 +11,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
 from kornia_learnnorm.estimators.fundamental_stages import SQUARE_FLOOR
-from kornia_learnnorm.estimators.linear import prepare_problem, solve_undetermined
+from kornia_learnnorm.estimators.linear import solve_undetermined
 from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.estimators.network_features import POINT_FEATURES, RESIDUAL_FEATURES, CommonFrame
 from kornia_learnnorm.estimators.set_network import SetWeightingNetwork
@@ -23,7 +23,7 @@ from kornia_learnnorm.geometry.checks import (
     read_condition,
     weighted_mean,
 )
-from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
+from kornia_learnnorm.geometry.problem import LinearProblem, prepare_problem, solve_where_determined
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.pretrained import check_architecture, load_module, save_module

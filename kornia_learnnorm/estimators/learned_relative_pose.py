@@ -10,7 +10,6 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.learned_layer import LearnedLayer, check_scores, inlier_probability
-from kornia_learnnorm.estimators.linear import prepare_problem
 from kornia_learnnorm.estimators.pose_stages import (
     POSE_OUTPUTS,
     POSE_POINT_FEATURES,
@@ -22,7 +21,7 @@ from kornia_learnnorm.geometry.checks import check_cameras, check_whole_number, 
 from kornia_learnnorm.geometry.dlt import MIN_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.pose import choose_pose
-from kornia_learnnorm.geometry.problem import LinearProblem, generic_points
+from kornia_learnnorm.geometry.problem import LinearProblem, generic_points, prepare_problem
 from kornia_learnnorm.models.essential import Calibrated, Essential
 from kornia_learnnorm.models.fundamental import Fundamental
 

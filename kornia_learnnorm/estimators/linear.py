@@ -6,17 +6,15 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.matches import MatchLayer, refuse_jit
+from kornia_learnnorm.estimators.matches import MatchLayer
 from kornia_learnnorm.geometry.checks import (
     check_cameras,
     check_correspondences,
-    check_mask,
     inference_mode,
-    solve_dtype,
 )
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
-from kornia_learnnorm.geometry.problem import LinearProblem, solve_where_determined
+from kornia_learnnorm.geometry.problem import LinearProblem, prepare_problem, solve_where_determined
 from kornia_learnnorm.geometry.transforms import transform_fundamental
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
@@ -281,26 +279,6 @@ class EightPoint(LinearLayer):
         return TwoViewEstimate(F_mat, essential_matrix(F_mat, K1, K2), problem.determined, gap)
 
 
-def prepare_problem(
-    model: TwoViewModel,
-    points1: Tensor,
-    points2: Tensor,
-    weights: Tensor | None,
-    mask: Tensor | None,
-    least: int | None = None,
-) -> LinearProblem:
-    """Return the problem of a layer's arguments, checked, ``least`` rows too; masked rows have weight zero."""
-    if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
-        refuse_jit()
-    if mask is not None:
-        check_mask(mask, points1, points2, weights)
-        points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
-        weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
-    check_correspondences(points1, points2, weights, model.min_points if least is None else least)
-    weights = None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
-    return LinearProblem.from_points(points1, points2, weights, model)
-
-
 @torch.no_grad()
 def solve_undetermined(problem: LinearProblem, normalizer: Normalizer | None) -> Tensor:
     """Return matrices of the model for sets of correspondences that do not determine them, without gradient."""
@@ -313,10 +291,3 @@ def essential_matrix(F_mat: Tensor, K1: Tensor | None, K2: Tensor | None) -> Ten
     if K1 is None or K2 is None:
         return None
     return unit_matrix(transform_fundamental(F_mat, K1.to(F_mat), K2.to(F_mat)))
-
-
-def _rescale(weights: Tensor) -> Tensor:
-    """Return weights scaled where the largest would over- or underflow; sets with none above 1e-30 get zeros."""
-    top = weights.detach().amax(-1, keepdim=True)
-    weights = torch.where(top < 1e-30, 0.0, weights)
-    return weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)

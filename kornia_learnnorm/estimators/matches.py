@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
-from kornia_learnnorm.geometry.checks import check_tensor
+from kornia_learnnorm.geometry.checks import check_tensor, refuse_jit
 
 
 class Correspondences(NamedTuple):
@@ -116,11 +116,6 @@ class MatchLayer(nn.Module):
     def __prepare_scriptable__(self) -> NoReturn:
         """Raise a TypeError: ``torch.jit`` is not supported."""
         refuse_jit()
-
-
-def refuse_jit() -> NoReturn:
-    """Raise a TypeError that says what to use instead of ``torch.jit``."""
-    raise TypeError("this layer cannot be compiled by torch.jit, use torch.compile or torch.export")
 
 
 def _keypoints(name: str, keypoints: Keypoints) -> Tensor:

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from typing import NoReturn
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -186,3 +187,8 @@ def weighted_mean(values: Tensor, weights: Tensor | None) -> Tensor:
 def safe_divisor(values: Tensor) -> Tensor:
     """Return non-negative values with 1 in place of zeros, to divide by."""
     return values + (values == 0)  # cheaper than `where`, which makes a tensor of the number
+
+
+def refuse_jit() -> NoReturn:
+    """Raise a TypeError that says what to use instead of ``torch.jit``."""
+    raise TypeError("this layer cannot be compiled by torch.jit, use torch.compile or torch.export")

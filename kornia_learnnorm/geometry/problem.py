@@ -10,7 +10,15 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_learnnorm.geometry.checks import needs_gradient, read_condition, solve_dtype, weighted_mean
+from kornia_learnnorm.geometry.checks import (
+    check_correspondences,
+    check_mask,
+    needs_gradient,
+    read_condition,
+    refuse_jit,
+    solve_dtype,
+    weighted_mean,
+)
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP, MIN_GAP, nearest_null_vector
 from kornia_learnnorm.geometry.matrices import inverse
 
@@ -164,6 +172,33 @@ def _solve_traced(
         torch.where(rows.view(-1, *[1] * (value.ndim - 1)), value, other)
         for value, other in zip(solutions, others, strict=True)
     )
+
+
+def prepare_problem(
+    model: Any,
+    points1: Tensor,
+    points2: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    least: int | None = None,
+) -> LinearProblem:
+    """Return the problem of a layer's arguments, checked, ``least`` rows too; masked rows have weight zero."""
+    if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
+        refuse_jit()
+    if mask is not None:
+        check_mask(mask, points1, points2, weights)
+        points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
+        weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)
+    check_correspondences(points1, points2, weights, model.min_points if least is None else least)
+    weights = None if weights is None else _rescale(weights.to(solve_dtype(points1.device)))
+    return LinearProblem.from_points(points1, points2, weights, model)
+
+
+def _rescale(weights: Tensor) -> Tensor:
+    """Return weights scaled where the largest would over- or underflow; sets with none above 1e-30 get zeros."""
+    top = weights.detach().amax(-1, keepdim=True)
+    weights = torch.where(top < 1e-30, 0.0, weights)
+    return weights / torch.where((top < 1e-30) | ((top > 1e-15) & (top < 1e15)), 1.0, top)
 
 
 def generic_points(like: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,7 +20,8 @@ from kornia_learnnorm.models.two_view_model import TwoViewModel
 from kornia_learnnorm.normalizers.closed_form import Hartley
 from kornia_learnnorm.normalizers.normalizer import Normalizer, check_normalizer
 from kornia_learnnorm.ransac.arguments import check_matches, check_numbers
-from kornia_learnnorm.ransac.local_optimization import fit_final, optimize_locally
+from kornia_learnnorm.ransac.final_fit import fit_final
+from kornia_learnnorm.ransac.local_optimization import optimize_locally
 from kornia_learnnorm.ransac.minimal_solver import solve_minimal_samples
 from kornia_learnnorm.ransac.samplers import Sampler, UniformSampler, WeightedSampler
 from kornia_learnnorm.ransac.scoring import MAX_MEDIAN_DISTANCES, PRESCORED, Hypotheses, PairScorer, finite_and_bounded

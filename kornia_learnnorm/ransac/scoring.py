@@ -7,6 +7,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
+from kornia_learnnorm.estimators.optimize import RobustCost
+from kornia_learnnorm.estimators.robust_losses import Loss
 from kornia_learnnorm.models.essential import Essential
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
@@ -109,6 +111,11 @@ class PairScorer:
     def distances(self, F_mat: Tensor) -> Tensor:
         """Return the distances (K, N) of all correspondences from matrices (K, 3, 3), pixels; NaN on an epipole."""
         return self.model.squares(self.model.residual(F_mat, self.x1[None], self.x2[None])).sqrt()
+
+    def cost(self, loss: Loss, rows: Tensor | slice = slice(None), weights: Tensor | None = None) -> RobustCost:
+        """Return the sum of losses over some correspondences; weights (K or 1, M)."""
+        x1, x2 = self.x1[None, :, rows], self.x2[None, :, rows]
+        return RobustCost(self.model, x1, x2, torch.ones_like(x1[:, 0]) if weights is None else weights, loss)
 
     def _scores(self, F_mat: Tensor, terms: Tensor) -> Tensor:
         size = max(1, BLOCK // terms.shape[-1])

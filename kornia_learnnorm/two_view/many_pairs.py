@@ -20,7 +20,7 @@ from kornia_learnnorm.data.matching.features import MissingWeightsError
 from kornia_learnnorm.data.matching.workers import open_workers
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.estimators.match_refiner import MatchRefiner
-from kornia_learnnorm.files import atomic_write, exclusive, full_disk_names, write_text
+from kornia_learnnorm.files import atomic_write, changed_options, exclusive, full_disk_names, write_text
 from kornia_learnnorm.optional import import_extra
 from kornia_learnnorm.protocol import INLIER_THRESHOLD, RATIO
 from kornia_learnnorm.ransac.ransac import RANSAC
@@ -130,8 +130,8 @@ def estimate_pairs(
         had = folder / OPTIONS
         if not had.exists():
             write_text(had, json.dumps(given, indent=2) + "\n")
-        elif (before := json.loads(had.read_text(encoding="utf-8"))) != given:
-            raise ValueError(f"{folder} holds results with other options: {before}, got {given}")
+        elif differ := changed_options(json.loads(had.read_text(encoding="utf-8")), given):
+            raise ValueError(f"{folder} holds results of other options, write elsewhere: {differ}")
         done = _read_done(folder / RESULTS)
         todo = [pair for pair in pairs if pair not in done]
         tqdm = import_extra("tqdm", "images", "estimating many pairs").tqdm

@@ -13,7 +13,7 @@ from kornia_learnnorm.geometry.distances import sampson_distance
 from kornia_learnnorm.geometry.pose import relative_pose
 from kornia_learnnorm.metrics.poses import pose_error
 from kornia_learnnorm.models.fundamental import Fundamental
-from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
+from kornia_learnnorm.ransac.final_fit import LOSS_SCALE
 from kornia_learnnorm.ransac.minimal_solver import spread_across
 from kornia_learnnorm.two_view.inputs import Cameras
 from kornia_learnnorm.two_view.predicted_error import MEDIAN_SQUARE, MIN_NOISE
@@ -141,7 +141,7 @@ def camera_misfit(
     many more parameters, and :math:`m` degrees of freedom: it is above :math:`2x` with probability
     :math:`(1 + 2x / m)^{-m / 2}`.
     """
-    x1, x2, loss = points1[None], points2[None], GemanMcClure(FINAL_LOSS_SCALE * threshold)
+    x1, x2, loss = points1[None], points2[None], GemanMcClure(LOSS_SCALE * threshold)
     E_mat = (cameras[1].mT @ F_mat @ cameras[0])[None]
     near = sampson_distance(x1, x2, refine_essential(x1, x2, E_mat, *cameras, loss=loss).F_mat)[0] < threshold
     freedom = int(near.sum()) - Fundamental.dof

@@ -25,7 +25,7 @@ from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.transforms import affine_transform
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.two_view_model import Residuals
-from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE
+from kornia_learnnorm.ransac.final_fit import LOSS_SCALE
 from kornia_learnnorm.ransac.scoring import PairScorer
 
 OFF_PLANE = 2.0  # thresholds, or standard deviations; a match that the homography misses by more is off the plane
@@ -145,7 +145,7 @@ def fit_plane_and_parallax(points1: Tensor, points2: Tensor, H: Tensor, threshol
     found = scorer.best(scorer.from_pixels(unit_matrix(cross_product_matrix(epipole) @ H)), 1).F_mat
     if len(found) == 0:
         return None
-    loss = GemanMcClure(FINAL_LOSS_SCALE * threshold)
+    loss = GemanMcClure(LOSS_SCALE * threshold)
     return refine_fundamental(points1[None], points2[None], scorer.to_pixels(found), loss=loss).F_mat[0]
 
 

@@ -15,7 +15,7 @@ from kornia_learnnorm.geometry.distances import symmetric_epipolar_distance
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.models.fundamental import Fundamental
 from kornia_learnnorm.models.homography import Homography
-from kornia_learnnorm.ransac.local_optimization import FINAL_LOSS_SCALE, fit_final
+from kornia_learnnorm.ransac.final_fit import LOSS_SCALE, fit_final
 from kornia_learnnorm.ransac.ransac import RANSAC, RansacResult
 from kornia_learnnorm.ransac.scoring import PairScorer
 from kornia_learnnorm.two_view import parallax
@@ -184,7 +184,7 @@ class TwoViewSolver:
     def _refine(self, F_mat: Tensor) -> Tensor:
         """Return the matrix refined on the robust loss with which RANSAC ends, of known cameras if there are."""
         if self.cameras is None:
-            return self._refine_at(FINAL_LOSS_SCALE * self.threshold, F_mat)
+            return self._refine_at(LOSS_SCALE * self.threshold, F_mat)
         start = self.scorer.best(self.scorer.from_pixels(F_mat[None]), 1)
         if len(start.F_mat) == 0:
             return F_mat
@@ -217,5 +217,5 @@ class TwoViewSolver:
             return F_mat
         # Parallax that is smaller than the threshold decides the epipole of a scene that is nearly a plane. So would
         # the inliers of largest error, if the scale of the loss were not the median distance of the inliers.
-        scale = distance[inliers].median().clamp(MIN_LOSS_SCALE * self.threshold, FINAL_LOSS_SCALE * self.threshold)
+        scale = distance[inliers].median().clamp(MIN_LOSS_SCALE * self.threshold, LOSS_SCALE * self.threshold)
         return self._refine_at(float(scale), F_mat)

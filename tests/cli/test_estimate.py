@@ -146,7 +146,7 @@ class TestManyPairs:
         assert np.allclose(lines[0]["F"], result.F_mat)
         assert lines[1]["F"] is None
         assert lines[1]["versions"] == lines[0]["versions"]
-        with pytest.raises(ValueError, match="results with other options"):
+        with pytest.raises(ValueError, match=r"results of other options, write elsewhere: ratio \S+, now 0\.7$"):
             command(*options, "--ratio", "0.7", images=())
         path.write_text(first + '{"F": nu')  # as a killed run leaves it
         # what was unreadable is tried again

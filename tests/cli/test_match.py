@@ -81,7 +81,7 @@ def test_rerun_says_that_the_store_exists(written, tmp_path, capsys):
         assert captured.out.startswith(f"{prefix}{tmp_path / 's.h5'}: 3 pairs, ")
         assert error in captured.err
     assert run(*args, "--gap", "2") == 2
-    assert "elsewhere: pairs was 'consecutive frames' and is 'frames 2 apart'" in capsys.readouterr().err
+    assert "elsewhere: pairs 'consecutive frames', now 'frames 2 apart'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kornia_learnnorm.data.datasets.frames import Frame, choose_sequences
+from kornia_learnnorm.data.datasets.frames import Frame
+from kornia_learnnorm.data.datasets.sequences import choose_sequences
 from kornia_learnnorm.data.datasets.textfiles import Array, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from kornia_learnnorm.data.datasets.cambridge import read_cambridge
 from kornia_learnnorm.data.datasets.colmap import read_colmap
-from kornia_learnnorm.data.datasets.frames import Frame, sequence_folders, split_sequences
+from kornia_learnnorm.data.datasets.frames import Frame
 from kornia_learnnorm.data.datasets.kitti import read_kitti
+from kornia_learnnorm.data.datasets.sequences import sequence_folders, split_sequences
 from kornia_learnnorm.data.datasets.tum import read_tum
 from kornia_learnnorm.data.images import image_size
 

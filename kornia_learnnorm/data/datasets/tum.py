@@ -6,7 +6,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from kornia_learnnorm.data.datasets.frames import Frame, choose_sequences
+from kornia_learnnorm.data.datasets.frames import Frame
+from kornia_learnnorm.data.datasets.sequences import choose_sequences
 from kornia_learnnorm.data.datasets.textfiles import Array, camera_matrix, rigid_motion, text_lines
 from kornia_learnnorm.data.images import image_size
 

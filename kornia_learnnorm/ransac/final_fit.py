@@ -1,0 +1,73 @@
+"""The final fit of RANSAC's best hypotheses to all correspondences."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose, keeps_fit
+from kornia_learnnorm.estimators.moments import Evidence
+from kornia_learnnorm.estimators.optimize import minimize
+from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
+from kornia_learnnorm.models.essential import Essential
+from kornia_learnnorm.models.fundamental import Fundamental
+from kornia_learnnorm.ransac.scoring import Hypotheses, PairScorer
+
+LOSS_SCALE = 0.7  # scale of the loss, in thresholds
+STEPS = 3  # steps of least squares on that loss
+MIN_GAIN = 1e-3  # share of the cost that least squares may leave to gain; above, Levenberg-Marquardt goes on
+MAX_LM_STEPS = 10  # steps of Levenberg-Marquardt
+LM_RELAXATION = 1.4  # of those on the manifold
+TOLERANCE = 1e-3  # cosine of distances and derivatives at which a matrix has converged
+POSE_PIXELS = 2.0  # scale at which the pose of a matrix that left the cameras must still fit
+POOL_SIZE = 2  # best hypotheses, of which correspondences in front of both cameras choose one
+
+
+def fit_final(scorer: PairScorer, pool: Hypotheses) -> Any:
+    """Return the optimum (1, 3, 3) on all correspondences that is next to the best of the pool."""
+    model, threshold = scorer.model, scorer.threshold
+    loss = GemanMcClure(LOSS_SCALE * threshold)
+    fit = model.reweighted_fit(scorer.x1, scorer.x2, pool.F_mat, [Truncated(threshold), *STEPS * [loss]])
+    if fit is None:
+        return _fit_on_manifold(scorer, pool.F_mat[:POOL_SIZE], loss)
+    best = int(fit.cost.argmin())
+    state, cost = model.state(fit.F_mat[best : best + 1]), float(fit.cost[best])
+    if not float(fit.gain[best]) <= MIN_GAIN:
+        optimum = minimize(scorer.cost(loss), state, MAX_LM_STEPS, TOLERANCE)[1]
+        state, cost = optimum.state, float(optimum.cost[0])
+    return state if cost <= _largest_cost(scorer, pool) else model.state(pool.F_mat[:1])
+
+
+def _fit_on_manifold(scorer: PairScorer, M: Tensor, loss: Loss) -> Any:
+    """Return the optimum (1, 3, 3) of the model that is next to the best of some matrices (K, 3, 3).
+
+    Correspondences behind a camera are mismatches: they neither vote nor count in the fit. Where the correspondences
+    contradict the cameras, the optimum is that of fundamental matrices, if its pose still fits.
+    """
+    model = scorer.model
+    state: Any = model.state(M)
+    gains = (1 - (scorer.distances(M) / scorer.threshold).square()).clamp(min=0).nan_to_num(0.0)
+    weights, evidence = torch.ones_like(gains), None
+    if isinstance(model, Essential):
+        evidence = Evidence.from_points(scorer.x1[None], scorer.x2[None])
+        weights = in_front_of_best_pose(evidence, state, gains[None], len(M))[0].to(gains)
+    best = int((gains * weights).sum(-1).argmax())
+    state, weights = type(state)(*(value[best : best + 1] for value in state)), weights[best : best + 1]
+    losses = Truncated(scorer.threshold), loss
+    near, last = (scorer.cost(rho, weights=weights)._replace(relaxation=LM_RELAXATION) for rho in losses)
+    state = minimize(near, state, 1, TOLERANCE)[1].state
+    state = minimize(last, state, MAX_LM_STEPS, TOLERANCE)[1].state
+    square_scale = weights.new_full((1, 1), (LOSS_SCALE * scorer.threshold) ** 2)
+    if evidence is None or not bool(contradict_cameras(evidence, state, weights, square_scale)):
+        return state
+    free = minimize(last, Fundamental().state(state.matrix()), MAX_LM_STEPS, TOLERANCE)[1].state
+    pose: Any = model.state(free.matrix())
+    wide = square_scale.clamp(min=POSE_PIXELS**2)
+    return free if bool(keeps_fit(evidence, state, pose, weights, wide)) else state
+
+
+def _largest_cost(scorer: PairScorer, pool: Hypotheses) -> float:
+    """Return what an optimum costs at most: the loss is nowhere above that of MSAC, up to a margin for the scores."""
+    share = 1 - float(pool.score[0]) / scorer.terms.shape[-1]
+    most: float = scorer.threshold**2 * (1.1 * share * scorer.x1.shape[-1] + scorer.model.sample_size)
+    return most
