@@ -15,7 +15,7 @@ from kornia_learnnorm.models.fundamental import Rank2
 COMPARED_SCALE, FIT_SCALE = 2.2, 3.0  # of comparisons and of fits on moments, in geometric means of the distances
 LAST_FLOOR = 0.002  # of the frame's unit, about half a pixel, added to the last scale
 LAST_POWER = 0.2  # of the probabilities in the last fit: most matches are to count, and a robust loss drops outliers
-FIRST_STEPS, LOCAL_STEPS = 1, 3  # reweightings of the network's matrix unless settled, and of candidates
+FIRST_STEPS, LOCAL_STEPS = 1, 3  # reweightings of the network's matrix before the search, and of candidates
 SEARCH_STEPS = 6  # of the last stage's steps that a search takes the place of
 RELAXATION = 1.3  # of a step: the curvature of a robust loss is less than its weights
 SQUARE_FLOOR = 1e-10  # of the frame's unit squared, added to squared distances before their logarithm
@@ -46,14 +46,10 @@ class FundamentalRefinement(Refinement):
         weights = probability if self.weights is None else probability * self.weights
         evidence, mean = Evidence.from_points(self.x1, self.x2), geometric_scale(weights, self.model.dof, SQUARE_FLOOR)
         with torch.no_grad():
-            own = M[:, None]
-            if not self.all_settled:
-                options = weights[:, None], lambda s: FIT_SCALE**2 * mean(s), FIRST_STEPS
-                stepped = descend(evidence, self.model.state(M), *options).matrix()
-                if self.few_outliers is not None:
-                    stepped = torch.where(self.few_outliers[:, None, None], M, stepped)
-                own = torch.stack([stepped, M], 1)
-            best = self._most_consistent(evidence, own, weights, mean)
+            own = descend(
+                evidence, self.model.state(M), weights[:, None], lambda s: FIT_SCALE**2 * mean(s), FIRST_STEPS
+            ).matrix()
+            best = self._most_consistent(evidence, torch.stack([own, M], 1), weights, mean)
         state = Rank2(best.axes + 0.0 * M[:, None], best.A)
         power = probability.clamp(min=torch.finfo(M.dtype).tiny) ** LAST_POWER
         power = power if self.weights is None else power * self.weights

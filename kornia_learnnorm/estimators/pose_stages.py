@@ -27,7 +27,7 @@ from kornia_learnnorm.models.fundamental import Fundamental
 
 POSE_POINT_FEATURES, POSE_RESIDUAL_FEATURES = POINT_FEATURES + 5, RESIDUAL_FEATURES + 1
 POSE_OUTPUTS = 1  # of a stage's network for the whole set: the logarithm of the robust scale's factor
-EARLY_STEPS, LOCAL_STEPS = 2, 6  # reweightings in all stages but the last, and of candidates in the last one
+EARLY_STEPS, LOCAL_STEPS = 2, 3  # reweightings in all stages but the last, and of candidates, twice if not settled
 # Scales of the robust loss in geometric means of the distances: of all stages but the last and of the last, times the
 # network's factor, and of settled sets.
 EARLY_SCALE, LAST_SCALE = 3.0, 0.7
@@ -41,8 +41,6 @@ PIXEL_FLOOR = 1e-3  # pixels, added to distances before their logarithm
 MIN_WEIGHT = 1e-6  # added to weights of which the largest is one
 MAX_SCORED = 256  # matches by which the matrices of minimal samples are compared first
 SHORTLIST = 6  # matrices of minimal samples that are compared on all matches
-# Enough for a settled set: one in so many of the samples, so many of their matrices, and so many of the reweightings.
-SETTLED_SHARE, SETTLED_SHORTLIST, SETTLED_STEPS = 4, 3, 2
 
 Candidates = tuple[Tensor, Tensor]  # essential matrices (B, S, 3, 3), and which of them are real
 
@@ -160,8 +158,8 @@ def _most_consistent(
     present, scale = (weights > 0).to(weights), LAST_PIXELS / unit
     # Matches in the order of their weights: samples and choices don't depend on the order that they came in.
     order = weights.argsort(dim=1, descending=True, stable=True)
-    few, all_settled = -(-samples // SETTLED_SHARE), is_known_true(settled.all())
-    samples = few if all_settled else samples
+    few = (samples + 1) // 2  # are enough for a settled set
+    samples = few if is_known_true(settled.all()) else samples
     drawn, used = _sample_spans(evidence, model, weights, order, samples)
     used = used & (~settled[:, None] | (torch.arange(samples, device=settled.device) < few))
     spans = _moment_spans(evidence, model, torch.stack([suggested, present], 1))
@@ -177,22 +175,17 @@ def _most_consistent(
         drawn, real = drawn.gather(1, first[..., None, None].expand(-1, -1, 3, 3)), real.gather(1, first)
     some = evenly_ranked(order, present, MAX_SCORED)
     losses = _losses(evidence.select(some), model, drawn, scale)
-    shortlist = SETTLED_SHORTLIST if all_settled else SHORTLIST
-    E_mat = torch.cat([E_mat, least_cost(drawn, real, losses, present.gather(1, some), shortlist)], 1)
+    E_mat = torch.cat([E_mat, least_cost(drawn, real, losses, present.gather(1, some), SHORTLIST)], 1)
     number = E_mat.shape[1]
     repeated = Essential(*(C.repeat_interleave(number, 0) for C in (model.C1, model.C2)))
     state, square = repeated.calibrated(E_mat.flatten(0, 1)), scale.square()[:, None]
     front = in_front_of_best_pose(evidence, state, present[:, None], number)
-    options = present[:, None] * front, lambda _: square
-    state = descend(evidence, state, *options, SETTLED_STEPS, RELAXATION)
-    if not all_settled:
-        further = descend(evidence, state, *options, LOCAL_STEPS - SETTLED_STEPS, RELAXATION)
-        state = choose(settled.repeat_interleave(number, 0), state, further)
+    options = present[:, None] * front, lambda _: square, LOCAL_STEPS, RELAXATION
+    state = descend(evidence, state, *options)
+    if not is_known_true(settled.all()):
+        state = choose(settled.repeat_interleave(number, 0), state, descend(evidence, state, *options))
     losses = evidence.losses(torch.unflatten(state.matrix(), 0, (-1, number)), square)
     cost = (torch.where(front, losses, 1.0) @ present[..., None])[..., 0]
-    if not all_settled:
-        beyond = torch.arange(number, device=cost.device) >= 2 + SETTLED_SHORTLIST
-        cost = torch.where(settled[:, None] & beyond, torch.inf, cost)
     best = cost.argmin(1)
     return pick(state, best, number), front.gather(1, best[:, None, None].expand(-1, 1, front.shape[-1]))[:, 0]
 
