@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kornia_learnnorm.estimators.optimize import choose
 from kornia_learnnorm.geometry.checks import safe_divisor
-from kornia_learnnorm.geometry.dlt import normal_equations, point_products, row_moments, row_products
+from kornia_learnnorm.geometry.row_moments import normal_equations, point_products, row_moments, row_products
 
 NORMAL_FLOOR = 1e-4  # of the norm of the matrix, added to that of each line's normal
 

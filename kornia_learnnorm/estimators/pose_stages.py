@@ -6,7 +6,8 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor, nn
 
-from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose, keeps_fit
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
+from kornia_learnnorm.estimators.cheirality import in_front_of_best_pose
 from kornia_learnnorm.estimators.moments import Evidence, descend, geometric_scale, least_cost, pick
 from kornia_learnnorm.estimators.network_features import (
     POINT_FEATURES,
@@ -19,9 +20,9 @@ from kornia_learnnorm.estimators.optimize import choose, differentiable_state
 from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, sample_null_spaces
 from kornia_learnnorm.geometry.checks import is_known_true
-from kornia_learnnorm.geometry.dlt import row_moments, row_products
 from kornia_learnnorm.geometry.five_point import essential_in_span
 from kornia_learnnorm.geometry.problem import LinearProblem
+from kornia_learnnorm.geometry.row_moments import row_moments, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
 from kornia_learnnorm.models.fundamental import Fundamental
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.geometry.distances import sampson_scale
-from kornia_learnnorm.geometry.dlt import point_products, row_moments, row_products
 from kornia_learnnorm.geometry.matrices import cofactors
+from kornia_learnnorm.geometry.row_moments import point_products, row_moments, row_products
 
 Loss = Callable[[Tensor], tuple[Tensor, Tensor]]  # of squared distances: values and derivatives
 

@@ -14,8 +14,8 @@ from torch.nn.functional import normalize, pad
 
 from kornia_learnnorm.geometry.checks import check_choice, safe_divisor
 from kornia_learnnorm.geometry.constrained_fit import Fit, Loss
-from kornia_learnnorm.geometry.dlt import normal_equations
 from kornia_learnnorm.geometry.matrices import cofactors, determinant, inverse
+from kornia_learnnorm.geometry.row_moments import normal_equations
 from kornia_learnnorm.models.two_view_model import TwoViewModel
 
 IDENTITY = (3**-0.5, 0.0, 0.0, 0.0, 3**-0.5, 0.0, 0.0, 0.0, 3**-0.5)

@@ -5,7 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, in_front_of_best_pose, keeps_fit
+from kornia_learnnorm.estimators.camera_evidence import contradict_cameras, keeps_fit
+from kornia_learnnorm.estimators.cheirality import in_front_of_best_pose
 from kornia_learnnorm.estimators.moments import Evidence
 from kornia_learnnorm.estimators.optimize import minimize
 from kornia_learnnorm.estimators.robust_losses import GemanMcClure, Loss, Truncated
