@@ -78,6 +78,8 @@ def exclusive(path: str | Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
+        if not file.exists():
+            raise PermissionError(f"cannot write {path}: the folder {file.parent} takes no files") from error
         with suppress(OSError):  # filelock before 3.30 empties the file when it asks for the lock
             file.write_text(holder, encoding="utf-8")
         raise BlockingIOError(f"{path} is in use by {holder}: wait for it to end, or write elsewhere") from error

@@ -1,6 +1,9 @@
 """Scenes, points and layers that the tests of the core share."""
 
+from collections.abc import Callable
+
 import numpy as np
+import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
@@ -29,6 +32,12 @@ def plane(batch_size: int = 3, number: int = 40, noise: float = 0.0, outliers: f
     wrong = int(outliers * number)
     points2[:, :wrong] = uniform(batch_size, wrong, 2, high=600, seed=3)
     return points1, points2, H / torch.linalg.matrix_norm(H, keepdim=True)
+
+
+def raises(error: type[Exception], message: str, function: Callable, *args, **options) -> None:
+    """Ask for the error of a call, whose message a pattern matches."""
+    with pytest.raises(error, match=message):
+        function(*args, **options)
 
 
 def distorted(points: Tensor, K: Tensor, share: float) -> Tensor:

@@ -1,6 +1,7 @@
 """Write a COLMAP database from a folder of images or their matches: ``learnnorm export-colmap``."""
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database,
 EXAMPLES = """\
 learnnorm export-colmap PHOTOS --out photos.db --single-camera
 learnnorm export-colmap PHOTOS --out photos.db --matches photos.h5"""
-NEXT = "to reconstruct: python -c \"import pycolmap; pycolmap.incremental_mapping('{}', '{}', 'sparse'{})\""
+RECONSTRUCT = "import pycolmap; pycolmap.incremental_mapping({!r}, {!r}, 'sparse'{})"
 KEEP_CAMERA = ", pycolmap.IncrementalPipelineOptions(ba_refine_focal_length=False)"
 
 
@@ -56,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"wrote {args.out}: {counts.images} images; {verified}, {inliers}")
     if counts.unverified:
         print(f"no verified pair: {', '.join(counts.unverified)}", file=sys.stderr)
-    print(NEXT.format(args.out, args.root, "" if K is None else KEEP_CAMERA), file=sys.stderr)
+    code = RECONSTRUCT.format(str(args.out), str(args.root), "" if K is None else KEEP_CAMERA)
+    print(f"to reconstruct: python -c {shlex.quote(code)}", file=sys.stderr)
     return 0
 
 

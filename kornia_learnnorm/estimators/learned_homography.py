@@ -71,7 +71,7 @@ class LearnedHomography(LearnedLayer):
     """
 
     model: Homography
-    model_name = Homography.name
+    model_name, takes_cameras = Homography.name, False
     architecture = ("width", "depth", "stages", "refine_steps", "samples")
     added: ClassVar[dict[str, Any]] = {"samples": 64}
 

@@ -74,6 +74,7 @@ class MatchLayer(nn.Module):
     """What all layers have in common: they take the output of matching networks, and refuse ``torch.jit``."""
 
     scores_are = "weights"  # what the scores of matches are to `estimate`, "weights" or "scores"
+    takes_cameras = True
     estimate: Callable[..., Any]
 
     def from_matches(
@@ -110,7 +111,9 @@ class MatchLayer(nn.Module):
             ValueError: if the matches do not fit the keypoints, or the scores not the matches, or as :meth:`estimate`.
         """
         points1, points2, weights, mask = correspondences_from_matches(keypoints1, keypoints2, matches, scores)
-        cameras = {name: K for name, K in (("K1", K1), ("K2", K2)) if K is not None}  # homographies have none
+        cameras = {name: K for name, K in (("K1", K1), ("K2", K2)) if K is not None}
+        if cameras and not self.takes_cameras:
+            raise ValueError(f"{type(self).__name__} takes no cameras, got {' and '.join(cameras)}")
         return self.estimate(points1, points2, mask=mask, **cameras, **{self.scores_are: weights})
 
     def __prepare_scriptable__(self) -> NoReturn:
@@ -176,7 +179,8 @@ def _check_scores(k: int, scores: Tensor, number: int) -> None:
     if scores.shape != (number,):
         raise ValueError(f"scores of pair {k} must have shape {[number]}, got {[*scores.shape]}")
     if not bool((scores.detach() >= 0).all()) or not bool(scores.detach().isfinite().all()):
-        raise ValueError(f"scores of pair {k} must be finite and not negative")
+        low, high = scores.detach().aminmax()
+        raise ValueError(f"scores of pair {k} must be finite and not negative, got {low:g} to {high:g}; logits are not")
 
 
 def _shape(value: object) -> object:

@@ -218,7 +218,7 @@ def differentiable_state(model: TwoViewModel, M: Tensor) -> Any:
         state = model.state(M)
     if not needs_gradient(M):
         return state
-    D = state.tangents()
-    change = (M - M.detach()).mT.flatten(1)  # zero, but for its derivative
+    D, size = state.tangents(), torch.linalg.matrix_norm(state.matrix())[:, None]
+    change = size * (M - M.detach()).mT.flatten(1)  # zero, but for its derivative
     step = torch.linalg.solve_ex(D.mT @ D, D.mT @ change[..., None])[0].squeeze(-1)
     return state.retract(step)

@@ -21,6 +21,7 @@ from kornia_learnnorm.estimators.stages import few_outliers
 from kornia_learnnorm.estimators.weighted_samples import evenly_ranked, sample_null_spaces
 from kornia_learnnorm.geometry.checks import is_known_true
 from kornia_learnnorm.geometry.five_point import essential_in_span
+from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.geometry.row_moments import row_moments, row_products
 from kornia_learnnorm.models.essential import Calibrated, Essential, nearest_essential
@@ -99,11 +100,13 @@ def run_pose_stages(
             break
         with torch.no_grad():
             state = _likeliest(evidence, model, unit, weights, suggested, before)
+        state = model.attach(state)
         square_scale = _square_scale(weights, early * scale, unit, near)
         states.append(descend(evidence, state, weights[:, None], square_scale, EARLY_STEPS, RELAXATION))
     drawn = 0 if detach_stages else samples
     with torch.no_grad():
         state, front = _most_consistent(evidence, model, unit, weights, suggested, before, drawn, settled)
+    state = model.attach(state)
     share = torch.where(front & (weights > 0), weights.clamp(min=tiny) ** LAST_POWER, 0.0)
     scale = torch.where(settled[:, None], SETTLED_SCALE, last * scale)
     options = _square_scale(weights, scale, unit, near), refine_steps, RELAXATION
@@ -250,9 +253,12 @@ def _leave_cameras(
         left = contradict_cameras(evidence, state, weights, square)
     if is_known_true(~left.any()):
         return state
-    start = Fundamental().state(state.matrix())
+    with torch.no_grad():
+        start = Fundamental().state(state.matrix())
     free = descend(evidence, start, weights[:, None], square_scale, steps, relaxation)
-    nearest = differentiable_state(model, free.matrix())
+    eye = Essential(torch.eye(3).to(model.C1)[None], torch.eye(3).to(model.C2)[None])
+    inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (model.C1, model.C2))
+    nearest = model.attach(differentiable_state(eye, unit_matrix(inverse2.mT @ free.matrix() @ inverse1)))
     wide = square.maximum((EARLY_PIXELS / unit).square())
     kept: Calibrated = choose(left & keeps_fit(evidence, state, nearest, weights, wide), nearest, state)
     return kept

@@ -105,6 +105,8 @@ def check_mask(mask: Tensor, points1: Tensor, points2: Tensor, weights: Tensor |
     for name, shape in shapes.items():
         if shape != mask.shape:
             raise ValueError(f"mask must have shape {[*shape]} as {name}, got {[*mask.shape]}")
+    if mask.device != points1.device:
+        raise ValueError(f"mask and points must be on one device, got {mask.device} and {points1.device}")
 
 
 def check_matrices(name: str, matrices: Tensor, number: int) -> None:

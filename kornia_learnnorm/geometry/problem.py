@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 from kornia_learnnorm.geometry.checks import (
     check_correspondences,
     check_mask,
+    check_pairs,
     needs_gradient,
     read_condition,
     refuse_jit,
@@ -186,6 +187,7 @@ def prepare_problem(
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
         refuse_jit()
     if mask is not None:
+        check_pairs(points1, points2, ["B", "N", "2"])
         check_mask(mask, points1, points2, weights)
         points1, points2 = (torch.where(mask[..., None], points, 0.0) for points in (points1, points2))
         weights = mask.to(points1) if weights is None else torch.where(mask, weights, 0.0)

@@ -59,6 +59,10 @@ class Essential(Fundamental):
         equal = torch.eye(2).to(A).expand_as(A) * 0.5**0.5
         return Calibrated(axes, equal, self.C1.expand_as(E_mat), self.C2.expand_as(E_mat))
 
+    def attach(self, state: "Calibrated") -> "Calibrated":
+        """Return states with the model's cameras, and so their derivatives."""
+        return state._replace(C1=self.C1.expand_as(state.C1), C2=self.C2.expand_as(state.C2))
+
     def solve_samples(self, x1: Tensor, x2: Tensor, shift: float) -> Tensor:
         """Return the matrices of samples of five, up to ten each; degenerate ones have none, five on one plane have."""
         Q, R = torch.linalg.qr(design_matrix(x1 @ self.C1.mT, x2 @ self.C2.mT).mT, mode="complete")

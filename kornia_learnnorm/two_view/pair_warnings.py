@@ -28,6 +28,7 @@ MAX_LOG_CHANCE_MISFIT = -3.0  # log10 of the probability that noise alone adds a
 MIN_POSE_CHANGE = 3.0  # degrees; a lens that distorts a little contradicts its camera too, and does less harm
 CONTRADICTION = "the matches contradict K1 and K2"
 MIN_FOCAL = 0.05  # of the median coordinate of points, about half of the image; no lens is as wide
+MAX_FOCAL, MAX_ASPECT = 100.0, 2.0  # of the largest coordinate of points, and of the other focal length
 MAX_OFFSET = 0.2  # of both sides of an image; a principal point is closer to the centre
 
 
@@ -105,9 +106,12 @@ def find_camera_doubt(
     Sizes are None where they are not known, F_mat (3, 3) where the matches may be those of a plane.
     """
     for name, K, size, points in zip(("K1", "K2"), cameras, sizes, (points1, points2), strict=True):
-        if (focal := float(K[0, 0] / K[2, 2])) < MIN_FOCAL * float(points.median()):
-            text = f"{name} has a focal length of {focal:.3g} px, too short for these points: they must be pixels"
-            return (PairWarning("cameras", text),)
+        fx, fy = (K.diagonal()[:2] / K[2, 2]).tolist()
+        text = f"{name} has the focal lengths {fx:.3g} and {fy:.3g} px, "
+        if min(fx, fy) < MIN_FOCAL * float(points.median()):
+            return (PairWarning("cameras", f"{text}too short for these points: they must be pixels"),)
+        if max(fx, fy) > min(MAX_ASPECT * min(fx, fy), MAX_FOCAL * float(points.max())):
+            return (PairWarning("cameras", f"{text}which is implausible for these points"),)
         if size is None:
             continue
         x, y = centre = K[:2, 2] / K[2, 2] / torch.tensor(size)

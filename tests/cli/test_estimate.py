@@ -175,7 +175,7 @@ class TestManyPairs:
 
     def test_lists(self, tmp_path):
         path = tmp_path / "list.txt"
-        path.write_text("# two images\n'a b.png' c.png\n")
+        path.write_text("# two images\n'a b.png' c.png\n", encoding="utf-8-sig")
         assert read_pair_list(path) == [(tmp_path / "a b.png", tmp_path / "c.png")]
         wrong = {"'a.png b.png\n": "line 1: No clos", "a b c\n": "line 1: .* got 'a b c'", "\n": "no pairs"}
         for text, message in wrong.items():

@@ -1,5 +1,8 @@
 """The command that writes a COLMAP database."""
 
+import ast
+import shlex
+
 import pytest
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
@@ -27,11 +30,11 @@ def test_a_folder(photos, tmp_path, capsys, args, pairs):
     names = sorted(path.name for path in photos.iterdir())
     (tmp_path / "pairs.txt").write_text(f"{names[0]} {names[3]}")
     args = [*args, tmp_path / "pairs.txt"] if args == ["--pairs"] else args
-    assert main(command(photos, tmp_path / "photos.db", *args)) == 0
+    assert main(command(photos, tmp_path / "photo's.db", *args)) == 0
     printed = capsys.readouterr()
     assert f"of {pairs} pairs verified" in printed.out
-    assert "pycolmap.incremental_mapping(" in printed.err
-    with pycolmap.Database.open(tmp_path / "photos.db") as file:
+    assert ast.parse(shlex.split(printed.err)[-1]).body[1].value.args[0].value == str(tmp_path / "photo's.db")
+    with pycolmap.Database.open(tmp_path / "photo's.db") as file:
         assert file.num_matched_image_pairs() == pairs
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from make_sequences import blobs, centroids, texture
 from pairwise import pairwise
+from scenes import raises
 
 from kornia_learnnorm.data import images
 
@@ -73,18 +74,14 @@ class TestBroken:
             assert np.abs(images.read_image(str(path)).astype(int) - texture()).mean() < 3
             data = change(data)
             path.write_bytes(data)
-            with pytest.raises(ValueError, match=rf"{name} .*: {len(data)} bytes, [^\n<]*truncated or corrupt$"):
-                images.read_image(path)
+            raises(ValueError, rf"{name} .*: {len(data)} bytes, [^\n<]*truncated or corrupt$", images.read_image, path)
 
     def test_not_a_file(self, tmp_path, monkeypatch):
         for read in (images.read_image, images.image_size):
-            with pytest.raises(FileNotFoundError, match=r"nothing\.png"):
-                read(tmp_path / "nothing.png")
-        with pytest.raises(ValueError, match=r"bytes, Is a directory$"):
-            images.read_image(tmp_path)
+            raises(FileNotFoundError, r"nothing\.png", read, tmp_path / "nothing.png")
+        raises(ValueError, r"bytes, Is a directory$", images.read_image, tmp_path)
         monkeypatch.setitem(sys.modules, "PIL.Image", None)
-        with pytest.raises(ImportError, match=r"pip install '\.\[images\]'"):
-            images.read_image(tmp_path)
+        raises(ImportError, r"pip install '\.\[images\]'", images.read_image, tmp_path)
 
 
 class TestSizeAndTurn:
@@ -165,8 +162,7 @@ class TestScaling:
 
     @pytest.mark.parametrize("sizes", [((0, 0), (3, 4)), ((3, 4), (3, 0))])
     def test_no_size(self, sizes):
-        with pytest.raises(ValueError, match=r"a positive width and height, got .*0\)"):
-            images.scaling(*sizes)
+        raises(ValueError, r"a positive width and height, got .*0\)", images.scaling, *sizes)
 
 
 class TestContentMask:
@@ -197,10 +193,8 @@ class TestContentMask:
         assert [images.content_mask(image) for image in (texture(), np.zeros((20, 30), np.uint8), inside)] == [None] * 3
 
     def test_wrong_arguments(self):
-        with pytest.raises(TypeError, match="array of uint8, got float64"):
-            images.content_mask(np.zeros((4, 5)))
-        with pytest.raises(ValueError, match=r"must be grey .* got \(4, 5, 3\)"):
-            images.content_mask(np.zeros((4, 5, 3), np.uint8))
+        raises(TypeError, "array of uint8, got float64", images.content_mask, np.zeros((4, 5)))
+        raises(ValueError, r"must be grey .* got \(4, 5, 3\)", images.content_mask, np.zeros((4, 5, 3), np.uint8))
 
 
 class TestReadMask:
@@ -211,7 +205,5 @@ class TestReadMask:
 
     def test_wrong(self, tmp_path):
         cv2.imwrite(str(tmp_path / "m.png"), np.ones((4, 5), np.uint8))
-        with pytest.raises(ValueError, match=r"m\.png has 5 x 4 pixels, its image 4 x 5"):
-            images.read_mask(tmp_path / "m.png", (4, 5))
-        with pytest.raises(ValueError, match=r"m\.png has no pixel above 127"):
-            images.read_mask(tmp_path / "m.png", (5, 4))
+        raises(ValueError, r"m\.png has 5 x 4 pixels, its image 4 x 5", images.read_mask, tmp_path / "m.png", (4, 5))
+        raises(ValueError, r"m\.png has no pixel above 127", images.read_mask, tmp_path / "m.png", (5, 4))

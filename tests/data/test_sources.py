@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from references import eight_point, epipolar_distances
-from scenes import seeded
+from scenes import raises, seeded
 
 from kornia_learnnorm.data import match_sets
 from kornia_learnnorm.data.match_sets import draw_samples, plain_residual
@@ -27,10 +27,8 @@ def test_paths(store, tmp_path, monkeypatch, kind):
         monkeypatch.setenv("EMPTY_DATA", "")
         with pytest.raises(ValueError, match=rf"environment variable {unset.strip('${}')}.* is not set; data\.train, "):
             kind([f"{unset}/a.h5"])
-    with pytest.raises(FileNotFoundError, match=r"c\.h5"):
-        kind(["$SOME_DATA/c.h5@0:1"])
-    with pytest.raises(ValueError, match="at least one store"):
-        kind([])
+    raises(FileNotFoundError, r"c\.h5", kind, ["$SOME_DATA/c.h5@0:1"])
+    raises(ValueError, "at least one store", kind, [])
 
 
 def test_synthetic_source():
@@ -42,8 +40,7 @@ def test_synthetic_source():
     assert [*samples.pair, *rest.pair] == list(range(9000))
     assert not torch.equal(samples.points1[:808], rest.points1)
     assert torch.equal(samples.points2, source.draw(0, 0).points2)
-    with pytest.raises(ValueError, match="number must be positive"):
-        SyntheticSamples(number=0)
+    raises(ValueError, "number must be positive", SyntheticSamples, number=0)
 
 
 def test_some_pairs_of_a_store(store, rows_of, tmp_path):
@@ -125,14 +122,12 @@ def test_blocks_without_samples(store, tmp_path):
     assert sorted(block.pairs for block in blocks) == [0, 1]
     for number, block in enumerate(blocks):
         assert source.draw(0, number).points1.shape == (block.samples, 9, 2)
-    with pytest.raises(ValueError, match=r"no pair of .*few\.h5 has 9 correspondences"):
-        StoreSamples([str(tmp_path / "few.h5")], size=9)
+    raises(ValueError, r"no pair of .*few\.h5 has 9 correspondences", StoreSamples, [str(tmp_path / "few.h5")], size=9)
 
 
 @pytest.mark.parametrize("arguments", [{"size": (7, 8)}, {"size": (9, 8)}, {"block_pairs": 0}])
 def test_bad_sources(sources, arguments):
-    with pytest.raises(ValueError, match="at least 8 correspondences, a block at least one pair, got"):
-        sources(**arguments)
+    raises(ValueError, "at least 8 correspondences, a block at least one pair, got", sources, **arguments)
 
 
 @pytest.mark.parametrize("kind", [StoreSamples, StoreSets])
@@ -142,8 +137,7 @@ def test_draws_that_cannot_be(sources, kind):
         ({"max_ratios": [0.8, 2.0]}, "max_ratios must be above 0 and at most 1, or null for no limit, got 2"),
         ({"max_ratios": [0.0]}, "max_ratios must be above 0 and at most 1, or null for no limit, got 0"),
     ]:
-        with pytest.raises(ValueError, match=message):
-            kind(sources().paths, **arguments)
+        raises(ValueError, message, kind, sources().paths, **arguments)
 
 
 def test_every_correspondence_is_used_at_most_once_and_passes_the_ratio_test(store, rows_of):
@@ -187,8 +181,7 @@ def test_bad_arguments(store):
         ({"max_ratio": 0.1}, "no pair of the store"),
         ({"size": 96, "max_ratio": None, "num_heldout": 4}, "held-out correspondences: a pair has only"),
     ]:
-        with pytest.raises(ValueError, match=message):
-            draw_samples(store, seeded(), **arguments)
+        raises(ValueError, message, draw_samples, store, seeded(), **arguments)
 
 
 def test_too_few_to_hold_out(store):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import store_of
+from scenes import raises, store_of
 
 from kornia_learnnorm.data.store import LAYOUT, CorrespondenceStore, StoreReader, read_store
 from kornia_learnnorm.data.writer import StoreWriter, write_store
@@ -44,8 +44,7 @@ def test_a_file_without_scores_has_one_minus_the_ratio(uneven, stored):
     same(read_store(stored), uneven)
     with h5py.File(stored, "r+") as file:
         file["ratio"][:3] = np.nan
-    with pytest.raises(ValueError, match="ratio holds NaN or infinite"):
-        read_store(stored)
+    raises(ValueError, "ratio holds NaN or infinite", read_store, stored)
 
 
 def test_matches_without_a_ratio_pass_every_ratio_test(uneven, tmp_path):
@@ -93,15 +92,13 @@ def test_inconsistent_arrays_and_links_to_others(stored, name, value, message):
             value(file)
         elif value is not None:
             file[name] = value
-    with pytest.raises(ValueError, match=message):
-        read_store(stored)
+    raises(ValueError, message, read_store, stored)
 
 
 def test_a_failed_write_leaves_the_old_file(uneven, stored):
     before = stored.read_bytes()
     broken = CorrespondenceStore(**{**vars(uneven), "K": "not an array"})
-    with pytest.raises(ValueError, match="could not convert"):
-        write_store(stored, broken)
+    raises(ValueError, "could not convert", write_store, stored, broken)
     assert stored.read_bytes() == before
     assert [file.name for file in stored.parent.iterdir()] == ["store.h5"]
 
@@ -185,8 +182,7 @@ class TestParts:
     )
     def test_of_other_options_or_images(self, path, options, message):
         StoreWriter(path, {**OPTIONS, "frames": "48af"}).add(0, pair(0))
-        with pytest.raises(ValueError, match=message):
-            StoreWriter(path, {**OPTIONS, "frames": "48af", **options})
+        raises(ValueError, message, StoreWriter, path, {**OPTIONS, "frames": "48af", **options})
 
     def test_folder_goes_if_nothing_is_in_it(self, path):
         writer = StoreWriter(path, OPTIONS)
@@ -198,15 +194,12 @@ class TestParts:
         writer = StoreWriter(path, OPTIONS)
         writer.add(0, pair(0))
         (writer.folder / "options.json").write_text(text)
-        with pytest.raises(ValueError, match=r"store\.h5\.parts exists, but was not made by this command"):
-            StoreWriter(path, OPTIONS)
+        raises(ValueError, r"store\.h5\.parts exists, but was not made by this command", StoreWriter, path, OPTIONS)
 
     def test_wrong_arguments(self, path):
         writer = StoreWriter(path, OPTIONS)
-        with pytest.raises(ValueError, match="got 1 pairs and place -1"):
-            writer.add(-1, pair(0))
-        with pytest.raises(ValueError, match="no pairs to write"):
-            writer.finish({})
+        raises(ValueError, "got 1 pairs and place -1", writer.add, -1, pair(0))
+        raises(ValueError, "no pairs to write", writer.finish, {})
 
 
 NO_PROC = pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
@@ -225,8 +218,7 @@ NO_PROC = pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is n
 )
 def test_places_that_are_refused(tmp_path, make, name, error, message):
     make(tmp_path / name)
-    with pytest.raises(error, match=message):
-        StoreWriter(tmp_path / name, OPTIONS)
+    raises(error, message, StoreWriter, tmp_path / name, OPTIONS)
 
 
 FULL_DISK = """

@@ -94,6 +94,8 @@ class TestMask:
         ]:
             with pytest.raises(error, match=message):
                 EightPoint()(*correspondences("handheld", 3), None, mask)
+        with pytest.raises(TypeError, match=r"points1 must be .*, got torch\.int64"):
+            EightPoint()(*(p.long() for p in correspondences("handheld", 3)), None, torch.ones(3, 8, dtype=torch.bool))
 
 
 @pytest.mark.parametrize("size", [1e-40, 1e-29, 1e-20, 1e20, 1e38])

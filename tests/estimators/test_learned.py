@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
 from references import check_gradients, check_refuses, corner_error, numpy_sampson, signless, true_essential, up_to_sign
-from scenes import DTYPES, inputs, plane, rewrite_weights, roughened, scenes, seeded, shaken_estimator, uniform
+from scenes import DTYPES, inputs, plane, raises, rewrite_weights, roughened, scenes, seeded, shaken_estimator, uniform
 from torch.autograd import gradcheck
 
 import kornia_learnnorm as kln
@@ -375,8 +375,7 @@ class TestExceptions:
             (torch.full((2, 12), torch.nan), ValueError, r"scores .* got nan"),
             (torch.ones(2, 12, dtype=torch.int64), TypeError, r"scores .* got torch\.int64"),
         ]:
-            with pytest.raises(error, match=message):
-                layer(points, points, *cameras, scores=scores)
+            raises(error, message, layer, points, points, *cameras, scores=scores)
 
     def test_cameras(self):
         points, K = torch.rand(2, 12, 2), torch.eye(3)
@@ -395,8 +394,7 @@ class TestExceptions:
         own += [({"learn_transforms": "no"}, "learn_transforms must be .* got 'no'")]
         for kind, cls in CLASSES.items():
             for options, message in shared + own * (kind == "fundamental"):
-                with pytest.raises(ValueError, match=message):
-                    cls(**options)
+                raises(ValueError, message, cls, **options)
 
 
 def test_median_of_the_present_rows():

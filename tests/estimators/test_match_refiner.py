@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pairwise import pairwise
 from references import check_gradients
-from scenes import DTYPES, rewrite_weights, roughened, seeded, uniform
+from scenes import DTYPES, raises, rewrite_weights, roughened, seeded, uniform
 from torch import Tensor
 
 import kornia_learnnorm as kln
@@ -189,11 +189,9 @@ def test_files_and_pickles_give_the_same_refiner(tmp_path):
     for other in (loaded, pickle.loads(pickle.dumps(refiner))):
         for one, two in zip(other(*values), refiner(*values), strict=True):
             assert torch.equal(one, two)
-    with pytest.raises(ValueError, match="MatchRefiner"):
-        kln.LearnedEightPoint.from_pretrained(tmp_path / "mine.safetensors")
+    raises(ValueError, "MatchRefiner", kln.LearnedEightPoint.from_pretrained, tmp_path / "mine.safetensors")
     rewrite_weights(tmp_path / "mine.safetensors", lambda state, about: about.update(architecture='{"width": 1e9}'))
-    with pytest.raises(ValueError, match="describes no refiner"):
-        kln.MatchRefiner.from_pretrained(tmp_path / "mine.safetensors")
+    raises(ValueError, "describes no refiner", kln.MatchRefiner.from_pretrained, tmp_path / "mine.safetensors")
 
 
 def test_exceptions():
@@ -210,18 +208,14 @@ def test_exceptions():
         ((image1, image2, nan, points2), ValueError, "points1 must be finite"),
         ((image1, image2, points1, points2, torch.ones(1, 20)), TypeError, "mask must be a boolean"),
     ):
-        with pytest.raises(error, match=match):
-            refiner(*wrong)
+        raises(error, match, refiner, *wrong)
     refiner.passes = 0
-    with pytest.raises(ValueError, match="passes must be a whole number, at least 1, got 0"):
-        refiner(image1, image2, points1, points2)
+    raises(ValueError, "passes must be a whole number, at least 1, got 0", refiner, image1, image2, points1, points2)
     for name, value, text in (
         ("patch_size", 8, "odd"),
         ("patch_size", 3, "5, got"),
         ("width", 0, "1"),
         ("bound", 0, "0"),
     ):
-        with pytest.raises(ValueError, match=text):
-            kln.MatchRefiner(**{name: value})
-    with pytest.raises(FileNotFoundError, match=r"no weights 'none': .* one of refiner$"):
-        kln.MatchRefiner.from_pretrained("none")
+        raises(ValueError, text, kln.MatchRefiner, **{name: value})
+    raises(FileNotFoundError, r"no weights 'none': .* one of refiner$", kln.MatchRefiner.from_pretrained, "none")

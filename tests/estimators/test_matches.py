@@ -10,6 +10,7 @@ from scenes import uniform
 from torch.nn.utils.rnn import pad_sequence
 from torch.testing import assert_close
 
+import kornia_learnnorm as kln
 from kornia_learnnorm.estimators.matches import correspondences_from_matches
 
 KEYPOINTS = uniform(2, 30, 2, high=600), uniform(2, 25, 2, high=600, seed=1)
@@ -123,3 +124,5 @@ def test_wrong_keypoints():
         correspondences_from_matches({"lafs": KEYPOINTS[0]}, KEYPOINTS[1], FIRST)
     with pytest.raises(ShapeError, match=r"(?s)\[30, 2\].*keypoints1\[None\]"):
         correspondences_from_matches(KEYPOINTS[0][0], KEYPOINTS[1][0], FIRST[:1])
+    with pytest.raises(ValueError, match="LearnedHomography takes no cameras, got K1"):
+        kln.LearnedHomography().from_matches(*KEYPOINTS, FIRST, K1=torch.eye(3))

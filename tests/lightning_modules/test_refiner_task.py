@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scenes import seeded, store_of
+from scenes import raises, seeded, store_of
 
 import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
@@ -86,12 +86,9 @@ def test_images_of_stores(folder, tmp_path):
     assert find("none.png", (WIDTH, HEIGHT)) is None
     assert source(folder).left_out == 0
     assert ImageSets([f"{folder}/matches.h5"], [f"{folder}/images/place1"]).left_out == 1
-    with pytest.raises(ValueError, match="none of 2 pairs"):
-        ImageSets([f"{folder}/matches.h5"], [str(tmp_path)])
-    with pytest.raises(FileNotFoundError, match="no folder of images at"):
-        ImageSets([f"{folder}/matches.h5"], [f"{folder}/none"])
-    with pytest.raises(ValueError, match="jitter must be"):
-        source(folder, jitter=-1.0)
+    raises(ValueError, "none of 2 pairs", ImageSets, [f"{folder}/matches.h5"], [str(tmp_path)])
+    raises(FileNotFoundError, "no folder of images at", ImageSets, [f"{folder}/matches.h5"], [f"{folder}/none"])
+    raises(ValueError, "jitter must be", source, folder, jitter=-1.0)
     shutil.copytree(folder / "images/place0", tmp_path / "copies/place0")
     find = find_images([f"{folder}/images", f"{folder}/images/place0", f"{tmp_path}/copies"])
     assert find("x/s0v1.png", (WIDTH, HEIGHT)) is None  # one of two
@@ -120,8 +117,7 @@ def test_the_loss_is_that_of_the_other_half(folder, kind):
 def test_bad_arguments_of_the_loss():
     with pytest.raises(TypeError, match="expected an estimator of fundamental matrices, got LearnedHomography"):
         HeldOutLoss(kln.LearnedHomography())
-    with pytest.raises(ValueError, match="floor and ceiling"):
-        HeldOutLoss(floor=0.0)
+    raises(ValueError, "floor and ceiling", HeldOutLoss, floor=0.0)
 
 
 def test_labels_take_the_place_of_matrices_where_they_are_known(folder):
@@ -157,8 +153,7 @@ def test_gradients_pass_the_layer_and_leave_it(folder, calibrated):
     assert task.trained.shift.weight.grad.any()
     assert task.trained.gates.weight.grad.isfinite().all()
     sets = RandomSets([SyntheticSets()], sizes=(16, 16)).draw(0, 0)
-    with pytest.raises(ValueError, match="needs sets with images"):
-        task.compute_loss(sets)
+    raises(ValueError, "needs sets with images", task.compute_loss, sets)
 
 
 def test_a_training_moves_matches_nearer_to_the_truth(folder, tmp_path, monkeypatch, capsys, refused):

@@ -143,7 +143,8 @@ def test_warnings_of_an_estimate():
         (with_focal(1.5), with_focal(1.5), "the matches contradict K1 and K2: without them the pose"),
         (with_focal(2.0), K, "the matches contradict K1 and K2: without them 2"),  # 217 of 300 agree
         (doubled, doubled, "the principal point of K1 is at 100% of the width"),
-        (K, torch.eye(3).double(), "K2 has a focal length of 1 px, too short for these points"),
+        (K, torch.eye(3).double(), "K2 has the focal lengths 1 and 1 px, too short for these points"),
+        (torch.diag(torch.tensor([1.0, 2.9, 1])).double() @ K, K, "px, which is implausible"),
     ]:
         found = kln.estimate_matches(*POINTS, size1=CAMERA_SIZE, size2=CAMERA_SIZE, K1=K1, K2=K2)
         warned = [warning.text for warning in found.warnings if warning.code == "cameras"]

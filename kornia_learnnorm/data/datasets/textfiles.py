@@ -51,7 +51,7 @@ def text_lines(path: Path, what: str) -> Iterator[TextLine]:
     """Yield the lines that are neither empty nor a comment."""
     if not path.is_file():
         raise FileNotFoundError(f"no {what} at {path}")
-    with path.open(encoding="utf-8") as file:
+    with path.open(encoding="utf-8-sig") as file:
         try:
             for number, line in enumerate(file, 1):
                 if line.strip() and not line.startswith("#"):

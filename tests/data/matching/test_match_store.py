@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import raises
 
 pytest.importorskip("cv2", reason="OpenCV is not installed")
 pytest.importorskip("h5py", reason="h5py is not installed")
@@ -242,10 +243,8 @@ class TestBadInput:
         assert len(read_store(tmp_path / "store.h5")) == 1
 
     def test_no_pairs(self, tmp_path):
-        with pytest.raises(ValueError, match="no pairs of frames to match"):
-            collect_matches([], tmp_path / "store.h5")
-        with pytest.raises(ValueError, match=r"detector must be one of sift, .* got 'orb'"):
-            MatchOptions(detector="orb")
+        raises(ValueError, "no pairs of frames to match", collect_matches, [], tmp_path / "store.h5")
+        raises(ValueError, r"detector must be one of sift, .* got 'orb'", MatchOptions, detector="orb")
 
 
 @given(seed=st.integers(0, 1000), most=st.integers(8, 40))
