@@ -55,7 +55,7 @@ def load_module(
     """
     path = weights_path(name)
     if not path.is_file() and Path(name).is_file():
-        raise ValueError(f"{name} is not a .safetensors file by its name")
+        raise ValueError(f"{name} is not a .safetensors file by its name; load_state_dict takes a saved state_dict")
     shipped = shipped_weights(file_format)
     fitting = ", ".join([other for other in shipped if weights_model(other) == model] or shipped)
     if not path.is_file():
@@ -75,7 +75,7 @@ def load_module(
         with torch.device("meta"):
             module = build(dict(json.loads(metadata.get("architecture", ""))))
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise ValueError(f"{path} describes no {kind} of this version: {error}") from error
+        raise ValueError(f"{path} describes no {kind} of this version and class: {error}") from error
     try:
         module.load_state_dict(state, strict=True, assign=True)
     except RuntimeError as error:

@@ -126,7 +126,7 @@ def _keypoints(name: str, keypoints: Keypoints) -> Tensor:
     values = _entry(keypoints, "keypoints") if isinstance(keypoints, Mapping) else keypoints
     if isinstance(keypoints, Mapping) and isinstance(values, Tensor) and values.ndim == 2:
         values = values[None]
-    check_tensor(name, values, ["B", "M", "2"])
+    check_tensor(name, values, ["B", "M", "2"], precise=True)
     return values
 
 

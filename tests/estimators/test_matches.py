@@ -118,7 +118,7 @@ def test_wrong_matches_and_scores():
 
 
 def test_wrong_keypoints():
-    with pytest.raises(TypeError, match="keypoints1 must be a floating-point tensor"):
+    with pytest.raises(TypeError, match="keypoints1 must be a float32 or float64 tensor"):
         correspondences_from_matches([[0.0, 0.0]], KEYPOINTS[1], FIRST)
     with pytest.raises(ValueError, match="'keypoints' expected, got one with 'lafs'"):
         correspondences_from_matches({"lafs": KEYPOINTS[0]}, KEYPOINTS[1], FIRST)
