@@ -54,8 +54,10 @@ def test_samples_lower_the_loss(tmp_path, precision):
 
 @pytest.mark.parametrize(
     ("kind", "labels", "steps", "least"),
-    [("layer", True, 40, 0.05), ("layer", False, 50, 0.01), ("normaliser", True, 60, 0.02)]
-    + [("pose", True, 240, 0.3), ("homography", True, 60, 0.05)],
+    [
+        *(("layer", True, 40, 0.05), ("layer", False, 50, 0.01), ("normaliser", True, 60, 0.02)),
+        *(("pose", True, 240, 0.3), ("homography", True, 60, 0.05)),
+    ],
 )
 def test_sets_lower_the_loss(kind, labels, steps, least, tmp_path):
     matches = random_planes if kind == "homography" else random_matches
