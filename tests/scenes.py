@@ -1,4 +1,4 @@
-"""Scenes, points and layers that the tests of the core share."""
+"""Scenes, points, layers and a check of errors that the tests share."""
 
 from collections.abc import Callable
 

@@ -180,7 +180,7 @@ def _check_scores(k: int, scores: Tensor, number: int) -> None:
         raise ValueError(f"scores of pair {k} must have shape {[number]}, got {[*scores.shape]}")
     if not bool((scores.detach() >= 0).all()) or not bool(scores.detach().isfinite().all()):
         low, high = scores.detach().aminmax()
-        raise ValueError(f"scores of pair {k} must be finite and not negative, got {low:g} to {high:g}; logits are not")
+        raise ValueError(f"scores of pair {k} must be finite and not negative, got {low:g} to {high:g}; no logits")
 
 
 def _shape(value: object) -> object:

@@ -256,6 +256,7 @@ def _leave_cameras(
     with torch.no_grad():
         start = Fundamental().state(state.matrix())
     free = descend(evidence, start, weights[:, None], square_scale, steps, relaxation)
+    # Between directions: there the matrix has derivatives by the cameras, and unit norm.
     eye = Essential(torch.eye(3).to(model.C1)[None], torch.eye(3).to(model.C2)[None])
     inverse1, inverse2 = (torch.linalg.inv_ex(C)[0] for C in (model.C1, model.C2))
     nearest = model.attach(differentiable_state(eye, unit_matrix(inverse2.mT @ free.matrix() @ inverse1)))

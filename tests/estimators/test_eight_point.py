@@ -8,7 +8,7 @@ import pytest
 import torch
 from pairwise import pairwise
 from references import check_gradients, derivative, in_hartley, signless, true_essential, unit, up_to_sign
-from scenes import LAYERS, correspondences, scenes, shaken, uniform
+from scenes import LAYERS, correspondences, raises, scenes, shaken, uniform
 from torch.func import grad, jacrev, vmap
 from torch.utils.checkpoint import checkpoint
 
@@ -90,12 +90,12 @@ class TestMask:
         for mask, error, message in [
             (torch.ones(3, 8), TypeError, r"mask must be a boolean tensor, got torch\.float32"),
             (np.ones((3, 8), bool), TypeError, "mask must be a boolean tensor, got <class 'numpy.ndarray'>"),
+            (torch.ones(3, 8, dtype=torch.bool, device="meta"), ValueError, "on one device, got meta and cpu"),
             (torch.ones(3, 7, dtype=torch.bool), ValueError, r"shape \[3, 8\] as points1, got \[3, 7\]"),
         ]:
-            with pytest.raises(error, match=message):
-                EightPoint()(*correspondences("handheld", 3), None, mask)
-        with pytest.raises(TypeError, match=r"points1 must be .*, got torch\.int64"):
-            EightPoint()(*(p.long() for p in correspondences("handheld", 3)), None, torch.ones(3, 8, dtype=torch.bool))
+            raises(error, message, EightPoint(), *correspondences("handheld", 3), None, mask)
+        whole = [p.long() for p in correspondences("handheld", 3)]
+        raises(TypeError, r"points1 must be .*, got torch\.int64", EightPoint(), *whole, None, torch.ones(3, 8) > 0)
 
 
 @pytest.mark.parametrize("size", [1e-40, 1e-29, 1e-20, 1e20, 1e38])

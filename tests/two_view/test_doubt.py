@@ -145,6 +145,7 @@ def test_warnings_of_an_estimate():
         (doubled, doubled, "the principal point of K1 is at 100% of the width"),
         (K, torch.eye(3).double(), "K2 has the focal lengths 1 and 1 px, too short for these points"),
         (torch.diag(torch.tensor([1.0, 2.9, 1])).double() @ K, K, "px, which is implausible"),
+        (with_focal(1e6), K, "px, which is implausible"),
     ]:
         found = kln.estimate_matches(*POINTS, size1=CAMERA_SIZE, size2=CAMERA_SIZE, K1=K1, K2=K2)
         warned = [warning.text for warning in found.warnings if warning.code == "cameras"]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_learnnorm.data.store import CorrespondenceStore
-from kornia_learnnorm.files import atomic_write, exclusive, write_text
+from kornia_learnnorm.files import atomic_write, changed_options, exclusive, write_text
 from kornia_learnnorm.optional import import_extra
 
 FORMAT = 4  # of the folder; runs of another format are refused
@@ -118,16 +118,12 @@ def _begin(
     }
     before = read_section(folder, section) or {}
     joined, had = JOINED[section], before or about
-    differ = [f"{key} {had[key]!r}, now {about[key]!r}" for key in OPTIONS[section] if had[key] != about[key]]
-    # A package that is or was not installed is no change.
-    differ += [
-        f"{name} {had[key][name]!r}, now {value!r}"
-        for key in joined
-        for name, value in about[key].items()
-        if name not in redo and had[key].get(name, value) != value and None not in (had[key][name], value)
-    ]
-    if differ:
-        raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {'; '.join(differ)}")
+    parts = [tuple({key: part[key] for key in OPTIONS[section]} for part in (had, about))]
+    for key in joined:  # a package that is or was not installed is no change
+        both = [n for n in about[key] if n not in redo and None not in (had[key].get(n), about[key][n])]
+        parts.append(tuple({name: part[key][name] for name in both} for part in (had, about)))
+    if differ := "; ".join(filter(None, (changed_options(*part) for part in parts))):
+        raise ValueError(f"{folder} is a run of other options, remove it or write elsewhere: {differ}")
     dates = {command: datetime.now().astimezone().date().isoformat()} if command else {}
     about["commands"] = {**had.get("commands", {}), **dates}
     for key in joined:  # what is not installed now stays as it was
