@@ -50,8 +50,8 @@ class LearnedEightPoint(LearnedLayer):
     :math:`\sigma(l_i)^{0.2}`. In evaluation, those of them with a mean :math:`\sigma(l_i)` above 0.7 in the first stage
     leave the other stages and the minimal samples out.
 
-    Eight correspondences determine their matrix whatever the weights: there the result is the optimal correction of
-    their null matrix, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
+    Eight correspondences determine their null matrix whatever the weights: there the result is its weighted optimal
+    correction, :func:`~kornia_learnnorm.optimal_rank2`, or Hartley's projection where the correction leaves the
     eight more than 1 % of their mean distance from the centroid away: some of them are outliers then. The networks
     get a gradient of zero.
 
@@ -67,6 +67,7 @@ class LearnedEightPoint(LearnedLayer):
             networks get no gradient (``find_unused_parameters=True`` of DistributedDataParallel).
         rank2: how the singularity constraint is enforced, see :func:`kornia_learnnorm.find_fundamental`.
         refine_steps: steps of the refinement of the last stage, and at most three of the others; 0 refines none.
+            Derivatives are those of the steps: 40 bring them closer to those of the optimum.
         samples: minimal samples in the last stage; without (0), there are none of 20 either, and the last fit is that
             of the other stages.
 

@@ -14,6 +14,7 @@ from kornia_learnnorm.estimators.learned_layer import LearnedLayer, inlier_proba
 from kornia_learnnorm.estimators.network_features import CommonFrame
 from kornia_learnnorm.estimators.stages import Refinement
 from kornia_learnnorm.geometry.checks import check_whole_number
+from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem
 from kornia_learnnorm.models.homography import Homography
 
@@ -59,7 +60,7 @@ class LearnedHomography(LearnedLayer):
         depth: blocks of each stage's network.
         stages: number of stages.
         refine_steps: reweightings in the last stage, and at most three in the others. Derivatives are those of the
-            steps: more steps bring them closer to those of the optimum.
+            steps: of many, they are huge where few matches are inliers.
         samples: minimal samples in the last stage; without (0), the last fit begins at the network's matrix.
 
     Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`.
@@ -133,7 +134,7 @@ class LearnedHomography(LearnedLayer):
         points1, points2 = torch.where(swapped, points2, points1), torch.where(swapped, points1, points2)
         ordered = LinearProblem.from_points(points1, points2, problem.weights, self.model)
         M, logits = super()._run(ordered, scores)
-        return torch.where(swapped[..., None], self.model.swap(M), M), logits
+        return torch.where(swapped[..., None], unit_matrix(self.model.swap(M)), M), logits
 
     def _refinement(self, problem: LinearProblem, frame: CommonFrame) -> Refinement:
         return HomographyRefinement(self.model, problem, frame, self.samples, not self.training)

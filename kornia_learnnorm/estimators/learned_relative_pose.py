@@ -74,7 +74,7 @@ class LearnedRelativePose(LearnedLayer):
         depth: blocks of each stage's network.
         stages: number of stages.
         refine_steps: reweightings in the last stage, and at most two in the others. Derivatives are those of the steps:
-            more steps bring them closer to those of the optimum.
+            more steps bring them closer to those of the optimum where most correspondences are right.
         samples: minimal samples in the last stage.
 
     Attributes and errors are those of :class:`~kornia_learnnorm.LearnedEightPoint`; with ``detach_stages`` there are no

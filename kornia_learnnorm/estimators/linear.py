@@ -7,11 +7,7 @@ import torch
 from torch import Tensor
 
 from kornia_learnnorm.estimators.matches import MatchLayer
-from kornia_learnnorm.geometry.checks import (
-    check_cameras,
-    check_correspondences,
-    inference_mode,
-)
+from kornia_learnnorm.geometry.checks import check_cameras, check_correspondences, inference_mode
 from kornia_learnnorm.geometry.dlt import DEPENDENT_GAP
 from kornia_learnnorm.geometry.matrices import unit_matrix
 from kornia_learnnorm.geometry.problem import LinearProblem, prepare_problem, solve_where_determined

@@ -93,7 +93,7 @@ def _solve_weighted(
     model: TwoViewModel, frame: CommonFrame, weights: Tensor, present: Tensor | None, params: Tensor | None
 ) -> Tensor:
     """Return the matrices of the weighted DLT with the predicted transforms, or Hartley's, in the frame."""
-    weights = weights / weights.detach().amax(1, keepdim=True)
+    weights = weights / weights.amax(1, keepdim=True)
     weights = weights + (MIN_WEIGHT if present is None else MIN_WEIGHT * present)
     weighted = LinearProblem.from_points(frame.x1, frame.x2, weights, model)
     if params is None:

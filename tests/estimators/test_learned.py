@@ -60,6 +60,7 @@ def test_invariances(kind, more, seed, factor, shift):
     found = layer.estimate(points1, points2, *cameras)
     shuffled = layer.estimate(points1[:, order], points2[:, order], *cameras)
     assert up_to_sign(shuffled[0], found[0]) < bound
+    assert torch.allclose(torch.linalg.matrix_norm(found[0]), torch.tensor(1.0).double())
     assert torch.allclose(shuffled.weights, found.weights[:, order], atol=least)
     assert up_to_sign(layer.model.swap(layer(points2, points1, *cameras[::-1])), found[0]) < bound
     T = torch.tensor([[factor, 0, factor * shift], [0, factor, factor * shift], [0, 0, 1]], dtype=torch.float64)
@@ -109,6 +110,14 @@ def test_weights_when_views_are_swapped(kind):
     points2 = torch.cat([600 * uniform(3, 5, 2), points2[:, 5:]], 1)
     found, swapped = layer.estimate(points1, points2, *cameras), layer.estimate(points2, points1, *cameras[::-1])
     assert torch.allclose(swapped.weights, found.weights, atol=1e-6)
+
+
+@every
+def test_a_common_factor_of_the_weights_has_no_derivative(kind):
+    weights = uniform(3, 40, low=0.1).requires_grad_()
+    for M, *_ in LAYERS[kind]().estimate(*inputs(kind, 3, 40), weights=weights).stages:
+        (gradient,) = torch.autograd.grad(M.square() @ uniform(3, 1), weights, uniform(3, 3, 1), retain_graph=True)
+        assert (gradient * weights).sum(1).abs().max() < 1e-6 * gradient.norm()
 
 
 @pytest.mark.parametrize("kind", ["fundamental", "homography"])
@@ -352,6 +361,8 @@ class TestFiles:
                 kln.LearnedEightPoint.from_pretrained(file)
         with pytest.raises(ValueError, match=r"crossview: .* LearnedEightPoint.* LearnedNormalizer"):
             kln.LearnedEightPoint.from_pretrained("crossview")
+        with pytest.raises(TypeError, match="expected a name or a path of weights, got None"):
+            kln.LearnedEightPoint.from_pretrained(None)
 
     @siblings
     def test_starts_from_an_eight_point_estimator(self, kind):
