@@ -89,20 +89,13 @@ def draw_samples(
     cut, rest = points[rows], points.new_full((len(rows), num_heldout, 4), torch.nan)
     drawable = passing > size
     samples, first, count = rows[drawable], first[drawable, None], passing[drawable, None]
-    rest[drawable] = points[_draw_others(samples, pool, first, count, num_heldout, generator)]
-    return MatchSets(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)
 
-
-def _draw_others(
-    samples: Tensor, pool: Tensor, first: Tensor, count: Tensor, number: int, generator: torch.Generator
-) -> Tensor:
-    """Draw ``number`` rows for each sample (S, N), of ``count`` in the pool from ``first`` on, not its own."""
-
-    def draw() -> Tensor:
-        u = torch.rand(len(samples), number, generator=generator, dtype=torch.float64)
+    def draw() -> Tensor:  # rows of the pool that belong to the pairs of the samples
+        u = torch.rand(len(samples), num_heldout, generator=generator, dtype=torch.float64)
         return pool[(u * count).long() + first]
 
     drawn = draw()
     while bool((own := (drawn[..., None] == samples[:, None, :]).any(-1)).any()):
         drawn = torch.where(own, draw(), drawn)
-    return drawn
+    rest[drawable] = points[drawn]
+    return MatchSets(cut[..., :2], cut[..., 2:], rest[..., :2], rest[..., 2:], sample_pair)

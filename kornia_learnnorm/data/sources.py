@@ -113,6 +113,7 @@ class StoreSamples:
         return low if low == high else int(torch.randint(low, high + 1, (), generator=generator))
 
 
+@dataclass(eq=False)
 class SyntheticSamples:
     """Samples from synthetic scenes, one sample per scene.
 
@@ -125,18 +126,15 @@ class SyntheticSamples:
             :mod:`kornia_learnnorm.data.synthetic`.
     """
 
-    def __init__(
-        self,
-        number: int = 262_144,
-        size: int = 8,
-        num_heldout: int = 0,
-        max_residual: float | None = MAX_RESIDUAL,
-        scenes: Callable[[int, int, torch.Generator], TwoViewScene] = random_scenes,
-    ) -> None:
-        if number < 1 or size < 8:
-            raise ValueError(f"number must be positive and size at least 8, got {number} and {size}")
-        self.number, self.size, self.num_heldout = number, size, num_heldout
-        self.max_residual, self.scenes = max_residual, scenes
+    number: int = 262_144
+    size: int = 8
+    num_heldout: int = 0
+    max_residual: float | None = MAX_RESIDUAL
+    scenes: Callable[[int, int, torch.Generator], TwoViewScene] = random_scenes
+
+    def __post_init__(self) -> None:
+        if self.number < 1 or self.size < 8:
+            raise ValueError(f"number must be positive and size at least 8, got {self.number} and {self.size}")
 
     def blocks(self, seed: int) -> list[Block]:
         """Return the sizes of the blocks before the residual filter."""

@@ -176,12 +176,7 @@ def _solve_traced(
 
 
 def prepare_problem(
-    model: Any,
-    points1: Tensor,
-    points2: Tensor,
-    weights: Tensor | None,
-    mask: Tensor | None,
-    least: int | None = None,
+    model: Any, points1: Tensor, points2: Tensor, weights: Tensor | None, mask: Tensor | None, least: int | None = None
 ) -> LinearProblem:
     """Return the problem of a layer's arguments, checked, ``least`` rows too; masked rows have weight zero."""
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]

@@ -35,7 +35,7 @@ MAX_DISTORTION = 0.2  # of the radius at the corners of an image
 MAX_LM_STEPS = 10
 TOLERANCE = 1e-6  # cosine of offsets and derivatives at which Levenberg-Marquardt has converged
 MIN_PLANAR_SHARE = 0.5  # of the inliers on one homography; below, the scene is no plane
-PARALLAX_NOISE = (1.0, 0.5, 0.25, 0.125)  # thresholds; noise that is tried, SIFT errs by 0.1 px or so
+NOISE = (1.0, 0.5, 0.25, 0.125)  # thresholds; noise that is tried, SIFT errs by 0.1 px or so
 MAX_LOG_CHANCE_PARALLAX = -3.0  # log10 of the expected number of epipoles that chance gives as much parallax
 AT_INFINITY = 1e6  # halves of the diagonal; offset of a point that the homography moves to infinity
 
@@ -92,12 +92,7 @@ def parallax(points1: Tensor, points2: Tensor, H: Tensor) -> Tensor:
 
 
 def parallax_evidence(
-    points1: Tensor,
-    points2: Tensor,
-    F_mat: Tensor,
-    distance: Tensor,
-    threshold: float,
-    noises: Sequence[float] = PARALLAX_NOISE,
+    points1: Tensor, points2: Tensor, F_mat: Tensor, distance: Tensor, threshold: float, noises: Sequence[float] = NOISE
 ) -> float:
     r"""Return log10 of the expected number of epipoles with as much evidence among matches without parallax.
 

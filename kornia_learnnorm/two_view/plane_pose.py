@@ -48,9 +48,8 @@ def plane_poses(H_mat: Tensor, K1: Tensor, K2: Tensor, points1: Tensor, points2:
         E. Malis, M. Vargas, Deeper understanding of the homography decomposition for vision-based control, INRIA
         report 6303, 2007, as OpenCV implements it.
     """
-    rays1, rays2 = (
-        torch.linalg.solve(K, convert_points_to_homogeneous(x).mT) for K, x in ((K1, points1), (K2, points2))
-    )
+    views = (K1, points1), (K2, points2)
+    rays1, rays2 = (torch.linalg.solve(K, convert_points_to_homogeneous(x).mT) for K, x in views)
     M = torch.linalg.solve(K2, H_mat @ K1)
     U, (largest, middle, smallest), Vh = torch.linalg.svd(M)
     sign = ((M @ rays1) * rays2).sum(0).sign().sum().sign()

@@ -28,8 +28,6 @@ from kornia_learnnorm.protocol import MAX_FILTERED, RATIO
 
 __all__ = ["MatchOptions", "collect_matches", "match_frames"]
 
-# one of the options of a store: those of earlier versions have matches that share points, and are not continued
-METHOD = {"matches": "one-to-one"}
 WINDOW = 8  # pairs per process that are matched before unneeded features are deleted
 Found = Features | str  # or the reason why there are none
 Result = CorrespondenceStore | str  # of a pair, or the reason why there is none
@@ -112,7 +110,8 @@ def collect_matches(
     if not pairs:
         raise ValueError("no pairs of frames to match: one pair or more expected, got none")
     with nullcontext() if Path(path).exists() else exclusive(path):
-        writer = StoreWriter(path, {**about, **asdict(options), **METHOD, "frames": _digest(pairs)})
+        # stores of earlier versions have matches that share points, and are not continued
+        writer = StoreWriter(path, {**about, **asdict(options), "matches": "one-to-one", "frames": _digest(pairs)})
         if writer.complete:
             print(f"{path} exists already, made with these options; remove it to match again", file=sys.stderr)
             return writer.skipped
@@ -171,20 +170,24 @@ def _match_rest(
 ) -> Generator[tuple[int, Result], None, None]:
     """Yield each place that is not ``done`` at the start, with the store of its pair or why there is none."""
     todo, window = [place for place in range(len(pairs)) if place not in done], WINDOW * workers.number
+    uses, held = Counter(frame.name for place in todo for frame in pairs[place]), dict[str, Path]()
     with TemporaryDirectory(prefix="features-", dir=folder) as features:
-        cache = FeatureCache(Path(features), [pairs[place] for place in todo])
         for first in range(0, len(todo), window):
             places = todo[first : first + window]
             frames = {frame.name: frame for place in places for frame in pairs[place]}
-            missing = [frame for name, frame in frames.items() if name not in cache.held]
+            missing = [frame for name, frame in frames.items() if name not in held]
             with workers.results(_detect, ((frame, options) for frame in missing)) as found:
                 for frame, detected in zip(missing, found, strict=True):
-                    cache.put(frame, detected)
-            tasks = ((pair, *map(cache.get, pair), options, place) for place in places for pair in [pairs[place]])
+                    held[frame.name] = Path(features, f"{len(held)}.npz")
+                    _keep(held[frame.name], frame, detected)
+            tasks = ((pairs[i], *(_kept(held[frame.name]) for frame in pairs[i]), options, i) for i in places)
             with workers.results(_match, tasks) as results:
                 for place, result in zip(places, results, strict=True):
                     yield place, result
-                    cache.release(pairs[place])
+                    for frame in pairs[place]:
+                        uses[frame.name] -= 1
+                        if uses[frame.name] == 0:  # no other pair needs its features
+                            held[frame.name].unlink()
 
 
 def _detect(frame: Frame, options: MatchOptions) -> Found:
@@ -210,33 +213,17 @@ def _match(pair: FramePair, features1: Found, features2: Found, options: MatchOp
         return str(error)
 
 
-class FeatureCache:
-    """Keep the features of frames in a folder, each until the last of all ``pairs`` with the frame is released."""
+def _keep(path: Path, frame: Frame, found: Found) -> None:
+    """Write the features of a frame, or the reason why it has none; OSError on a full disk."""
+    arrays: dict[str, Any] = {"reason": found} if isinstance(found, str) else found._asdict()
+    try:
+        np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    except OSError as error:  # NumPy's message does not name the file
+        raise OSError(f"cannot write the features of {frame.name}, is the disk full? {error}") from error
 
-    def __init__(self, folder: Path, pairs: Sequence[FramePair]) -> None:
-        self.folder = folder
-        self.uses = Counter(frame.name for frame in chain(*pairs))
-        self.held: dict[str, Path] = {}  # by the frame's name
 
-    def put(self, frame: Frame, found: Found) -> None:
-        """Keep the features of a frame, or the reason why it has none; OSError on a full disk."""
-        path = self.held[frame.name] = self.folder / f"{len(self.held)}.npz"
-        arrays: dict[str, Any] = {"reason": found} if isinstance(found, str) else found._asdict()
-        try:
-            np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
-        except OSError as error:  # NumPy's message does not name the file
-            raise OSError(f"cannot write the features of {frame.name}, is the disk full? {error}") from error
-
-    def get(self, frame: Frame) -> Found:
-        """Return the features of a frame, or the reason why there are none."""
-        with np.load(self.held[frame.name]) as data:
-            if "reason" in data:
-                return str(data["reason"])
-            return Features(data["points"], data["descriptors"], tuple(data["size"].tolist()), data.get("lafs"))
-
-    def release(self, pair: FramePair) -> None:
-        """Mark a pair as done and delete features that no other pair needs."""
-        for frame in pair:
-            self.uses[frame.name] -= 1
-            if self.uses[frame.name] == 0:
-                self.held[frame.name].unlink()
+def _kept(path: Path) -> Found:
+    with np.load(path) as data:
+        if "reason" in data:
+            return str(data["reason"])
+        return Features(data["points"], data["descriptors"], tuple(data["size"].tolist()), data.get("lafs"))
