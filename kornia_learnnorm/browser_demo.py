@@ -25,6 +25,7 @@ from kornia_learnnorm.data.images import read_colour
 from kornia_learnnorm.data.matching.features import DETECTORS
 from kornia_learnnorm.data.matching.matchers import MATCHERS
 from kornia_learnnorm.data.synthetic.render import render_pair, write_pair
+from kornia_learnnorm.geometry.checks import check_choice
 from kornia_learnnorm.two_view.drawing import INLIER, OUTLIER, blend_images, draw_line, import_matplotlib, stacked
 from kornia_learnnorm.two_view.estimate_pair import estimate_pair
 from kornia_learnnorm.two_view.inputs import MODELS
@@ -89,6 +90,7 @@ def solve(
         for file in files:
             if (size := file.stat().st_size) > MAX_BYTES:
                 raise ValueError(f"{file} has {size / 1e6:.0f} MB, at most {LIMIT} expected")
+        check_choice("estimator", estimator, ESTIMATORS)
         first, second, *others = files
         K, weights = _cameras(cameras, others), ESTIMATORS[estimator]
         options = PairOptions(weights, ratio, threshold, K=K, detector=detector, matcher=matcher, model=model)

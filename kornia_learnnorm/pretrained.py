@@ -8,6 +8,7 @@ import inspect
 import json
 from collections.abc import Callable, Collection, Mapping
 from hashlib import sha256
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -133,6 +134,8 @@ def weights_digest(name: str | Path) -> str:
 
 def weights_path(name: str | Path) -> Path:
     """Return the file of shipped weights, of some of which the wheel has only the card, or a ``.safetensors`` path."""
+    if not isinstance(name, str | PathLike):
+        raise TypeError(f"expected a name or a path of weights, got {name!r}")
     if Path(name).suffix == ".safetensors":
         return Path(name)
     path = WEIGHTS / f"{name}.safetensors"

@@ -140,10 +140,13 @@ class AgainstStart(Callback):
 
     def summary(self) -> str:
         """Return whether the last errors are below those at the start, and all of them."""
-        better = sum(self.last[name] < value for name, value in self.start.items())
+        start = {name: value for name, value in self.start.items() if name in self.last}
+        if not start:
+            return "other errors were measured at the start"
+        better = sum(self.last[name] < value for name, value in start.items())
         verdict = "better" if better else "not better"
-        verdict += f" in {better} of {len(self.start)} errors" if 0 < better < len(self.start) else ""
-        pairs = [f"{name} {self.last[name]:.3f}, at the start {value:.3f}" for name, value in self.start.items()]
+        verdict += f" in {better} of {len(start)} errors" if 0 < better < len(start) else ""
+        pairs = [f"{name} {self.last[name]:.3f}, at the start {value:.3f}" for name, value in start.items()]
         return f"{verdict} than at the start: {'; '.join(pairs)}"
 
     def state_dict(self) -> dict[str, Any]:
@@ -170,8 +173,8 @@ def _duration(seconds: float) -> str:
 class ExportWeights(Callback):
     """Write the trained module to ``weights.safetensors`` in the trainer's default root directory when training ends.
 
-    What cannot be saved, loaded again and used is refused before the training. The file names the stores of the
-    training data and ``synthetic scenes``.
+    What cannot be saved is refused before the training, and a learned normaliser that cannot be loaded again and used.
+    The file names the stores of the training data and ``synthetic scenes``.
     """
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:

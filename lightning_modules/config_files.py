@@ -19,12 +19,11 @@ def find_config(name: str) -> Path:
     """Return the file of a configuration, which is given by its name or by its path."""
     if Path(name).is_file():
         return Path(name)
-    stem = name.removesuffix(".yaml")
     names = config_names()
-    if stem not in names:
+    if name not in names:
         known = ", ".join(known for known in names if "/" not in known)
         raise FileNotFoundError(f"no configuration {name}: expected a file, or one of {known}, ablations/*, table1/*")
-    return FOLDER / f"{stem}.yaml"
+    return FOLDER / f"{name}.yaml"
 
 
 def with_config_paths(args: Sequence[str]) -> list[str]:
@@ -41,9 +40,9 @@ def names_task(args: Sequence[str]) -> bool:
         try:
             with Path(path).open(encoding="utf-8") as file:  # whose name is in the messages of yaml
                 model = yaml.safe_load(file)["model"]
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise ValueError(f"{path} is not a configuration: {' '.join(str(error).split())}") from error
-        except (UnicodeDecodeError, LookupError, TypeError):  # an error of jsonargparse, or no model
+        except (LookupError, TypeError):  # an error of jsonargparse, or no model
             continue
         if isinstance(model, dict) and "class_path" in model:
             return True

@@ -304,7 +304,7 @@ class OneCycle(OneCycleLR):
 
 
 class Median(CatMetric):
-    """The median of all values."""
+    """The median of all values, the lower one of two."""
 
     def compute(self) -> Tensor:
         """Return the median."""

@@ -65,6 +65,7 @@ class TestSolve:
         for options, message in [
             ({"image2": None}, "two images expected, image 2 is missing"),
             ({"matcher": "lightglue"}, "needs detector .*, got sift"),
+            ({"estimator": "nope"}, "estimator must be 'RANSAC' or 'learned', got 'nope'"),
             ({"ratio": None}, "ratio must be a number, got None"),
             ({"estimator": "learned", "model": "homography"}, "leave it out with model homography"),
             ({"cameras": "576,576"}, "camera 576,576: expected fx,fy,cx,cy in pixels, or exif"),

@@ -163,6 +163,8 @@ def _check_options(args: argparse.Namespace) -> None:
         if len(values) > 2:
             got = f"got {len(values)}; give the images before it"
             raise ValueError(f"--{name}: one value for both images or one for each expected, {got}")
+    if args.matches and args.json is None and args.pairs is None:
+        raise ValueError("--matches: only for --json or --pairs, which were not given")
     if args.pairs is not None:
         _check_many(args)
         return
@@ -173,7 +175,8 @@ def _check_options(args: argparse.Namespace) -> None:
         raise ValueError(f"two image files expected, got {len(args.images)}; --pairs LIST for many")
     if args.out is not None and args.out.suffix.lower() not in PICTURE_SUFFIXES:
         raise ValueError(f"--out {args.out}: expected a name that ends in one of {' '.join(PICTURE_SUFFIXES)}")
-    taken = [path.resolve() for path in (*args.images, *args.mask)]
+    inputs = *args.images, *args.mask, *args.K, *([] if args.weights is None else [args.weights])
+    taken = [Path(path).resolve() for path in inputs]
     for option, path in (("--out", args.out), ("--json", _json_path(args))):
         if path is not None and path.resolve() in taken:
             raise ValueError(f"{option} {path}: would overwrite another file of this command")

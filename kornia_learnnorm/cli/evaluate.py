@@ -8,11 +8,12 @@ from pathlib import Path
 
 import torch
 
-from kornia_learnnorm.evaluation.methods import KEPT_METHODS, SHIPPED, default_methods, short_name_of
+from kornia_learnnorm.evaluation.methods import KEPT_METHODS, SHIPPED, base_name, default_methods, short_name_of
 from kornia_learnnorm.evaluation.report.method_tables import HEADER, method_rows, was_trained_on
 from kornia_learnnorm.evaluation.runs.prediction_run import Run, SampleOptions, read_run, record_run, temporary_run
 from kornia_learnnorm.evaluation.tables import Table, format_table, names_of, tables_as_json
 from kornia_learnnorm.files import atomic_write
+from kornia_learnnorm.pretrained import own_weights
 from kornia_learnnorm.protocol import RATIO
 
 EXAMPLES = """\
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         if (name := short_name_of(path)) in SHIPPED and path != name:
             print(f"{name} is {path} here, not the weights of this name that ship", file=sys.stderr)
     options = SampleOptions(args.size, args.seed, args.max_samples or None, args.max_residual)
-    with json_tables(args, [*args.stores, *weights]) as tables:
+    with json_tables(args, [*args.stores, *(own_weights(base_name(name))[1] for name in methods)]) as tables:
         if args.out is None:
             _print_tables(args, temporary_run(stores, methods, options), tables)
             return 0

@@ -15,10 +15,12 @@ from kornia_learnnorm.data.matching.workers import check_jobs
 from kornia_learnnorm.data.store import CorrespondenceStore, read_store
 from kornia_learnnorm.estimators.learned_eight_point import LearnedEightPoint
 from kornia_learnnorm.two_view.colmap_database import THRESHOLD, check_database, export_colmap
+from kornia_learnnorm.two_view.inputs import check_settings
 
 EXAMPLES = """\
 learnnorm export-colmap PHOTOS --out photos.db --single-camera
 learnnorm export-colmap PHOTOS --out photos.db --matches photos.h5"""
+MATCHES = ".h5"  # suffix of the store of matches beside the database
 RECONSTRUCT = "import pycolmap; pycolmap.incremental_mapping({!r}, {!r}, 'sparse'{})"
 KEEP_CAMERA = ", pycolmap.IncrementalPipelineOptions(ba_refine_focal_length=False)"
 
@@ -49,6 +51,9 @@ def run(args: argparse.Namespace) -> int:
     check_jobs(args.jobs)
     K = None if args.K is None else read_camera(args.K)
     layer = None if args.weights is None else LearnedEightPoint.from_pretrained(args.weights)
+    check_settings(args.threshold, args.seed, layer)
+    if args.out.suffix == MATCHES:
+        raise ValueError(f"--out {args.out}: this is where the matches go, expected a name such as photos.db")
     estimation = {"layer": layer, "threshold": args.threshold, "seed": args.seed, "jobs": args.jobs}
     store, turned = _matches(args), len(args.matches) != 2
     counts = export_colmap(store, args.root, args.out, K, args.single_camera, turned=turned, **estimation)
@@ -70,7 +75,7 @@ def _matches(args: argparse.Namespace) -> CorrespondenceStore:
     frames = read_dataset("folder", args.root)
     pairs, pairing = choose_pairs(frames, args.gap, args.pairs)
     print(f"{len(frames)} images; {len(pairs)} pairs ({pairing})", file=sys.stderr)
-    store = args.out.with_suffix(".h5")
+    store = args.out.with_suffix(MATCHES)
     options = MatchOptions(args.detector, args.num_features, args.matcher, max_matches=None)
     about = {"dataset": str(args.root), "pairs": pairing}
     print_skipped(collect_matches(pairs, store, options, about, args.jobs, args.dask))

@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write ``report.md``, ``report.html`` and the pictures; print the summary and the tables that fit."""
-    with json_tables(args) as tables:
+    with json_tables(args, [str(args.folder / name) for name in ("run.json", "report.md", "report.html")]) as tables:
         report = write_report(args.folder)
         tables += report.tables
         if args.json != "-":

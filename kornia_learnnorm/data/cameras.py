@@ -40,7 +40,7 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
         numbers = np.array(content.replace(",", " ").split(), float)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"camera {text}: no such file; {expected}") from error
-    except ValueError as error:
+    except (ValueError, IsADirectoryError) as error:
         raise ValueError(f"camera {text}: {expected}: {error}") from error
     if numbers.size == 4:
         numbers = camera_matrix(*numbers)
@@ -51,8 +51,9 @@ def read_camera(text: str, image: str | Path | None = None) -> NDArray[np.float6
     if numbers.size != 9:
         raise ValueError(f"camera {text}: {expected}, got {numbers.size} numbers")
     K: NDArray[np.float64] = numbers.reshape(3, 3)
-    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K[2], [0, 0, 1]):
-        raise ValueError(f"camera {text}: positive focal lengths and a last row of 0 0 1 expected, got {K.tolist()}")
+    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] or not np.array_equal(K[2], [0, 0, 1]):
+        wanted = "positive focal lengths, K[1, 0] = 0 and a last row of 0 0 1 expected"
+        raise ValueError(f"camera {text}: {wanted}, got {K.tolist()}")
     return K
 
 

@@ -1,5 +1,6 @@
 """Random sets of matches together with the images that they were found in."""
 
+import re
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -104,15 +105,20 @@ def find_images(folders: Sequence[str]) -> Callable[[str, Size], Path | None]:
         if not root.is_dir():
             raise FileNotFoundError(f"no folder of images at {root}")
         for path in filter(Path.is_file, root.rglob("*")):
-            stem = path.name.partition(".")[0]
+            stem = _stem(path.name)
             by_stem[stem] = path if by_stem.get(stem, path) == path else None
 
     def find(name: str, size: Size) -> Path | None:
         exact = (path for path in (root / name for root in roots) if path.is_file())
-        path = next(exact, by_stem.get(Path(name).name.partition(".")[0]))
+        path = next(exact, by_stem.get(_stem(Path(name).name)))
         return path if path is not None and reduced_size(image_size(path), max(size)) == size else None
 
     return find
+
+
+def _stem(name: str) -> str:
+    """Return the name of a file without suffixes: 00046 of 00046._c.png, but 1341.59 of 1341.59.png, a time."""
+    return re.sub(r"(\.[^\d.][^.]*)+$", "", name)
 
 
 def _mapped(image: NDArray[np.uint8], symmetry: int) -> tuple[NDArray[np.uint8], Tensor]:

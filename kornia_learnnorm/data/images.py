@@ -130,6 +130,8 @@ def stored_pixels(path: Path, points: Array, size: Sequence[int], turned: bool =
     """Return pixels (N, 2) and the (width, height) of an image, ``turned`` by EXIF or not, in the file as stored."""
     turn = 1
     if turned:
+        if image_size(path) == (0, 0):
+            raise ValueError(f"{path} is not an image that can be read")
         with open_image(path) as image:
             turn = _orientation(image)
     x, y = np.asarray(points, np.float64).T

@@ -113,27 +113,26 @@ class StoreSets:
         if not self._pairs:
             raise ValueError(f"no pair of {', '.join(self.paths)} has {MIN_HELDOUT} matches to hold out")
         self._sizes = [torch.tensor([len(pair.passing(ratio)) for pair in self._pairs]) for ratio in self.max_ratios]
+        if empty := [r for r, sizes in zip(self.max_ratios, self._sizes, strict=True) if not sizes.any()]:
+            raise ValueError(f"no match of {', '.join(self.paths)} has a ratio below {empty[0]}")
 
     def draw(self, num_sets: int, num_points: int, generator: Generator) -> MatchSets:
         """Return sets of random matches of random pairs; the pairs with most matches where too few have enough."""
         choice = int(torch.randint(len(self.max_ratios), (), generator=generator))
         ratio, sizes = self.max_ratios[choice], self._sizes[choice]
         able = (sizes >= min(num_points, int(sizes.max()))).nonzero()[:, 0]
-        chosen = able[torch.randint(len(able), (num_sets,), generator=generator)].tolist()
-        parts = [self._draw_set(index, num_points, ratio, generator) for index in chosen]
+        parts = []
+        for index in able[torch.randint(len(able), (num_sets,), generator=generator)].tolist():
+            pair = self._pairs[index]
+            passing = pair.passing(ratio)
+            rows = passing[torch.randperm(len(passing), generator=generator)]
+            rows = rows[torch.arange(num_points) % len(rows)]
+            chosen = torch.randint(len(pair.heldout), (self.num_heldout,), generator=generator)
+            points, held, distance = pair.points[rows], pair.points[pair.heldout[chosen]], pair.distance[rows]
+            inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
+            about = torch.tensor(index), pair.score[rows], inliers, pair.labelled, *pair.cameras
+            parts.append((points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], *about))
         return MatchSets(*(torch.stack(values) for values in zip(*parts, strict=True)))
-
-    def _draw_set(self, index: int, num_points: int, ratio: float | None, generator: Generator) -> Sequence[Tensor]:
-        """Return the fields of a :class:`MatchSets` of one set of the pair of this index."""
-        pair = self._pairs[index]
-        passing = pair.passing(ratio)
-        rows = passing[torch.randperm(len(passing), generator=generator)]
-        rows = rows[torch.arange(num_points) % len(rows)]
-        held = pair.points[pair.heldout[torch.randint(len(pair.heldout), (self.num_heldout,), generator=generator)]]
-        points, distance = pair.points[rows], pair.distance[rows]
-        inliers = torch.where(distance.isnan(), torch.nan, (distance < LABEL_THRESHOLD).float())
-        about = torch.tensor(index), pair.score[rows], inliers, pair.labelled, *pair.cameras
-        return points[:, :2], points[:, 2:], held[:, :2], held[:, 2:], *about
 
 
 class _Pair:

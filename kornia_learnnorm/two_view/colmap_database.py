@@ -113,7 +113,11 @@ def export_colmap(
     names = sorted({name for both in store.names for name in both})
     if missing := [name for name in names if not (images / name).is_file()]:
         raise FileNotFoundError(f"{len(missing)} of {len(names)} images are not in {images}, the first is {missing[0]}")
-    camera = None if K is None else K + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]])
+    camera = None
+    if K is not None:
+        if K[0, 1] != 0:
+            raise ValueError(f"K must have no skew, as COLMAP's PINHOLE has none, got {K[0, 1]}")
+        camera = np.asarray(K / K[2, 2]) + np.array([[0, 0, CORNER], [0, 0, CORNER], [0, 0, 0]])
     pairs = _read_pairs(store, images, turned)
     with atomic_write(path) as temporary:
         ids = _write_images(pycolmap, temporary, images, pairs, camera, single_camera)

@@ -58,6 +58,8 @@ def read_size(name: str, size: Size | Points | None, points: Tensor) -> Size:
     given: Any = torch.where(near, points, 1.0).amax(0).clamp(min=1.0).ceil() + 1 if size is None else size
     if isinstance(given, np.ndarray | Tensor):  # LightGlue's are float32
         given = tuple(int(value) if value.is_integer() else value for value in map(float, given.reshape(-1)))
+    if not isinstance(given, tuple | list):
+        raise TypeError(f"{name} must be a width and a height, got {given!r}")
     for value in given:
         check_number(f"width and height of {name}", value, whole=True)
     if len(given) != 2 or min(given) < 1:

@@ -32,7 +32,8 @@ RESULTS = "pairs.jsonl"  # one line a pair, in the order in which they are done
 TABLE = "pairs.csv"  # the same without the matches, in the order of the pairs
 COLUMNS = ("model", "num_matches", "num_inliers", "predicted_error_px", "F", "H", "E", "R", "t", "n")  # of the table
 OPTIONS = "options.json"
-UNREADABLE = "unreadable"  # code of a pair of which an image cannot be read; tried again by the next run
+MAX_PASSES = 100  # of MatchRefiner, which takes a few
+UNREADABLE = "unreadable"  # code of a pair of which an image or its camera cannot be read; tried again by the next run
 
 FilePair = tuple[Path, Path]
 Line = dict[str, Any]  # the JSON object of a pair
@@ -58,8 +59,8 @@ class PairOptions:
         check_settings(self.threshold, self.seed, model=self.model)
         check_matching(self.ratio, self.max_size, self.detector, self.matcher)
         check_number("refine", self.refine, whole=True)
-        if self.refine < 0:
-            raise ValueError(f"refine must be 0 or more passes, got {self.refine}")
+        if not 0 <= self.refine <= MAX_PASSES:
+            raise ValueError(f"refine must be from 0 to {MAX_PASSES} passes, got {self.refine}")
 
     def arguments(self, image1: Path, image2: Path) -> dict[str, Any]:
         """Return the keyword arguments of ``estimate_pair`` for two image files."""
@@ -67,23 +68,19 @@ class PairOptions:
             name: value for name, value in vars(self).items() if name not in ("weights", "K", "matches", "refine")
         }
         texts = self.K * 2 if len(self.K) == 1 else self.K
+        if len(texts) not in (0, 2):
+            raise ValueError(f"K must be one camera for both images or two, got {len(texts)}")
         cameras = [read_camera(text, image) for text, image in zip(texts, (image1, image2), strict=False)]
-        modules = {"layer": _layer(self.weights), "refiner": _refiner(self.refine)}
+        modules = _modules(self.weights, self.refine)
         return {**options, **modules, **dict(zip(("K1", "K2"), cameras, strict=False))}
 
 
 @lru_cache(maxsize=1)
-def _layer(weights: str | None) -> LearnedEightPoint | None:
-    return None if weights is None else LearnedEightPoint.from_pretrained(weights)
-
-
-@lru_cache(maxsize=1)
-def _refiner(passes: int) -> MatchRefiner | None:
-    if passes == 0:
-        return None
-    refiner = MatchRefiner.from_pretrained()
-    refiner.passes = passes
-    return refiner
+def _modules(weights: str | None, passes: int) -> dict[str, Any]:
+    refiner = MatchRefiner.from_pretrained() if passes else None
+    if refiner is not None:
+        refiner.passes = passes
+    return {"layer": None if weights is None else LearnedEightPoint.from_pretrained(weights), "refiner": refiner}
 
 
 def read_pair_list(path: str | Path) -> list[FilePair]:
@@ -123,14 +120,14 @@ def estimate_pairs(
     """
     folder = Path(folder)
     cameras = [text if text == "exif" else read_camera(text).tolist() for text in options.K]
-    _layer(options.weights)  # wrong weights are an error of the options, not of each pair
+    _modules(options.weights, options.refine)  # wrong weights are an error of the options, not of each pair
     given = json.loads(json.dumps({**asdict(options), "K": cameras}))
     folder.mkdir(parents=True, exist_ok=True)
     with exclusive(folder):
         had = folder / OPTIONS
         if not had.exists():
             write_text(had, json.dumps(given, indent=2) + "\n")
-        elif differ := changed_options(json.loads(had.read_text(encoding="utf-8")), given):
+        elif differ := changed_options(_parse(had, had.read_text(encoding="utf-8")), given):
             raise ValueError(f"{folder} holds results of other options, write elsewhere: {differ}")
         done = _read_done(folder / RESULTS)
         todo = [pair for pair in pairs if pair not in done]
@@ -169,9 +166,19 @@ def _read_done(path: Path) -> dict[FilePair, Line]:
     if not path.exists():
         return {}
     texts = [text for text in path.read_text(encoding="utf-8").splitlines(keepends=True) if text.endswith("\n")]
-    lines = [line for line in map(json.loads, texts) if UNREADABLE not in [why["code"] for why in line["warnings"]]]
-    write_text(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
-    return {(Path(line["image1"]["file"]), Path(line["image2"]["file"])): line for line in lines}
+    lines = {}
+    for line in (_parse(path, text) for text in texts):
+        if UNREADABLE not in [why["code"] for why in line["warnings"]]:
+            lines[Path(line["image1"]["file"]), Path(line["image2"]["file"])] = line
+    write_text(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines.values()))
+    return lines
+
+
+def _parse(path: Path, text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: remove it and estimate again: {error}") from error
 
 
 def describe_failure(code: str, text: str, image1: Path, image2: Path, options: PairOptions) -> Line:

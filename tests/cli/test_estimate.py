@@ -106,10 +106,12 @@ class TestOnePair:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setattr(command_module, "estimate_pair", lambda *_, **__: pytest.fail("the work was begun"))
         for arguments, error, message in [
-            (["--refine", "-1"], ValueError, "refine must be 0 or more passes, got -1"),
+            (["--refine", "-1"], ValueError, "refine must be from 0 to 100 passes, got -1"),
+            (["--matches"], ValueError, "--matches: only for --json or --pairs"),
             (["--out", "pair.txt"], ValueError, r"--out pair\.txt: expected a name that ends in one of \.png"),
             (["--json", "none/F.json"], FileNotFoundError, "folder none does not exist"),
             (["--out", "IMAGE"], ValueError, r"--out .*left\.png: would overwrite"),
+            (["--K", "list.txt", "--json", "list.txt"], ValueError, r"--json list\.txt: would overwrite"),
             (["--out", "pair.png"], ImportError, r"pip install '\.\[report\]'"),  # without Matplotlib
             (["--K", "1,2"], ValueError, "camera 1,2: expected fx,fy,cx,cy, .* got 2 numbers"),
             (["--K", "a", "b", "c"], ValueError, "--K: one value for both images or one for each expected, got 3"),
@@ -156,6 +158,9 @@ class TestManyPairs:
         assert solved == first.splitlines()[0]
         assert [warning["code"] for warning in json.loads(failed)["warnings"]] == ["blank"]
         assert json.loads(failed)["image2"] == {"file": "late.png", "width": WIDTH, "height": HEIGHT}
+        path.write_text("{}}\n")
+        with pytest.raises(ValueError, match=r"pairs\.jsonl is damaged: remove it"):
+            command(*options, images=())
 
     @pytest.mark.parametrize(("options", "pairs"), [([], 2), (["--gap", "2"], 1), (["--exhaustive"], 3)])
     def test_a_folder(self, planes, command, options, pairs):

@@ -143,6 +143,9 @@ def test_json_is_not_written_where_a_command_fails_or_over_its_input(folder, tmp
     store.write_bytes((folder / "known.h5").read_bytes())
     refused(["evaluate", f"{store}@0:2", "--json", store], "known.h5: expected a new file or -")
     refused(["evaluate", store, "--json", tmp_path / "none/a.json"], "none does not exist")
+    refused(["evaluate", store, "--seed", "-1"], "seed must be 0 or more, got -1")
+    own = tmp_path / "own.safetensors"
+    refused(["evaluate", store, "--methods", f"{own}+LM", "--json", own], "own.safetensors: expected a new file or -")
     refused(["evaluate", store, "--json", tmp_path / "a.json", "--weights", "nothing"], "no weights")
     assert [*tmp_path.iterdir()] == [store]
 

@@ -77,6 +77,8 @@ def test_errors(photos, tmp_path, refused):
         (command(photos, tmp_path / "no" / "photos.db"), "the folder"),
         (command(tmp_path / "none", out), "no folder at"),
         (command(photos, out, "--K", "1,2,3"), "got 3 numbers"),
+        (command(photos, out, "--seed", "-1"), "seed must"),
+        (command(photos, tmp_path / "a.h5"), "a.h5: this is where the matches go"),
         (command(photos, out, "--weights", "none"), "none"),
         (command(photos, out, "--matches", "a", "b", "c"), "got 3 files"),
         (command(photos, out, "--jobs", "-2"), "jobs"),

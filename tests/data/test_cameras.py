@@ -58,6 +58,8 @@ def test_what_is_refused():
         ("-1,700,320,240", ValueError, "positive focal lengths"),
         ("nan,700,320,240", ValueError, "positive focal lengths"),
         ("1 0 0 0 1 0 0,0,2", ValueError, "a last row of 0 0 1"),
+        ("1 0 0 7 1 0 0,0,1", ValueError, r"K\[1, 0\] = 0"),
+        (".", ValueError, "Is a directory"),
         ("exif", ValueError, "an image file expected"),
     ]:
         with pytest.raises(error, match=message):

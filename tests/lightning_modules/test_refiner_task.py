@@ -82,7 +82,7 @@ def test_images_of_stores(folder, tmp_path):
     find = find_images([f"{folder}/images"])
     assert find("place0/s0v1.png", (WIDTH, HEIGHT)) == folder / "images/place0/s0v1.png"
     assert find("x/s0v1._c.jpg", (WIDTH // 2, HEIGHT // 2)) == folder / "images/place0/s0v1.png"
-    assert find("x/s0v1.png", (HEIGHT, WIDTH)) is None
+    assert find("x/s0v1.png", (HEIGHT, WIDTH)) is find("x/s0v1.5.png", (WIDTH, HEIGHT)) is None
     assert find("none.png", (WIDTH, HEIGHT)) is None
     assert source(folder).left_out == 0
     assert ImageSets([f"{folder}/matches.h5"], [f"{folder}/images/place1"]).left_out == 1

@@ -94,7 +94,7 @@ def test_reference(images):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_colmap_reconstructs(images, known):
-    _, path = export(images, K=K if known else None, single_camera=True)
+    _, path = export(images, K=2 * K if known else None, single_camera=True)  # a multiple is the same camera
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size, options.random_seed, options.num_threads = 3, 0, 1
     if known:
@@ -170,6 +170,13 @@ class TestErrors:
         with pytest.raises(FileExistsError, match=r"written\.db exists already: remove it"):
             export(images)
         assert (images / "written.db").read_text() == "mine"
+
+    def test_skew_and_unreadable(self, images):
+        with pytest.raises(ValueError, match=r"K must have no skew, .* got 5\.0"):
+            export(images, K=K + np.array([[0, 5, 0], [0, 0, 0], [0, 0, 0]]))
+        (images / NAMES[1]).write_bytes(b"")
+        with pytest.raises(ValueError, match=r"views/1\.png is not an image that can be read"):
+            export(images)
 
     def test_missing_image(self, images):
         (images / NAMES[2]).unlink()

@@ -115,7 +115,7 @@ def method_rows(predictions: Mapping[str, Mapping[str, Tensor]]) -> list[list[Ce
         [
             name,
             *(rate(name, baseline, "own") for baseline in (BASELINE, "whitening")),
-            Number(errors["own"][finite].mean().item()),
+            tables.number(errors["own"][finite].mean().item()) or "-",
             *(median_number(errors[key]) or "-" for key in ("own", "truth")),
             rate(name, BASELINE, "truth"),
         ]

@@ -77,6 +77,10 @@ def record_robust(
     identify = robust_estimators.identify_estimator
     identities = {short: identify(name) if short in installed else None for name, short in names.items()}
     read = {name: read_store(path) for name, path in stores.items()}
+    if calibrated := [name for name in names if name.endswith("-calibrated")]:
+        for name, store in read.items():
+            if not np.isfinite(store.K).any():
+                raise ValueError(f"{' and '.join(calibrated)} need cameras, store {name} has none: leave out either")
     about: About = {"estimators": identities, **options, "threads": torch.get_num_threads()}
     jobs = _jobs(folder, read, installed, options)
     total = len(read) * len(PROTOCOLS) * len(THRESHOLDS) * len(installed)

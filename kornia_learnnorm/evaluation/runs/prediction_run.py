@@ -52,6 +52,8 @@ class SampleOptions:
     def __post_init__(self) -> None:
         if self.size < 8:
             raise ValueError(f"a sample needs at least 8 correspondences, got size={self.size}")
+        if self.seed < 0:
+            raise ValueError(f"seed must be 0 or more, got {self.seed}")
         if self.max_samples is not None and self.max_samples < 1:
             raise ValueError(f"max_samples must be 1 or more, or None for all, got {self.max_samples}")
 

@@ -167,6 +167,8 @@ def test_weights_without_a_network_end_a_list_of_pairs(monkeypatch, tmp_path, pl
     with pytest.raises(features.MissingWeightsError, match="the weights of XFeat are not in"):
         estimate_pairs(pairs, out, PairOptions(detector="xfeat"), jobs=1)
     assert (out / "pairs.jsonl").read_text() == ""
+    with pytest.raises(ValueError, match="K must be one camera for both images or two, got 3"):
+        PairOptions(K=("1,1,1,1",) * 3).arguments(*pairs[0])
 
 
 @given(seed=st.integers(0, 10**6), width=st.integers(1, 60), height=st.integers(1, 50), share=st.floats(0, 0.02))

@@ -46,6 +46,7 @@ def test_files(written):
 
 def test_not_a_run_or_without_the_baseline(tmp_path, copied, refused):
     refused(["report", tmp_path], "no run at")
+    refused(["report", tmp_path, "--json", tmp_path / "report.md"], "report.md: expected a new file or -")
     for protocol in ("filtered", "unfiltered"):
         (copied / "scenes" / protocol / "Hartley.npz").unlink()
     refused(["report", copied], "compares with Hartley, the run has predictions of Hartley+LM, ")

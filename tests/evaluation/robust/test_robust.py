@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import kornia_learnnorm as kln
 from kornia_learnnorm.cli.main import main
 from kornia_learnnorm.data.store import read_store
 from kornia_learnnorm.data.synthetic.scenes import synthetic_store
+from kornia_learnnorm.data.writer import write_store
 from kornia_learnnorm.evaluation.robust import peers, robust_estimators
 from kornia_learnnorm.evaluation.robust.robust_estimators import DEFAULT_ESTIMATORS, find_estimator, run_estimator
 from kornia_learnnorm.evaluation.robust.robust_run import estimate_path, measure, read_robust, shuffled_pair
@@ -95,6 +97,11 @@ def test_what_fails_is_left_out_and_others_go_on(robust_store, tmp_path, monkeyp
     assert [*found.cells[0].estimates] == ["RANSAC"]
     assert found.cells[0].estimates["RANSAC"][1.0]["samples"].min() >= 1
     assert main(["report", str(out)]) == 0
+    store = replace(read_store(robust_store), K=np.full((len(read_store(robust_store)), 2, 3, 3), np.nan))
+    write_store(tmp_path / "bare.h5", store)
+    options = ["--out", str(tmp_path / "other"), "--estimators", "RANSAC-calibrated"]
+    assert main(["robust", str(tmp_path / "bare.h5"), *options]) == 2
+    assert "RANSAC-calibrated need cameras, store bare has none: leave out either" in capsys.readouterr().err
 
 
 def test_protocols_and_order():
